@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Strict conversion between frozen dataclasses and plain data (TOML, JSON).
+
+Every setting of the package is a frozen dataclass. This module is the only place where such a
+setting meets a file: unknown keys are refused with the nearest valid name, values are type-checked,
+and what is written reads back equal.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+
+T = TypeVar("T")
+
+
+def to_dict(setting: Any) -> Any:
+    """Plain data (dict, list, str, number, bool, None) of a dataclass, `type` first where it is tagged."""
+    if dataclasses.is_dataclass(setting) and not isinstance(setting, type):
+        fields = {f.name: to_dict(getattr(setting, f.name)) for f in dataclasses.fields(setting) if f.init}
+        tag = getattr(setting, "type_name", None)
+        return {"type": tag, **fields} if tag else fields
+    if isinstance(setting, np.ndarray):
+        return setting.tolist()
+    if isinstance(setting, Mapping):
+        return {key: to_dict(value) for key, value in setting.items()}
+    if isinstance(setting, (tuple, list)):
+        return [to_dict(value) for value in setting]
+    return setting
+
+
+def from_dict(cls: type[T], data: Any, where: str = "") -> T:
+    """An instance of the dataclass `cls` from plain data.
+
+    Parameters
+    ----------
+    cls : dataclass type; if it is abstract, `data["type"]` names one of its subclasses' `type_name`.
+    data : mapping of field names to plain values.
+    where : name of the place in the file, for messages, for example "sensors[0].rig".
+
+    Raises
+    ------
+    ValueError
+        Unknown or missing key, wrong type or a value the dataclass refuses; the message names the place.
+    """
+    place = where or cls.__name__
+    if not isinstance(data, Mapping):
+        raise ValueError(f"{place}: expected a table of settings, got {type(data).__name__} {data!r}.")
+    values = dict(data)
+    cls = _concrete(cls, values, place)
+    hints = get_type_hints(cls)
+    names = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    check_keys(values, names, place)
+    missing = [n for n, f in names.items() if n not in values and _required(f)]
+    if missing:
+        raise ValueError(f"{place}: missing {', '.join(map(repr, missing))}.")
+    arguments = {key: _value(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in values.items()}
+    try:
+        return cls(**arguments)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
+
+
+def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:
+    """Raise ValueError on the first key that is not valid, naming the nearest valid one."""
+    valid = list(valid)
+    for key in given:
+        if key not in valid:
+            raise ValueError(f"{place}: unknown key {key!r}{nearest(key, valid)}; valid are {', '.join(valid)}.")
+
+
+def nearest(name: str, valid: typing.Iterable[str]) -> str:
+    """' (did you mean ...?)' if some valid name is close to `name`, else ''."""
+    close = difflib.get_close_matches(str(name), list(valid), n=1, cutoff=0.5)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def _required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
+    """`cls` itself, or the subclass that the key `type` names; removes that key from `values`."""
+    choices = {sub.type_name: sub for sub in cls.__subclasses__() if getattr(sub, "type_name", None)}
+    own = getattr(cls, "type_name", None)
+    if own:
+        choices[own] = cls
+    if not choices:
+        return cls
+    tag = values.pop("type", own)
+    if tag not in choices:
+        raise ValueError(
+            f"{place}: expected 'type' to be one of {', '.join(choices)}, got {tag!r}{nearest(str(tag), choices)}."
+        )
+    return choices[tag]
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    """`value` converted to the annotated type."""
+    if get_origin(hint) in (Union, types.UnionType):
+        if value is None and type(None) in get_args(hint):
+            return None
+        hint = next(arg for arg in get_args(hint) if arg is not type(None))
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return from_dict(hint, value, where)
+    if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):
+        return tuple(from_dict(get_args(hint)[0], v, f"{where}[{i}]") for i, v in enumerate(value))
+    if hint is np.ndarray or get_origin(hint) is np.ndarray:
+        try:
+            return np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{where}: expected an array of numbers, got {value!r}.") from error
+    try:
+        return msgspec.convert(value, hint)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{where}: {error}, got {value!r}.") from error

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a sensor reads of one light path: a weight that depends on (u, v) and the path length.
+
+A range sensor is a linear functional of light paths. A path leaves the projector at (u, v), has the
+optical length l, and brings the radiance w to a pixel. A `DenseResponse` adds w * r_c(u, v, l) to
+each of its channels c; a `SparseResponse` adds w to one of many bins. Frames that a sensor can
+compute from other frames (an inverse pattern is white minus the pattern; four taps are two phasor
+components and the mean) are no channels: sensors declare the smallest basis, and build their frames
+from it.
+
+The formulas are written once, over `Math`: NumPy evaluates them for tests and pattern images,
+the renderer evaluates them per light path.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""Metres per second in vacuum, exact."""
+
+
+class LightPath(NamedTuple):
+    """One light path, or arrays of them.
+
+    u, v : projector pixel coordinates, 0 <= u <= width, 0 <= v <= height.
+    path_length_m : optical length from projector to camera, metres (refractive index included).
+    is_first : whether the camera sees the lit point directly or through delta surfaces only.
+    """
+
+    u: Any
+    v: Any
+    path_length_m: Any
+    is_first: Any
+
+
+class Math(Protocol):
+    """The array functions a response may use."""
+
+    def cos(self, x: Any) -> Any: ...
+    def sin(self, x: Any) -> Any: ...
+    def floor(self, x: Any) -> Any: ...
+    def abs(self, x: Any) -> Any: ...
+    def select(self, condition: Any, a: Any, b: Any) -> Any: ...
+    def unsigned(self, x: Any) -> Any:
+        """`x` (>= 0) truncated to a 32-bit unsigned integer."""
+    def lookup(self, table: np.ndarray, index: Any) -> Any:
+        """table[index] for a flat float32 table."""
+
+
+class NumpyMath:
+    """`Math` on NumPy arrays."""
+
+    cos, sin, floor, abs = np.cos, np.sin, np.floor, np.abs
+    select = staticmethod(np.where)
+
+    @staticmethod
+    def unsigned(x: Any) -> Any:
+        return np.asarray(x).astype(np.uint32)
+
+    @staticmethod
+    def lookup(table: np.ndarray, index: Any) -> Any:
+        return table[index]
+
+
+class Response(ABC):
+    """A linear functional of light paths."""
+
+    channels: int
+    """Number of channels (dense) or bins (sparse)."""
+
+
+class DenseResponse(Response):
+    """Every path counts in every channel, with a weight."""
+
+    @abstractmethod
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        """One real weight per channel."""
+
+
+class SparseResponse(Response):
+    """A path counts in one bin, with weight one, or in none."""
+
+    @abstractmethod
+    def bin(self, path: LightPath, m: Math) -> Any:
+        """Unsigned bin index; an index >= `channels` means none."""
+
+
+@dataclass(frozen=True)
+class GrayBits(DenseResponse):
+    """Bits of the Gray code of the projector column or row, most significant first; pixels are squares."""
+
+    axis: int
+    """0: columns (u), 1: rows (v)."""
+    bits: int
+    shift: int = 0
+    """Finest bits left out."""
+
+    @property
+    def channels(self) -> int:  # type: ignore[override]
+        return self.bits - self.shift
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        coordinate = m.unsigned(path[self.axis])
+        gray = coordinate ^ (coordinate >> 1)
+        return [m.select((gray >> b) & 1 == 1, 1.0, 0.0) for b in reversed(range(self.shift, self.bits))]
+
+
+@dataclass(frozen=True)
+class Fringes(DenseResponse):
+    """cos and sin of the phase 2 pi x / period along the projector columns or rows, x continuous."""
+
+    axis: int
+    period_px: float
+    channels: ClassVar[int] = 2  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        phase = path[self.axis] * (2 * np.pi / self.period_px)
+        return [m.cos(phase), m.sin(phase)]
+
+
+@dataclass(frozen=True, eq=False)
+class Images(DenseResponse):
+    """Arbitrary patterns, (k, height, width) float32 in 0..1, each projector pixel a uniform square."""
+
+    patterns: np.ndarray
+
+    @property
+    def channels(self) -> int:  # type: ignore[override]
+        return len(self.patterns)
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        _, height, width = self.patterns.shape
+        column = m.unsigned(m.select(path.u < width, path.u, width - 1.0))
+        row = m.unsigned(m.select(path.v < height, path.v, height - 1.0))
+        index = row * width + column
+        return [m.lookup(np.ascontiguousarray(p, dtype=np.float32).ravel(), index) for p in self.patterns]
+
+
+@dataclass(frozen=True)
+class Phasor(DenseResponse):
+    """Correlation of the returned modulation with a reference in phase and in quadrature, over 2 pi f l / c.
+
+    A sine source gives cos and sin; a square source and a square reference give triangle waves of the same
+    period, which hold odd harmonics (the "wiggling" error of AMCW cameras).
+    """
+
+    modulation_hz: float
+    square: bool = False
+    channels: ClassVar[int] = 2  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        turns = path.path_length_m * (self.modulation_hz / SPEED_OF_LIGHT)
+        if self.square:
+            return [_triangle(turns, m), _triangle(turns - 0.25, m)]
+        return [m.cos(2 * np.pi * turns), m.sin(2 * np.pi * turns)]
+
+
+def _triangle(turns: Any, m: Math) -> Any:
+    """Triangle wave of period 1 with value 1 at 0 and -1 at 1/2."""
+    return 4 * m.abs(turns - m.floor(turns) - 0.5) - 1
+
+
+@dataclass(frozen=True)
+class FirstReturn(DenseResponse):
+    """Radiance, and radiance times path length, of the paths that are lit where the camera looks."""
+
+    channels: ClassVar[int] = 2  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        first = m.select(path.is_first, 1.0, 0.0)
+        return [first, first * path.path_length_m]
+
+
+@dataclass(frozen=True)
+class LengthBins(SparseResponse):
+    """Histogram over the path length (round trip), `channels` bins from `start_m`, `width_m` each."""
+
+    start_m: float
+    width_m: float
+    channels: int  # type: ignore[misc]
+
+    def bin(self, path: LightPath, m: Math) -> Any:
+        position = (path.path_length_m - self.start_m) * (1 / self.width_m)
+        inside = (position >= 0) & (position < self.channels)
+        return m.unsigned(m.select(inside, position, float(self.channels)))

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every range sensor has in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from rangesim.response import Response
+
+if TYPE_CHECKING:
+    from rangesim.capture import Capture
+    from rangesim.range_image import RangeImage
+
+
+class Sensor(ABC):
+    """A measuring principle: which responses to light paths it reads, and how to decode its frames.
+
+    A sensor holds no geometry (that is the `Rig`) and no electronics (that is the `Detector`).
+    Subclasses are frozen dataclasses.
+    """
+
+    type_name: ClassVar[str]
+    """Name in configuration files and sidecars."""
+
+    @abstractmethod
+    def responses(self) -> tuple[Response, ...]:
+        """The basis of linear functionals that the transport pass has to accumulate."""
+
+    @abstractmethod
+    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        """(k, h, w) float32 mean radiance of the frames, W/m2/sr, from what the transport pass accumulated.
+
+        Parameters
+        ----------
+        channels : one (c, h, w) float32 per response, in the order of `responses()`, W/m2/sr.
+        steady : (h, w) float32, radiance under constant light of the projector at full power, without ambient.
+        ambient : (h, w) float32, radiance of all other light that passes the camera's filter.
+        """
+
+    @abstractmethod
+    def frame_names(self) -> list[str]:
+        """One short name per frame, as used for files and plots."""
+
+    @abstractmethod
+    def decode(self, capture: Capture) -> RangeImage:
+        """Range image of a capture; needs neither scene nor renderer."""
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames in a capture."""
+        return len(self.frame_names())

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time of flight: ideal path length, AMCW (indirect) and histogram (direct)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+
+from rangesim.response import SPEED_OF_LIGHT, FirstReturn, LengthBins, Phasor, Response
+from rangesim.sensors.base import Sensor
+
+if TYPE_CHECKING:
+    from rangesim.capture import Capture
+    from rangesim.range_image import RangeImage
+
+
+@dataclass(frozen=True)
+class IdealToF(Sensor):
+    """Range from the path length of the first return alone: the best any time of flight sensor could do.
+
+    Frames: `radiance` of the first return, and `radiance_x_length`, the same times its path length in metres.
+    """
+
+    type_name: ClassVar[str] = "ideal-tof"
+
+    def responses(self) -> tuple[Response, ...]:
+        return (FirstReturn(),)
+
+    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        return np.asarray(channels[0], dtype=np.float32)
+
+    def frame_names(self) -> list[str]:
+        return ["radiance", "radiance_x_length"]
+
+    def decode(self, capture: Capture) -> RangeImage:
+        from rangesim.decode.time_of_flight import decode_ideal
+
+        return decode_ideal(capture)
+
+
+@dataclass(frozen=True)
+class AmcwToF(Sensor):
+    """Amplitude-modulated continuous wave camera with four taps per frequency (0, 90, 180, 270 degrees).
+
+    The mean of tap theta is (A + contrast * B cos(phi - theta)) / 2 with phi = 2 pi f l / c over the path length
+    l (there and back); A holds steady and ambient light. Frames: frequency by frequency, four taps each.
+
+    Parameters
+    ----------
+    modulation_hz : tuple of floats, hertz.
+    contrast : float in (0, 1], demodulation contrast.
+    waveform : "sine", or "square" for a square source against a square reference (triangle correlation, "wiggling").
+    """
+
+    modulation_hz: tuple[float, ...] = (20e6, 80e6, 100e6)
+    contrast: float = 0.8
+    waveform: Literal["sine", "square"] = "sine"
+
+    type_name: ClassVar[str] = "amcw-tof"
+
+    def __post_init__(self) -> None:
+        if not self.modulation_hz or not all(f > 0 for f in self.modulation_hz):
+            raise ValueError(f"expected positive modulation frequencies in hertz, got {self.modulation_hz}.")
+        if not 0 < self.contrast <= 1:
+            raise ValueError(f"expected a contrast in (0, 1], got {self.contrast}.")
+        if self.waveform not in ("sine", "square"):
+            raise ValueError(f"expected waveform 'sine' or 'square', got {self.waveform!r}.")
+
+    @property
+    def unambiguous_range_m(self) -> float:
+        """Range beyond which all frequencies together wrap, c / (2 gcd f); frequencies are taken to 1 kHz."""
+        common = int(np.gcd.reduce([round(f / 1e3) for f in self.modulation_hz])) * 1e3
+        return SPEED_OF_LIGHT / (2 * max(common, 1e3))
+
+    def responses(self) -> tuple[Response, ...]:
+        return tuple(Phasor(f, self.waveform == "square") for f in self.modulation_hz)
+
+    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        offset = steady + ambient
+        taps = [s * self.contrast * c[i] for c in channels for s, i in ((1, 0), (1, 1), (-1, 0), (-1, 1))]
+        return np.stack([0.5 * (offset + t) for t in taps]).astype(np.float32)
+
+    def frame_names(self) -> list[str]:
+        return [f"{f / 1e6:g}MHz_{tap}deg" for f in self.modulation_hz for tap in (0, 90, 180, 270)]
+
+    def decode(self, capture: Capture) -> RangeImage:
+        from rangesim.decode.time_of_flight import decode_amcw
+
+        return decode_amcw(capture)
+
+
+@dataclass(frozen=True)
+class DirectToF(Sensor):
+    """Pulsed time of flight with a photon histogram per pixel (SPAD and TDC). Frames: the bins.
+
+    Ambient light spreads evenly over the bins.
+
+    Parameters
+    ----------
+    bins : int, number of time bins.
+    bin_s : float, seconds, width of a bin.
+    start_s : float, seconds, delay of the first bin after the pulse.
+    pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response; 0 for none.
+    """
+
+    bins: int = 256
+    bin_s: float = 100e-12
+    start_s: float = 0.0
+    pulse_fwhm_s: float = 0.0
+
+    type_name: ClassVar[str] = "direct-tof"
+
+    def __post_init__(self) -> None:
+        if self.bins < 2 or not self.bin_s > 0 or self.start_s < 0 or self.pulse_fwhm_s < 0:
+            raise ValueError(
+                f"expected 2 bins or more of positive width and no negative start or pulse width, got {self.bins} bins "
+                f"of {self.bin_s} s from {self.start_s} s, pulse {self.pulse_fwhm_s} s."
+            )
+
+    def responses(self) -> tuple[Response, ...]:
+        return (LengthBins(self.start_s * SPEED_OF_LIGHT, self.bin_s * SPEED_OF_LIGHT, self.bins),)
+
+    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        histogram = np.asarray(channels[0], dtype=np.float32)
+        if self.pulse_fwhm_s > 0:
+            from scipy.ndimage import gaussian_filter1d
+
+            sigma = self.pulse_fwhm_s / self.bin_s / np.sqrt(8 * np.log(2))
+            histogram = gaussian_filter1d(histogram, sigma, axis=0, mode="constant")
+        return np.asarray(histogram + (ambient / self.bins).astype(np.float32), dtype=np.float32)
+
+    def frame_names(self) -> list[str]:
+        return [f"bin{b:04d}" for b in range(self.bins)]
+
+    def decode(self, capture: Capture) -> RangeImage:
+        from rangesim.decode.time_of_flight import decode_direct
+
+        return decode_direct(capture)
