@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one transport pass returns: signals, energy split and ground truth, as NumPy arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from rangesim.response import Response
+from rangesim.rig import Rig
+from rangesim.sensors import Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class EnergySplit:
+    """Radiance per pixel by the kind of light path, each (h, w) float32, W/m2/sr; the parts add up to all light.
+
+    direct : projector -> surface -> camera.
+    multipath : two or more non-delta surfaces.
+    via_delta : the camera sees the lit surface off a mirror or through glass.
+    caustic : the projector lights the surface off a mirror or through glass (zero until photons are traced).
+    glint : the camera sees the projector's lens off a mirror or through glass (zero until traced).
+    ambient : every light but the projector, before any filter.
+    """
+
+    direct: np.ndarray
+    multipath: np.ndarray
+    via_delta: np.ndarray
+    caustic: np.ndarray
+    glint: np.ndarray
+    ambient: np.ndarray
+
+    @property
+    def projector(self) -> np.ndarray:
+        """(h, w) float32, all light of the projector at full power, without ambient."""
+        return self.direct + self.multipath + self.via_delta + self.caustic + self.glint
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """First surface behind each pixel centre; NaN (ids: -1) where there is none.
+
+    z, range_m : (h, w) float32, metres, depth along the axis and Euclidean distance from the camera centre.
+    normal : (h, w, 3) float32, unit, world, towards the camera.
+    instance : (h, w) int32, index into `instance_names`.
+    material : (h, w) int32, index into `material_names`.
+    projector_uv : (h, w, 2) float32, projector pixel coordinates of the point (also outside the projector's image).
+    projector_visible : (h, w) bool, the straight segment to the projector is free and inside its image.
+    """
+
+    z: np.ndarray
+    range_m: np.ndarray
+    normal: np.ndarray
+    instance: np.ndarray
+    material: np.ndarray
+    projector_uv: np.ndarray
+    projector_visible: np.ndarray
+    instance_names: tuple[str, ...] = ()
+    material_names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Everything one transport pass accumulated for the sensors that share a rig.
+
+    rig : Rig
+    channels : response -> (c, h, w) float32, W/m2/sr.
+    energy : EnergySplit
+    truth : GroundTruth
+    """
+
+    rig: Rig
+    channels: dict[Response, np.ndarray]
+    energy: EnergySplit
+    truth: GroundTruth
+
+    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0) -> np.ndarray:
+        """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass."""
+        missing = [r for r in sensor.responses() if r not in self.channels]
+        if missing:
+            raise ValueError(f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; trace it with this sensor.")
+        channels = [self.channels[r] for r in sensor.responses()]
+        return sensor.frames(channels, self.energy.projector, ambient_transmission * self.energy.ambient)
+
+    def save(self, path: str) -> None:
+        """Write energy split and ground truth to a compressed .npz file (for later comparison)."""
+        arrays = {f"energy_{f.name}": getattr(self.energy, f.name) for f in fields(self.energy)}
+        arrays |= {f"truth_{f.name}": np.asarray(getattr(self.truth, f.name)) for f in fields(self.truth)}
+        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
