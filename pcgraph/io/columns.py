@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a file's named columns to a `Cloud`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.cloud import Cloud
+from pcgraph.errors import CloudReadError
+
+Columns = Mapping[str, NDArray[np.generic]]
+
+_NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
+_LABEL_NAMES = ("label", "labels")
+
+
+def cloud_from_columns(
+    columns: Columns, shape: tuple[int, ...], viewpoint: NDArray[np.float64] | None = None
+) -> Cloud:
+    """Cloud built from one array per field.
+
+    Parameters
+    ----------
+    columns : mapping of field name to (n,) array
+        Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``), normals
+        and labels are picked up under the names that PCL, Open3D and MeshLab write.
+    shape : (n,) or (h, w)
+        Leading shape of the result.
+    viewpoint : (3,) float64, metres, optional
+
+    Raises
+    ------
+    CloudReadError
+        A coordinate is missing or is not a floating-point or integer number.
+    """
+    missing = [name for name in "xyz" if name not in columns]
+    if missing:
+        raise CloudReadError(
+            f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)}"
+        )
+    return Cloud(
+        points=_stack(columns, ("x", "y", "z"), shape),
+        colors=_colors(columns, shape),
+        normals=_normals(columns, shape),
+        labels=_labels(columns, shape),
+        viewpoint=viewpoint,
+    )
+
+
+def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.floating]:
+    wide = any(columns[name].dtype.itemsize > 4 for name in names)
+    dtype = np.float64 if wide else np.float32
+    stacked = np.empty((*shape, len(names)), dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis, name in enumerate(names):
+            stacked[..., axis] = columns[name].reshape(shape)
+    return stacked
+
+
+def _colors(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
+    for name in ("rgb", "rgba"):
+        packed = columns.get(name)
+        if packed is not None and packed.dtype.itemsize == 4:
+            bits = np.ascontiguousarray(packed).view(np.uint32)
+            channels = [(bits >> shift) & 0xFF for shift in (16, 8, 0)]
+            return np.stack(channels, axis=-1).astype(np.uint8).reshape(*shape, 3)
+    if not all(name in columns for name in ("red", "green", "blue")):
+        return None
+    channels = [columns[name] for name in ("red", "green", "blue")]
+    if all(channel.dtype == np.uint8 for channel in channels):
+        return np.stack(channels, axis=-1).astype(np.uint8).reshape(*shape, 3)
+    top = 255.0 if all(channel.dtype.kind == "f" for channel in channels) else 255.0 / 65535.0
+    scaled = np.stack(channels, axis=-1).astype(np.float64) * top
+    return np.clip(np.nan_to_num(np.rint(scaled)), 0, 255).astype(np.uint8).reshape(*shape, 3)
+
+
+def _normals(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.floating] | None:
+    for names in _NORMAL_NAMES:
+        if all(name in columns for name in names):
+            return _stack(columns, names, shape)
+    return None
+
+
+def _labels(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.int32] | None:
+    for name in _LABEL_NAMES:
+        if name in columns and columns[name].dtype.kind in "iu":
+            return columns[name].astype(np.int32).reshape(shape)
+    return None

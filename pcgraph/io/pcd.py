@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PCD files (Point Cloud Data, PCL's format, version 0.7): ascii, binary and binary_compressed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.cloud import Cloud
+from pcgraph.errors import CloudReadError
+from pcgraph.io.columns import cloud_from_columns
+from pcgraph.io.text import numbers_from_text
+
+_KINDS = {"F": "f", "I": "i", "U": "u"}
+_SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
+_REQUIRED = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
+_MAX_HEADER_BYTES = 1 << 16
+
+
+@dataclass(frozen=True)
+class PcdHeader:
+    """What a PCD header promises.
+
+    Attributes
+    ----------
+    names, dtypes, counts : one per field
+        Field name, little-endian scalar type, elements per point.
+    width, height : int
+        Lattice size; height 1 means unorganised.
+    viewpoint : (3,) float64, metres
+        Sensor position.
+    data : str
+        ``ascii``, ``binary`` or ``binary_compressed``.
+    """
+
+    names: tuple[str, ...]
+    dtypes: tuple[np.dtype[np.generic], ...]
+    counts: tuple[int, ...]
+    width: int
+    height: int
+    viewpoint: NDArray[np.float64]
+    data: str
+
+    @property
+    def n_points(self) -> int:
+        """Number of points, width x height."""
+        return self.width * self.height
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading shape of the cloud: (n,), or (h, w) when organised."""
+        return (self.n_points,) if self.height == 1 else (self.height, self.width)
+
+
+def read_pcd(content: bytes) -> Cloud:
+    """Cloud held by the bytes of a PCD file; organisation, NaN, colours, normals and labels kept.
+
+    Raises
+    ------
+    CloudReadError
+        The header is incomplete or contradicts itself, or the data is shorter than the header says.
+    """
+    header, body = _parse_header(content)
+    readers = {"ascii": _ascii_columns, "binary": _binary_columns, "binary_compressed": _compressed_columns}
+    if header.data not in readers:
+        raise CloudReadError(f"expected DATA ascii, binary or binary_compressed, got {header.data!r}")
+    return cloud_from_columns(readers[header.data](header, body), header.shape, header.viewpoint)
+
+
+def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
+    entries: dict[str, list[str]] = {}
+    position = 0
+    while "DATA" not in entries:
+        end = content.find(b"\n", position, _MAX_HEADER_BYTES)
+        if end < 0:
+            raise CloudReadError("expected a PCD header that ends in a DATA line, but found none")
+        words = content[position:end].decode("latin-1").split()
+        position = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+    missing = [key for key in _REQUIRED if not entries.get(key)]
+    if missing:
+        raise CloudReadError(f"expected PCD header lines {', '.join(_REQUIRED)}; missing or empty: {', '.join(missing)}")
+    return _checked_header(entries), content[position:]
+
+
+def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
+    names = tuple(name.lower() for name in entries["FIELDS"])
+    counts = _integers(entries, "COUNT", default=[1] * len(names))
+    sizes = _integers(entries, "SIZE")
+    kinds = [kind.upper() for kind in entries["TYPE"]]
+    if not len(names) == len(sizes) == len(kinds) == len(counts):
+        raise CloudReadError(
+            f"expected as many SIZE, TYPE and COUNT entries as FIELDS ({len(names)}), "
+            f"got {len(sizes)}, {len(kinds)} and {len(counts)}"
+        )
+    dtypes = []
+    for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True):
+        if kind not in _KINDS or size not in _SIZES[kind] or not 1 <= count <= 4096:
+            raise CloudReadError(f"field {name!r}: TYPE {kind}, SIZE {size}, COUNT {count} is not a PCD number type")
+        dtypes.append(np.dtype(f"<{_KINDS[kind]}{size}"))
+    width, height = _integers(entries, "WIDTH")[0], _integers(entries, "HEIGHT")[0]
+    points = _integers(entries, "POINTS", default=[width * height])[0]
+    if min(width, height) < 0 or points != width * height:
+        raise CloudReadError(f"expected POINTS = WIDTH x HEIGHT, got {points} != {width} x {height}")
+    viewpoint = _viewpoint(entries.get("VIEWPOINT", []))
+    return PcdHeader(names, tuple(dtypes), tuple(counts), width, height, viewpoint, entries["DATA"][0].lower())
+
+
+def _integers(entries: dict[str, list[str]], key: str, default: list[int] | None = None) -> list[int]:
+    words = entries.get(key)
+    if not words and default is not None:
+        return default
+    try:
+        return [int(word) for word in words or []]
+    except ValueError:
+        raise CloudReadError(f"expected whole numbers after {key} in the PCD header, got {words}") from None
+
+
+def _viewpoint(words: list[str]) -> NDArray[np.float64]:
+    try:
+        position = np.array([float(word) for word in words[:3]])
+    except ValueError:
+        position = np.empty(0)
+    return position if position.shape == (3,) and np.isfinite(position).all() else np.zeros(3)
+
+
+def _ascii_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
+    table = numbers_from_text(body, header.n_points, sum(header.counts))
+    columns: dict[str, NDArray[np.generic]] = {}
+    first = 0
+    for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns[name] = table[:, first].astype(dtype)
+        first += count
+    return columns
+
+
+def _binary_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
+    fields = zip(header.dtypes, header.counts, strict=True)
+    record = np.dtype([(f"f{i}", dtype, (count,)) for i, (dtype, count) in enumerate(fields)])
+    _check_length(len(body), header.n_points * record.itemsize, header)
+    rows = np.frombuffer(body, record, count=header.n_points)
+    return {name: rows[f"f{i}"][:, 0] for i, name in enumerate(header.names)}
+
+
+def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
+    from pcgraph.io.lzf import decompress
+
+    per_point = sum(dtype.itemsize * count for dtype, count in zip(header.dtypes, header.counts, strict=True))
+    if len(body) < 8:
+        raise CloudReadError("the compressed PCD data is cut off before its two sizes")
+    packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", count=2))
+    _check_length(unpacked, header.n_points * per_point, header)
+    # LZF shrinks by at most 264 bytes to 3, so a size far above that is a lie and is not worth allocating.
+    if packed > len(body) - 8 or unpacked > 88 * packed + 264:
+        raise CloudReadError(f"the PCD data promises {packed} compressed bytes, but {len(body) - 8} are left")
+    target = np.empty(unpacked, np.uint8)
+    if decompress(np.frombuffer(body, np.uint8, count=packed, offset=8), target) != unpacked:
+        raise CloudReadError("the compressed PCD data is damaged and cannot be unpacked")
+    columns: dict[str, NDArray[np.generic]] = {}
+    start = 0
+    for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
+        end = start + header.n_points * dtype.itemsize * count
+        columns[name] = target[start:end].view(dtype).reshape(header.n_points, count)[:, 0]
+        start = end
+    return columns
+
+
+def _check_length(available: int, needed: int, header: PcdHeader) -> None:
+    if available < needed:
+        raise CloudReadError(
+            f"the PCD header promises {header.n_points} points ({needed} bytes), but only {available} bytes follow"
+        )

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PLY files (Stanford polygon format 1.0): ascii and both binary byte orders; only the vertices are read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.cloud import Cloud
+from pcgraph.errors import CloudReadError
+from pcgraph.io.columns import cloud_from_columns
+from pcgraph.io.text import numbers_from_text
+
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_NAMES = {"i4": "int", "u1": "uchar", "f4": "float", "f8": "double"}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+_MAX_HEADER_BYTES = 1 << 16
+
+
+@dataclass
+class PlyElement:
+    """One element of a PLY header: its name, its count and its scalar properties in file order."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]] = field(default_factory=list)
+    has_list: bool = False
+
+
+def read_ply(content: bytes) -> Cloud:
+    """Cloud held by the vertices of a PLY file; colours, normals and labels kept.
+
+    Raises
+    ------
+    CloudReadError
+        The header is broken, there are no vertices' coordinates, or the data is shorter than the header says.
+    """
+    code, elements, body = _parse_header(content)
+    for element in elements:
+        if element.has_list and (element.name == "vertex" or code != "ascii"):
+            raise CloudReadError(f"expected scalar properties up to the vertices, but {element.name!r} has a list")
+        if element.name == "vertex":
+            break
+        body = _skip(element, code, body)
+    else:
+        raise CloudReadError("expected a PLY element called vertex, but the header names none")
+    names = [name for name, _ in element.properties]
+    if len(set(names)) != len(names) or not names:
+        raise CloudReadError(f"expected distinct vertex properties, got {names}")
+    columns = _ascii_columns(element, body) if code == "ascii" else _binary_columns(element, code, body)
+    return cloud_from_columns(columns, (element.count,))
+
+
+def encode_ply(columns: dict[str, NDArray[np.generic]]) -> bytes:
+    """Bytes of a binary little-endian PLY file with one vertex property per column.
+
+    Parameters
+    ----------
+    columns : mapping of property name to (n,) array of int32, uint8, float32 or float64
+    """
+    record = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    n_points = len(next(iter(columns.values())))
+    rows = np.empty(n_points, record)
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n_points}"]
+    for name, column in columns.items():
+        rows[name] = column
+        lines.append(f"property {_NAMES[column.dtype.str[1:]]} {name}")
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.tobytes()
+
+
+def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
+    end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
+    newline = content.find(b"\n", end)
+    if not content.startswith(b"ply") or end < 0 or newline < 0:
+        raise CloudReadError("expected a PLY header from 'ply' to 'end_header', but found none")
+    code = ""
+    elements: list[PlyElement] = []
+    for line in content[:end].decode("latin-1").splitlines()[1:]:
+        words = line.split()
+        if words[:1] == ["format"] and len(words) == 3:
+            code = words[1]
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
+            elements.append(PlyElement(words[1], int(words[2])))
+        elif words[:1] == ["property"] and elements:
+            _add_property(elements[-1], words)
+        elif words and words[0] not in ("comment", "obj_info"):
+            raise CloudReadError(f"PLY header line not understood: {line[:80]!r}")
+    if code not in _ORDERS:
+        raise CloudReadError(f"expected PLY format {', '.join(_ORDERS)}, got {code!r}")
+    return code, elements, content[newline + 1 :]
+
+
+def _add_property(element: PlyElement, words: list[str]) -> None:
+    if len(words) == 5 and words[1] == "list":
+        element.has_list = True
+    elif len(words) == 3 and words[1] in _TYPES:
+        element.properties.append((words[2].lower(), _TYPES[words[1]]))
+    else:
+        raise CloudReadError(f"PLY property not understood: {' '.join(words)[:80]!r}")
+
+
+def _record(element: PlyElement, code: str) -> np.dtype[np.void]:
+    return np.dtype([(name, _ORDERS[code] + kind) for name, kind in element.properties])
+
+
+def _skip(element: PlyElement, code: str, body: bytes) -> bytes:
+    if code == "ascii":
+        lines = body.split(b"\n", element.count)
+        return lines[-1] if len(lines) > element.count else b""
+    size = sum(int(kind[1]) for _, kind in element.properties)
+    return body[element.count * size :]
+
+
+def _ascii_columns(element: PlyElement, body: bytes) -> dict[str, NDArray[np.generic]]:
+    table = numbers_from_text(body, element.count, len(element.properties))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return {name: table[:, i].astype(kind) for i, (name, kind) in enumerate(element.properties)}
+
+
+def _binary_columns(element: PlyElement, code: str, body: bytes) -> dict[str, NDArray[np.generic]]:
+    record = _record(element, code)
+    needed = element.count * record.itemsize
+    if len(body) < needed:
+        raise CloudReadError(
+            f"the PLY header promises {element.count} vertices ({needed} bytes), but only {len(body)} bytes follow"
+        )
+    rows = np.frombuffer(body, record, count=element.count)
+    return {name: rows[name].astype(kind) for name, kind in element.properties}

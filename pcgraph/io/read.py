@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading point clouds: one function for all formats."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+from pcgraph.cloud import Cloud
+from pcgraph.errors import CloudReadError
+from pcgraph.io.pcd import read_pcd
+from pcgraph.io.ply import read_ply
+
+_READERS = {".pcd": read_pcd, ".ply": read_ply}
+
+
+def read_cloud(path: str | PathLike[str]) -> Cloud:
+    """Cloud held by a PCD or PLY file, in the file's own frame and unit (metres assumed elsewhere).
+
+    Parameters
+    ----------
+    path : str or path
+        ``.pcd`` (ascii, binary, binary_compressed) or ``.ply`` (ascii, binary of either byte order).
+
+    Raises
+    ------
+    CloudReadError
+        No such file, another extension, or content that is truncated or contradicts its header.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise CloudReadError(f"expected a file ending in {' or '.join(_READERS)}, got {path.name!r}: convert it first")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CloudReadError(f"cannot read {path}: {error.strerror or error}") from None
+    try:
+        return reader(content)
+    except CloudReadError as error:
+        raise CloudReadError(f"{path}: {error}") from None
