@@ -41,7 +41,6 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 _NAME = re.compile(
     r"libLLVM(?:-(?P<before>\d+(?:\.\d+)*))?\.(?:so(?:\.(?P<after>\d+(?:\.\d+)*))?|dylib)|LLVM-C\.dll"
 )
-_FOLDER = re.compile(r"llvm[-@/\\]?(\d+(?:\.\d+)*)", re.IGNORECASE)
 _ASK = """
 import ctypes, sys
 numbers = [ctypes.c_uint() for _ in range(3)]
@@ -139,26 +138,19 @@ def _usual_folders() -> Iterator[Path]:
     multiarch = sysconfig.get_config_var("MULTIARCH") or f"{platform.machine()}-linux-gnu"
     fixed = (f"/usr/lib/{multiarch}", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/local/lib64", "/opt/homebrew/lib")
     yield from (Path(folder) for folder in (*fixed, f"{sys.prefix}/lib", r"C:\Program Files\LLVM\bin"))
-    for pattern in (
-        "usr/lib/llvm*/lib",
-        "usr/lib64/llvm*/lib*",
-        "usr/local/llvm*/lib",
-        "opt/homebrew/opt/llvm*/lib",
-        "usr/local/opt/llvm*/lib",
-        "opt/local/libexec/llvm-*/lib",
-    ):
+    for pattern in ("usr/lib*/llvm*/lib*", "usr/local/*/llvm*/lib", "opt/homebrew/opt/llvm*/lib"):
         yield from Path("/").glob(pattern)
 
 
 def _libraries_in(folders: Iterable[Path]) -> list[LlvmLibrary]:
-    """Every libLLVM file in the folders, each file once, in order of discovery."""
-    paths: dict[Path, Path] = {}
-    for folder in folders:
-        if folder.is_dir():
-            for path in sorted((*folder.glob("libLLVM[-.]*"), *folder.glob("LLVM-C.dll"))):
-                if _NAME.fullmatch(path.name) and path.is_file() and _is_for_this_machine(path):
-                    paths.setdefault(path.resolve(), path)
-    return [LlvmLibrary(path, _version_of(path)) for path in paths.values()]
+    """Every libLLVM file in the folders, each file once however many links lead to it."""
+    found: dict[Path, LlvmLibrary] = {}
+    for folder in filter(Path.is_dir, folders):
+        for path in sorted((*folder.glob("libLLVM[-.]*"), *folder.glob("LLVM-C.dll"))):
+            file = path.resolve()
+            if _NAME.fullmatch(path.name) and file.is_file() and file not in found and _is_for_this_machine(file):
+                found[file] = LlvmLibrary(file, _version_of(path))
+    return list(found.values())
 
 
 def _libraries_of_linker() -> list[LlvmLibrary]:
@@ -172,14 +164,11 @@ def _libraries_of_linker() -> list[LlvmLibrary]:
 
 
 def _version_of(path: Path) -> tuple[int, ...]:
-    """The version in the name of the file a link leads to, else of its folder, else as the library says."""
-    target = path.resolve()
-    for name in (target.name, path.name):
-        match = _NAME.fullmatch(name)
-        if match and (text := match["before"] or match["after"]):
-            return tuple(map(int, text.split(".")))
-    match = _FOLDER.search(str(target.parent))
-    text = match[1] if match else _ask(target)
+    """The version in the name of the file a link leads to, else in the link's name, else as the library says."""
+    file = path.resolve()
+    matches = filter(None, (_NAME.fullmatch(name) for name in (file.name, path.name)))
+    named = (match["before"] or match["after"] for match in matches)
+    text = next(filter(None, named), None) or _ask(file)
     return tuple(int(part) for part in text.split(".") if part)
 
 
@@ -194,14 +183,14 @@ def _ask(path: Path) -> str:
 
 def _is_for_this_machine(path: Path) -> bool:
     """False for an ELF library of another word size or processor than the running Python's."""
-    headers = []
-    for file in (path, Path(sys.executable)):
-        with file.open("rb") as stream:
-            headers.append(stream.read(20))
-    library, python = headers
-    if not (library.startswith(b"\x7fELF") and python.startswith(b"\x7fELF")):
-        return True
-    return (library[4], library[18:20]) == (python[4], python[18:20])
+    library, python = _head(path), _head(Path(sys.executable))
+    both_elf = library.startswith(b"\x7fELF") and python.startswith(b"\x7fELF")
+    return not both_elf or (library[4], library[18:20]) == (python[4], python[18:20])
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(20)
 
 
 def _version_held_by_drjit() -> tuple[int, ...] | None:

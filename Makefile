@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+# `make demo` and `make test` are all that is needed on a fresh machine; `make help` lists the rest.
+
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO_SCENE := scenes/tabletop.xml
+DEMO_OUT := out/demo
+export PYTHON
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-quick lint format clean system
+
+help: ## this list
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
+
+demo: $(VENV)/.installed ## set up if needed, run the comparison on the tabletop scene, say where the report is
+	$(BIN)/rangesim run $(DEMO_SCENE) --out $(DEMO_OUT)
+	@echo "Report: $(CURDIR)/$(DEMO_OUT)/report.html"
+
+test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run every test with coverage
+	$(BIN)/python -m pytest --cov --cov-report=term
+
+test-quick: $(VENV)/.installed-test ## the tests without those marked slow, without coverage
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: $(VENV)/.installed-test ## ruff and mypy
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-test ## let ruff put the code in order
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+clean: ## remove the environment, caches and results
+	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage htmlcov
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The system libraries are looked at every time, which is quick; packages are installed only when
+# pyproject.toml has changed.
+system:
+	@scripts/setup system
+
+$(VENV)/.installed: pyproject.toml scripts/setup | system
+	@scripts/setup venv $(VENV)
+	@scripts/setup install $(VENV)
+	@touch $@
+
+$(VENV)/.installed-test: pyproject.toml scripts/setup | system
+	@scripts/setup system --test
+	@scripts/setup venv $(VENV)
+	@scripts/setup install $(VENV) test
+	@touch $(VENV)/.installed $@
