@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from rangesim.detector import Detector
+from rangesim.detector import Detector, PhotoDetector
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
+
+DTYPES = ("uint8", "uint16", "uint32", "float32")
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,19 +24,63 @@ class Capture:
     frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free capture.
     sensor : Sensor, the measuring principle the frames were taken with.
     rig : Rig, or None for an uncalibrated capture.
-    detector : Detector, or None if unknown (a real capture) or noise-free.
+    detector : PhotoDetector, or None if unknown (a real capture) or noise-free.
     exposure_s : float, seconds per frame; NaN if unknown.
     """
 
     frames: np.ndarray
     sensor: Sensor
     rig: Rig | None = None
-    detector: Detector | None = None
+    detector: PhotoDetector | None = None
     exposure_s: float = float("nan")
 
     def __post_init__(self) -> None:
-        if self.frames.ndim != 3 or len(self.frames) != self.sensor.n_frames:
+        if self.frames.ndim != 3 or len(self.frames) != self.sensor.n_frames or self.frames.size == 0:
             raise ValueError(
                 f"expected {self.sensor.n_frames} frames of equal size for {self.sensor.type_name}, "
                 f"got an array of shape {self.frames.shape}."
             )
+        if self.frames.dtype.name not in DTYPES:
+            raise ValueError(f"expected frames of type {', '.join(DTYPES)}, got {self.frames.dtype.name}.")
+        if self.rig is not None and self.frames.shape[1:] != (self.rig.camera.height, self.rig.camera.width):
+            raise ValueError(
+                f"expected frames of {self.rig.camera.width} x {self.rig.camera.height} pixels as the rig's camera, "
+                f"got {self.frames.shape[2]} x {self.frames.shape[1]}."
+            )
+
+    @property
+    def is_digital(self) -> bool:
+        """Whether the frames are digital numbers, not radiance."""
+        return bool(np.issubdtype(self.frames.dtype, np.integer))
+
+    @property
+    def black_level(self) -> float:
+        """Digital number without light; 0 if unknown or noise-free."""
+        return self.detector.offset_dn if isinstance(self.detector, Detector) else 0.0
+
+    @property
+    def full_scale(self) -> float:
+        """Largest signal above black that a frame can hold; of a noise-free capture, the largest it does hold."""
+        if not self.is_digital:
+            return float(max(self.frames.max(), np.finfo(np.float32).tiny))
+        return self._max_dn - self.black_level
+
+    @property
+    def _max_dn(self) -> int:
+        return self.detector.max_dn if self.detector else int(np.iinfo(self.frames.dtype).max)
+
+    def saturated(self, frames: np.ndarray) -> np.ndarray:
+        """(h, w) bool, where any of `frames` (k, h, w) of this capture is at the largest digital number."""
+        if not self.is_digital:
+            return np.zeros(frames.shape[1:], dtype=bool)
+        return np.asarray(frames.max(axis=0) >= self._max_dn)
+
+    def noise(self, frame: np.ndarray) -> np.ndarray | None:
+        """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown."""
+        return self.detector.noise_dn(frame) if isinstance(self.detector, Detector) else None
+
+    def save(self, directory: str | Path) -> None:
+        """Write the capture as a directory of images and a sidecar; see `rangesim.capture_files`."""
+        from rangesim.capture_files import save_capture
+
+        save_capture(self, directory)

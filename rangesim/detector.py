@@ -1,29 +1,108 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Radiance to digital numbers, after EMVA 1288."""
+"""Light to digital numbers: integrating image sensors after EMVA 1288, and photon counters.
+
+A pixel of a camera with entrance pupil radius a and focal length f collects from radiance L the irradiance
+E = L pi (a/f)^2, so E A t lambda / (h c) photons on its area A in the exposure t. With f = fx sqrt(A) the pixel
+pitch drops out: photons = L pi a^2 / (fx fy) t lambda / (h c), radiance times etendue. The fall-off towards the
+corners (cos^4) is left out.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from rangesim.rig import Rig
+from rangesim.sensors import DirectToF, Sensor
+
+PLANCK_TIMES_C = 6.626_070_15e-34 * 299_792_458.0
+"""h c in joule metres, exact."""
+
+
+class PhotoDetector(ABC):
+    """What turns the radiance of a sensor's frames into digital numbers. Subclasses are frozen dataclasses."""
+
+    type_name: ClassVar[str]
+    wavelength_m: float
+    quantum_efficiency: float
+    bits: int
+    ambient_transmission: float
+    min_exposure_s: float
+    max_exposure_s: float
+
+    @property
+    @abstractmethod
+    def capacity_e(self) -> float:
+        """Electrons (counts) at which a pixel saturates."""
+
+    @abstractmethod
+    def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
+        """(..., h, w) expected electrons (counts) of frames of `radiance` in W/m2/sr, dark ones included."""
+
+    @abstractmethod
+    def read_out(
+        self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int
+    ) -> np.ndarray:
+        """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr."""
+
+    @property
+    def max_dn(self) -> int:
+        """Largest digital number; a pixel that reads it is saturated."""
+        return int(2**self.bits - 1)
+
+    @property
+    def dtype(self) -> type[np.unsignedinteger]:
+        """Smallest unsigned integer that holds a digital number."""
+        return np.uint8 if self.bits <= 8 else np.uint16
+
+    def electrons_per_radiance(self, rig: Rig) -> float:
+        """Electrons per second of exposure for a radiance of 1 W/m2/sr."""
+        camera = rig.camera
+        etendue = np.pi * rig.camera_aperture_radius_m**2 / (camera.fx * camera.fy)
+        return float(etendue * self.quantum_efficiency * self.wavelength_m / PLANCK_TIMES_C)
+
+    def _check(self, *positive: str) -> None:
+        for name in ("wavelength_m", "min_exposure_s", "max_exposure_s", *positive):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"expected {name} to be positive and finite, got {getattr(self, name)}.")
+        if not 0 < self.quantum_efficiency <= 1:
+            raise ValueError(f"expected a quantum_efficiency in (0, 1], got {self.quantum_efficiency}.")
+        if not 0 <= self.ambient_transmission <= 1:
+            raise ValueError(f"expected an ambient_transmission in 0..1, got {self.ambient_transmission}.")
+        if not 1 <= self.bits <= 16:
+            raise ValueError(f"expected 1 to 16 bits, got {self.bits}.")
+        if self.min_exposure_s > self.max_exposure_s:
+            raise ValueError(
+                f"expected min_exposure_s <= max_exposure_s, got {self.min_exposure_s} > {self.max_exposure_s}."
+            )
+
+
+def streams(seed: int, n: int) -> list[np.random.Generator]:
+    """One independent random generator per frame; the same seed gives the same streams."""
+    return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(n)]
 
 
 @dataclass(frozen=True)
-class Detector:
-    """Linear image sensor after EMVA Standard 1288, release 4.0 (symbols of the standard in brackets).
+class Detector(PhotoDetector):
+    """Linear image sensor after EMVA Standard 1288, release 4.0 Linear (symbols of the standard in brackets).
 
     Parameters
     ----------
-    pixel_pitch_m : float, metres; pixels are square [sqrt A].
     wavelength_m : float, metres, of the projector's light [lambda].
     quantum_efficiency : float in (0, 1], fill factor and lens transmission included [eta].
-    full_well_e : float, electrons, saturation capacity [mu_e.sat].
+    full_well_e : float, electrons, saturation capacity [mu_e.sat]; it maps to the largest digital number.
     read_noise_e : float, electrons rms, temporal dark noise [sigma_d].
     dark_current_e_s : float, electrons per second [mu_I].
-    bits : int, ADC resolution.
-    offset_dn : float, digital numbers, black level [mu_y.dark].
+    bits : int in 1..16, ADC resolution.
+    offset_dn : float, digital numbers, black level [mu_y.dark without dark current].
     ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through.
+    pixel_pitch_m : float, metres; pixels are square [sqrt A]. Informative: it cancels, see the module.
+    min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
     """
 
-    pixel_pitch_m: float = 5e-6
     wavelength_m: float = 850e-9
     quantum_efficiency: float = 0.4
     full_well_e: float = 12_000.0
@@ -32,3 +111,131 @@ class Detector:
     bits: int = 12
     offset_dn: float = 16.0
     ambient_transmission: float = 0.05
+    pixel_pitch_m: float = 5e-6
+    min_exposure_s: float = 10e-6
+    max_exposure_s: float = 0.1
+
+    type_name: ClassVar[str] = "emva1288"
+
+    def __post_init__(self) -> None:
+        self._check("full_well_e", "pixel_pitch_m")
+        if self.read_noise_e < 0 or self.dark_current_e_s < 0:
+            raise ValueError(
+                f"expected no negative noise, got read_noise_e {self.read_noise_e}, "
+                f"dark_current_e_s {self.dark_current_e_s}."
+            )
+        if not 0 <= self.offset_dn < self.max_dn:
+            raise ValueError(f"expected 0 <= offset_dn < {self.max_dn}, got {self.offset_dn}.")
+
+    @classmethod
+    def time_of_flight(cls) -> Detector:
+        """A lock-in pixel as in indirect time-of-flight cameras: large, deep, noisier, behind a narrow filter."""
+        return cls(full_well_e=100_000.0, read_noise_e=20.0, dark_current_e_s=1000.0, pixel_pitch_m=10e-6,
+                   ambient_transmission=0.03, max_exposure_s=0.02)  # fmt: skip
+
+    @classmethod
+    def ideal(cls) -> Detector:
+        """Shot noise and 16-bit quantisation alone: every photon counts, nothing is dark, the well is deep."""
+        return cls(quantum_efficiency=1.0, full_well_e=1e6, read_noise_e=0.0, dark_current_e_s=0.0, bits=16,
+                   offset_dn=0.0, ambient_transmission=0.0)  # fmt: skip
+
+    @property
+    def gain_dn_e(self) -> float:
+        """Digital numbers per electron, overall system gain [K]."""
+        return (self.max_dn - self.offset_dn) / self.full_well_e
+
+    @property
+    def capacity_e(self) -> float:
+        return self.full_well_e
+
+    def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
+        signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * exposure_s)
+        return np.asarray(signal + self.dark_current_e_s * exposure_s)
+
+    def read_out(
+        self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int
+    ) -> np.ndarray:
+        if isinstance(sensor, DirectToF):
+            raise ValueError("expected a SpadDetector for direct-tof, got an integrating Detector.")
+        result = np.empty(radiance.shape, dtype=self.dtype)
+        for frame, out, rng in zip(radiance, result, streams(seed, len(radiance)), strict=True):
+            mean = np.maximum(self.mean_electrons(frame, sensor, rig, exposure_s), 0)
+            electrons = rng.poisson(np.minimum(mean, 10 * self.full_well_e + 1000)).astype(np.float64)
+            electrons = np.minimum(electrons, self.full_well_e)
+            electrons += self.read_noise_e * rng.standard_normal(frame.shape)
+            out[:] = np.clip(np.rint(self.gain_dn_e * electrons + self.offset_dn), 0, self.max_dn)
+        return result
+
+    def noise_dn(self, dn: np.ndarray) -> np.ndarray:
+        """Standard deviation of a pixel whose mean is `dn`, digital numbers: K^2 sigma_d^2 + 1/12 + K (mu - offset)."""
+        k = self.gain_dn_e
+        shot = k * np.maximum(np.asarray(dn, dtype=np.float32) - self.offset_dn, 0)
+        return np.asarray(np.sqrt(np.float32(k**2 * self.read_noise_e**2 + 1 / 12) + shot), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class SpadDetector(PhotoDetector):
+    """Single-photon counter with a histogram memory per pixel.
+
+    The laser fires again as soon as the histogram is full, so an exposure holds exposure_s / (bins bin_s) pulses,
+    and ambient light and dark counts spread evenly over the bins.
+
+    Parameters
+    ----------
+    wavelength_m : float, metres.
+    quantum_efficiency : float in (0, 1], photon detection efficiency, fill factor included.
+    dark_counts_hz : float, counts per second per pixel.
+    bits : int in 1..16, depth of the counter of a bin.
+    pile_up : bool; True: only the first photon after each pulse is counted (Coates 1968), False: every photon.
+    ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through.
+    min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
+    """
+
+    wavelength_m: float = 905e-9
+    quantum_efficiency: float = 0.15
+    dark_counts_hz: float = 500.0
+    bits: int = 12
+    pile_up: bool = False
+    ambient_transmission: float = 0.02
+    min_exposure_s: float = 10e-6
+    max_exposure_s: float = 0.1
+
+    type_name: ClassVar[str] = "spad"
+
+    def __post_init__(self) -> None:
+        self._check()
+        if self.dark_counts_hz < 0:
+            raise ValueError(f"expected no negative dark_counts_hz, got {self.dark_counts_hz}.")
+
+    @property
+    def capacity_e(self) -> float:
+        return float(self.max_dn)
+
+    def pulses(self, sensor: Sensor, exposure_s: float) -> int:
+        """Number of laser pulses in an exposure."""
+        if not isinstance(sensor, DirectToF):
+            raise ValueError(f"expected a direct-tof sensor for a SpadDetector, got {sensor.type_name}.")
+        return max(1, round(exposure_s / (sensor.bins * sensor.bin_s)))
+
+    def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
+        pulses = self.pulses(sensor, exposure_s)
+        assert isinstance(sensor, DirectToF)
+        open_s = pulses * sensor.bins * sensor.bin_s
+        signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * open_s)
+        return np.asarray(signal + self.dark_counts_hz * open_s / sensor.bins)
+
+    def read_out(
+        self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int
+    ) -> np.ndarray:
+        pulses = self.pulses(sensor, exposure_s)
+        result = np.empty(radiance.shape, dtype=self.dtype)
+        unused = np.full(radiance.shape[1:], pulses, dtype=np.int64)
+        for frame, out, rng in zip(radiance, result, streams(seed, len(radiance)), strict=True):
+            mean = np.maximum(self.mean_electrons(frame, sensor, rig, exposure_s), 0)
+            if self.pile_up:
+                counts = rng.binomial(unused, -np.expm1(-mean / pulses))
+                unused -= counts
+            else:
+                counts = rng.poisson(np.minimum(mean, 1e9))
+            out[:] = np.minimum(counts, self.max_dn)
+        return result

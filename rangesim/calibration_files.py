@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigs from calibration files: procam-calibration's OpenCV XML, and our own JSON.
+
+OpenCV has pixel centres at integer coordinates, we have them at integer + 0.5: principal points move by 0.5.
+OpenCV's stereo calibration maps the first device's coordinates to the second's, X_projector = R X_camera + T, here
+in millimetres; our `T_camera_projector` is the inverse, in metres.
+"""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from rangesim.config import from_dict, to_dict
+from rangesim.errors import FileFormatError
+from rangesim.rig import Intrinsics, Rig
+
+_SHAPES = {
+    "img_shape": 2,
+    "cam_int": 9,
+    "cam_dist": 5,
+    "proj_int": 9,
+    "proj_dist": 5,
+    "roration": 9,  # spelt so in the files
+    "translation": 3,
+}
+
+
+def load_calibration(
+    path: str | Path, projector_size: tuple[int, int] | None = None, unit_m: float = 1e-3
+) -> Rig:
+    """Rig of a calibration file.
+
+    Parameters
+    ----------
+    path : `.xml`, OpenCV FileStorage as kamino410/procam-calibration writes it; or `.json`, as `save_calibration`.
+    projector_size : (width, height) in pixels; XML files do not hold it, so it is required for them.
+    unit_m : float, metres per unit of length of an XML file (there, of its chessboard's square); millimetres.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing, broken, or does not hold a calibration.
+    ValueError
+        `projector_size` is missing for an XML file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileFormatError(f"{path} does not exist; expected a calibration file (.xml or .json).")
+    if path.suffix.lower() != ".xml":
+        return _load_json(path)
+    if projector_size is None:
+        raise ValueError(f"expected projector_size (width, height) in pixels: {path} does not hold it.")
+    values = _read_opencv(path)
+    try:
+        return _rig(values, projector_size, unit_m)
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def save_calibration(rig: Rig, path: str | Path) -> None:
+    """Write a rig as JSON; `load_calibration` reads it back equal."""
+    path = Path(path)
+    staging = path.with_name(f".{path.name}.part")
+    staging.write_text(json.dumps(to_dict(rig), indent=1) + "\n", encoding="utf-8")
+    staging.replace(path)
+
+
+def _load_json(path: Path) -> Rig:
+    try:
+        return from_dict(Rig, json.loads(path.read_text(encoding="utf-8")), "rig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is no text file.") from error
+    except json.JSONDecodeError as error:
+        raise FileFormatError(f"{path} is no valid JSON: {error}.") from error
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def _read_opencv(path: Path) -> dict[str, np.ndarray]:
+    try:
+        root = ET.parse(path).getroot()
+    except ET.ParseError as error:
+        raise FileFormatError(f"{path} is no valid XML: {error}.") from error
+    values = {}
+    for name, size in _SHAPES.items():
+        text = root.findtext(f"{name}/data")
+        if text is None:
+            raise FileFormatError(f"{path}: expected a matrix {name!r} as procam-calibration writes it, found none.")
+        try:
+            values[name] = np.array(text.split(), dtype=np.float64)
+        except ValueError as error:
+            raise FileFormatError(f"{path}: matrix {name!r} does not hold numbers.") from error
+        if values[name].size != size:
+            raise FileFormatError(f"{path}: expected {size} numbers in {name!r}, got {values[name].size}.")
+    return values
+
+
+def _rig(values: dict[str, np.ndarray], projector_size: tuple[int, int], unit_m: float) -> Rig:
+    height, width = (int(n) for n in values["img_shape"])
+    projector_from_camera = np.eye(4)
+    projector_from_camera[:3, :3] = _nearest_rotation(values["roration"].reshape(3, 3))
+    projector_from_camera[:3, 3] = values["translation"] * unit_m
+    return Rig(
+        camera=_intrinsics(width, height, values["cam_int"], values["cam_dist"]),
+        projector=_intrinsics(*projector_size, values["proj_int"], values["proj_dist"]),
+        T_camera_projector=np.linalg.inv(projector_from_camera),
+    )
+
+
+def _intrinsics(width: int, height: int, matrix: np.ndarray, distortion: np.ndarray) -> Intrinsics:
+    fx, _, cx, _, fy, cy = (float(v) for v in matrix[:6])
+    return Intrinsics(width, height, fx, fy, cx + 0.5, cy + 0.5, tuple(float(v) for v in distortion))
+
+
+def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ vt)

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures as directories: one image per frame and `capture.json`; and folders of real images."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import tempfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangesim.capture import DTYPES, Capture
+from rangesim.config import check_keys, from_dict, to_dict
+from rangesim.detector import PhotoDetector
+from rangesim.errors import FileFormatError
+from rangesim.image_files import SUFFIXES, read_grey, write_grey
+from rangesim.rig import Rig
+from rangesim.sensors import Sensor
+
+SIDECAR = "capture.json"
+FORMAT = "rangesim-capture"
+FORMAT_VERSION = 1
+_KEYS = ("format", "format_version", "rangesim", "dtype", "frames", "sensor", "rig", "detector", "exposure_s")
+
+
+def save_capture(capture: Capture, directory: str | Path) -> None:
+    """Write a capture as a directory: PNG (8 or 16 bits) or EXR (float32) per frame, and `capture.json`.
+
+    The directory appears only when it is complete. An older capture of that name is replaced.
+
+    Raises
+    ------
+    FileFormatError
+        `directory` exists and is no capture, or the frames do not fit 16 bits.
+    """
+    target = Path(directory)
+    _check_target(target)
+    if capture.is_digital and capture.frames.dtype.itemsize > 2 and capture.frames.max() > 65535:
+        raise FileFormatError(
+            f"{target}: the frames hold counts up to {capture.frames.max()}, the files at most 65535; expose shorter."
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        names = _file_names(capture)
+        for name, frame in zip(names, capture.frames, strict=True):
+            write_grey(staging / name, frame.astype(np.uint16) if frame.dtype == np.uint32 else frame)
+        (staging / SIDECAR).write_text(json.dumps(_sidecar(capture, names), indent=1) + "\n", encoding="utf-8")
+        staging.chmod(0o755)
+        _replace(staging, target)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def load_capture(directory: str | Path) -> Capture:
+    """The capture that `Capture.save` wrote, bytes and settings equal.
+
+    Raises
+    ------
+    FileFormatError
+        Missing directory, sidecar or frame, broken JSON, unknown key, wrong size or type; the message names the file.
+    """
+    sidecar = Path(directory) / SIDECAR
+    settings = _read_sidecar(sidecar)
+    try:
+        check_keys(settings, _KEYS, str(sidecar))
+        sensor = from_dict(Sensor, settings.get("sensor"), "sensor")  # type: ignore[type-abstract]
+        rig = from_dict(Rig, settings["rig"], "rig") if settings.get("rig") is not None else None
+        given = settings.get("detector")
+        detector = from_dict(PhotoDetector, given, "detector") if given is not None else None  # type: ignore[type-abstract]
+        exposure = settings.get("exposure_s")
+        frames = _read_frames(sidecar, settings, sensor)
+        return Capture(frames, sensor, rig, detector, math.nan if exposure is None else float(exposure))
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"{sidecar}: {str(error).removeprefix(f'{sidecar}: ')}") from error
+
+
+def import_capture(
+    folder: str | Path, sensor: Sensor, rig: Rig | None = None, detector: PhotoDetector | None = None
+) -> Capture:
+    """A real capture from a folder of images, one per frame, in the order of their names (numbers by value).
+
+    Parameters
+    ----------
+    folder : holds as many images (PNG, TIFF, JPEG, BMP, EXR; 8 or 16 bits; colour becomes grey) as the sensor has frames.
+    sensor : Sensor, with the patterns in the order of `sensor.frame_names()`.
+    rig : Rig, or None if uncalibrated. detector : PhotoDetector, or None if unknown.
+
+    Raises
+    ------
+    FileFormatError
+        No such folder, another number of images, unreadable images, or images of different size or type.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileFormatError(f"{folder} is no folder of images.")
+    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+    if len(paths) != sensor.n_frames:
+        raise FileFormatError(
+            f"{folder}: expected {sensor.n_frames} images for {sensor.type_name} "
+            f"({sensor.frame_names()[0]} ... {sensor.frame_names()[-1]}), got {len(paths)}."
+        )
+    frames = _stack(paths)
+    try:
+        return Capture(frames, sensor, rig, detector)
+    except ValueError as error:
+        raise FileFormatError(f"{folder}: {error}") from error
+
+
+def _file_names(capture: Capture) -> list[str]:
+    suffix = ".png" if capture.is_digital else ".exr"
+    return [f"{i:03d}_{name}{suffix}" for i, name in enumerate(capture.sensor.frame_names())]
+
+
+def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "rangesim": _package_version(),
+        "dtype": capture.frames.dtype.name,
+        "sensor": to_dict(capture.sensor),
+        "rig": to_dict(capture.rig),
+        "detector": to_dict(capture.detector),
+        "exposure_s": None if math.isnan(capture.exposure_s) else capture.exposure_s,
+        "frames": names,
+    }
+
+
+def _package_version() -> str:
+    try:
+        return version("rangesim")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _read_sidecar(sidecar: Path) -> dict[str, Any]:
+    if not sidecar.is_file():
+        raise FileFormatError(f"{sidecar.parent} is no capture: it has no {SIDECAR}.")
+    try:
+        settings = json.loads(sidecar.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{sidecar} is no valid JSON: {error}.") from error
+    if not isinstance(settings, dict) or settings.get("format") != FORMAT:
+        raise FileFormatError(f"{sidecar} is no {FORMAT} file.")
+    if settings.get("format_version") != FORMAT_VERSION:
+        raise FileFormatError(
+            f"{sidecar}: expected format version {FORMAT_VERSION}, got {settings.get('format_version')!r}."
+        )
+    return settings
+
+
+def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor) -> np.ndarray:
+    names, dtype = settings.get("frames"), settings.get("dtype")
+    if dtype not in DTYPES:
+        raise ValueError(f"expected dtype to be one of {', '.join(DTYPES)}, got {dtype!r}.")
+    if not isinstance(names, list) or len(names) != sensor.n_frames:
+        raise ValueError(f"expected a list of {sensor.n_frames} frames for {sensor.type_name}.")
+    for name in names:
+        if not isinstance(name, str) or Path(name).name != name:
+            raise ValueError(f"expected plain file names under frames, got {name!r}.")
+    frames = _stack([sidecar.parent / name for name in names])
+    stored = "uint16" if dtype == "uint32" else dtype
+    if frames.dtype.name != stored:
+        raise ValueError(f"expected frames of type {stored}, got {frames.dtype.name}.")
+    return frames.astype(dtype, copy=False)
+
+
+def _stack(paths: list[Path]) -> np.ndarray:
+    """(k, h, w) images of one size and type."""
+    first: np.ndarray | None = None
+    for i, path in enumerate(paths):
+        if not path.is_file():
+            raise FileFormatError(f"frame {path} is missing.")
+        image = read_grey(path)
+        if first is None:
+            first = image
+            frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
+        if image.shape != first.shape or image.dtype != first.dtype:
+            raise FileFormatError(
+                f"{path}: expected {first.shape[1]} x {first.shape[0]} {first.dtype} as {paths[0].name}, "
+                f"got {image.shape[1]} x {image.shape[0]} {image.dtype}."
+            )
+        frames[i] = image
+    return frames
+
+
+def _natural(path: Path) -> list[tuple[int, int | str]]:
+    return [(0, int(s)) if s.isdigit() else (1, s) for s in re.split(r"(\d+)", path.name.lower())]
+
+
+def _check_target(target: Path) -> None:
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise FileFormatError(f"{target} exists and is no directory; a capture is one.")
+    if any(target.iterdir()) and not (target / SIDECAR).is_file():
+        raise FileFormatError(f"{target} exists and is no capture (it has no {SIDECAR}); nothing was overwritten.")
+
+
+def _replace(staging: Path, target: Path) -> None:
+    """Put `staging` in the place of `target`, which may exist."""
+    if not target.exists():
+        staging.rename(target)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
+    target.rename(old / "capture")
+    staging.rename(target)
+    shutil.rmtree(old)

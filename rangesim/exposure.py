@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals to a capture, as a camera would deliver it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rangesim.capture import Capture
+from rangesim.detector import PhotoDetector
+from rangesim.rig import Rig
+from rangesim.sensors import IdealToF, Sensor
+
+if TYPE_CHECKING:
+    from rangesim.signals import Signals
+
+TARGET_SHARE = 0.7
+"""Share of the saturation capacity that automatic exposure aims for."""
+TARGET_PERCENTILE = 99.0
+"""Percentile of the lit pixels, in their brightest frame, that automatic exposure puts there."""
+
+
+def expose(
+    signals: Signals,
+    sensor: Sensor,
+    detector: PhotoDetector | None = None,
+    exposure_s: float | None = None,
+    seed: int = 0,
+) -> Capture:
+    """Capture of `sensor`: its frames with the noise and limits of `detector`.
+
+    Parameters
+    ----------
+    signals : Signals of a transport pass that this sensor was part of.
+    sensor : Sensor.
+    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: a noise-free capture, float32
+        radiance in W/m2/sr, unfiltered ambient light included. `IdealToF` has no noise model: its frames are always
+        noise-free.
+    exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
+    seed : int, of the noise. Every frame has its own stream; the same seed gives the same bytes.
+
+    Raises
+    ------
+    ValueError
+        The pass lacks the sensor's signals, the exposure is not positive, or detector and sensor do not go together.
+    """
+    if exposure_s is not None and not 0 < exposure_s < np.inf:
+        raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
+    if detector is None or isinstance(sensor, IdealToF):
+        return Capture(signals.frames(sensor), sensor, signals.rig)
+    radiance = signals.frames(sensor, ambient_transmission=detector.ambient_transmission)
+    if exposure_s is None:
+        exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
+    frames = detector.read_out(radiance, sensor, signals.rig, exposure_s, seed)
+    return Capture(frames, sensor, signals.rig, detector, exposure_s)
+
+
+def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:
+    """Exposure in seconds, one for all frames, that puts the bright pixels at 70 % of saturation.
+
+    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: the highlights of
+    mirrors and gloss may saturate. Limited by the detector's shortest and longest exposure.
+
+    Parameters
+    ----------
+    radiance : (k, h, w) float, W/m2/sr, mean of the frames.
+    """
+    brightest = radiance.max(axis=0)
+    lit = brightest[brightest > 0]
+    if lit.size == 0:
+        return detector.max_exposure_s
+    level = float(np.percentile(lit, TARGET_PERCENTILE)) * detector.electrons_per_radiance(rig)
+    wanted = TARGET_SHARE * detector.capacity_e / level
+    return float(np.clip(wanted, detector.min_exposure_s, detector.max_exposure_s))
