@@ -85,8 +85,8 @@ def ensure_llvm(variant: str = "llvm_ad_mono") -> LlvmLibrary | None:
     loaded = _version_held_by_drjit()
     if loaded is not None and loaded < (MINIMUM,):
         raise EnvironmentProblem(
-            f"Dr.Jit was imported before rangesim and has loaded LLVM {loaded[0]}, but needs {MINIMUM} or newer: "
-            f"import rangesim first, or start Python with {VARIABLE}={library.path}."
+            f"Dr.Jit was imported earlier and has loaded LLVM {loaded[0]}, but needs {MINIMUM} or newer: "
+            f"start Python with {VARIABLE}={library.path}, or call ensure_llvm() before the import."
         )
     os.environ[VARIABLE] = str(library.path)
     return library
@@ -119,7 +119,8 @@ def _check_named(path: Path) -> LlvmLibrary:
         raise EnvironmentProblem(f"{VARIABLE} names {path}, which is not a file: {_fix()}.")
     library = LlvmLibrary(path, _version_of(path))
     if not library.suitable:
-        raise EnvironmentProblem(f"{VARIABLE} names {library}, but Dr.Jit needs LLVM {MINIMUM} or newer: {_fix()}.")
+        needed = f"Dr.Jit needs LLVM {MINIMUM} or newer"
+        raise EnvironmentProblem(f"{VARIABLE} names {library}, but {needed}: {_fix()}.")
     return library
 
 
@@ -136,8 +137,9 @@ def _usual_folders() -> Iterator[Path]:
     for variable in ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH") + (("PATH",) if os.name == "nt" else ()):
         yield from (Path(entry) for entry in os.environ.get(variable, "").split(os.pathsep) if entry)
     multiarch = sysconfig.get_config_var("MULTIARCH") or f"{platform.machine()}-linux-gnu"
-    fixed = (f"/usr/lib/{multiarch}", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/local/lib64", "/opt/homebrew/lib")
-    yield from (Path(folder) for folder in (*fixed, f"{sys.prefix}/lib", r"C:\Program Files\LLVM\bin"))
+    system = (f"/usr/lib/{multiarch}", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/local/lib64")
+    others = ("/opt/homebrew/lib", f"{sys.prefix}/lib", r"C:\Program Files\LLVM\bin")
+    yield from map(Path, system + others)
     for pattern in ("usr/lib*/llvm*/lib*", "usr/local/*/llvm*/lib", "opt/homebrew/opt/llvm*/lib"):
         yield from Path("/").glob(pattern)
 
@@ -148,7 +150,8 @@ def _libraries_in(folders: Iterable[Path]) -> list[LlvmLibrary]:
     for folder in filter(Path.is_dir, folders):
         for path in sorted((*folder.glob("libLLVM[-.]*"), *folder.glob("LLVM-C.dll"))):
             file = path.resolve()
-            if _NAME.fullmatch(path.name) and file.is_file() and file not in found and _is_for_this_machine(file):
+            usable = _NAME.fullmatch(path.name) and file.is_file() and _is_for_this_machine(file)
+            if usable and file not in found:
                 found[file] = LlvmLibrary(file, _version_of(path))
     return list(found.values())
 
@@ -164,7 +167,7 @@ def _libraries_of_linker() -> list[LlvmLibrary]:
 
 
 def _version_of(path: Path) -> tuple[int, ...]:
-    """The version in the name of the file a link leads to, else in the link's name, else as the library says."""
+    """The version in the name of the file a link leads to, else in the link's, else as the library says."""
     file = path.resolve()
     matches = filter(None, (_NAME.fullmatch(name) for name in (file.name, path.name)))
     named = (match["before"] or match["after"] for match in matches)
@@ -175,7 +178,8 @@ def _version_of(path: Path) -> tuple[int, ...]:
 def _ask(path: Path) -> str:
     """The version the library itself reports, or ""; in another process, where loading can do no harm."""
     try:
-        answer = subprocess.run([sys.executable, "-c", _ASK, path], capture_output=True, text=True, timeout=30)
+        command = [sys.executable, "-c", _ASK, str(path)]
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=30)
     except subprocess.TimeoutExpired:
         return ""
     return answer.stdout.strip() if answer.returncode == 0 else ""
@@ -183,14 +187,10 @@ def _ask(path: Path) -> str:
 
 def _is_for_this_machine(path: Path) -> bool:
     """False for an ELF library of another word size or processor than the running Python's."""
-    library, python = _head(path), _head(Path(sys.executable))
+    with path.open("rb") as file, Path(sys.executable).open("rb") as interpreter:
+        library, python = file.read(20), interpreter.read(20)
     both_elf = library.startswith(b"\x7fELF") and python.startswith(b"\x7fELF")
     return not both_elf or (library[4], library[18:20]) == (python[4], python[18:20])
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(20)
 
 
 def _version_held_by_drjit() -> tuple[int, ...] | None:

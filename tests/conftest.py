@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every test may use: real data where it is, and Dr.Jit's LLVM chosen before Mitsuba is imported."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from rangesim.errors import EnvironmentProblem
+from rangesim.llvm import ensure_llvm
+
+with suppress(EnvironmentProblem):  # tests that render say it again; those of decoders need no LLVM
+    ensure_llvm()
+
+REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real captures and clouds beside the repository; skips the test where there is none."""
+    if not REAL_DATA.is_dir():
+        pytest.skip(f"no real data at {REAL_DATA}")
+    return REAL_DATA
