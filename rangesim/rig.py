@@ -64,11 +64,16 @@ class Intrinsics:
         distorted = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         if not any(self.distortion):
             return distorted
-        xy = distorted.copy()
+        target_x, target_y = np.ascontiguousarray(distorted[..., 0]), np.ascontiguousarray(distorted[..., 1])
+        x, y = target_x, target_y
         for _ in range(50):  # fixed point of Brown-Conrady, as there is no closed inverse
-            radial, tangential = self._distortion_terms(xy)
-            xy = (distorted - tangential) / radial
-        return xy
+            radial, tangential_x, tangential_y = self._distortion_terms(x, y)
+            next_x, next_y = (target_x - tangential_x) / radial, (target_y - tangential_y) / radial
+            step = max(np.abs(next_x - x).max(initial=0), np.abs(next_y - y).max(initial=0))
+            x, y = next_x, next_y
+            if step < 1e-12:
+                break
+        return np.stack([x, y], axis=-1)
 
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) pixel coordinates of points (..., 3) in this device's frame; NaN behind it."""
@@ -76,8 +81,9 @@ class Intrinsics:
         z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
         xy = points[..., :2] / z
         if any(self.distortion):
-            radial, tangential = self._distortion_terms(xy)
-            xy = xy * radial + tangential
+            x, y = xy[..., 0], xy[..., 1]
+            radial, tangential_x, tangential_y = self._distortion_terms(x, y)
+            xy = np.stack([x * radial + tangential_x, y * radial + tangential_y], axis=-1)
         return xy * [self.fx, self.fy] + [self.cx, self.cy]
 
     def directions(self, pixels: ArrayLike) -> Array:
@@ -85,15 +91,12 @@ class Intrinsics:
         xy = self.normalise(pixels)
         return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
 
-    def _distortion_terms(self, xy: Array) -> tuple[Array, Array]:
+    def _distortion_terms(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         k1, k2, p1, p2, k3 = (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-        x, y = xy[..., :1], xy[..., 1:]
-        r2 = x * x + y * y
+        xx, yy, xy = x * x, y * y, x * y
+        r2 = xx + yy
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        tangential = np.concatenate(
-            [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=-1
-        )
-        return radial, tangential
+        return radial, 2 * p1 * xy + p2 * (r2 + 2 * xx), p1 * (r2 + 2 * yy) + 2 * p2 * xy
 
 
 def pose(matrix: ArrayLike, name: str) -> Array:
