@@ -30,14 +30,20 @@ _SHAPES = {
 
 
 def load_calibration(
-    path: str | Path, projector_size: tuple[int, int] | None = None, unit_m: float = 1e-3
+    path: str | Path,
+    projector_size: tuple[int, int] | None = None,
+    code_step: int = 1,
+    unit_m: float = 1e-3,
 ) -> Rig:
     """Rig of a calibration file.
 
     Parameters
     ----------
     path : `.xml`, OpenCV FileStorage as kamino410/procam-calibration writes it; or `.json`, as `save_calibration`.
-    projector_size : (width, height) in pixels; XML files do not hold it, so it is required for them.
+    projector_size : (width, height) of the coded area in cells of `code_step` pixels; XML files do not hold it, so it is
+        required for them.
+    code_step : int, projector pixels per cell of the Gray code at calibration (procam-calibration's graycode_step).
+        The rig's projector then has the cells for pixels.
     unit_m : float, metres per unit of length of an XML file (there, of its chessboard's square); millimetres.
 
     Raises
@@ -45,18 +51,20 @@ def load_calibration(
     FileFormatError
         The file is missing, broken, or does not hold a calibration.
     ValueError
-        `projector_size` is missing for an XML file.
+        `code_step` or `unit_m` is not positive, or `projector_size` is missing for an XML file.
     """
     path = Path(path)
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; expected a calibration file (.xml or .json).")
     if path.suffix.lower() != ".xml":
         return _load_json(path)
+    if code_step < 1 or not unit_m > 0:
+        raise ValueError(f"expected a positive code_step and unit_m, got {code_step} and {unit_m}.")
     if projector_size is None:
         raise ValueError(f"expected projector_size (width, height) in pixels: {path} does not hold it.")
     values = _read_opencv(path)
     try:
-        return _rig(values, projector_size, unit_m)
+        return _rig(values, projector_size, code_step, unit_m)
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
 
@@ -99,14 +107,15 @@ def _read_opencv(path: Path) -> dict[str, np.ndarray]:
     return values
 
 
-def _rig(values: dict[str, np.ndarray], projector_size: tuple[int, int], unit_m: float) -> Rig:
+def _rig(values: dict[str, np.ndarray], projector_size: tuple[int, int], code_step: int, unit_m: float) -> Rig:
     height, width = (int(n) for n in values["img_shape"])
     projector_from_camera = np.eye(4)
     projector_from_camera[:3, :3] = _nearest_rotation(values["roration"].reshape(3, 3))
     projector_from_camera[:3, 3] = values["translation"] * unit_m
+    in_cells = values["proj_int"] / np.array([code_step] * 6 + [1] * 3)
     return Rig(
         camera=_intrinsics(width, height, values["cam_int"], values["cam_dist"]),
-        projector=_intrinsics(*projector_size, values["proj_int"], values["proj_dist"]),
+        projector=_intrinsics(*projector_size, in_cells, values["proj_dist"]),
         T_camera_projector=np.linalg.inv(projector_from_camera),
     )
 

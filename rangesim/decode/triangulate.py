@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projector coordinates to depth: where a camera ray meets the projector's light plane or ray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesim.rig import Intrinsics, Rig
+
+ITERATIONS = 4
+"""Rounds to find the undecoded projector coordinate, which matters through the lens distortion only."""
+
+
+@dataclass(frozen=True, eq=False)
+class Triangulation:
+    """z : (n,) float64, metres, camera frame; NaN if not in front of both devices.
+
+    epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected coordinate;
+        zero if only one axis was decoded.
+    """
+
+    z: np.ndarray
+    epipolar_px: np.ndarray
+
+
+def triangulate(
+    directions: np.ndarray, rig: Rig, column: np.ndarray | None, row: np.ndarray | None
+) -> Triangulation:
+    """Depth of camera rays from projector coordinates.
+
+    With a = R^T d and b = -R^T t (camera ray d and camera centre in the projector frame), the point at depth z projects
+    to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z. Column x_p and row y_p each give an equation linear
+    in w (ray meets plane); with both, w is their least-squares solution in projector pixels.
+
+    Parameters
+    ----------
+    directions : (n, 3) float64, camera rays with z = 1 (lens distortion already undone), camera frame.
+    column, row : (n,) float, projector pixel coordinates, pixel centres at integer + 0.5; None where not coded.
+
+    Raises
+    ------
+    ValueError
+        Neither axis is given.
+    """
+    if column is None and row is None:
+        raise ValueError("expected projector columns, rows or both, got neither.")
+    rotation, t = rig.T_camera_projector[:3, :3], rig.T_camera_projector[:3, 3]
+    a, b = directions @ rotation, -t @ rotation
+    projector = rig.projector
+    both = column is not None and row is not None
+    u = np.full(len(a), projector.cx) if column is None else np.asarray(column, dtype=np.float64)
+    v = np.full(len(a), projector.cy) if row is None else np.asarray(row, dtype=np.float64)
+    rounds = 1 if both or not any(projector.distortion) else ITERATIONS
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for i in range(rounds):
+            xy = projector.normalise(np.stack([u, v], axis=-1))
+            w = _inverse_depth(a, b, xy, projector, column is not None, row is not None)
+            if i + 1 < rounds:
+                u, v = _complete(a + w[:, None] * b, projector, u, v, column is None)
+        point = a + w[:, None] * b
+        z = np.where((w > 0) & np.isfinite(w) & (point[:, 2] > 0), 1 / w, np.nan)
+        error = (point[:, :2] / point[:, 2:] - xy) * [projector.fx, projector.fy]
+        epipolar = np.hypot(error[:, 0], error[:, 1]) if both else np.zeros(len(a))
+    return Triangulation(z, epipolar)
+
+
+def _inverse_depth(
+    a: np.ndarray, b: np.ndarray, xy: np.ndarray, projector: Intrinsics, columns: bool, rows: bool
+) -> np.ndarray:
+    """(n,) w of the linear equations w (b_x - x b_z) = x a_z - a_x, weighted to projector pixels."""
+    numerator, denominator = np.zeros(len(a)), np.zeros(len(a))
+    for axis, used, focal in ((0, columns, projector.fx), (1, rows, projector.fy)):
+        if used:
+            slope = b[axis] - xy[:, axis] * b[2]
+            numerator += focal**2 * slope * (xy[:, axis] * a[:, 2] - a[:, axis])
+            denominator += focal**2 * slope**2
+    return np.asarray(numerator / denominator)
+
+
+def _complete(
+    point: np.ndarray, projector: Intrinsics, u: np.ndarray, v: np.ndarray, columns_missing: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """(u, v) with the undecoded one replaced by where `point` (n, 3), projector frame, projects to."""
+    projected = projector.project(point)
+    missing = projected[:, 0] if columns_missing else projected[:, 1]
+    if columns_missing:
+        return np.where(np.isfinite(missing), missing, u), v
+    return u, np.where(np.isfinite(missing), missing, v)
