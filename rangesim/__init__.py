@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated range sensors: light transport, captures, decoders, comparison.
+
+Names are imported when they are first used, so that decoding a real capture starts no renderer.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_HOME = {
+    "AmcwToF": "rangesim.sensors",
+    "Capture": "rangesim.capture",
+    "Detector": "rangesim.detector",
+    "DirectToF": "rangesim.sensors",
+    "IdealToF": "rangesim.sensors",
+    "Intrinsics": "rangesim.rig",
+    "RangeImage": "rangesim.range_image",
+    "Rig": "rangesim.rig",
+    "Scene": "rangesim.scene",
+    "Sensor": "rangesim.sensors",
+    "Signals": "rangesim.signals",
+    "Status": "rangesim.status",
+    "StructuredLight": "rangesim.sensors",
+    "compare": "rangesim.compare",
+    "decode": "rangesim.decode",
+    "expose": "rangesim.exposure",
+    "import_capture": "rangesim.capture_files",
+    "load_capture": "rangesim.capture_files",
+    "load_scene": "rangesim.scene",
+    "look_at": "rangesim.rig",
+    "transport": "rangesim.transport",
+}
+
+__all__ = sorted(_HOME)
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'rangesim' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bare mesh becomes a scene: on a matte table, in front of a camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from rangesim.config import nearest
+from rangesim.errors import FileFormatError
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+Y_UP_SUFFIXES = (".glb", ".gltf")
+"""glTF defines y as up; the other formats define nothing, and z is taken."""
+
+MESH_MATERIALS: dict[str, dict[str, Any]] = {
+    "matte": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.6}},
+    "glossy": {"type": "twosided", "bsdf": {"type": "roughplastic", "diffuse_reflectance": 0.5, "alpha": 0.1}},
+    "mirror": {"type": "twosided", "bsdf": {"type": "conductor", "material": "Ag"}},
+    "transparent": {"type": "dielectric", "int_ior": "bk7"},
+}
+
+
+def scene_around_mesh(path: Path, material: str, folder: Path) -> dict[str, Any]:
+    """Mitsuba scene dictionary with the mesh standing on a table, camera 640 x 480, 57 degrees wide.
+
+    Coordinates are taken as metres; table and camera distance follow the size of the mesh. Mitsuba reads fewer formats
+    than there are, so it gets a copy of the mesh in `folder`, which must live until the scene is instantiated.
+    """
+    if material not in MESH_MATERIALS:
+        raise ValueError(
+            f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{nearest(material, MESH_MATERIALS)}."
+        )
+    vertices, faces = _read(path)
+    if path.suffix.lower() in Y_UP_SUFFIXES:
+        vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size = float(np.linalg.norm(high - low))
+    if not size > 0:
+        raise FileFormatError(f"expected {path} to have an extent, but all its vertices coincide.")
+    vertices = vertices - [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
+    centre = [0.0, 0.0, float(high[2] - low[2]) / 2]
+    eye = [centre[0], centre[1] - 1.6 * size, centre[2] + 0.9 * size]
+    T = mi.ScalarTransform4f
+    return {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "fov": 57.0,
+            "to_world": T().look_at(origin=eye, target=centre, up=[0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 640, "height": 480},
+        },
+        "table": {
+            "type": "rectangle",
+            "to_world": T().scale([1.5 * size, 1.5 * size, 1]),
+            "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.4}},
+        },
+        "light": {"type": "constant", "radiance": 0.05},
+        "mesh": {
+            "type": "ply",
+            "filename": _write(folder, vertices, faces),
+            "face_normals": True,
+            "bsdf": MESH_MATERIALS[material],
+        },
+    }
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) float64 vertices in metres and (m, 3) faces of a mesh file."""
+    import open3d as o3d
+
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(str(path))
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    if len(faces) == 0:
+        raise FileFormatError(f"expected a triangle mesh in {path}, got {len(vertices)} vertices and no faces.")
+    if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        raise FileFormatError(f"expected finite vertices and valid face indices in {path}; repair the mesh first.")
+    return vertices, faces
+
+
+def _write(folder: Path, vertices: np.ndarray, faces: np.ndarray) -> str:
+    """Name of a PLY file in `folder` with this mesh."""
+    import open3d as o3d
+
+    target = folder / "mesh.ply"
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
+    o3d.io.write_triangle_mesh(str(target), mesh)
+    return str(target)

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A Mitsuba scene with what range sensing needs to know of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rangesim.rig import Intrinsics, Rig, look_at, pose
+
+PROJECTOR_PIXELS = (1280, 800)
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One shape of the scene: its name (id in the scene file) and material class."""
+
+    name: str
+    material: str
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Geometry and materials to measure.
+
+    name : str
+    mitsuba : mitsuba.Scene of the active variant.
+    instances : one per shape, in the order of `mitsuba.shapes()`.
+    camera, T_world_camera : the scene's own sensor.
+    working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
+    """
+
+    name: str
+    mitsuba: Any
+    instances: tuple[Instance, ...]
+    camera: Intrinsics
+    T_world_camera: np.ndarray
+    working_distance_m: float
+
+    @property
+    def has_ambient(self) -> bool:
+        """Whether the scene has light sources of its own."""
+        return len(self.mitsuba.emitters()) > 0
+
+    def rig(
+        self,
+        baseline_m: float | None = None,
+        projector_size: tuple[int, int] = PROJECTOR_PIXELS,
+        power_w: float = 1.0,
+        width: int | None = None,
+        height: int | None = None,
+    ) -> Rig:
+        """Rig of the scene's camera and a projector to its right that covers the camera's view.
+
+        Parameters
+        ----------
+        baseline_m : metres; default a fifth of the working distance. The projector turns towards the point that the
+            optical axis meets at the working distance.
+        projector_size : (width, height) in projector pixels.
+        power_w : radiant power of white.
+        width, height : camera pixels; default as in the scene file. The field of view is kept.
+        """
+        camera = self.camera.resized(width or self.camera.width, height or self.camera.height)
+        if baseline_m is None:
+            baseline_m = float(f"{0.2 * self.working_distance_m:.1g}")
+        if not baseline_m > 0:
+            raise ValueError(f"expected a positive baseline in metres, got {baseline_m}.")
+        target = (0.0, 0.0, self.working_distance_m)
+        return Rig(
+            camera=camera,
+            projector=covering(camera, *projector_size),
+            T_world_camera=pose(self.T_world_camera, "T_world_camera"),
+            T_camera_projector=look_at((baseline_m, 0.0, 0.0), target, up=(0.0, -1.0, 0.0)),
+            projector_power_w=power_w,
+        )
+
+
+def covering(camera: Intrinsics, width: int, height: int, margin: float = 1.1) -> Intrinsics:
+    """Projector of the given pixel count, square pixels, whose field covers the camera's with a margin."""
+    half_x = margin * 0.5 * camera.width / camera.fx
+    half_y = margin * 0.5 * camera.height / camera.fy
+    f = min(0.5 * width / half_x, 0.5 * height / half_y)
+    return Intrinsics(width, height, f, f, width / 2, height / 2)

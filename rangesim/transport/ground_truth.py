@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ground truth: what lies behind each pixel centre, found with one camera ray and one shadow ray."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim.rig import Rig
+from rangesim.scene import Scene
+from rangesim.scene.materials import MATERIAL_CLASSES
+from rangesim.signals import GroundTruth
+from rangesim.transport.loop import Device, connect
+
+
+def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
+    """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
+    h, w = rig.camera.height, rig.camera.width
+    camera, projector = Device(rig.camera, rig.T_world_camera), Device(rig.projector, rig.T_world_projector)
+    pixel = dr.arange(mi.UInt32, h * w)
+    centre = mi.Point2f(mi.Float(pixel % w) + 0.5, mi.Float(pixel // w) + 0.5)
+    ray = mi.Ray3f(mi.Point3f(camera.centre), camera.ray_direction(centre))
+    si = scene.mitsuba.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    hit = si.is_valid()
+    uv, _, _, _, visible = connect(scene.mitsuba, projector, si, hit)
+    z = dr.dot(mi.Vector3f(si.p) - camera.centre, camera.z)
+    normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+    index = dr.gather(mi.Int32, _index_of_shape(scene), dr.reinterpret_array(mi.UInt32, si.shape), hit)
+    dr.eval(hit, uv, visible, z, normal, index, si.t)
+
+    inside = _image(hit, h, w)
+    masked = lambda x: np.where(inside, _image(x, h, w), np.float32(np.nan))  # noqa: E731
+    instance = np.where(inside, _image(index, h, w), -1).astype(np.int32)
+    materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
+    return GroundTruth(
+        z=masked(z),
+        range_m=masked(si.t),
+        normal=np.stack([masked(normal[i]) for i in range(3)], axis=-1),
+        instance=instance,
+        material=np.where(instance >= 0, materials[instance], -1).astype(np.int32),
+        projector_uv=np.stack([masked(uv[i]) for i in range(2)], axis=-1),
+        projector_visible=_image(visible, h, w),
+        instance_names=tuple(i.name for i in scene.instances),
+        material_names=MATERIAL_CLASSES,
+    )
+
+
+def _index_of_shape(scene: Scene) -> Any:
+    """Table from Mitsuba's registry ids to positions in `scene.instances`."""
+    ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0]) for s in scene.mitsuba.shapes()]
+    table = np.full(max(ids) + 1, -1, dtype=np.int32)
+    table[ids] = np.arange(len(ids))
+    return mi.Int32(table)
+
+
+def _image(array: Any, h: int, w: int) -> np.ndarray:
+    return np.asarray(array.numpy()).reshape(h, w)

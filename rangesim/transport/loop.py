@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The path loop: one pass of light paths serves every pattern, frequency and bin.
+
+One lane owns one pixel and traces its samples one after the other; where a path ends, the lane starts the
+next sample in the same turn of the loop. So no lane idles while its neighbours finish, every channel is a
+register instead of a film, and each sum is made by one thread in one order: same seed, same bytes,
+whatever the number of threads or the size of a tile.
+
+The strategies that bring projector light to the camera partition all light paths:
+next-event estimation (here), caustic photons gathered at every non-delta vertex, and glint (both to come; their
+places in the loop are marked).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim.response import LightPath
+from rangesim.rig import Intrinsics, Rig
+from rangesim.transport.responses import Accumulators
+
+
+class Device:
+    """A pinhole of the rig on the renderer's side: intrinsics, centre, axes; all opaque to the kernel cache."""
+
+    def __init__(self, intrinsics: Intrinsics, T_world_device: np.ndarray) -> None:
+        opaque = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731
+        self.f = mi.Vector2f(opaque(intrinsics.fx), opaque(intrinsics.fy))
+        self.c = mi.Vector2f(opaque(intrinsics.cx), opaque(intrinsics.cy))
+        self.size = mi.Vector2f(opaque(intrinsics.width), opaque(intrinsics.height))
+        self.x, self.y, self.z, self.centre = (
+            mi.Vector3f(*map(opaque, T_world_device[:3, column])) for column in range(4)
+        )
+
+    def ray_direction(self, pixel: Any) -> Any:
+        """Unit world direction through pixel coordinates."""
+        p = (pixel - self.c) / self.f
+        return dr.normalize(self.x * p.x + self.y * p.y + self.z)
+
+    def project(self, point: Any) -> tuple[Any, Any]:
+        """Pixel coordinates of a world point, and its depth z in metres."""
+        d = mi.Vector3f(point) - self.centre
+        z = dr.dot(d, self.z)
+        return mi.Point2f(dr.dot(d, self.x), dr.dot(d, self.y)) / z * self.f + self.c, z
+
+
+class Settings(NamedTuple):
+    """Sampling of the loop. `seed`, `spp` and `max_depth` are opaque; the others shape the kernel."""
+
+    seed: Any
+    spp: Any
+    max_depth: Any
+    rr_depth: Any
+    ambient: bool
+
+
+class Radiance(NamedTuple):
+    """Sums over the samples of one pixel by kind of light path (see `rangesim.signals.EnergySplit`)."""
+
+    direct: Any
+    multipath: Any
+    via_delta: Any
+    ambient: Any
+
+
+@dr.syntax
+def trace(
+    scene: Any, camera: Device, projector: Device, irradiance: Any, accumulators: Accumulators, pixel: Any, settings: Settings
+) -> tuple[list[list[Any]], Radiance]:
+    """Sums over all samples: dense channels, and radiance by kind of path; bins go to the accumulators' buffers.
+
+    `pixel` (lanes,) UInt32 is the flat index of each lane's pixel in the whole image: random numbers depend on it and
+    the seed alone.
+    """
+    # ---- State of the lane: its random numbers, its sums --------------------------------------------
+    lanes = dr.width(pixel)
+    lane = dr.arange(mi.UInt32, lanes)
+    rng = mi.PCG32(lanes, *(mi.UInt64(x) for x in mi.sample_tea_32(settings.seed, pixel)))
+    width = mi.UInt32(camera.size.x)
+    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
+    shift = mi.Point2f(rng.next_float32(), rng.next_float32())
+    channels = accumulators.zeros()
+    direct, multipath, via_delta, ambient = (dr.zeros(mi.Float, lanes) for _ in range(4))
+
+    # ---- State of the path ---------------------------------------------------------------------------
+    sample = dr.zeros(mi.UInt32, lanes)  # samples of this pixel finished so far
+    depth = dr.zeros(mi.UInt32, lanes)  # surfaces met so far
+    ray = dr.zeros(mi.Ray3f, lanes)
+    throughput = dr.ones(mi.Float, lanes)  # radiance at the camera per radiance along the ray
+    length = dr.zeros(mi.Float, lanes)  # optical length from the camera to `previous.p`, metres
+    ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
+    first = dr.full(mi.Bool, True, lanes)  # no non-delta surface so far
+    delta_seen = dr.full(mi.Bool, False, lanes)  # some delta surface so far
+    previous = dr.zeros(mi.Interaction3f, lanes)
+    previous_pdf = dr.zeros(mi.Float, lanes)  # of the BSDF sample that made the ray; for MIS with ambient light
+    previous_delta = dr.full(mi.Bool, True, lanes)
+    active = sample < settings.spp
+
+    while active:
+        # ---- A new sample starts at the camera -------------------------------------------------------
+        starts = depth == 0
+        jitter = stratified(shift, sample)
+        ray.o = dr.select(starts, mi.Point3f(camera.centre), ray.o)
+        ray.d = dr.select(starts, camera.ray_direction(corner + jitter), ray.d)
+        previous.p = dr.select(starts, mi.Point3f(camera.centre), previous.p)
+
+        # ---- Next surface ----------------------------------------------------------------------------
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        hit = si.is_valid() & active
+        depth += 1
+        # Not si.t: spawned rays start a little off the surface
+        length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous.p), length), length)
+        bsdf = si.bsdf(ray)
+        may_connect = hit & (depth < settings.max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+
+        # ---- Next-event estimation: straight to the projector ----------------------------------------
+        uv, to_projector, distance, geometry, lit = connect(scene, projector, si, may_connect)
+        value, _, bs, bs_weight = bsdf.eval_pdf_sample(
+            mi.BSDFContext(),
+            si,
+            si.to_local(to_projector),
+            rng.next_float32(),
+            mi.Point2f(rng.next_float32(), rng.next_float32()),
+            hit,
+        )
+        radiance = dr.select(lit, throughput * mono(value) * geometry * irradiance, 0)
+        path = LightPath(uv.x, uv.y, length + distance, first)
+        channels = accumulators.add(channels, path, radiance, lane, lit)
+        direct += dr.select((depth == 1) & ~delta_seen, radiance, 0)
+        via_delta += dr.select(delta_seen, radiance, 0)
+        multipath += dr.select((depth > 1) & ~delta_seen, radiance, 0)
+
+        # ---- Caustic photons: gather around si.p here ------------------------------------------------
+        # ---- Glint: does a segment off a delta surface meet the projector's lens? here ---------------
+
+        # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
+        if dr.hint(settings.ambient, mode="scalar"):
+            emitted = emission(scene, si, previous, previous_pdf, previous_delta, active)
+            xi = mi.Point2f(rng.next_float32(), rng.next_float32())
+            ambient += throughput * (emitted + sampled_emission(scene, bsdf, si, xi, may_connect))
+
+        # ---- Next direction --------------------------------------------------------------------------
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        is_transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
+        throughput *= mono(bs_weight)
+        ior = dr.select(is_transmitted, ior * bs.eta, ior)
+        survival = dr.select(depth > settings.rr_depth, dr.minimum(throughput * dr.square(ior), 0.95), 1)
+        survives = rng.next_float32() < survival
+        throughput /= survival
+        first &= ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        delta_seen |= is_delta
+        previous = mi.Interaction3f(si)
+        previous_pdf = mi.Float(bs.pdf)
+        previous_delta = mi.Bool(is_delta)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+
+        # ---- Or next sample --------------------------------------------------------------------------
+        # The last surface can only be seen to emit, so it is needed for ambient light alone
+        last = settings.max_depth if settings.ambient else settings.max_depth - 1
+        ends = ~(hit & survives & (throughput > 0) & (depth < last))
+        sample = dr.select(ends, sample + 1, sample)
+        depth = dr.select(ends, 0, depth)
+        throughput = dr.select(ends, 1, throughput)
+        length = dr.select(ends, 0, length)
+        ior = dr.select(ends, 1, ior)
+        first |= ends
+        delta_seen &= ~ends
+        previous_delta |= ends
+        active = sample < settings.spp
+
+    return channels, Radiance(direct, multipath, via_delta, ambient)
+
+
+def stratified(shift: Any, sample: Any) -> Any:
+    """Place of a sample within its pixel: the R2 sequence (Roberts 2018), shifted per pixel; fills the pixel evenly."""
+    n = mi.Float(sample)
+    p = shift + mi.Point2f(n * 0.7548776662466927, n * 0.5698402909980532)
+    return p - dr.floor(p)
+
+
+def connect(scene: Any, projector: Device, si: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Projector pixel, direction, distance, geometry factor and visibility of the straight connection to the projector.
+
+    The geometry factor times the irradiance at z = 1 m is the irradiance on a surface that faces the projector:
+    the pattern is uniform per projector pixel, so the radiant intensity is E / cos^3 and falls as
+    cos^2 / z^2, which leaves E / (z^2 cos).
+    """
+    uv, z = projector.project(si.p)
+    to_projector = projector.centre - mi.Vector3f(si.p)
+    distance = dr.norm(to_projector)
+    to_projector /= distance
+    inside = (uv.x >= 0) & (uv.x < projector.size.x) & (uv.y >= 0) & (uv.y < projector.size.y) & (z > 0)
+    geometry = dr.rcp(dr.square(z) * -dr.dot(projector.z, to_projector))
+    inside &= active
+    shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
+    return uv, to_projector, distance, geometry, inside & ~scene.ray_test(shadow_ray, coherent=False, active=inside)
+
+
+def emission(scene: Any, si: Any, previous: Any, pdf: Any, is_delta: Any, active: Any) -> Any:
+    """Radiance that a scene emitter sends along the ray, weighted against having been sampled at `previous`."""
+    emitter = si.emitter(scene, active)
+    ds = mi.DirectionSample3f(scene, si, previous)
+    emitter_pdf = scene.pdf_emitter_direction(previous, ds, active & ~is_delta)
+    weight = dr.select(is_delta, 1, power_heuristic(pdf, emitter_pdf))
+    return dr.select(active, weight * mono(emitter.eval(si, active)), 0)
+
+
+def sampled_emission(scene: Any, bsdf: Any, si: Any, xi: Any, active: Any) -> Any:
+    """Reflected radiance of one sampled direction to a scene emitter, weighted against BSDF sampling."""
+    ds, radiance = scene.sample_emitter_direction(si, xi, True, active)
+    active &= ds.pdf != 0
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+    weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
+    return dr.select(active, weight * mono(value) * mono(radiance), 0)
+
+
+def power_heuristic(a: Any, b: Any) -> Any:
+    """Weight of a sample of density `a` that density `b` could have made too (Veach 1997)."""
+    weight = dr.square(a) / (dr.square(a) + dr.square(b))
+    return dr.select(dr.isfinite(weight), weight, 0)
+
+
+def mono(spectrum: Any) -> Any:
+    """The single channel of a monochrome spectrum."""
+    return mi.unpolarized_spectrum(spectrum)[0]

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One entry point to the renderer: scene + rig + sensors -> signals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim.response import Response
+from rangesim.rig import Rig
+from rangesim.scene import Scene
+from rangesim.sensors import Sensor
+from rangesim.signals import EnergySplit, Signals
+from rangesim.transport.ground_truth import ground_truth
+from rangesim.transport.loop import Device, Radiance, Settings, trace
+from rangesim.transport.responses import Accumulators
+
+BYTES_PER_LANE = 512
+"""State of one lane besides its channels, an upper bound."""
+PROGRESS_STEPS = 16
+
+
+def transport(
+    scene: Scene,
+    rig: Rig,
+    sensors: Sequence[Sensor | Response],
+    *,
+    spp: int = 64,
+    max_depth: int = 5,
+    rr_depth: int = 5,
+    seed: int = 0,
+    memory_bytes: int = 2 << 30,
+    progress: Callable[[float], None] | None = None,
+) -> Signals:
+    """Signals of any number of sensors that share a rig, from one pass of light paths.
+
+    Parameters
+    ----------
+    scene : Scene
+    rig : Rig; its lenses must be free of distortion (rendering distorted lenses is not implemented).
+    sensors : sensors, or bare responses.
+    spp : int >= 1, samples (camera paths) per pixel.
+    max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba.
+    rr_depth : int >= 1, surfaces after which Russian roulette may end a path.
+    seed : int; the same seed gives the same bytes, whatever the number of threads and the memory budget.
+    memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size.
+    progress : called with the share done, 0..1, after each tile.
+
+    Raises
+    ------
+    ValueError
+        A number out of its range, a distorted lens, or no memory for a single row.
+    """
+    _check(rig, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
+    h, w = rig.camera.height, rig.camera.width
+    channels = {r: np.empty((r.channels, h * w), dtype=np.float32) for r in responses}
+    energy = np.zeros((len(Radiance._fields), h * w), dtype=np.float32)
+    camera, projector = Device(rig.camera, rig.T_world_camera), Device(rig.projector, rig.T_world_projector)
+    settings = Settings(
+        seed=dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
+        spp=dr.opaque(mi.UInt32, spp),
+        max_depth=dr.opaque(mi.UInt32, max_depth),
+        rr_depth=dr.opaque(mi.UInt32, rr_depth),
+        ambient=scene.has_ambient,
+    )
+    irradiance = dr.opaque(mi.Float, rig.projector_irradiance)
+    for begin, end in _tiles(h * w, responses, memory_bytes, PROGRESS_STEPS if progress else 1):
+        accumulators = Accumulators(responses, end - begin)
+        pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
+        dense, radiance = trace(scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings)
+        dr.eval(dense, list(radiance), list(accumulators.bins.values()))  # all at once: one by one, the loop would run once for each
+        for response, values in zip(responses, dense, strict=True):
+            part = accumulators.bins.get(response)
+            rows = part.numpy().reshape(-1, end - begin) if part is not None else [v.numpy() for v in values]
+            for row, total in zip(channels[response], rows, strict=True):
+                np.multiply(total, np.float32(1 / spp), out=row[begin:end])
+        energy[:, begin:end] = [v.numpy() / np.float32(spp) for v in radiance]
+        if progress:
+            progress(end / (h * w))
+    return _signals(rig, {r: c.reshape(-1, h, w) for r, c in channels.items()}, energy.reshape(-1, h, w), scene)
+
+
+def _signals(rig: Rig, channels: dict[Response, np.ndarray], energy: np.ndarray, scene: Scene) -> Signals:
+    parts = Radiance(*energy)
+    nothing = np.zeros_like(parts.direct)
+    split = EnergySplit(
+        direct=parts.direct,
+        multipath=parts.multipath,
+        via_delta=parts.via_delta,
+        caustic=nothing,
+        glint=nothing,
+        ambient=parts.ambient,
+    )
+    return Signals(rig, channels, split, ground_truth(scene, rig))
+
+
+def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, at_least: int) -> Iterator[tuple[int, int]]:
+    """Ranges of flat pixel indices that fit the budget, of about equal size."""
+    bytes_per_pixel = BYTES_PER_LANE + 4 * sum(r.channels for r in responses)
+    if memory_bytes < bytes_per_pixel:
+        raise ValueError(f"expected a memory budget of at least {bytes_per_pixel} bytes, got {memory_bytes}.")
+    tiles = max(at_least, -(-pixels * bytes_per_pixel // memory_bytes))
+    size = max(1, -(-pixels // tiles))
+    for begin in range(0, pixels, size):
+        yield begin, min(begin + size, pixels)
+
+
+def _check(rig: Rig, **counts: int) -> None:
+    for name, value in counts.items():
+        if not isinstance(value, (int, np.integer)) or value < 1:
+            raise ValueError(f"expected {name} to be a whole number of at least 1, got {value!r}.")
+    if any(rig.camera.distortion) or any(rig.projector.distortion):
+        raise ValueError("expected lenses without distortion: rendering distorted lenses is not implemented yet.")
