@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Path lengths to ranges, for an emitter at any pose; and ideal time of flight."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rangesim.capture import Capture
+from rangesim.range_image import RangeImage
+from rangesim.rig import Rig
+from rangesim.status import Status
+
+
+def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
+    """(...) range in metres along camera rays at which the path emitter -> point -> camera has this length.
+
+    With unit ray d and emitter centre b (camera frame) the length is l = r + |r d - b|. Squaring (l - r)^2 =
+    r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid with foci at
+    camera and emitter. NaN where the length is not larger than the baseline |b|: no such point is in front.
+
+    Parameters
+    ----------
+    length_m : (...) float, metres. directions : (..., 3) float, camera rays of any length, camera frame.
+    """
+    b = rig.T_camera_projector[:3, 3]
+    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    length = np.asarray(length_m, dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        result = (length**2 - b @ b) / (2 * (length - d @ b))
+        return np.asarray(np.where(length > np.linalg.norm(b), result, np.nan))
+
+
+def range_image_from_path_length(
+    capture: Capture, length_m: np.ndarray, status: np.ndarray, confidence: np.ndarray, intensity: np.ndarray
+) -> RangeImage:
+    """Range image of decoded path lengths; lengths that lead to no point in front of the camera are OUT_OF_RANGE.
+
+    Without a rig, range is half the path length and z is NaN.
+
+    Parameters
+    ----------
+    length_m : (h, w) float, metres. status : (h, w) uint8. confidence, intensity : (h, w) float.
+    """
+    rig = capture.rig
+    if rig is None:
+        range_m, z = length_m / 2, np.full(length_m.shape, np.nan)
+    else:
+        directions = rig.camera.directions(rig.camera.pixel_centres())
+        range_m = range_from_path_length(length_m, directions, rig)
+        z = range_m / np.linalg.norm(directions, axis=-1)
+    status = status.astype(np.uint8)
+    in_front = np.nan_to_num(range_m, nan=-1.0) > 0
+    status[(status == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
+    ok = status == Status.OK
+    return RangeImage(
+        z=np.where(ok, z, np.nan).astype(np.float32),
+        range_m=np.where(ok, range_m, np.nan).astype(np.float32),
+        confidence=np.clip(confidence, 0, 1).astype(np.float32),
+        status=status,
+        intensity=np.asarray(intensity, dtype=np.float32),
+        camera=rig.camera if rig else None,
+        T_world_camera=rig.T_world_camera if rig else None,
+    )
+
+
+def decode_ideal(capture: Capture) -> RangeImage:
+    """Range image of an `IdealToF` capture: path length = radiance_x_length / radiance; no radiance is LOW_SIGNAL."""
+    radiance, weighted = (frame.astype(np.float64) for frame in capture.frames)
+    dark = ~(radiance > 0)
+    length = weighted / np.where(dark, 1.0, radiance)
+    status = np.where(dark, Status.LOW_SIGNAL, Status.OK)
+    return range_image_from_path_length(capture, length, status, radiance / capture.full_scale, radiance)
