@@ -98,7 +98,8 @@ def llvm_package() -> str:
 
 def apt(action: str, *arguments: str) -> int:
     """apt-get's exit status; it never asks."""
-    options = ["install", "-y", "-q", "--no-install-recommends"] if action == "install" else [action]
+    quiet = ["-y", "-q", "-o", "Dpkg::Use-Pty=0", "--no-install-recommends"]
+    options = [action, *quiet] if action == "install" else [action]
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     command = ["apt-get", *options, *arguments]
     return subprocess.run(command, env=environment, stdout=subprocess.DEVNULL).returncode
