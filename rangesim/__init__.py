@@ -30,7 +30,7 @@ _HOME = {
     "load_capture": "rangesim.capture_files",
     "load_scene": "rangesim.scene",
     "look_at": "rangesim.rig",
-    "transport": "rangesim.transport",
+    "transport": "rangesim.light_transport.one_pass",
 }
 
 __all__ = sorted(_HOME)

@@ -18,7 +18,7 @@ from rangesim.rig import Intrinsics
 from rangesim.scene.materials import MATERIAL_CLASSES, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.scene import Instance, Scene
-from rangesim.transport.backend import select_variant
+from rangesim.light_transport.backend import select_variant
 
 # Mitsuba's camera looks along +z with x to the left and y up; ours has x to the right and y down.
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])

@@ -14,9 +14,9 @@ from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.sensors import Sensor
 from rangesim.signals import EnergySplit, Signals
-from rangesim.transport.ground_truth import ground_truth
-from rangesim.transport.loop import Device, Radiance, Settings, trace
-from rangesim.transport.responses import Accumulators
+from rangesim.light_transport.ground_truth import ground_truth
+from rangesim.light_transport.loop import Device, Radiance, Settings, trace
+from rangesim.light_transport.responses import Accumulators
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from rangesim.response import LightPath
 from rangesim.rig import Intrinsics, Rig
-from rangesim.transport.responses import Accumulators
+from rangesim.light_transport.responses import Accumulators
 
 
 class Device:

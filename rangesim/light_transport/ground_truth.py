@@ -13,7 +13,7 @@ from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
 from rangesim.signals import GroundTruth
-from rangesim.transport.loop import Device, connect
+from rangesim.light_transport.loop import Device, connect
 
 
 def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
