@@ -25,6 +25,7 @@ LIBRARIES = {  # soname -> (Debian package, who needs it)
     "libusb-1.0.so.0": ("libusb-1.0-0", "Open3D"),
     "libgomp.so.1": ("libgomp1", "Open3D"),
     "libGL.so.1": ("libgl1", "Open3D"),
+    "libEGL.so.1": ("libegl1", "Open3D"),
 }
 LLVM_PACKAGES = ("libllvm22", "libllvm21", "libllvm20", "libllvm19", "libllvm18", "libllvm17t64", "libllvm17")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
