@@ -89,7 +89,7 @@ def trace(
     # ---- State of the path ---------------------------------------------------------------------------
     sample = dr.zeros(mi.UInt32, lanes)  # samples of this pixel finished so far
     depth = dr.zeros(mi.UInt32, lanes)  # surfaces met so far
-    ray = dr.zeros(mi.Ray3f, lanes)
+    ray = mi.Ray3f(dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes))
     throughput = dr.ones(mi.Float, lanes)  # radiance at the camera per radiance along the ray
     length = dr.zeros(mi.Float, lanes)  # optical length from the camera to `previous.p`, metres
     ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
