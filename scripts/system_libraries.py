@@ -20,12 +20,16 @@ import sys
 import types
 from pathlib import Path
 
-LIBRARIES = {  # soname -> (Debian package, who needs it)
+LIBRARIES = {  # soname -> (Debian package, who needs it); measured in a minimal Debian 12 and 13
+    "libstdc++.so.6": ("libstdc++6", "every compiled package"),
     "libatomic.so.1": ("libatomic1", "Dr.Jit"),
     "libusb-1.0.so.0": ("libusb-1.0-0", "Open3D"),
     "libgomp.so.1": ("libgomp1", "Open3D"),
     "libGL.so.1": ("libgl1", "Open3D"),
     "libEGL.so.1": ("libegl1", "Open3D"),
+    "libX11.so.6": ("libx11-6", "Open3D"),
+    "libidn2.so.0": ("libidn2-0", "Open3D"),
+    "libudev.so.1": ("libudev1", "Open3D"),
 }
 LLVM_PACKAGES = ("libllvm22", "libllvm21", "libllvm20", "libllvm19", "libllvm18", "libllvm17t64", "libllvm17")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
