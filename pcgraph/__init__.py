@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point clouds as supervoxels, an adjacency graph and a segmentation tree.
+
+Names load on first use, so that ``import pcgraph`` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pcgraph.boundary import BoundaryCost
+    from pcgraph.cloud import Cloud
+    from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+    from pcgraph.graph import AdjacencyGraph, EdgeFeatures
+    from pcgraph.io import read_cloud, write_segmentation
+    from pcgraph.moments import Moments
+    from pcgraph.nodes import NodeFeatures
+    from pcgraph.segmentation import Segmentation, segment
+    from pcgraph.tree import SegmentationTree
+
+__all__ = [
+    "AdjacencyGraph",
+    "BoundaryCost",
+    "Cloud",
+    "CloudReadError",
+    "CloudWriteError",
+    "EdgeFeatures",
+    "Moments",
+    "NodeFeatures",
+    "PcgraphError",
+    "Segmentation",
+    "SegmentationTree",
+    "read_cloud",
+    "segment",
+    "write_segmentation",
+]
+
+_HOMES = {
+    "AdjacencyGraph": "graph",
+    "BoundaryCost": "boundary",
+    "Cloud": "cloud",
+    "CloudReadError": "errors",
+    "CloudWriteError": "errors",
+    "EdgeFeatures": "graph",
+    "Moments": "moments",
+    "NodeFeatures": "nodes",
+    "PcgraphError": "errors",
+    "Segmentation": "segmentation",
+    "SegmentationTree": "tree",
+    "read_cloud": "io",
+    "segment": "segmentation",
+    "write_segmentation": "io",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'pcgraph' has no attribute {name!r}")
+    return getattr(import_module(f"pcgraph.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

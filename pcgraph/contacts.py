@@ -28,12 +28,20 @@ class Contacts:
         Mean centroid of those voxels.
     normals : (m, 2, 3) float64
         Unit mean of their normals (zero if they cancel).
+    lengths : (m,) float64, metres
+        Sum of those voxels' edge lengths, mean of both sides.
     """
 
     edges: NDArray[np.int32]
     voxels: NDArray[np.int64]
     positions: NDArray[np.float64]
     normals: NDArray[np.float64]
+    lengths: NDArray[np.float64]
+
+    @property
+    def voxel_edges(self) -> NDArray[np.float64]:
+        """Mean edge length of the voxels at each contact, (m,) float64, metres."""
+        return 2.0 * self.lengths / self.voxels.sum(axis=1)
 
 
 def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray[np.int32]) -> Contacts:
@@ -58,7 +66,8 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
     sums = _rim_sums(normals[voxel], rim, len(keys))
     length = np.linalg.norm(sums, axis=2, keepdims=True)
     edges = np.stack((keys // n, keys % n), axis=1).astype(np.int32)
-    return Contacts(edges, voxels.reshape(-1, 2), positions, sums / np.maximum(length, 1e-12))
+    lengths = np.bincount(edge, grid.edge_lengths[voxel], len(keys)) / 2.0
+    return Contacts(edges, voxels.reshape(-1, 2), positions, sums / np.maximum(length, 1e-12), lengths)
 
 
 def _rim_sums(values: NDArray[np.float64], rim: NDArray[np.int64], n_edges: int) -> NDArray[np.float64]:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from pcgraph.moments import Moments
 
+_NO_PLANE = 1e-5  # second over first standard deviation below which points lie on a line
+
 
 @dataclass(frozen=True)
 class NodeFeatures:
@@ -21,7 +23,8 @@ class NodeFeatures:
         Number of points.
     centroid : (k, 3) float64, metres, the points' frame
     normal : (k, 3) float64
-        Unit normal of the least-squares plane, on the viewpoint's side.
+        Unit normal of the least-squares plane, on the viewpoint's side; of points on a line, the direction across
+        it that faces the viewpoint most.
     covariance : (k, 3, 3) float64, square metres
     linearity, planarity, scattering : (k,) float64, 0..1
         (s1 - s2) / s1, (s2 - s3) / s1 and s3 / s1 for standard deviations s1 >= s2 >= s3; their sum is 1, and all
@@ -64,7 +67,7 @@ def node_features(moments: Moments, viewpoint: NDArray[np.float64]) -> NodeFeatu
     return NodeFeatures(
         size=moments.counts,
         centroid=moments.centroids,
-        normal=_facing(vectors[:, :, 0], viewpoint - moments.centroids),
+        normal=_plane_normals(deviations, vectors, viewpoint - moments.centroids),
         covariance=covariance,
         linearity=(high - middle) / scale,
         planarity=(middle - low) / scale,
@@ -74,6 +77,15 @@ def node_features(moments: Moments, viewpoint: NDArray[np.float64]) -> NodeFeatu
     )
 
 
-def _facing(normals: NDArray[np.float64], towards: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plane_normals(deviations: NDArray[np.float64], vectors: NDArray[np.float64], towards: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Direction of least spread on the viewpoint's side; where there is no plane, the nearest thing to facing it."""
+    normals = vectors[:, :, 0].copy()
+    flat = deviations[:, 1] > _NO_PLANE * deviations[:, 2]
+    line = np.where((deviations[:, 2] > 0.0)[:, None], vectors[:, :, 2], 0.0)
+    across = towards - line * np.einsum("ij,ij->i", line, towards)[:, None]
+    length = np.linalg.norm(across, axis=1)
+    usable = ~flat & (length > 1e-12 * np.linalg.norm(towards, axis=1))
+    normals[usable] = across[usable] / length[usable, None]
     away = np.einsum("ij,ij->i", normals, towards) < 0.0
-    return np.where(away[:, None], -normals, normals)
+    normals[away] *= -1.0
+    return normals

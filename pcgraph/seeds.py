@@ -30,15 +30,15 @@ def seed_voxels(grid: VoxelGrid, seed_size: float) -> NDArray[np.int32]:
     -----
     Source: Papon et al. 2013, section 3.2, whose filter against seeds in the void drops components altogether.
     """
-    cells = np.floor(grid.centroids / seed_size)
+    cells = np.floor(grid.warped / seed_size)
     _, cell_of_voxel, cell_counts = np.unique(
         _component_first(cells, components := component_of_voxel(grid)), axis=0, return_inverse=True, return_counts=True
     )
     cell_of_voxel = cell_of_voxel.reshape(-1)
     means = np.stack(
-        [np.bincount(cell_of_voxel, grid.centroids[:, axis]) / cell_counts for axis in range(3)], axis=1
+        [np.bincount(cell_of_voxel, grid.warped[:, axis]) / cell_counts for axis in range(3)], axis=1
     )
-    distance = np.linalg.norm(grid.centroids - means[cell_of_voxel], axis=1)
+    distance = np.linalg.norm(grid.warped - means[cell_of_voxel], axis=1)
     order = np.lexsort((np.arange(grid.n_voxels), distance, cell_of_voxel))
     best_of_cell = order[np.cumsum(cell_counts) - cell_counts]
     component_of_cell = components[best_of_cell]

@@ -74,7 +74,7 @@ def _features(
     """Rows (position, normal, colour) and the three weights for their distances, (v, 9) and (3,)."""
     colors = np.zeros_like(normals) if grid.colors is None else grid.colors
     scale = np.array([weights.spatial / seed_size, weights.normal, weights.color])
-    return np.hstack((grid.centroids, normals, colors)), scale
+    return np.hstack((grid.warped, normals, colors)), scale
 
 
 @njit(cache=True)

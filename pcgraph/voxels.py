@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.warp import Warp
+
 # Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
 _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
@@ -22,13 +24,17 @@ class VoxelGrid:
     Attributes
     ----------
     size : float, metres
-        Edge length of a voxel. The grid is aligned with the frame's origin.
+        Edge length of a voxel in the warped space. The grid is aligned with the origin of that space.
     voxel_of_point : (n,) int32
         Voxel of each point.
     counts : (v,) int64
         Points per voxel.
-    centroids : (v, 3) float64, metres
-        Mean of the voxel's points, to 2**-21 of a voxel.
+    warped : (v, 3) float64, metres of the warped space
+        Mean of the voxel's points there, to 2**-21 of a voxel.
+    centroids : (v, 3) float64, metres, the points' frame
+        The same place in the points' frame.
+    edge_lengths : (v,) float64, metres
+        Edge length of each voxel in the points' frame; `size` throughout unless a camera warp is in use.
     colors : (v, 3) float64, 0..1, or None
         Mean colour of the voxel's points.
     indptr : (v + 1,) int64
@@ -39,7 +45,9 @@ class VoxelGrid:
     size: float
     voxel_of_point: NDArray[np.int32]
     counts: NDArray[np.int64]
+    warped: NDArray[np.float64]
     centroids: NDArray[np.float64]
+    edge_lengths: NDArray[np.float64]
     colors: NDArray[np.float64] | None
     indptr: NDArray[np.int64]
     neighbours: NDArray[np.int32]
@@ -50,7 +58,9 @@ class VoxelGrid:
         return len(self.counts)
 
 
-def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, size: float) -> VoxelGrid:
+def voxel_grid(
+    points: NDArray[np.float64], colors: NDArray[np.float64] | None, size: float, warp: Warp
+) -> VoxelGrid:
     """Voxel grid over finite points.
 
     Parameters
@@ -60,13 +70,15 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
     colors : (n, 3) float64, 0..1, or None
     size : float, metres
         Voxel edge length, > 0.
+    warp : Warp
+        To the space in which voxels are cubes of this size.
 
     Raises
     ------
     ValueError
         The cloud spans so many voxels that a grid coordinate cannot be written as a whole number.
     """
-    scaled = points / size
+    scaled = warp.forward(points) / size
     cells = np.floor(scaled)
     keys, pitch = _keys(cells, size)
     order = np.argsort(keys, kind="stable")
@@ -78,11 +90,13 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
     counts = np.bincount(voxel_of_point)
     offsets = np.rint((scaled - cells) * _STEPS_PER_VOXEL)
     inside = _means(offsets, voxel_of_point, counts) / _STEPS_PER_VOXEL
-    centroids = (cells[order[first]] + inside) * size
+    warped = (cells[order[first]] + inside) * size
+    centroids = warp.backward(warped)
     if colors is not None:
         colors = _means(np.rint(colors * _COLOR_STEPS), voxel_of_point, counts) / _COLOR_STEPS
     indptr, neighbours = _adjacency(unique_keys, *pitch)
-    return VoxelGrid(size, voxel_of_point, counts, centroids, colors, indptr, neighbours)
+    lengths = size * warp.scale(centroids)
+    return VoxelGrid(size, voxel_of_point, counts, warped, centroids, lengths, colors, indptr, neighbours)
 
 
 def sparse_means(

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checking what callers hand in, and bringing it to one form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_LARGEST = 1e100  # metres; beyond it squares of distances overflow
+
+
+@dataclass(frozen=True)
+class CleanCloud:
+    """The finite points of a cloud.
+
+    Attributes
+    ----------
+    points : (n, 3) float64, metres, contiguous
+    colors : (n, 3) float64, 0..1, or None
+    normals : (n, 3) float64, unit length, or zero where none was given, or None
+    shape : (s,) or (h, w)
+        Leading shape of what came in.
+    finite : (s,) or (h * w,) bool
+        Which points those are.
+    """
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.float64] | None
+    normals: NDArray[np.float64] | None
+    shape: tuple[int, ...]
+    finite: NDArray[np.bool_]
+
+    def spread(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Labels of the finite points in the shape of what came in, -1 elsewhere."""
+        full = np.full(len(self.finite), -1, np.int32)
+        full[self.finite] = labels
+        return full.reshape(self.shape)
+
+
+def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike | None) -> CleanCloud:
+    """Finite points with their colours and normals.
+
+    Raises
+    ------
+    ValueError
+        A shape, dtype or range is not the documented one, or no point is finite.
+    """
+    array = _numbers("points", points)
+    if array.ndim not in (2, 3) or array.shape[-1] != 3:
+        raise ValueError(f"expected points of shape (n, 3) or (h, w, 3), got {array.shape}")
+    shape = array.shape[:-1]
+    flat = array.reshape(-1, 3)
+    if not len(flat):
+        raise ValueError("expected at least one point, got an empty cloud")
+    finite = np.isfinite(flat).all(axis=1)
+    if not finite.any():
+        raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
+    kept = np.ascontiguousarray(flat[finite], dtype=np.float64)
+    if np.abs(kept).max() > _LARGEST:
+        raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {np.abs(kept).max():g} m")
+    return CleanCloud(kept, _colors(colors, shape, finite), _normals(normals, shape, finite), shape, finite)
+
+
+def clean_viewpoint(viewpoint: ArrayLike | None, points: NDArray[np.float64], organised: bool) -> NDArray[np.float64]:
+    """The viewpoint, (3,) float64, metres: as given, or by the rule that `pcgraph.segment` documents."""
+    if viewpoint is not None:
+        position = _numbers("viewpoint", viewpoint).astype(np.float64)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise ValueError(f"expected a viewpoint of three finite coordinates in metres, got {viewpoint!r}")
+        return position
+    low, high = points.min(axis=0), points.max(axis=0)
+    if organised or (low > 0.0).any() or (high < 0.0).any():
+        return np.zeros(3)
+    above = (low + high) / 2.0
+    above[2] += 10.0 * float(np.linalg.norm(high - low)) + 1e-3
+    return above
+
+
+def positive(name: str, value: float) -> float:
+    """The value as float, if it is a finite number of metres above zero; ValueError otherwise."""
+    number = non_negative(name, value)
+    if number == 0.0:
+        raise ValueError(f"expected {name} above 0 metres, got {value!r}")
+    return number
+
+
+def non_negative(name: str, value: float) -> float:
+    """The value as float, if it is a finite number of at least zero; ValueError otherwise."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not 0.0 <= number < float("inf"):
+        raise ValueError(f"expected {name} to be a finite number, not negative, got {value!r}")
+    return number
+
+
+def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"expected {name} as a regular array of numbers, got rows of different lengths") from None
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"expected {name} of a floating-point or integer dtype, got {array.dtype}")
+    return array
+
+
+def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.generic]:
+    array = _numbers(name, values)
+    if array.shape != (*shape, 3):
+        raise ValueError(f"expected {name} of the points' shape {(*shape, 3)}, got {array.shape}")
+    return array.reshape(-1, 3)
+
+
+def _colors(
+    colors: ArrayLike | None, shape: tuple[int, ...], finite: NDArray[np.bool_]
+) -> NDArray[np.float64] | None:
+    if colors is None:
+        return None
+    array = _same_shape("colors", colors, shape)[finite]
+    if array.dtype == np.uint8:
+        return array.astype(np.float64) / 255.0
+    if array.dtype.kind != "f":
+        raise ValueError(f"expected colors as uint8 (0..255) or float (0..1), got {array.dtype}")
+    if not ((array >= 0.0) & (array <= 1.0)).all():
+        raise ValueError("expected float colors within 0..1 at finite points; divide by 255 or pass uint8")
+    return array.astype(np.float64)
+
+
+def _normals(
+    normals: ArrayLike | None, shape: tuple[int, ...], finite: NDArray[np.bool_]
+) -> NDArray[np.float64] | None:
+    if normals is None:
+        return None
+    array = _same_shape("normals", normals, shape)[finite].astype(np.float64)
+    array[~np.isfinite(array).all(axis=1)] = 0.0
+    array /= np.maximum(np.abs(array).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return array / np.maximum(np.linalg.norm(array, axis=1, keepdims=True), 1e-300)
