@@ -16,15 +16,18 @@ import numpy as np
 
 from rangesim.capture import DTYPES, Capture
 from rangesim.config import check_keys, from_dict, to_dict
-from rangesim.detector import PhotoDetector
+from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
 from rangesim.image_files import SUFFIXES, read_grey, write_grey
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
+from rangesim.spad import SpadDetector
 
 SIDECAR = "capture.json"
 FORMAT = "rangesim-capture"
 FORMAT_VERSION = 1
+DETECTORS = (Detector, SpadDetector)
+"""What the key `detector` of a sidecar may hold."""
 _KEYS = ("format", "format_version", "rangesim", "dtype", "frames", "sensor", "rig", "detector", "exposure_s")
 
 

@@ -25,16 +25,23 @@ from rangesim.status import Status
 TAPS = 4
 MAX_RANGE_M = 100.0
 """Ranges beyond are not searched, even if the frequencies were unambiguous farther out."""
-MAX_RESIDUAL_TURNS = 0.125
+MAX_RESIDUAL_TURNS = 0.1
 """A frequency whose phase is farther than this from that of the common path length contradicts it."""
+MAX_AMBIGUITY = 0.5
+"""Misfit of the best wrap counts over that of the second best: above, the choice between them is a guess."""
 
 
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
-    """length_m : (h, w) float64, metres, path length; residual_turns : (h, w) largest misfit of any frequency."""
+    """Common path length of several phases.
+
+    length_m : (h, w) float64, metres. residual_turns : (h, w), largest misfit of any frequency's phase.
+    ambiguity : (h, w) in 0..1, root of the best cost over the second best; 0 if there is no second.
+    """
 
     length_m: np.ndarray
     residual_turns: np.ndarray
+    ambiguity: np.ndarray
 
 
 def decode_amcw(capture: Capture, correct_wiggling: bool = True) -> RangeImage:
@@ -62,7 +69,8 @@ def decode_amcw(capture: Capture, correct_wiggling: bool = True) -> RangeImage:
     unwrapped = unwrap([p.turns for p in phases], sensor.modulation_hz, weights, longest)
 
     status = np.zeros(capture.frames.shape[1:], dtype=np.uint8)
-    status[unwrapped.residual_turns > MAX_RESIDUAL_TURNS] = Status.WRAPPED
+    contradiction = (unwrapped.residual_turns > MAX_RESIDUAL_TURNS) | (unwrapped.ambiguity > MAX_AMBIGUITY)
+    status[contradiction] = Status.WRAPPED
     for phase in phases:
         status[modulation_is_weak(capture, phase, TAPS)] = Status.LOW_SIGNAL
     status[capture.saturated(capture.frames)] = Status.SATURATED
@@ -107,7 +115,7 @@ def unwrap(
     base = int(np.argmin(wavelengths))
     candidates = max(1, int(np.ceil(longest_m / wavelengths[base] - 1e-6)))
     total = np.sum(weights, axis=0)
-    best_cost = np.full(turns[0].shape, np.inf)
+    best_cost, second_cost = np.full((2, *turns[0].shape), np.inf)
     best = np.zeros(turns[0].shape)
     for n in range(candidates):
         guess = (turns[base].astype(np.float64) + n) * wavelengths[base]
@@ -115,10 +123,12 @@ def unwrap(
         mean = sum(x * k for x, k in zip(lengths, weights, strict=True)) / total
         cost = sum(k * (x - mean) ** 2 for x, k in zip(lengths, weights, strict=True))
         better = cost < best_cost
-        best_cost = np.where(better, cost, best_cost)
+        second_cost = np.minimum(second_cost, np.maximum(cost, best_cost))
+        best_cost = np.minimum(cost, best_cost)
         best = np.where(better, mean, best)
     misfits = [best / w - t for t, w in zip(turns, wavelengths, strict=True)]
-    return Unwrapped(best, np.max([np.abs(m - np.rint(m)) for m in misfits], axis=0))
+    residual = np.max([np.abs(m - np.rint(m)) for m in misfits], axis=0)
+    return Unwrapped(best, residual, np.sqrt(best_cost / np.maximum(second_cost, 1e-30)))
 
 
 def _weight(capture: Capture, phase: Phase, modulation_hz: float) -> np.ndarray:

@@ -9,10 +9,10 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.decode.path_length import range_image_from_path_length
-from rangesim.detector import SpadDetector
 from rangesim.range_image import RangeImage
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.sensors import DirectToF
+from rangesim.spad import SpadDetector
 from rangesim.status import Status
 
 PEAK_SIGMAS = 5.0

@@ -9,8 +9,9 @@ import numpy as np
 
 from rangesim.rig import Intrinsics, Rig
 
-ITERATIONS = 4
-"""Rounds to find the undecoded projector coordinate, which matters through the lens distortion only."""
+ITERATIONS = 20
+"""Most rounds to find the undecoded projector coordinate, which matters through the lens distortion only."""
+CONVERGED_PX = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +55,14 @@ def triangulate(
     v = np.full(len(a), projector.cy) if row is None else np.asarray(row, dtype=np.float64)
     rounds = 1 if both or not any(projector.distortion) else ITERATIONS
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for i in range(rounds):
+        for _ in range(rounds):
             xy = projector.normalise(np.stack([u, v], axis=-1))
             w = _inverse_depth(a, b, xy, projector, column is not None, row is not None)
-            if i + 1 < rounds:
-                u, v = _complete(a + w[:, None] * b, projector, u, v, column is None)
+            if rounds == 1:
+                break
+            u, v, change = _complete(a + w[:, None] * b, projector, u, v, column is None)
+            if change < CONVERGED_PX:
+                break
         point = a + w[:, None] * b
         z = np.where((w > 0) & np.isfinite(w) & (point[:, 2] > 0), 1 / w, np.nan)
         error = (point[:, :2] / point[:, 2:] - xy) * [projector.fx, projector.fy]
@@ -81,10 +85,10 @@ def _inverse_depth(
 
 def _complete(
     point: np.ndarray, projector: Intrinsics, u: np.ndarray, v: np.ndarray, columns_missing: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """(u, v) with the undecoded one replaced by where `point` (n, 3), projector frame, projects to."""
-    projected = projector.project(point)
-    missing = projected[:, 0] if columns_missing else projected[:, 1]
-    if columns_missing:
-        return np.where(np.isfinite(missing), missing, u), v
-    return u, np.where(np.isfinite(missing), missing, v)
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """(u, v) with the undecoded one replaced by where `point` (n, 3), projector frame, projects to; largest change."""
+    old = u if columns_missing else v
+    new = projector.project(point)[:, 0 if columns_missing else 1]
+    new = np.where(np.isfinite(new), new, old)
+    change = float(np.abs(new - old).max(initial=0))
+    return (new, v, change) if columns_missing else (u, new, change)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Range images to point clouds with normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from rangesim.range_image import RangeImage
+
+FRAMES = ("camera", "world")
+NORMAL_RADIUS = 2
+"""Pixels; normals are fitted to a window of (2 r + 1)^2 pixels."""
+MAX_SLOPE = 4.0
+"""Depth step over lateral step between two pixels of one surface: 4 keeps surfaces seen up to 76 degrees off."""
+STEP_FLOOR = 0.005
+"""Share of z by which neighbours may always differ, for noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points, organised as the image they come from (h, w, ...) or as a list (n, ...).
+
+    Parameters
+    ----------
+    points : (h, w, 3) or (n, 3) float32, metres, in `frame`; NaN where there is none.
+    frame : "camera" (OpenCV: x right, y down, z forward) or "world".
+    normals : (..., 3) float32, unit, towards the camera, in `frame`; NaN where unknown. Or None.
+    intensity : (...) float32, the capture's units. Or None.
+    colors : (..., 3) uint8, RGB. Or None.
+    confidence : (...) float32 in 0..1, see `RangeImage`. Or None.
+    """
+
+    points: np.ndarray
+    frame: str = "camera"
+    normals: np.ndarray | None = None
+    intensity: np.ndarray | None = None
+    colors: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.points.shape
+        if len(shape) not in (2, 3) or shape[-1] != 3:
+            raise ValueError(f"expected points of shape (n, 3) or (h, w, 3), got {shape}.")
+        if self.frame not in FRAMES:
+            raise ValueError(f"expected frame to be one of {', '.join(FRAMES)}, got {self.frame!r}.")
+        for name, value in self.attributes().items():
+            if value.shape not in (shape[:-1], shape):
+                raise ValueError(f"expected {name} of shape {shape[:-1]} or {shape}, got {value.shape}.")
+
+    def attributes(self) -> dict[str, np.ndarray]:
+        """The arrays that are there beside the points, by name."""
+        names = ("normals", "intensity", "colors", "confidence")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(...) bool, where there is a point."""
+        return np.asarray(np.isfinite(self.points).all(axis=-1))
+
+    def finite(self) -> PointCloud:
+        """The points that are there, as a list (n, ...), row by row."""
+        keep = self.valid
+        return replace(self, points=self.points[keep], **{k: v[keep] for k, v in self.attributes().items()})
+
+    def save(self, path: str | Path) -> None:
+        """Write `.ply` (the finite points) or `.pcd` (organised, NaN kept); see `rangesim.point_cloud_files`."""
+        from rangesim.point_cloud_files import save_point_cloud
+
+        save_point_cloud(self, path)
+
+
+def from_range_image(image: RangeImage, frame: str = "camera") -> PointCloud:
+    """Organised point cloud of a range image, with normals.
+
+    Parameters
+    ----------
+    frame : "camera" or "world".
+
+    Raises
+    ------
+    ValueError
+        The range image has no camera (uncalibrated capture), or the frame is unknown.
+    """
+    if frame not in FRAMES:
+        raise ValueError(f"expected frame to be one of {', '.join(FRAMES)}, got {frame!r}.")
+    if image.camera is None or image.T_world_camera is None:
+        raise ValueError("expected a calibrated range image: without a rig there are no points.")
+    rays = image.camera.directions(image.camera.pixel_centres())
+    z = image.z.astype(np.float64)
+    points, normals = rays * z[..., None], lattice_normals(z, rays)
+    if frame == "world":
+        rotation, origin = image.T_world_camera[:3, :3], image.T_world_camera[:3, 3]
+        points, normals = points @ rotation.T + origin, normals @ rotation.T
+    return PointCloud(
+        points=points.astype(np.float32),
+        frame=frame,
+        normals=normals.astype(np.float32),
+        intensity=image.intensity,
+        colors=_grey_colors(image.intensity, image.valid),
+        confidence=image.confidence,
+    )
+
+
+def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS) -> np.ndarray:
+    """(h, w, 3) unit normals towards the camera from depths on an image lattice; NaN where there is no surface.
+
+    On a plane n.X = 1 the inverse depth is linear in the image, 1/z = n.(x, y, 1). It is fitted by least squares to
+    the window around each pixel; pixels across a depth step are left out, so edges are not rounded off.
+
+    Parameters
+    ----------
+    z : (h, w) float, metres, NaN where invalid. rays : (h, w, 3) float, directions with z = 1, camera frame.
+    """
+    h, w = z.shape
+    pixel = _pixel_size(rays)
+    inverse = 1 / z
+    sums = np.zeros((9, h, w))
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            here, there = _overlap(h, dy), _overlap(h, -dy)
+            at, other = (here, _overlap(w, dx)), (there, _overlap(w, -dx))
+            limit = np.maximum(MAX_SLOPE * np.hypot(dx, dy) * pixel, STEP_FLOOR) * z[at]
+            used = np.abs(z[other] - z[at]) <= limit  # False with NaN
+            x, y = rays[other][..., 0] - rays[at][..., 0], rays[other][..., 1] - rays[at][..., 1]
+            value = np.where(used, inverse[other] - inverse[at], 0.0)
+            x, y = x * used, y * used
+            for total, term in zip(
+                sums, (used, x, y, value, x * x, x * y, y * y, x * value, y * value), strict=True
+            ):
+                total[at] += term
+    return _normals_of_fit(sums, rays, inverse)
+
+
+def _normals_of_fit(sums: np.ndarray, rays: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Normals from the sums n, x, y, v, xx, xy, yy, xv, yv over each window, relative to its centre pixel."""
+    n, x, y, v, xx, xy, yy, xv, yv = sums
+    count = np.maximum(n, 1)
+    sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
+    sxv, syv = xv - x * v / count, yv - y * v / count
+    determinant = sxx * syy - sxy**2
+    solvable = determinant > 1e-3 * np.maximum(sxx, syy) ** 2
+    safe = np.where(solvable, determinant, 1.0)
+    a, b = (sxv * syy - syv * sxy) / safe, (syv * sxx - sxv * sxy) / safe
+    centre = inverse + (v - a * x - b * y) / count
+    normal = -np.stack([a, b, centre - a * rays[..., 0] - b * rays[..., 1]], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.where((solvable & (n >= 3))[..., None], normal, np.nan)
+
+
+def _pixel_size(rays: np.ndarray) -> float:
+    """Typical step between neighbouring rays at z = 1."""
+    return float(np.median(np.abs(np.diff(rays[..., 0], axis=1)))) if rays.shape[1] > 1 else 1.0
+
+
+def _overlap(size: int, shift: int) -> slice:
+    """Part of an axis that stays inside when moved by `shift`."""
+    return slice(max(0, -shift), min(size, max(0, size - shift)))
+
+
+def _grey_colors(intensity: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8 grey: the 99th percentile of the valid pixels is white, with display gamma 2.2."""
+    bright = float(np.percentile(intensity[valid], 99)) if valid.any() else 0.0
+    share = np.clip(np.nan_to_num(intensity) / (bright if bright > 0 else 1.0), 0, 1) ** (1 / 2.2)
+    return np.repeat(np.rint(255 * share).astype(np.uint8)[..., None], 3, axis=-1)

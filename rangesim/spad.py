@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photon counters for direct time of flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from rangesim.detector import PhotoDetector, streams
+from rangesim.rig import Rig
+from rangesim.sensors import DirectToF, Sensor
+
+
+@dataclass(frozen=True)
+class SpadDetector(PhotoDetector):
+    """Single-photon counter with a histogram memory per pixel.
+
+    The laser fires again as soon as the histogram is full, so an exposure holds exposure_s / (bins bin_s) pulses,
+    and ambient light and dark counts spread evenly over the bins.
+
+    Parameters
+    ----------
+    wavelength_m : float, metres.
+    quantum_efficiency : float in (0, 1], photon detection efficiency, fill factor included.
+    dark_counts_hz : float, counts per second per pixel.
+    bits : int in 1..16, depth of the counter of a bin.
+    pile_up : bool; True: only the first photon after each pulse is counted (Coates 1968), False: every photon.
+    ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through.
+    min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
+    """
+
+    wavelength_m: float = 905e-9
+    quantum_efficiency: float = 0.15
+    dark_counts_hz: float = 500.0
+    bits: int = 12
+    pile_up: bool = False
+    ambient_transmission: float = 0.02
+    min_exposure_s: float = 10e-6
+    max_exposure_s: float = 0.1
+
+    type_name: ClassVar[str] = "spad"
+
+    def __post_init__(self) -> None:
+        self._check()
+        if self.dark_counts_hz < 0:
+            raise ValueError(f"expected no negative dark_counts_hz, got {self.dark_counts_hz}.")
+
+    @property
+    def capacity_e(self) -> float:
+        return float(self.max_dn)
+
+    def pulses(self, sensor: Sensor, exposure_s: float) -> int:
+        """Number of laser pulses in an exposure."""
+        if not isinstance(sensor, DirectToF):
+            raise ValueError(f"expected a direct-tof sensor for a SpadDetector, got {sensor.type_name}.")
+        return max(1, round(exposure_s / (sensor.bins * sensor.bin_s)))
+
+    def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
+        pulses = self.pulses(sensor, exposure_s)
+        assert isinstance(sensor, DirectToF)
+        open_s = pulses * sensor.bins * sensor.bin_s
+        signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * open_s)
+        return np.asarray(signal + self.dark_counts_hz * open_s / sensor.bins)
+
+    def read_out(
+        self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int
+    ) -> np.ndarray:
+        pulses = self.pulses(sensor, exposure_s)
+        result = np.empty(radiance.shape, dtype=self.dtype)
+        unused = np.full(radiance.shape[1:], pulses, dtype=np.int64)
+        for frame, out, rng in zip(radiance, result, streams(seed, len(radiance)), strict=True):
+            mean = np.maximum(self.mean_electrons(frame, sensor, rig, exposure_s), 0)
+            if self.pile_up:
+                counts = rng.binomial(unused, -np.expm1(-mean / pulses))
+                unused -= counts
+            else:
+                counts = rng.poisson(np.minimum(mean, 1e9))
+            out[:] = np.minimum(counts, self.max_dn)
+        return result

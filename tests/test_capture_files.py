@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures load back the same; broken ones are refused in one sentence, and nothing is written half-way."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic import plane_signals, stereo_rig
+
+from rangesim.calibration_files import load_calibration, save_calibration
+from rangesim.capture import Capture
+from rangesim.capture_files import SIDECAR, import_capture, load_capture
+from rangesim.detector import Detector, PhotoDetector
+from rangesim.errors import FileFormatError
+from rangesim.exposure import expose
+from rangesim.rig import Intrinsics
+from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
+from rangesim.spad import SpadDetector
+
+SMALL = StructuredLight(8, 4, "gray")
+
+
+def small_capture(detector: PhotoDetector | None = None, sensor: Sensor = SMALL) -> Capture:
+    rig = dataclasses.replace(stereo_rig(32, 24), projector=Intrinsics.from_fov(8, 4, 60))
+    return expose(plane_signals(rig, sensor, ambient=0.1), sensor, detector)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "detector"),
+    [
+        (SMALL, None),
+        (SMALL, Detector()),
+        (SMALL, Detector(bits=8)),
+        (StructuredLight(8, 4, axes=("columns", "rows"), period_px=4.0), Detector(bits=16)),
+        (AmcwToF(waveform="square"), Detector.time_of_flight()),
+        (DirectToF(bins=20, bin_s=1e-9), SpadDetector(pile_up=True)),
+        (IdealToF(), None),
+    ],
+)
+def test_captures_load_back_the_same(tmp_path: Path, sensor: Sensor, detector: PhotoDetector | None) -> None:
+    capture = small_capture(detector, sensor)
+    capture.save(tmp_path / "out" / "capture")
+    loaded = load_capture(tmp_path / "out" / "capture")
+    assert loaded.frames.dtype == capture.frames.dtype
+    assert loaded.frames.tobytes() == capture.frames.tobytes()
+    assert (loaded.sensor, loaded.rig, loaded.detector) == (capture.sensor, capture.rig, capture.detector)
+    np.testing.assert_equal(loaded.exposure_s, capture.exposure_s)
+    suffix = ".exr" if detector is None else ".png"
+    names = sorted(p.name for p in (tmp_path / "out" / "capture").iterdir() if p.name != SIDECAR)
+    assert names == [f"{i:03d}_{name}{suffix}" for i, name in enumerate(sensor.frame_names())]
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["capture"]
+
+
+def test_an_uncalibrated_capture_and_wide_counts_load_back(tmp_path: Path) -> None:
+    sensor = DirectToF(bins=2)
+    capture = Capture(np.full((2, 3, 4), 60_000, dtype=np.uint32), sensor)
+    capture.save(tmp_path / "c")
+    loaded = load_capture(tmp_path / "c")
+    assert loaded.frames.dtype == np.uint32
+    assert loaded.rig is None
+    assert loaded.detector is None
+    too_many = Capture(np.full((2, 3, 4), 70_000, dtype=np.uint32), sensor)
+    with pytest.raises(FileFormatError, match="70000"):
+        too_many.save(tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_capture_is_replaced_and_nothing_else_is(tmp_path: Path) -> None:
+    small_capture(Detector()).save(tmp_path / "c")
+    small_capture(None).save(tmp_path / "c")
+    assert load_capture(tmp_path / "c").frames.dtype == np.float32
+    assert not list((tmp_path / "c").glob("*.png"))
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "thesis.txt").write_text("all my work")
+    with pytest.raises(FileFormatError, match="nothing was overwritten"):
+        small_capture().save(precious)
+    with pytest.raises(FileFormatError, match="no directory"):
+        small_capture().save(precious / "thesis.txt")
+    assert (precious / "thesis.txt").read_text() == "all my work"
+
+
+def _edit(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        settings = json.loads((folder / SIDECAR).read_text())
+        change(settings)
+        (folder / SIDECAR).write_text(json.dumps(settings))
+
+    return apply
+
+
+def _overwrite(name: str, image: np.ndarray) -> Callable[[Path], None]:
+    return lambda folder: Image.fromarray(image).save(folder / name)
+
+
+FIRST = "000_columns_bit2.png"
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: (d / SIDECAR).unlink(), "is no capture: it has no capture.json"),
+        (lambda d: (d / SIDECAR).write_text("{"), "is no valid JSON"),
+        (lambda d: (d / SIDECAR).write_text("[]"), "is no rangesim-capture file"),
+        (lambda d: (d / FIRST).unlink(), f"{FIRST} is missing"),
+        (lambda d: (d / FIRST).write_bytes(b"not a picture"), "cannot be read as an image"),
+        (lambda d: (d / FIRST).write_bytes((d / FIRST).read_bytes()[:200]), "cannot be read as an image"),
+        (_overwrite("001_columns_bit2_inverse.png", np.zeros((5, 6), np.uint16)), "got 6 x 5 uint16"),
+        (_overwrite("001_columns_bit2_inverse.png", np.zeros((24, 32), np.uint8)), "got 32 x 24 uint8"),
+        (_edit(lambda s: s.update(exposure=1)), "unknown key 'exposure' .did you mean 'exposure_s'"),
+        (_edit(lambda s: s["sensor"].update(code="grey")), "sensor.code: .*'grey'"),
+        (_edit(lambda s: s["sensor"].update(type="structured-ligth")), "did you mean 'structured-light'"),
+        (_edit(lambda s: s["sensor"].pop("type")), "expected 'type'"),
+        (_edit(lambda s: s.pop("sensor")), "expected a table"),
+        (_edit(lambda s: s["rig"]["camera"].update(width=33)), "expected frames of 33 x 24"),
+        (_edit(lambda s: s["detector"].update(bits=40)), "1 to 16 bits"),
+        (_edit(lambda s: s.update(format_version=99)), "format version 1, got 99"),
+        (_edit(lambda s: s.update(exposure_s="long")), "long"),
+        (_edit(lambda s: s.update(frames=s["frames"][1:])), "list of 8 frames"),
+        (_edit(lambda s: s["frames"].__setitem__(0, "../../etc/passwd")), "plain file names"),
+        (_edit(lambda s: s.update(dtype="float32")), "expected frames of type float32"),
+    ],
+)
+def test_damaged_captures_are_refused(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
+    small_capture(Detector()).save(tmp_path / "c")
+    damage(tmp_path / "c")
+    with pytest.raises(FileFormatError, match=message) as caught:
+        load_capture(tmp_path / "c")
+    assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("rangesim.capture_files.json.dumps", full)
+    with pytest.raises(OSError, match="No space"):
+        small_capture(Detector()).save(tmp_path / "c")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_real_images_come_in_by_number(tmp_path: Path) -> None:
+    for i in range(SMALL.n_frames):
+        image = np.full((4, 5, 3), 20 * i, dtype=np.uint8)
+        Image.fromarray(image if i % 2 else image[..., 0]).save(tmp_path / f"shot{i + 1}.png")
+    for i, value in enumerate([9, 10, 11]):
+        (tmp_path / f"notes{i}.txt").write_text(str(value))
+    capture = import_capture(tmp_path, SMALL)
+    np.testing.assert_array_equal(capture.frames[:, 0, 0], 20 * np.arange(8))
+    with pytest.raises(FileFormatError, match="expected 10 images"):
+        import_capture(tmp_path, StructuredLight(16, 4, "gray"))
+    with pytest.raises(FileFormatError, match="expected frames of 160 x 120"):
+        import_capture(tmp_path, SMALL, stereo_rig())
+    Image.fromarray(np.zeros((4, 6), np.uint8)).save(tmp_path / "shot5.png")
+    with pytest.raises(FileFormatError, match="shot5.png: expected 5 x 4 uint8"):
+        import_capture(tmp_path, SMALL)
+    with pytest.raises(FileFormatError, match="no folder"):
+        import_capture(tmp_path / "nowhere", SMALL)
+
+
+def test_impossible_captures_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected 8 frames"):
+        Capture(np.zeros((7, 4, 4), np.uint8), SMALL)
+    with pytest.raises(ValueError, match="float64"):
+        Capture(np.zeros((8, 4, 4)), SMALL)
+    with pytest.raises(ValueError, match="160 x 120"):
+        Capture(np.zeros((8, 4, 4), np.uint8), SMALL, stereo_rig())
+
+
+def test_rigs_load_back_the_same(tmp_path: Path) -> None:
+    rig = dataclasses.replace(stereo_rig(), camera=Intrinsics(160, 120, 100.5, 101, 80, 60.25, (0.1, -0.2)))
+    save_calibration(rig, tmp_path / "rig.json")
+    assert load_calibration(tmp_path / "rig.json") == rig
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.json"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.json", "{", "no valid JSON"),
+        ("a.json", '{"camera": {}}', "missing 'projector'"),
+        ("a.json", '{"camara": {}}', "did you mean 'camera'"),
+        ("a.xml", "<opencv_storage>", "no valid XML"),
+        ("a.xml", "<opencv_storage/>", "matrix 'img_shape'"),
+        ("a.xml", "<o><img_shape><data>1 2 3</data></img_shape></o>", "expected 2 numbers"),
+        ("a.xml", "<o><img_shape><data>1 two</data></img_shape></o>", "does not hold numbers"),
+    ],
+)
+def test_broken_calibrations_are_refused(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        load_calibration(tmp_path / name, (8, 8))
+    with pytest.raises(FileFormatError, match="does not exist"):
+        load_calibration(tmp_path / "nowhere.xml")
+    if name == "a.xml":
+        with pytest.raises(ValueError, match="projector_size"):
+            load_calibration(tmp_path / name)

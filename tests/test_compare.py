@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Statistics of errors that were put in by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from rangesim.compare import compare
+from rangesim.range_image import RangeImage
+from rangesim.signals import GroundTruth
+from rangesim.status import Status
+
+
+def truth_of(z: np.ndarray, material: np.ndarray, visible: np.ndarray | None = None) -> GroundTruth:
+    shape = z.shape
+    return GroundTruth(
+        z=z.astype(np.float32),
+        range_m=z.astype(np.float32),
+        normal=np.zeros((*shape, 3), np.float32),
+        instance=material,
+        material=material,
+        projector_uv=np.zeros((*shape, 2), np.float32),
+        projector_visible=np.isfinite(z) if visible is None else visible,
+        material_names=("matte", "glass", "unused"),
+    )
+
+
+def image_of(z: np.ndarray) -> RangeImage:
+    status = np.where(np.isfinite(z), Status.OK, Status.LOW_SIGNAL).astype(np.uint8)
+    return RangeImage(z, z, np.ones_like(z), status, np.ones_like(z))
+
+
+@pytest.fixture
+def scene() -> tuple[np.ndarray, GroundTruth]:
+    """Left half matte, right half glass at 1 m; the last row sees nothing."""
+    z = np.ones((11, 20))
+    z[10] = np.nan
+    material = np.tile(np.where(np.arange(20) < 10, 0, 1), (11, 1)).astype(np.int32)
+    material[10] = -1
+    return z, truth_of(z, material)
+
+
+def test_a_perfect_image_has_no_errors(scene: tuple[np.ndarray, GroundTruth]) -> None:
+    z, truth = scene
+    result = compare(image_of(z), truth)
+    assert [row.material for row in result.table] == ["matte", "glass", "all"]
+    for row in result.table:
+        assert row.pixels == row.lit == (200 if row.material == "all" else 100)
+        assert (row.completeness, row.coverage) == (1, 1)
+        assert row.bias_m == row.median_abs_m == row.rmse_m == row.p95_abs_m == row.outlier_rate == 0
+        assert row.edge_pixels == 0 or row.flying_rate == 0
+
+
+def test_errors_come_out_per_class(scene: tuple[np.ndarray, GroundTruth]) -> None:
+    z, truth = scene
+    measured = z.copy()
+    measured[:, :10] += 0.002
+    measured[:5, 10:] = np.nan
+    measured[5:, 10:] -= 0.050
+    result = compare(image_of(measured), truth)
+    matte, glass = result.row("matte"), result.row("glass")
+    np.testing.assert_allclose([matte.bias_m, matte.median_abs_m, matte.rmse_m, matte.p95_abs_m], 0.002, atol=1e-6)
+    assert matte.outlier_rate == 0
+    assert glass.completeness == 0.5
+    assert glass.outlier_rate == 1
+    assert abs(glass.bias_m + 0.05) < 1e-6
+    assert abs(result.row("all").outlier_rate - 50 / 150) < 1e-9
+    assert np.isnan(result.error_m[:5, 10:]).all()
+    assert np.isnan(result.error_m[10]).all()
+    np.testing.assert_allclose(result.error_m[:10, :10], 0.002, atol=1e-6)
+    assert compare(image_of(measured), truth, outlier_m=0.001).row("matte").outlier_rate == 1
+
+
+def test_shadow_is_no_incompleteness(scene: tuple[np.ndarray, GroundTruth]) -> None:
+    z, truth = scene
+    visible = np.isfinite(z)
+    visible[:, :5] = False
+    measured = np.where(visible, z, np.nan)
+    row = compare(image_of(measured), dataclasses.replace(truth, projector_visible=visible)).row("matte")
+    assert (row.pixels, row.lit, row.completeness, row.coverage) == (100, 50, 1.0, 0.5)
+
+
+def test_flying_pixels_lie_on_neither_side_of_an_edge() -> None:
+    z = np.where(np.arange(20)[None, :] < 10, 1.0, 2.0) * np.ones((10, 1))
+    truth = truth_of(z, np.zeros(z.shape, np.int32))
+    measured = z.copy()
+    measured[:, 9] = 1.5  # between both sides: flies
+    measured[:, 10] = 1.0  # on the wrong side of the edge: an outlier, but no flying pixel
+    measured[:, 3] = 1.5  # far from the edge: an outlier only
+    result = compare(image_of(measured), truth)
+    row = result.row("all")
+    assert row.edge_pixels == 60
+    assert result.flying.sum() == 10
+    assert result.flying[:, 9].all()
+    assert abs(row.flying_rate - 10 / 60) < 1e-9
+    assert abs(row.outlier_rate - 30 / 200) < 1e-9
+
+
+def test_tables_are_json_and_markdown(scene: tuple[np.ndarray, GroundTruth]) -> None:
+    z, truth = scene
+    result = compare(image_of(np.full_like(z, np.nan)), truth)
+    rows = json.loads(json.dumps(result.rows(), allow_nan=False))
+    assert rows[0]["bias_m"] is None
+    assert rows[0]["completeness"] == 0
+    assert math.isnan(result.table[0].bias_m)
+    lines = result.to_markdown().splitlines()
+    assert len(lines) == 2 + len(result.table)
+    assert len({line.count("|") for line in lines}) == 1
+    nothing = truth_of(np.full_like(z, np.nan), np.full(z.shape, -1, np.int32))
+    assert [row.material for row in compare(image_of(z), nothing).table] == ["all"]
+
+
+def test_impossible_comparisons_are_refused(scene: tuple[np.ndarray, GroundTruth]) -> None:
+    z, truth = scene
+    with pytest.raises(ValueError, match="shape"):
+        compare(image_of(z[:5]), truth)
+    with pytest.raises(ValueError, match="outlier_m"):
+        compare(image_of(z), truth, outlier_m=0)
+    with pytest.raises(ValueError, match="matte, glass, all"):
+        compare(image_of(z), truth).row("wood")

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Path lengths come back exactly without noise, and with the noise that theory gives them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
+
+from rangesim.capture import Capture
+from rangesim.decode import decode
+from rangesim.decode.amcw import decode_amcw, tap_phase
+from rangesim.decode.histogram import coates, decode_direct
+from rangesim.decode.path_length import range_from_path_length
+from rangesim.detector import Detector
+from rangesim.exposure import expose
+from rangesim.response import SPEED_OF_LIGHT
+from rangesim.rig import Rig, translation
+from rangesim.sensors import AmcwToF, DirectToF, IdealToF
+from rangesim.spad import SpadDetector
+from rangesim.status import Status
+
+
+@given(st.floats(0.1, 10), st.lists(st.floats(-2, 2), min_size=3, max_size=3), st.floats(-0.5, 0.5))
+def test_range_from_path_length_inverts_the_ellipsoid(range_m: float, b: list[float], slope: float) -> None:
+    rig = dataclasses.replace(stereo_rig(), T_camera_projector=translation(*b))
+    direction = np.array([slope, 0.1, 1.0])
+    point = range_m * direction / np.linalg.norm(direction)
+    length = range_m + np.linalg.norm(point - b)
+    found = range_from_path_length(np.array([length]), direction[None], rig)[0]
+    if length - np.linalg.norm(b) > 1e-3:  # else the emitter lies on the ray: every point between has this length
+        assert abs(found - range_m) < 1e-6
+
+
+def test_ideal_range_is_exact_for_an_emitter_at_any_pose() -> None:
+    for baseline in (0.0, 0.05, 0.5):
+        rig, sensor = stereo_rig(baseline_m=baseline), IdealToF()
+        signals = plane_signals(rig, sensor)
+        image = decode(expose(signals, sensor, Detector()))
+        lit = signals.truth.projector_visible
+        assert (image.valid == lit).all()
+        assert (image.status[~lit] == Status.LOW_SIGNAL).all()
+        np.testing.assert_allclose(image.z[lit], signals.truth.z[lit], atol=2e-6)
+        np.testing.assert_allclose(image.range_m[lit], signals.truth.range_m[lit], atol=2e-6)
+
+
+@pytest.mark.parametrize("waveform", ["sine", "square"])
+@pytest.mark.parametrize("frequencies", [(20e6,), (20e6, 80e6, 100e6), (80e6, 16e6, 120e6)])
+def test_amcw_is_exact_without_noise(waveform: str, frequencies: tuple[float, ...]) -> None:
+    rig = stereo_rig(baseline_m=0.02)
+    sensor = AmcwToF(frequencies, waveform=waveform)  # type: ignore[arg-type]
+    for distance in (0.5, 1.0, 5.0):
+        signals = plane_signals(rig, sensor, distance_m=distance, ambient=0.01)
+        image = decode(expose(signals, sensor))
+        lit = signals.truth.projector_visible
+        assert (image.valid[lit]).all()
+        assert np.nanmax(np.abs(image.z - signals.truth.z)) < 5e-5
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.05, 18.7), st.sampled_from([(80e6, 16e6, 120e6), (24e6, 56e6)]))
+def test_amcw_unwraps_up_to_the_common_range(range_m: float, frequencies: tuple[float, ...]) -> None:
+    sensor = AmcwToF(frequencies)
+    phases = np.array([2 * np.pi * f * 2 * range_m / SPEED_OF_LIGHT for f in frequencies])
+    taps = [100 + 40 * np.cos(p - k * np.pi / 2) for p in phases for k in range(4)]
+    image = decode(Capture(np.array(taps, dtype=np.float32).reshape(-1, 1, 1), sensor))
+    assert sensor.unambiguous_range_m > 18.7
+    assert abs(image.range_m[0, 0] - range_m) < 1e-4
+
+
+def test_phases_that_agree_on_nothing_are_wrapped() -> None:
+    sensor = AmcwToF((80e6, 100e6))
+    turns = np.linspace(0, 1, 50, endpoint=False)
+    taps = [[100 + 40 * np.cos(2 * np.pi * t - k * np.pi / 2) for t in turns] for k in range(4)]
+    other = [[100 + 40 * np.cos(1.0 - k * np.pi / 2) for _ in turns] for k in range(4)]
+    frames = np.array([*taps, *other], dtype=np.float32)[:, None, :]
+    status = decode(Capture(frames, sensor)).status
+    assert set(np.unique(status)) <= {Status.OK, Status.WRAPPED}
+    three = AmcwToF((20e6, 80e6, 100e6))
+    frames = np.concatenate([frames[4:], np.roll(frames[:4], 7, axis=2), frames[:4]])
+    assert (decode(Capture(frames, three)).status == Status.WRAPPED).mean() > 0.3
+
+
+def test_square_waves_wiggle_unless_corrected() -> None:
+    rig, sensor = stereo_rig(baseline_m=0.0), AmcwToF((20e6,), waveform="square")
+    z = np.tile(np.linspace(0.3, 6, 160), (120, 1))
+    capture = expose(signals_of_depth(rig, z, [sensor]), sensor)
+    raw = decode_amcw(capture, correct_wiggling=False)
+    wiggle = np.nanmax(np.abs(raw.z - z)) * 2 * 20e6 / SPEED_OF_LIGHT
+    assert 0.008 < wiggle < 0.0125  # turns; largest |atan2 - triangle| is 0.0113
+    assert np.nanmax(np.abs(decode_amcw(capture).z - z)) < 1e-4
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_noise_of_amcw_is_that_of_theory(seed: int) -> None:
+    """sigma_d = c / (4 pi f) sqrt((A + sigma_r^2) / 2) / B in electrons: A mean and B modulation of the taps."""
+    rig, sensor = stereo_rig(baseline_m=0.0), AmcwToF((50e6,))
+    detector = Detector.time_of_flight()
+    signals = plane_signals(rig, sensor, ambient=0.05)
+    capture = expose(signals, sensor, detector, seed=seed)
+    image = decode(capture)
+    taps = detector.mean_electrons(signals.frames(sensor, detector.ambient_transmission), sensor, rig, capture.exposure_s)
+    phase = tap_phase(taps)
+    variance = phase.mean + detector.read_noise_e**2 + 1 / 12 / detector.gain_dn_e**2
+    sigma = SPEED_OF_LIGHT / (4 * np.pi * 50e6) * np.sqrt(variance / 2) / phase.modulation
+    inside = image.valid
+    assert inside.mean() > 0.9
+    normalised = (image.range_m - signals.truth.range_m)[inside] / sigma[inside]
+    assert abs(normalised.std() - 1) < 0.1
+    assert abs(normalised.mean()) < 0.05
+
+
+def test_several_frequencies_weigh_in_by_their_precision() -> None:
+    rig, sensor = stereo_rig(baseline_m=0.0), AmcwToF((20e6, 80e6, 100e6))
+    signals = plane_signals(rig, sensor)
+    detector = Detector.time_of_flight()
+    error = {}
+    for frequencies in ((20e6,), (20e6, 80e6, 100e6)):
+        one = AmcwToF(frequencies)
+        capture = expose(signals, one, detector, exposure_s=2e-4) if frequencies == (20e6,) else None
+        capture = capture or expose(signals, sensor, detector, exposure_s=2e-4)
+        image = decode(capture)
+        error[frequencies] = np.nanstd((image.z - signals.truth.z)[image.valid])
+    expected = 20 / np.sqrt(20**2 + 80**2 + 100**2)
+    ratio = error[(20e6, 80e6, 100e6)] / error[(20e6,)]
+    assert abs(ratio / expected - 1) < 0.1
+
+
+def test_dark_and_saturated_taps_say_so() -> None:
+    rig, sensor = stereo_rig(baseline_m=0.0), AmcwToF()
+    signals = plane_signals(rig, sensor)
+    detector = Detector.time_of_flight()
+    assert (decode(expose(signals, sensor, detector, 1e-7)).status == Status.LOW_SIGNAL).mean() > 0.95
+    assert (decode(expose(signals, sensor, detector, 1.0)).status == Status.SATURATED).mean() > 0.9
+
+
+def histogram_sensor(**changes: float) -> DirectToF:
+    return DirectToF(**({"bins": 200, "bin_s": 100e-12, "start_s": 3e-9} | changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("fwhm", [0.0, 300e-12])
+def test_histogram_finds_the_bin(fwhm: float) -> None:
+    rig, sensor = stereo_rig(baseline_m=0.0), histogram_sensor(pulse_fwhm_s=fwhm)
+    signals = plane_signals(rig, sensor, ambient=0.02)
+    image = decode(expose(signals, sensor))
+    lit = signals.truth.projector_visible
+    assert image.valid[lit].all()
+    half_bin = sensor.bin_s * SPEED_OF_LIGHT / 4
+    assert np.nanmax(np.abs(image.range_m - signals.truth.range_m)) <= half_bin + 1e-4
+
+
+def test_photon_noise_of_the_centroid_is_that_of_theory() -> None:
+    """Without background the centroid of N photons has sigma_t / sqrt(N); the window of two sigma keeps 95 %."""
+    sensor = histogram_sensor(pulse_fwhm_s=500e-12)
+    rig = Rig(stereo_rig().camera, stereo_rig().projector)
+    z = plane_depth(rig, normal=(0.0, 0.0, -1.0))
+    signals = signals_of_depth(rig, z, [sensor])
+    detector = SpadDetector(dark_counts_hz=0.0, bits=16)
+    capture = expose(signals, sensor, detector, exposure_s=2e-5)
+    still = decode(expose(signals, sensor))
+    image = decode(capture)
+    photons = capture.frames.sum(axis=0)
+    inside = image.valid & (photons > 50)
+    assert inside.mean() > 0.8
+    sigma = 500e-12 / np.sqrt(8 * np.log(2)) * SPEED_OF_LIGHT / 2 / np.sqrt(photons)
+    normalised = ((image.range_m - still.range_m) / sigma)[inside]
+    assert abs(normalised.std() - 1) < 0.15
+
+
+def test_coates_undoes_pile_up() -> None:
+    sensor = histogram_sensor(bins=64)
+    rig = stereo_rig(64, 48, baseline_m=0.0)
+    signals = plane_signals(rig, sensor, distance_m=0.7, ambient=0.5)
+    detector = SpadDetector(pile_up=True, bits=16, ambient_transmission=1.0, quantum_efficiency=1.0)
+    exposure = 2e-4
+    capture = expose(signals, sensor, detector, exposure_s=exposure)
+    mean = detector.mean_electrons(signals.frames(sensor), sensor, rig, exposure)
+    pulses = detector.pulses(sensor, exposure)
+    assert capture.frames.sum(axis=0).max() <= pulses
+    restored = coates(capture.frames.astype(np.float64), pulses)
+    assert abs(restored.sum() / mean.sum() - 1) < 0.01
+    assert capture.frames.sum() < 0.99 * mean.sum()
+
+
+def test_histogram_of_darkness_is_low_signal() -> None:
+    rig, sensor = stereo_rig(32, 24), histogram_sensor()
+    nothing = signals_of_depth(rig, np.full((24, 32), np.nan), [sensor])
+    assert (decode(expose(nothing, sensor)).status == Status.LOW_SIGNAL).all()
+    image = decode(expose(nothing, sensor, SpadDetector(), exposure_s=1e-3))
+    assert (image.status == Status.LOW_SIGNAL).mean() > 0.99
+
+
+def test_wrong_sensors_are_refused() -> None:
+    capture = Capture(np.ones((2, 4, 4), np.float32), IdealToF())
+    with pytest.raises(ValueError, match="amcw-tof"):
+        decode_amcw(capture)
+    with pytest.raises(ValueError, match="direct-tof"):
+        decode_direct(capture)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposure obeys EMVA 1288: photon transfer, saturation, dark signal; and repeats with its seed."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from synthetic import plane_signals, signals_of_depth, stereo_rig
+
+from rangesim.config import from_dict, to_dict
+from rangesim.detector import Detector, PhotoDetector
+from rangesim.exposure import TARGET_PERCENTILE, TARGET_SHARE, expose
+from rangesim.rig import Intrinsics
+from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
+from rangesim.spad import SpadDetector
+
+SENSOR = StructuredLight(code="gray")
+
+
+def uniform_frames(radiance: np.ndarray, detector: Detector, exposure_s: float, seed: int = 0) -> np.ndarray:
+    """Frames (k, 200, 200) of uniform radiance each."""
+    rig = stereo_rig(200, 200)
+    frames = np.broadcast_to(np.asarray(radiance, dtype=np.float32)[:, None, None], (len(radiance), 200, 200))
+    return detector.read_out(frames, SENSOR, rig, exposure_s, seed).astype(np.float64)
+
+
+def test_photons_follow_from_the_etendue() -> None:
+    """E = L pi (a/f)^2 on a pixel of 5 um, by hand."""
+    detector = Detector(quantum_efficiency=0.5)
+    rig = dataclasses.replace(stereo_rig(), camera=Intrinsics(100, 100, 800, 800, 50, 50))
+    irradiance = 2.0 * np.pi * (rig.camera_aperture_radius_m / (800 * 5e-6)) ** 2
+    photons = irradiance * (5e-6) ** 2 * 1e-3 * detector.wavelength_m / (6.62607015e-34 * 299792458)
+    assert np.isclose(detector.electrons_per_radiance(rig) * 2.0 * 1e-3, 0.5 * photons)
+
+
+def test_photon_transfer_curve_has_the_gain_for_slope_and_the_read_noise_at_zero() -> None:
+    """EMVA 1288: sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark)."""
+    detector = Detector(read_noise_e=8.0, dark_current_e_s=0.0, offset_dn=40.0)
+    rig = stereo_rig(200, 200)
+    level = 0.7 * detector.full_well_e / (detector.electrons_per_radiance(rig) * 1e-3)
+    frames = uniform_frames(np.linspace(0, level, 12), detector, 1e-3)
+    mean, variance = frames.mean(axis=(1, 2)), frames.var(axis=(1, 2))
+    slope, start = np.polyfit(mean - detector.offset_dn, variance, 1)
+    k = detector.gain_dn_e
+    assert abs(slope / k - 1) < 0.02
+    assert abs(variance[0] / (k**2 * 64 + 1 / 12) - 1) < 0.03
+    np.testing.assert_allclose(np.sqrt(variance), detector.noise_dn(mean), rtol=0.02)
+    expected = detector.offset_dn + k * 0.7 * detector.full_well_e
+    assert abs(mean[-1] / expected - 1) < 1e-3
+    assert start > 0
+
+
+def test_dark_current_grows_with_time() -> None:
+    detector = Detector(dark_current_e_s=1000.0)
+    for seconds in (0.1, 1.0):
+        dark = uniform_frames(np.zeros(1), detector, seconds).mean()
+        assert abs(dark - detector.offset_dn - detector.gain_dn_e * 1000 * seconds) < 0.1
+
+
+@pytest.mark.parametrize("bits", [8, 10, 16])
+def test_saturated_pixels_read_the_largest_number(bits: int) -> None:
+    detector = Detector(bits=bits, offset_dn=4.0)
+    rig = stereo_rig(200, 200)
+    radiance = np.array([2.0, 1e6]) * detector.full_well_e / detector.electrons_per_radiance(rig)
+    frames = detector.read_out(
+        np.broadcast_to(radiance[:, None, None], (2, 200, 200)), SENSOR, rig, exposure_s=1.0, seed=0
+    )
+    assert frames.dtype == (np.uint8 if bits <= 8 else np.uint16)
+    assert (frames == 2**bits - 1).all()
+
+
+def test_auto_exposure_puts_the_bright_pixels_at_its_target() -> None:
+    rig, detector = stereo_rig(), Detector()
+    for ambient in (0.0, 5.0):
+        capture = expose(plane_signals(rig, SENSOR, ambient=ambient), SENSOR, detector)
+        brightest = (capture.frames.max(axis=0) - detector.offset_dn) / (detector.max_dn - detector.offset_dn)
+        assert abs(np.percentile(brightest, TARGET_PERCENTILE) - TARGET_SHARE) < 0.03
+        assert not capture.saturated(capture.frames).any()
+    limited = dataclasses.replace(detector, min_exposure_s=0.05)
+    assert expose(plane_signals(rig, SENSOR), SENSOR, limited).exposure_s == 0.05
+    nothing = signals_of_depth(rig, np.full((120, 160), np.nan), [SENSOR])
+    assert expose(nothing, SENSOR, detector).exposure_s == detector.max_exposure_s
+
+
+@pytest.mark.parametrize(
+    ("sensor", "detector"),
+    [(SENSOR, Detector()), (AmcwToF(), Detector.time_of_flight()), (DirectToF(bins=80), SpadDetector())],
+)
+def test_same_seed_same_bytes_and_every_frame_its_own_noise(
+    sensor: Sensor, detector: PhotoDetector
+) -> None:
+    signals = plane_signals(stereo_rig(80, 60), sensor, ambient=0.05)
+    one, two, other = (expose(signals, sensor, detector, seed=s).frames for s in (7, 7, 8))
+    assert one.tobytes() == two.tobytes()
+    assert one.tobytes() != other.tobytes()
+    level = 0.5 * Detector().full_well_e / Detector().electrons_per_radiance(signals.rig) / 1e-3
+    flat = np.full((2, 60, 80), level)
+    a, b = Detector().read_out(flat, SENSOR, signals.rig, 1e-3, seed=1).astype(float)
+    assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.05
+
+
+def test_the_filter_holds_back_ambient_light() -> None:
+    rig, ambient = stereo_rig(), 0.5
+    signals = plane_signals(rig, SENSOR, ambient=ambient)
+    detector = Detector(ambient_transmission=0.1, dark_current_e_s=0.0)
+    capture = expose(signals, SENSOR, detector, exposure_s=2e-4)
+    black = capture.frames[-1].mean() - detector.offset_dn
+    expected = 0.1 * ambient * detector.electrons_per_radiance(rig) * 2e-4 * detector.gain_dn_e
+    assert abs(black / expected - 1) < 0.02
+
+
+def test_photon_counts_are_poisson() -> None:
+    rig, sensor = stereo_rig(200, 200), DirectToF(bins=4)
+    detector = SpadDetector(dark_counts_hz=0.0, bits=16)
+    radiance = 50 / detector.electrons_per_radiance(rig) / 1e-3
+    counts = detector.read_out(np.full((4, 200, 200), radiance), sensor, rig, 1e-3, seed=0)
+    assert abs(counts.mean() / 50 - 1) < 0.01
+    assert abs(counts.var() / 50 - 1) < 0.02
+
+
+def test_without_a_detector_frames_are_the_radiance() -> None:
+    signals = plane_signals(stereo_rig(), SENSOR, IdealToF(), ambient=0.1)
+    capture = expose(signals, SENSOR)
+    np.testing.assert_array_equal(capture.frames, signals.frames(SENSOR))
+    assert capture.frames.dtype == np.float32
+    assert capture.detector is None
+    assert np.isnan(capture.exposure_s)
+    assert expose(signals, IdealToF(), Detector()).detector is None
+
+
+def test_detectors_are_settings() -> None:
+    for detector in (Detector.ideal(), Detector.time_of_flight(), SpadDetector(pile_up=True)):
+        assert from_dict(PhotoDetector, to_dict(detector)) == detector  # type: ignore[type-abstract]
+
+
+@pytest.mark.parametrize(
+    ("cls", "wrong"),
+    [
+        (Detector, {"bits": 0}),
+        (Detector, {"bits": 17}),
+        (Detector, {"quantum_efficiency": 1.5}),
+        (Detector, {"full_well_e": 0.0}),
+        (Detector, {"offset_dn": 5000.0}),
+        (Detector, {"read_noise_e": -1.0}),
+        (Detector, {"ambient_transmission": 2.0}),
+        (Detector, {"min_exposure_s": 1.0, "max_exposure_s": 0.1}),
+        (SpadDetector, {"dark_counts_hz": -1.0}),
+    ],
+)
+def test_impossible_detectors_are_refused(cls: type[PhotoDetector], wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        cls(**wrong)
+
+
+def test_impossible_exposures_are_refused() -> None:
+    signals = plane_signals(stereo_rig(), SENSOR, DirectToF(bins=4))
+    for exposure in (0.0, -1.0, float("inf")):
+        with pytest.raises(ValueError, match="more than 0 s"):
+            expose(signals, SENSOR, Detector(), exposure)
+    with pytest.raises(ValueError, match="expected a direct-tof sensor"):
+        expose(signals, SENSOR, SpadDetector(), 1e-3)
+    with pytest.raises(ValueError, match="SpadDetector"):
+        expose(signals, DirectToF(bins=4), Detector(), 1e-3)
+    with pytest.raises(ValueError, match="trace it with this sensor"):
+        expose(signals, AmcwToF(), Detector(), 1e-3)

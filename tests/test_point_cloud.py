@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Range images become clouds that Open3D reads back, with normals that keep edges sharp."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
+
+from rangesim.decode import decode
+from rangesim.detector import Detector
+from rangesim.errors import FileFormatError
+from rangesim.exposure import expose
+from rangesim.point_cloud import PointCloud
+from rangesim.point_cloud_files import load_point_cloud
+from rangesim.range_image import RangeImage
+from rangesim.rig import Rig, look_at
+from rangesim.sensors import IdealToF, StructuredLight
+
+
+def range_image(rig: Rig, z: np.ndarray) -> RangeImage:
+    return decode(expose(signals_of_depth(rig, z, [IdealToF()]), IdealToF()))
+
+
+def test_points_of_a_plane_lie_on_it_and_have_its_normal() -> None:
+    rig = stereo_rig()
+    cloud = range_image(rig, plane_depth(rig)).to_point_cloud()
+    normal = np.array([0.2, 0.1, -1.0]) / np.linalg.norm([0.2, 0.1, -1.0])
+    assert cloud.normals is not None
+    inside = cloud.valid
+    assert inside.mean() > 0.9
+    np.testing.assert_allclose(cloud.points[inside] @ normal, normal[2] * 1.0, atol=1e-5)
+    np.testing.assert_allclose(cloud.normals[inside] @ normal, 1, atol=1e-5)
+
+
+def test_world_frame_is_the_camera_frame_moved() -> None:
+    rig = dataclasses.replace(stereo_rig(), T_world_camera=look_at((1.0, 2.0, 3.0), (0.0, 0.0, 0.0)))
+    image = range_image(rig, plane_depth(rig))
+    camera, world = image.to_point_cloud("camera"), image.to_point_cloud("world")
+    rotation, origin = rig.T_world_camera[:3, :3], rig.T_world_camera[:3, 3]
+    np.testing.assert_allclose(world.points, camera.points @ rotation.T + origin, atol=1e-5)
+    assert world.normals is not None
+    towards = np.einsum("...i,...i", world.normals, origin - world.points)[world.valid]
+    assert (towards > 0).all()
+    assert world.frame == "world"
+
+
+def test_normals_do_not_round_off_a_depth_edge() -> None:
+    rig = stereo_rig()
+    near = plane_depth(rig, 0.8, (0.2, 0.1, -1.0))
+    far = plane_depth(rig, 1.0, (-0.3, 0.1, -1.0))
+    left = np.arange(near.shape[1])[None, :] < 80
+    cloud = range_image(rig, np.where(left, near, far)).to_point_cloud()
+    assert cloud.normals is not None
+    for mask, normal in ((left, (0.2, 0.1, -1.0)), (~left, (-0.3, 0.1, -1.0))):
+        inside = cloud.valid & mask
+        unit = np.asarray(normal) / np.linalg.norm(normal)
+        assert (cloud.normals[inside] @ unit > 0.99999).all()
+
+
+def test_noise_and_holes_leave_unit_normals_or_nan() -> None:
+    rig, sensor = stereo_rig(), StructuredLight()
+    image = decode(expose(plane_signals(rig, sensor), sensor, Detector()))
+    cloud = image.to_point_cloud()
+    assert cloud.normals is not None
+    length = np.linalg.norm(cloud.normals, axis=-1)
+    known = np.isfinite(length)
+    np.testing.assert_allclose(length[known], 1, atol=1e-5)
+    assert not known[~cloud.valid].any()
+    assert known[cloud.valid].mean() > 0.99
+    normal = np.array([0.2, 0.1, -1.0]) / np.linalg.norm([0.2, 0.1, -1.0])
+    assert np.median(cloud.normals[known] @ normal) > np.cos(np.radians(6))
+
+
+@pytest.fixture
+def cloud() -> PointCloud:
+    rig = stereo_rig(40, 30)
+    z = plane_depth(rig)
+    z[5:9, 10:20] = np.nan
+    return range_image(rig, z).to_point_cloud("world")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_files_load_back_the_same(tmp_path: Path, cloud: PointCloud, suffix: str) -> None:
+    cloud.save(tmp_path / f"cloud{suffix}")
+    loaded = load_point_cloud(tmp_path / f"cloud{suffix}")
+    expected = cloud if suffix == ".pcd" else cloud.finite()
+    assert loaded.frame == "world"
+    np.testing.assert_array_equal(loaded.points, expected.points)
+    for name, value in expected.attributes().items():
+        np.testing.assert_array_equal(loaded.attributes()[name], value, err_msg=name)
+    assert [p.name for p in tmp_path.iterdir()] == [f"cloud{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_open3d_reads_the_files(tmp_path: Path, cloud: PointCloud, suffix: str) -> None:
+    o3d = pytest.importorskip("open3d")
+    path = str(tmp_path / f"cloud{suffix}")
+    cloud.save(path)
+    finite = cloud.finite()
+    read = {name: value.numpy() for name, value in o3d.t.io.read_point_cloud(path).point.items()}
+    keep = np.isfinite(read["positions"]).all(axis=1)
+    assert len(keep) == (cloud.valid.size if suffix == ".pcd" else len(finite.points))
+    np.testing.assert_array_equal(read["positions"][keep], finite.points)
+    np.testing.assert_array_equal(read["normals"][keep], finite.normals)
+    np.testing.assert_array_equal(read["colors"][keep], finite.colors)
+    np.testing.assert_array_equal(read["intensity"][keep].ravel(), finite.intensity)
+    np.testing.assert_array_equal(read["confidence"][keep].ravel(), finite.confidence)
+    legacy = o3d.io.read_point_cloud(path, remove_nan_points=True)
+    np.testing.assert_allclose(np.asarray(legacy.points), finite.points)
+    np.testing.assert_allclose(np.asarray(legacy.colors), np.asarray(finite.colors) / 255, atol=1e-6)
+
+
+def test_bad_clouds_are_refused(tmp_path: Path, cloud: PointCloud) -> None:
+    nothing = PointCloud(np.full((4, 5, 3), np.nan, np.float32))
+    for name in ("a.ply", "a.pcd"):
+        with pytest.raises(ValueError, match="at least one finite point"):
+            nothing.save(tmp_path / name)
+    with pytest.raises(ValueError, match=r"\.ply or \.pcd"):
+        cloud.save(tmp_path / "a.obj")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match="shape"):
+        PointCloud(np.zeros((4, 2), np.float32))
+    with pytest.raises(ValueError, match="normals"):
+        PointCloud(np.zeros((4, 3), np.float32), normals=np.zeros((5, 3), np.float32))
+    with pytest.raises(ValueError, match="frame"):
+        PointCloud(np.zeros((4, 3), np.float32), frame="table")
+
+
+def test_uncalibrated_images_have_no_points() -> None:
+    rig = stereo_rig(40, 30)
+    image = dataclasses.replace(range_image(rig, plane_depth(rig)), camera=None)
+    with pytest.raises(ValueError, match="calibrated"):
+        image.to_point_cloud()
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_broken_files_are_refused(tmp_path: Path, cloud: PointCloud, suffix: str) -> None:
+    path = tmp_path / f"cloud{suffix}"
+    with pytest.raises(FileFormatError, match="does not exist"):
+        load_point_cloud(path)
+    cloud.save(path)
+    whole = path.read_bytes()
+    for broken in (b"", whole[: len(whole) // 2], b"ply\nformat ascii 1.0\nend_header\n"):
+        path.write_bytes(broken)
+        with pytest.raises(FileFormatError, match="is no binary PLY or PCD"):
+            load_point_cloud(path)
