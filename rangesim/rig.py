@@ -50,9 +50,10 @@ class Intrinsics:
         return cls(width, height, float(f), float(f), width / 2, height / 2)
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The same lens with another pixel count; the field of view is kept."""
-        sx, sy = width / self.width, height / self.height
-        return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.distortion)
+        """The same lens with another pixel count; the horizontal field of view and the shape of pixels are kept."""
+        scale = width / self.width
+        cx, cy = (self.cx - self.width / 2) * scale + width / 2, (self.cy - self.height / 2) * scale + height / 2
+        return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy, self.distortion)
 
     def pixel_centres(self) -> Array:
         """(height, width, 2) pixel coordinates (x, y) of all pixel centres."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -57,8 +58,7 @@ def transport(
     _check(rig, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
-    channels = {r: np.empty((r.channels, h * w), dtype=np.float32) for r in responses}
-    energy = np.zeros((len(Radiance._fields), h * w), dtype=np.float32)
+    parts: dict[Response | None, list[np.ndarray]] = {r: [] for r in [*responses, None]}  # None: radiance by kind of path
     camera, projector = Device(rig.camera, rig.T_world_camera), Device(rig.projector, rig.T_world_projector)
     settings = Settings(
         seed=dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
@@ -67,35 +67,37 @@ def transport(
         rr_depth=dr.opaque(mi.UInt32, rr_depth),
         ambient=scene.has_ambient,
     )
-    irradiance = dr.opaque(mi.Float, rig.projector_irradiance)
+    irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
     for begin, end in _tiles(h * w, responses, memory_bytes, PROGRESS_STEPS if progress else 1):
         accumulators = Accumulators(responses, end - begin)
         pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
         dense, radiance = trace(scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings)
-        dr.eval(dense, list(radiance), list(accumulators.bins.values()))  # all at once: one by one, the loop would run once for each
-        for response, values in zip(responses, dense, strict=True):
-            part = accumulators.bins.get(response)
-            rows = part.numpy().reshape(-1, end - begin) if part is not None else [v.numpy() for v in values]
-            for row, total in zip(channels[response], rows, strict=True):
-                np.multiply(total, np.float32(1 / spp), out=row[begin:end])
-        energy[:, begin:end] = [v.numpy() / np.float32(spp) for v in radiance]
+        bins = accumulators.bins
+        dr.eval(dense, list(radiance), list(bins.values()))  # all at once: one by one, the loop would run once for each
+        for r, values in zip(responses, dense, strict=True):
+            parts[r].append(bins[r].numpy().reshape(-1, end - begin) if r in bins else _stack(values))
+        parts[None].append(_stack(radiance))
         if progress:
             progress(end / (h * w))
-    return _signals(rig, {r: c.reshape(-1, h, w) for r, c in channels.items()}, energy.reshape(-1, h, w), scene)
+    images = {r: (p[0] if len(p) == 1 else np.concatenate(p, axis=1)).reshape(-1, h, w) for r, p in parts.items()}
+    return _signals(scene, rig, Radiance(*images.pop(None)), images, spp)
 
 
-def _signals(rig: Rig, channels: dict[Response, np.ndarray], energy: np.ndarray, scene: Scene) -> Signals:
-    parts = Radiance(*energy)
-    nothing = np.zeros_like(parts.direct)
+def _signals(scene: Scene, rig: Rig, radiance: Radiance, channels: dict[Response, np.ndarray], spp: int) -> Signals:
+    nothing = np.zeros_like(radiance.direct)
     split = EnergySplit(
-        direct=parts.direct,
-        multipath=parts.multipath,
-        via_delta=parts.via_delta,
+        direct=radiance.direct,
+        multipath=radiance.multipath,
+        via_delta=radiance.via_delta,
         caustic=nothing,
         glint=nothing,
-        ambient=parts.ambient,
+        ambient=radiance.ambient / np.float32(spp),
     )
     return Signals(rig, channels, split, ground_truth(scene, rig))
+
+
+def _stack(values: Sequence[Any]) -> np.ndarray:
+    return np.stack([v.numpy() for v in values])
 
 
 def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, at_least: int) -> Iterator[tuple[int, int]]:

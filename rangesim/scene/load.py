@@ -153,7 +153,7 @@ def _camera(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
     if "x_fov" not in params:
         raise FileFormatError(f"expected the sensor of {label} to be perspective, got {sensor.class_name()}.")
     width, height = (int(n) for n in sensor.film().size())
-    f = 0.5 * width / np.tan(np.radians(float(np.array(params["x_fov"]).item())) / 2)
+    f = float(0.5 * width / np.tan(np.radians(float(np.array(params["x_fov"]).item())) / 2))
     offset = [float(np.array(params[f"principal_point_offset_{a}"]).item()) for a in "xy"]
     camera = Intrinsics(width, height, f, f, width * (0.5 + offset[0]), height * (0.5 + offset[1]))
     matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ MITSUBA_FROM_OPENCV

@@ -60,7 +60,7 @@ class Scene:
             optical axis meets at the working distance.
         projector_size : (width, height) in projector pixels.
         power_w : radiant power of white.
-        width, height : camera pixels; default as in the scene file. The field of view is kept.
+        width, height : camera pixels; default as in the scene file. The horizontal field of view is kept.
         """
         camera = self.camera.resized(width or self.camera.width, height or self.camera.height)
         if baseline_m is None:

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The path loop against closed forms, Mitsuba's own integrator, and its own promises."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rangesim
+from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, StructuredLight, look_at, transport
+from rangesim.response import FirstReturn, Images, LengthBins
+
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
+SIZE = {"width": 64, "height": 48}
+
+
+@pytest.fixture(scope="module")
+def corner() -> rangesim.Scene:
+    return rangesim.load_scene(SCENES / "corner.xml")
+
+
+@pytest.fixture(scope="module")
+def tabletop() -> rangesim.Scene:
+    return rangesim.load_scene(SCENES / "tabletop.xml")
+
+
+def all_sensors() -> list[rangesim.Sensor]:
+    return [
+        StructuredLight(axes=("columns", "rows")),
+        AmcwToF(waveform="square"),
+        DirectToF(bins=64, bin_s=400e-12),
+        IdealToF(),
+    ]
+
+
+def all_bytes(signals: rangesim.Signals) -> bytes:
+    arrays = [*signals.channels.values(), *vars(signals.energy).values(), signals.truth.z, signals.truth.instance]
+    return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
+
+
+# ---- Closed forms -----------------------------------------------------------------------------------
+
+
+def test_a_fronto_parallel_plane_has_the_radiance_of_lambert_s_law() -> None:
+    """Uniform irradiance E on the plane z = 1 gives E rho / pi cos^... = E rho / pi, the same everywhere."""
+    scene = rangesim.load_scene(SCENES / "plane.xml")
+    camera = scene.camera.resized(64, 48)
+    rig = Rig(camera, Intrinsics.from_fov(1280, 800, 70), scene.T_world_camera, projector_power_w=3.0)
+    signals = transport(scene, rig, [], spp=4)
+    expected = 0.5 / np.pi * rig.projector_irradiance
+    np.testing.assert_allclose(signals.energy.direct, expected, rtol=2e-4)
+    assert not signals.energy.multipath.any() and not signals.energy.via_delta.any()
+
+
+def test_the_projector_s_power_is_what_reaches_a_plane() -> None:
+    intrinsics = Intrinsics.from_fov(1280, 800, 70)
+    rig = Rig(intrinsics, intrinsics, projector_power_w=3.0)
+    area_at_1_m = (1280 / intrinsics.fx) * (800 / intrinsics.fy)
+    assert rig.projector_irradiance * area_at_1_m == pytest.approx(3.0)
+
+
+def test_the_path_length_of_a_plane_is_exact() -> None:
+    scene = rangesim.load_scene(SCENES / "plane.xml")
+    rig = scene.rig(**SIZE)
+    radiance, moment = transport(scene, rig, [FirstReturn()], spp=256).channels[FirstReturn()]
+    points = rig.camera.directions(rig.camera.pixel_centres())  # the plane z = 1 m in the camera's frame
+    expected = np.linalg.norm(points, axis=-1) + np.linalg.norm(points - rig.T_camera_projector[:3, 3], axis=-1)
+    np.testing.assert_allclose(moment / radiance, expected, atol=1e-4)
+
+
+def test_off_a_mirror_the_path_length_is_that_of_the_mirror_image() -> None:
+    """A camera looks down a flat mirror at 45 degrees: the wall appears straight behind the mirror."""
+    import mitsuba as mi
+
+    rangesim.load_scene(mi_free_plane())  # selects the variant
+    T = mi.ScalarTransform4f
+    scene = rangesim.load_scene(
+        {
+            "type": "scene",
+            "sensor": perspective(T().look_at([0, 0, 0], [0, 1, 0], [0, 0, 1])),
+            "mirror": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 1, 0]).rotate([0, 0, 1], 45).rotate([1, 0, 0], 90).scale(0.4),
+                "bsdf": {"type": "conductor"},
+            },
+            "wall": {
+                "type": "rectangle",
+                "to_world": T().translate([2, 1, 0]).rotate([0, 1, 0], -90).scale(5),
+                "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+            },
+            "wall_left": {
+                "type": "rectangle",
+                "to_world": T().translate([-2, 1, 0]).rotate([0, 1, 0], 90).scale(5),
+                "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+            },
+        }
+    )
+    # The lamp sees the walls beside the mirror, not through it
+    lamp = Intrinsics.from_fov(100, 100, 175)
+    rig = Rig(scene.camera, lamp, scene.T_world_camera, look_at((0, 0, 0.6), (0, 0, 1.6), (0, -1, 0)))
+    signals = transport(scene, rig, [FirstReturn()], spp=64)
+    radiance, moment = signals.channels[FirstReturn()]
+    centre = (slice(23, 25), slice(31, 33))
+    assert signals.truth.material_names[signals.truth.material[24, 32]] == "mirror"
+    assert signals.energy.direct[centre].max() == 0 and signals.energy.via_delta[centre].min() > 0
+    wall_point = np.array([2.0, 1.0, 0.0]) * np.sign(mirrored_side(scene))
+    wall_point[1] = 1.0
+    lamp_centre = rig.T_world_projector[:3, 3]
+    expected = 1.0 + 2.0 + np.linalg.norm(wall_point - lamp_centre)
+    np.testing.assert_allclose((moment / radiance)[centre].mean(), expected, atol=2e-3)
+
+
+def mirrored_side(scene: rangesim.Scene) -> float:
+    """+1 if the mirror's normal sends the optical axis to +x, else -1."""
+    import mitsuba as mi
+
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 1, 0))
+    n = np.array(scene.mitsuba.ray_intersect(ray).n).ravel()
+    d = np.array([0.0, 1.0, 0.0])
+    return float((d - 2 * (d @ n) * n)[0])
+
+
+def mi_free_plane() -> Path:
+    return SCENES / "plane.xml"
+
+
+def perspective(to_world: Any) -> dict[str, Any]:
+    return {
+        "type": "perspective",
+        "fov": 30.0,
+        "to_world": to_world,
+        "film": {"type": "hdrfilm", "width": 64, "height": 48},
+    }
+
+
+# ---- Against Mitsuba's own path integrator ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["corner", "tabletop", "cornell"])
+def test_white_and_ambient_agree_with_mitsuba_s_path_integrator(name: str) -> None:
+    import mitsuba as mi
+    from plain_mitsuba import plain_scene, render, z_score
+
+    scene = rangesim.load_scene(SCENES / f"{name}.xml")
+    rig = scene.rig(width=96, height=72)
+    plain = plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"})
+    integrator = mi.load_dict({"type": "path", "max_depth": 6, "rr_depth": 3})
+    reference = render(plain, integrator, spp=256, seed=1)
+    energy = transport(scene, rig, [], spp=256, max_depth=6, rr_depth=3, seed=2).energy
+    assert abs(z_score(energy.projector + energy.ambient, reference)) < 5
+    assert (energy.ambient.max() > 0) == scene.has_ambient
+
+
+def test_patterns_agree_with_a_projector_that_shows_them() -> None:
+    import mitsuba as mi
+    from plain_mitsuba import plain_scene, render, show, z_score
+
+    scene = rangesim.load_scene(SCENES / "matte.xml")
+    rig = scene.rig(width=96, height=72, projector_size=(64, 40))
+    light = StructuredLight(64, 40, code="gray", axes=("columns", "rows"))
+    rng = np.random.default_rng(0)
+    images = Images(rng.random((2, 40, 64), dtype=np.float32))
+    signals = transport(scene, rig, [light, images], spp=64)
+    plain = plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"})
+    integrator = mi.load_dict({"type": "path", "max_depth": 5})
+    patterns = np.concatenate([light.patterns()[:-1], images.patterns])
+    frames = np.concatenate([signals.frames(light)[:-1], signals.channels[images]])
+    for k, (pattern, frame) in enumerate(zip(patterns, frames, strict=True)):
+        show(plain, pattern)
+        reference = render(plain, integrator, spp=64, seed=k)
+        assert abs(z_score(frame, reference)) < 5, f"pattern {k}"
+        lit = reference > np.quantile(reference, 0.2)
+        assert np.corrcoef(frame[lit], reference[lit])[0, 1] > 0.99, f"pattern {k}"
+
+
+# ---- One pass, one truth ----------------------------------------------------------------------------
+
+
+def test_bins_add_up_to_the_steady_image(corner: rangesim.Scene) -> None:
+    bins = LengthBins(0.0, 0.1, 200)
+    signals = transport(corner, corner.rig(**SIZE), [bins], spp=32)
+    np.testing.assert_allclose(signals.channels[bins].sum(axis=0), signals.energy.projector, rtol=1e-5)
+
+
+def test_a_pattern_and_its_inverse_add_up_to_white(tabletop: rangesim.Scene) -> None:
+    light = StructuredLight(axes=("columns",), code="gray")
+    signals = transport(tabletop, tabletop.rig(**SIZE), [light], spp=8)
+    frames = signals.frames(light, ambient_transmission=0.0)
+    white, black = frames[-2], frames[-1]
+    np.testing.assert_allclose(frames[0:-2:2] + frames[1:-2:2], np.broadcast_to(white, (11, 48, 64)), rtol=1e-5)
+    assert not black.any()
+
+
+def test_sensors_of_one_pass_do_not_disturb_each_other(corner: rangesim.Scene) -> None:
+    rig, light = corner.rig(**SIZE), StructuredLight()
+    alone = transport(corner, rig, [light], spp=8).frames(light)
+    together = transport(corner, rig, all_sensors(), spp=8)
+    with pytest.raises(ValueError, match="trace it with this sensor"):
+        together.frames(AmcwToF((1e6,)))
+    both = transport(corner, rig, [light, *all_sensors()], spp=8).frames(light)
+    np.testing.assert_allclose(both, alone, rtol=1e-6)
+
+
+def test_corner_multipath_biases_amcw_long_and_vanishes_with_direct_light(corner: rangesim.Scene) -> None:
+    rig, sensor = corner.rig(baseline_m=0.03, **SIZE), AmcwToF((20e6,))
+    bias = {}
+    for depth in (2, 6):
+        signals = transport(corner, rig, [sensor], spp=256, max_depth=depth)
+        image = rangesim.decode(rangesim.expose(signals, sensor))
+        bias[depth] = np.nanmedian((image.range_m - signals.truth.range_m)[:, 24:40])
+    assert abs(bias[2]) < 0.0005
+    assert bias[6] > 0.02
+
+
+# ---- Same seed, same bytes --------------------------------------------------------------------------
+
+
+def test_threads_and_memory_budget_do_not_change_a_byte(tabletop: rangesim.Scene) -> None:
+    import drjit as dr
+
+    rig = tabletop.rig(width=160, height=120)
+    before = dr.thread_count()
+    results = []
+    for threads, memory in ((1, 2 << 30), (2, 2 << 30), (2, 2 << 21)):
+        dr.set_thread_count(threads)
+        results.append(all_bytes(transport(tabletop, rig, all_sensors(), spp=4, seed=7, memory_bytes=memory)))
+    dr.set_thread_count(before)
+    assert results[0] == results[1] == results[2]
+    assert results[0] != all_bytes(transport(tabletop, rig, all_sensors(), spp=4, seed=8))
+
+
+def test_progress_ends_at_one_and_changes_nothing(corner: rangesim.Scene) -> None:
+    shares: list[float] = []
+    rig = corner.rig(**SIZE)
+    quiet = transport(corner, rig, all_sensors(), spp=4)
+    assert all_bytes(transport(corner, rig, all_sensors(), spp=4, progress=shares.append)) == all_bytes(quiet)
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 4
+
+
+def test_independent_seeds_are_unbiased(corner: rangesim.Scene) -> None:
+    """Means of 12 seeds at 4 spp agree with one long pass: no bias from sharing paths between patterns."""
+    rig, light = corner.rig(**SIZE), StructuredLight(code="gray")
+    short = np.stack([transport(corner, rig, [light], spp=4, seed=s).frames(light).mean(axis=(1, 2)) for s in range(12)])
+    long = transport(corner, rig, [light], spp=512, seed=99).frames(light).mean(axis=(1, 2))
+    error = short.std(axis=0, ddof=1) / np.sqrt(len(short))
+    lit = error > 0
+    assert (np.abs(short.mean(axis=0) - long)[lit] < 5 * error[lit]).all()
+
+
+# ---- Ground truth -----------------------------------------------------------------------------------
+
+
+def test_ground_truth_of_the_plane() -> None:
+    scene = rangesim.load_scene(SCENES / "plane.xml")
+    rig = scene.rig(**SIZE)
+    truth = transport(scene, rig, [], spp=1).truth
+    np.testing.assert_allclose(truth.z, 1.0, atol=1e-5)
+    directions = rig.camera.directions(rig.camera.pixel_centres())
+    np.testing.assert_allclose(truth.range_m, np.linalg.norm(directions, axis=-1), atol=1e-5)
+    np.testing.assert_allclose(truth.normal, np.broadcast_to([0, -1, 0], truth.normal.shape), atol=1e-5)
+    points = np.linalg.inv(rig.T_camera_projector) @ np.concatenate([directions, np.ones((48, 64, 1))], -1)[..., None]
+    np.testing.assert_allclose(truth.projector_uv, rig.projector.project(points[..., :3, 0]), atol=0.02)
+    assert truth.projector_visible.all() and set(truth.instance.ravel()) == {0}
+
+
+def test_ground_truth_knows_the_objects(tabletop: rangesim.Scene) -> None:
+    truth = transport(tabletop, tabletop.rig(**SIZE), [], spp=1).truth
+    classes = {
+        truth.instance_names[i]: truth.material_names[m]
+        for i, m in zip(truth.instance.ravel(), truth.material.ravel(), strict=True)
+    }
+    expected = {"clay_ball": "matte", "mug": "glossy", "silver_ball": "mirror", "glass_ball": "transparent"}
+    assert expected.items() <= classes.items()
+    assert not truth.projector_visible.all() and truth.projector_visible.mean() > 0.8
+
+
+@pytest.mark.parametrize(("option", "value"), [("spp", 0), ("spp", -4), ("max_depth", 0), ("spp", 1.5)])
+def test_bad_numbers_get_one_clear_sentence(corner: rangesim.Scene, option: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"expected {option} to be a whole number of at least 1, got {value}"):
+        transport(corner, corner.rig(**SIZE), [], **{option: value})
+
+
+def test_distorted_lenses_are_refused(corner: rangesim.Scene) -> None:
+    lens = Intrinsics(64, 48, 60, 60, 32, 24, distortion=(0.1,))
+    with pytest.raises(ValueError, match="not implemented"):
+        transport(corner, Rig(lens, lens, corner.T_world_camera), [], spp=1)
