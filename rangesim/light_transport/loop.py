@@ -79,7 +79,7 @@ def trace(
     # ---- State of the lane: its random numbers, its sums --------------------------------------------
     lanes = dr.width(pixel)
     lane = dr.arange(mi.UInt32, lanes)
-    rng = mi.PCG32(lanes, *(mi.UInt64(x) for x in mi.sample_tea_32(settings.seed, pixel)))
+    rng = mi.PCG32(1, *(mi.UInt64(x) for x in mi.sample_tea_32(settings.seed, pixel)))  # 1: no lane number mixed in
     width = mi.UInt32(camera.size.x)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     shift = mi.Point2f(rng.next_float32(), rng.next_float32())
