@@ -17,8 +17,8 @@ _COST_STEPS = float(1 << 20)
 class BoundaryCost:
     """Cost of merging over an edge, in radians of concavity.
 
-    cost = (1 - contact) V(convexity) + contact V(contact_convexity) + step min(step / voxel edge, step_limit),
-    where V(angle) is -angle of a concave edge and `convex` times the angle of a convex one.
+    cost = (1 - contact) V(convexity) + contact V(contact_convexity) + step min(step / voxel edge,
+    step_limit), where V(angle) is -angle of a concave edge and `convex` times the angle of a convex one.
 
     Attributes
     ----------
@@ -33,8 +33,8 @@ class BoundaryCost:
 
     Notes
     -----
-    Convexity as evidence for objects: LCCP, Stein et al. 2014. As a mean over the contact instead of a yes or no
-    per edge, one noisy normal cannot open or close a boundary.
+    Convexity as evidence for objects: LCCP, Stein et al. 2014. As a mean over the contact instead of a yes or
+    no per edge, one noisy normal cannot open or close a boundary.
     """
 
     contact: float = 0.5

@@ -72,7 +72,7 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
 
 def _rim_sums(values: NDArray[np.float64], rim: NDArray[np.int64], n_edges: int) -> NDArray[np.float64]:
     sums = [np.bincount(rim, values[:, axis], 2 * n_edges) for axis in range(3)]
-    return np.stack(sums, axis=1).reshape(n_edges, 2, 3)
+    return np.stack(sums, axis=1, dtype=np.float64).reshape(n_edges, 2, 3)
 
 
 @njit(cache=True)

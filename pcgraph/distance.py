@@ -23,9 +23,12 @@ def distance(
 
 @njit(cache=True)
 def update_means(
-    features: NDArray[np.float64], owner: NDArray[np.int32], sums: NDArray[np.float64], means: NDArray[np.float64]
+    features: NDArray[np.float64],
+    owner: NDArray[np.int32],
+    sums: NDArray[np.float64],
+    means: NDArray[np.float64],
 ) -> None:
-    """Nothing; `means` become the supervoxels' mean rows, normals at unit length (a row without voxels stays).
+    """Nothing; `means` become the supervoxels' mean rows, normals at unit length (empty ones stay).
 
     Sums are taken anew, in voxel order, rather than kept up to date: so they carry no history of rounding.
     """

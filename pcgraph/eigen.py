@@ -12,7 +12,7 @@ _MAX_ROTATIONS = 30
 
 @njit(cache=True)
 def symmetric_eigen(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -> None:
-    """Nothing; `matrix` becomes diagonal (its eigenvalues, unsorted), the columns of `vectors` its eigenvectors.
+    """Nothing; `matrix` becomes diagonal (unsorted eigenvalues), `vectors` its eigenvectors as columns.
 
     Parameters
     ----------
@@ -23,8 +23,9 @@ def symmetric_eigen(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -
 
     Notes
     -----
-    Jacobi's method with the largest off-diagonal element first: unlike the closed form by cosines it keeps full
-    precision when eigenvalues (nearly) coincide, which perfectly flat and collinear clouds make the normal case.
+    Jacobi's method with the largest off-diagonal element first: unlike the closed form by cosines it keeps
+    full precision when eigenvalues (nearly) coincide, which perfectly flat and collinear clouds make the
+    normal case.
     """
     vectors[:] = 0.0
     for i in range(3):

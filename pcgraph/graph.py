@@ -22,8 +22,9 @@ class EdgeFeatures:
     Attributes
     ----------
     convexity : (m,) float64, radians
-        Angle between the nodes' normals, positive where the two bend away from the viewer (convex), negative where
-        they form a valley (concave): the sign of (n_j - n_i) . (x_j - x_i). Source: LCCP, Stein et al. 2014.
+        Angle between the nodes' normals, positive where the two bend away from the viewer (convex), negative
+        where they form a valley (concave): the sign of (n_j - n_i) . (x_j - x_i). Source: LCCP, Stein et al.
+        2014.
     contact_convexity : (m,) float64, radians
         The same from the normals and positions of the two rims of voxels that touch.
     normal_angle : (m,) float64, radians, 0..pi
@@ -33,8 +34,9 @@ class EdgeFeatures:
     contact_length : (m,) float64, metres
         Mean over both rims of the number of touching voxels times their edge length.
     step : (m,) float64, metres
-        Offset between the surfaces at the contact: distance of each rim to the other node's plane, the smaller of
-        the two. Near 0 where surfaces meet in a crease, the height of the step where one lies before the other.
+        Offset between the surfaces at the contact: distance of each rim to the other node's plane, the
+        smaller of the two. Near 0 where surfaces meet in a crease, the height of the step where one lies
+        before the other.
     """
 
     convexity: NDArray[np.float64]
@@ -73,7 +75,7 @@ class AdjacencyGraph:
         return len(self.node_features.size)
 
     def to_networkx(self) -> networkx.Graph:
-        """The graph as ``networkx.Graph``; nodes and edges carry their features as attributes of the same names."""
+        """The graph as ``networkx.Graph``, features as attributes of the same names."""
         from networkx import Graph
 
         graph = Graph()
@@ -83,7 +85,9 @@ class AdjacencyGraph:
         return graph
 
 
-def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int) -> list[dict[str, object]]:
+def rows(
+    columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int
+) -> list[dict[str, object]]:
     """One dict per row from one array per column; scalars become Python numbers, vectors stay arrays."""
     names = list(columns)
     lists = [column.tolist() if column.ndim == 1 else list(column) for column in columns.values()]

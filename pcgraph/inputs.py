@@ -54,16 +54,20 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     flat = array.reshape(-1, 3)
     if not len(flat):
         raise ValueError("expected at least one point, got an empty cloud")
-    finite = np.isfinite(flat).all(axis=1)
+    finite = np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2])
     if not finite.any():
-        raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
+        raise ValueError(
+            f"expected at least one finite point, but all {len(flat)} points are NaN or infinite"
+        )
     kept = np.ascontiguousarray(flat[finite], dtype=np.float64)
     if np.abs(kept).max() > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {np.abs(kept).max():g} m")
     return CleanCloud(kept, _colors(colors, shape, finite), _normals(normals, shape, finite), shape, finite)
 
 
-def clean_viewpoint(viewpoint: ArrayLike | None, points: NDArray[np.float64], organised: bool) -> NDArray[np.float64]:
+def clean_viewpoint(
+    viewpoint: ArrayLike | None, points: NDArray[np.float64], organised: bool
+) -> NDArray[np.float64]:
     """The viewpoint, (3,) float64, metres: as given, or by the rule that `pcgraph.segment` documents."""
     if viewpoint is not None:
         position = _numbers("viewpoint", viewpoint).astype(np.float64)
@@ -101,7 +105,9 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
     try:
         array = np.asarray(values)
     except ValueError:
-        raise ValueError(f"expected {name} as a regular array of numbers, got rows of different lengths") from None
+        raise ValueError(
+            f"expected {name} as a regular array of numbers, got rows of different lengths"
+        ) from None
     if array.dtype.kind not in "fiu":
         raise ValueError(f"expected {name} of a floating-point or integer dtype, got {array.dtype}")
     return array
@@ -124,9 +130,10 @@ def _colors(
         return array.astype(np.float64) / 255.0
     if array.dtype.kind != "f":
         raise ValueError(f"expected colors as uint8 (0..255) or float (0..1), got {array.dtype}")
-    if not ((array >= 0.0) & (array <= 1.0)).all():
+    shades = array.astype(np.float64)
+    if not ((shades >= 0.0) & (shades <= 1.0)).all():
         raise ValueError("expected float colors within 0..1 at finite points; divide by 255 or pass uint8")
-    return array.astype(np.float64)
+    return shades
 
 
 def _normals(

@@ -32,15 +32,18 @@ def average_linkage(
     pairs : (t, 2) int32
         Merge i joins these two into the new node n_nodes + i.
     altitudes : (t,) float64
-        Weighted mean cost of all edges between the two, not decreasing. Of equal costs the first edge merges first.
+        Weighted mean cost of all edges between the two, not decreasing. Of equal costs the first edge merges
+        first.
 
     Notes
     -----
-    A mean of two costs is never below the smaller one, so merging in ascending order yields ascending altitudes.
+    A mean of two costs is never below the smaller one, so merging in ascending order yields ascending
+    altitudes.
     """
     low, high = edges[:, 0].astype(np.int64), edges[:, 1].astype(np.int64)
     pairs, altitudes = _merge(n_nodes, low, high, costs * weights, weights.astype(np.float64))
-    return pairs, np.maximum.accumulate(altitudes)  # a mean may still round down by one unit in the last place
+    # A mean may still round down by one unit in the last place.
+    return pairs, np.maximum.accumulate(altitudes)
 
 
 @njit(cache=True)
@@ -57,7 +60,7 @@ def _merge(
     after, before = np.full(2 * m, _NONE), np.full(2 * m, _NONE)
     first, degree = np.full(n_nodes, _NONE), np.zeros(n_nodes, np.int64)
     version = np.zeros(m, np.int64)
-    heap = [(0.0, np.int64(0), np.int64(0)) for _ in range(0)]
+    heap = [(0.0, np.int64(0), np.int64(0)) for _ in range(0)]  # empty, but typed for the compiler
     for e in range(m):
         ends[2 * e], ends[2 * e + 1] = low[e], high[e]
         _hang(2 * e, ends, after, before, first, degree)
@@ -68,10 +71,11 @@ def _merge(
     pairs, altitudes = np.empty((max(n_nodes - 1, 0), 2), np.int32), np.empty(max(n_nodes - 1, 0))
     t = 0
     while len(heap) > 0:
-        cost, e, stamp = heapq.heappop(heap)
+        cost, cheapest, stamp = heapq.heappop(heap)
+        e = int(cheapest)
         if version[e] != stamp:
             continue
-        kept, gone = ends[2 * e], ends[2 * e + 1]
+        kept, gone = int(ends[2 * e]), int(ends[2 * e + 1])
         pairs[t, 0], pairs[t, 1] = min(name[kept], name[gone]), max(name[kept], name[gone])
         altitudes[t] = cost
         if degree[gone] > degree[kept]:
@@ -79,9 +83,9 @@ def _merge(
         name[kept] = n_nodes + t
         t += 1
         _drop(e, ends, after, before, first, degree, version)
-        half = first[gone]
+        half = int(first[gone])
         while half != _NONE:
-            following = after[half]
+            following = int(after[half])
             twin = _find(kept, ends[half ^ 1], ends, after, first, degree)
             moved = half >> 1
             if twin == _NONE:

@@ -36,8 +36,9 @@ def segmentation_tree(
 
     Notes
     -----
-    Parts that do not touch are joined at infinite altitude, the smallest (in points) first, each to the nearest
-    larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large parts apart.
+    Parts that do not touch are joined at infinite altitude, the smallest (in points) first, each to the
+    nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large
+    parts apart.
     """
     n_leaves = len(leaves)
     pairs, altitudes = average_linkage(n_leaves, edges, costs, weights)
@@ -78,7 +79,7 @@ def _join_parts(parts: NDArray[np.int32], leaves: Moments, next_node: int) -> ND
 def _nearest_larger(
     part: NDArray[np.int64], rank: NDArray[np.int64], centroids: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """For each part the larger one whose leaf lies nearest to one of its own; the largest part if none is near."""
+    """For each part the larger one with a leaf nearest to its own; the largest part if none is near."""
     n_near = min(_GAP_CANDIDATES + 1, len(centroids))
     distance, leaf = cKDTree(centroids).query(centroids, k=n_near)
     larger = rank[part[leaf]] > rank[part][:, None]

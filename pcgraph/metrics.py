@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 
 
 def contingency(labels: ArrayLike, truth: ArrayLike) -> coo_array:
-    """Number of points per pair of segment and true segment, sparse (s, g), s and g in ascending order of label.
+    """Number of points per pair of segment and true segment, sparse (s, g), in ascending order of labels.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def weighted_overlap(labels: ArrayLike, truth: ArrayLike) -> float:
 
 
 def undersegmentation_error(labels: ArrayLike, truth: ArrayLike) -> float:
-    """UE of Neubert and Protzel 2012: sum over overlapping pairs of min(|S and G|, |S without G|), over the points."""
+    """UE of Neubert and Protzel 2012: sum over pairs of min(|S and G|, |S without G|), over points."""
     table = contingency(labels, truth)
     found, _ = _sizes(table)
     leak = np.minimum(table.data, found[table.row] - table.data)
@@ -61,4 +61,6 @@ def achievable_accuracy(labels: ArrayLike, truth: ArrayLike) -> float:
 
 def _sizes(table: coo_array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     rows, columns = table.shape
-    return np.bincount(table.row, table.data, rows), np.bincount(table.col, table.data, columns)
+    weights = table.data.astype(np.float64)
+    found = np.bincount(table.row, weights, rows).astype(np.float64)
+    return found, np.bincount(table.col, weights, columns).astype(np.float64)

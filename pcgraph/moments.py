@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 class Moments:
     """Number, means and scatter of k groups of points.
 
-    Scatter is kept about each group's own centroid, not about the origin, so nothing cancels when a cloud lies far
-    from its frame's origin.
+    Scatter is kept about each group's own centroid, not about the origin, so nothing cancels when a cloud
+    lies far from its frame's origin.
 
     Attributes
     ----------
@@ -85,7 +85,11 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     counts = np.zeros(k, np.int64)
     centroids, scatters = np.zeros((k, 3)), np.zeros((k, 3, 3))
     colors = np.zeros((k, 3))
-    counts[:n_leaves], centroids[:n_leaves], scatters[:n_leaves] = leaves.counts, leaves.centroids, leaves.scatters
+    counts[:n_leaves], centroids[:n_leaves], scatters[:n_leaves] = (
+        leaves.counts,
+        leaves.centroids,
+        leaves.scatters,
+    )
     if leaves.colors is not None:
         colors[:n_leaves] = leaves.colors
     pool_moments(parents, counts, centroids, scatters, colors)

@@ -23,12 +23,12 @@ class NodeFeatures:
         Number of points.
     centroid : (k, 3) float64, metres, the points' frame
     normal : (k, 3) float64
-        Unit normal of the least-squares plane, on the viewpoint's side; of points on a line, the direction across
-        it that faces the viewpoint most.
+        Unit normal of the least-squares plane, on the viewpoint's side; of points on a line, the direction
+        across it that faces the viewpoint most.
     covariance : (k, 3, 3) float64, square metres
     linearity, planarity, scattering : (k,) float64, 0..1
-        (s1 - s2) / s1, (s2 - s3) / s1 and s3 / s1 for standard deviations s1 >= s2 >= s3; their sum is 1, and all
-        are 0 where the points coincide. Source: Demantke et al. 2011.
+        (s1 - s2) / s1, (s2 - s3) / s1 and s3 / s1 for standard deviations s1 >= s2 >= s3; their sum is 1, and
+        all are 0 where the points coincide. Source: Demantke et al. 2011.
     residual : (k,) float64, metres
         Root mean square distance to the plane, s3.
     color : (k, 3) float64, 0..1
@@ -77,8 +77,10 @@ def node_features(moments: Moments, viewpoint: NDArray[np.float64]) -> NodeFeatu
     )
 
 
-def _plane_normals(deviations: NDArray[np.float64], vectors: NDArray[np.float64], towards: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Direction of least spread on the viewpoint's side; where there is no plane, the nearest thing to facing it."""
+def _plane_normals(
+    deviations: NDArray[np.float64], vectors: NDArray[np.float64], towards: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Direction of least spread on the viewpoint's side; of points on a line, across it."""
     normals = vectors[:, :, 0].copy()
     flat = deviations[:, 1] > _NO_PLANE * deviations[:, 2]
     line = np.where((deviations[:, 2] > 0.0)[:, None], vectors[:, :, 2], 0.0)

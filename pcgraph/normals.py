@@ -27,13 +27,14 @@ def voxel_normals(
     Returns
     -------
     (v, 3) float64
-        Normal of the plane through the centroids of two rings of neighbours, the inner ones counting more. Voxels
-        that lie on a line get the normal nearest to the viewpoint, lone ones the direction to the viewpoint.
+        Normal of the plane through the centroids of two rings of neighbours, the inner ones counting more.
+        Voxels that lie on a line get the normal nearest to the viewpoint, lone ones the direction to the
+        viewpoint.
 
     Notes
     -----
-    Source: Papon et al. 2013, as PCL estimates them, but weighted by the number of ways in which a voxel is reached
-    in two steps, which rounds off edges less.
+    Source: Papon et al. 2013, as PCL estimates them, but weighted by the number of ways in which a voxel is
+    reached in two steps, which rounds off edges less.
     """
     towards = viewpoint - grid.centroids
     estimated = _estimate(grid.centroids, grid.indptr, grid.neighbours, towards)
@@ -52,40 +53,60 @@ def _estimate(
     neighbours: NDArray[np.int32],
     towards: NDArray[np.float64],
 ) -> NDArray[np.float64]:
+    """Normals by pooling moments twice: the second ring comes as sums of first rings, not voxel by voxel."""
+    n = len(centroids)
+    counts, means, scatters = np.ones(n), centroids.copy(), np.zeros((n, 6))
+    wide_counts, wide_means, wide_scatters = np.empty(n), np.empty((n, 3)), np.empty((n, 6))
+    _pool_rings(indptr, neighbours, counts, means, scatters, wide_counts, wide_means, wide_scatters)
+    _pool_rings(indptr, neighbours, wide_counts, wide_means, wide_scatters, counts, means, scatters)
     normals = np.empty_like(centroids)
     scatter, vectors = np.empty((3, 3)), np.empty((3, 3))
-    for i in range(len(centroids)):
-        _two_ring_scatter(i, centroids, indptr, neighbours, scatter)
+    for i in range(n):
+        scatter[0, 0], scatter[1, 1], scatter[2, 2] = scatters[i, 0], scatters[i, 1], scatters[i, 2]
+        scatter[0, 1] = scatter[1, 0] = scatters[i, 3]
+        scatter[0, 2] = scatter[2, 0] = scatters[i, 4]
+        scatter[1, 2] = scatter[2, 1] = scatters[i, 5]
         symmetric_eigen(scatter, vectors)
         oriented_normal(scatter, vectors, towards[i], normals[i])
     return normals
 
 
 @njit(cache=True)
-def _two_ring_scatter(
-    i: int,
-    centroids: NDArray[np.float64],
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
-    scatter: NDArray[np.float64],
-) -> None:
-    x0, y0, z0 = centroids[i, 0], centroids[i, 1], centroids[i, 2]
-    n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-    for a in range(indptr[i] - 1, indptr[i + 1]):
-        j = i if a < indptr[i] else neighbours[a]
-        for b in range(indptr[j] - 1, indptr[j + 1]):
-            k = j if b < indptr[j] else neighbours[b]
-            x, y, z = centroids[k, 0] - x0, centroids[k, 1] - y0, centroids[k, 2] - z0
-            n += 1.0
-            sx, sy, sz = sx + x, sy + y, sz + z
-            xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
-            yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
-    scatter[0, 0] = xx - sx * sx / n
-    scatter[1, 1] = yy - sy * sy / n
-    scatter[2, 2] = zz - sz * sz / n
-    scatter[0, 1] = scatter[1, 0] = xy - sx * sy / n
-    scatter[0, 2] = scatter[2, 0] = xz - sx * sz / n
-    scatter[1, 2] = scatter[2, 1] = yz - sy * sz / n
+def _pool_rings(indptr, neighbours, counts, means, scatters, to_counts, to_means, to_scatters):  # type: ignore[no-untyped-def]
+    """Moments of each voxel with its neighbours; scatters (xx, yy, zz, xy, xz, yz) about the mean."""
+    for i in range(len(counts)):
+        n = sx = sy = sz = xx = yy = zz = xy = xz = yz = 0.0
+        for a in range(indptr[i] - 1, indptr[i + 1]):
+            j = i if a < indptr[i] else neighbours[a]
+            w = counts[j]
+            x, y, z = means[j, 0] - means[i, 0], means[j, 1] - means[i, 1], means[j, 2] - means[i, 2]
+            n, sx, sy, sz = n + w, sx + w * x, sy + w * y, sz + w * z
+            xx, yy, zz = (
+                xx + scatters[j, 0] + w * x * x,
+                yy + scatters[j, 1] + w * y * y,
+                zz + scatters[j, 2] + w * z * z,
+            )
+            xy, xz, yz = (
+                xy + scatters[j, 3] + w * x * y,
+                xz + scatters[j, 4] + w * x * z,
+                yz + scatters[j, 5] + w * y * z,
+            )
+        to_counts[i] = n
+        to_means[i, 0], to_means[i, 1], to_means[i, 2] = (
+            means[i, 0] + sx / n,
+            means[i, 1] + sy / n,
+            means[i, 2] + sz / n,
+        )
+        to_scatters[i, 0], to_scatters[i, 1], to_scatters[i, 2] = (
+            xx - sx * sx / n,
+            yy - sy * sy / n,
+            zz - sz * sz / n,
+        )
+        to_scatters[i, 3], to_scatters[i, 4], to_scatters[i, 5] = (
+            xy - sx * sy / n,
+            xz - sx * sz / n,
+            yz - sy * sz / n,
+        )
 
 
 @njit(cache=True)

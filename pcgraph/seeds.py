@@ -23,23 +23,23 @@ def seed_voxels(grid: VoxelGrid, seed_size: float) -> NDArray[np.int32]:
     Returns
     -------
     (k,) int32
-        In each seed cell with enough voxels for a surface, the voxel nearest to the mean of the cell's voxels; in a
-        component that has no such cell, the best of its fullest cell.
+        In each seed cell with enough voxels for a surface, the voxel nearest to the mean of the cell's
+        voxels; in a component that has no such cell, the best of its fullest cell.
 
     Notes
     -----
-    Source: Papon et al. 2013, section 3.2, whose filter against seeds in the void drops components altogether.
+    Source: Papon et al. 2013, section 3.2, whose filter against seeds in the void drops components
+    altogether.
     """
-    cells = np.floor(grid.warped / seed_size)
-    _, cell_of_voxel, cell_counts = np.unique(
-        _component_first(cells, components := component_of_voxel(grid)), axis=0, return_inverse=True, return_counts=True
-    )
-    cell_of_voxel = cell_of_voxel.reshape(-1)
+    components = component_of_voxel(grid)
+    cell_of_voxel = _seed_cells(np.floor(grid.warped / seed_size), components)
+    cell_counts = np.bincount(cell_of_voxel)
     means = np.stack(
         [np.bincount(cell_of_voxel, grid.warped[:, axis]) / cell_counts for axis in range(3)], axis=1
     )
-    distance = np.linalg.norm(grid.warped - means[cell_of_voxel], axis=1)
-    order = np.lexsort((np.arange(grid.n_voxels), distance, cell_of_voxel))
+    offset = grid.warped - means[cell_of_voxel]
+    distance = np.einsum("ij,ij->i", offset, offset)
+    order = np.lexsort((distance, cell_of_voxel))
     best_of_cell = order[np.cumsum(cell_counts) - cell_counts]
     component_of_cell = components[best_of_cell]
     ratio = seed_size / grid.size  # a cell counts if it holds a tenth of a plane, or half of a line
@@ -58,6 +58,11 @@ def component_of_voxel(grid: VoxelGrid) -> NDArray[np.int32]:
     return connected_components(matrix, directed=False)[1]
 
 
-def _component_first(cells: NDArray[np.float64], components: NDArray[np.int32]) -> NDArray[np.float64]:
-    # Two components that share a seed cell are two surfaces: each gets a seed of its own.
-    return np.column_stack((components.astype(np.float64), cells))
+def _seed_cells(cells: NDArray[np.float64], components: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Seed cell of each voxel, (v,); one that two components share counts as two, being two surfaces."""
+    order = np.lexsort((cells[:, 2], cells[:, 1], cells[:, 0], components))
+    ordered, owner = cells[order], components[order]
+    new = (owner[1:] != owner[:-1]) | (ordered[1:] != ordered[:-1]).any(axis=1)
+    number = np.empty(len(cells), np.int64)
+    number[order] = np.concatenate(([0], np.cumsum(new)))
+    return number

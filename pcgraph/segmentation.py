@@ -37,7 +37,8 @@ class Segmentation:
     labels : (n,) or (h, w) int32
         Object of each point, the default cut of the tree; -1 where the point is not finite.
     supervoxels : (n,) or (h, w) int32
-        Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where the point is not finite.
+        Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where the point is not
+        finite.
     graph : AdjacencyGraph
     tree : SegmentationTree
     voxel_size, seed_size : float, metres
@@ -58,7 +59,7 @@ class Segmentation:
     camera: bool
 
     def cut(self, n: int | None = None, altitude: float | None = None) -> NDArray[np.int32]:
-        """Segment of each point in the shape of the input, -1 where not finite; see `SegmentationTree.cut`."""
+        """Segment of each point in the input's shape, -1 where not finite; see `SegmentationTree.cut`."""
         return self.on_points(self.tree.cut(n, altitude))
 
     def on_points(self, values: NDArray[np.int32], missing: int = -1) -> NDArray[np.int32]:
@@ -86,15 +87,15 @@ def segment(
     Parameters
     ----------
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame
-        NaN and infinite points are left out and labelled -1. Organised points (h, w, 3) are taken for a camera's
-        image in the camera's frame (z forward) unless `viewpoint` or `camera` say otherwise.
+        NaN and infinite points are left out and labelled -1. Organised points (h, w, 3) are taken for a
+        camera's image in the camera's frame (z forward) unless `viewpoint` or `camera` say otherwise.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
         Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
     viewpoint : (3,) float, metres, the points' frame, optional
-        Where the sensor stood; estimated normals point to its side, and convexity depends on that. Default: the
-        origin for organised clouds and for clouds whose bounding box leaves the origin out; otherwise a place high
-        above (+z) the box.
+        Where the sensor stood; estimated normals point to its side, and convexity depends on that. Default:
+        the origin for organised clouds and for clouds whose bounding box leaves the origin out; otherwise a
+        place high above (+z) the box.
     voxel_size : float, metres, optional
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
     seed_size : float, metres, optional
@@ -102,8 +103,8 @@ def segment(
     color_weight, spatial_weight, normal_weight : float, >= 0
         Their w_c, w_s, w_n.
     camera : bool, optional
-        Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median depth, as
-        a camera's pixels do. Default: organised clouds that lie in front of the viewpoint.
+        Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
+        depth, as a camera's pixels do. Default: organised clouds that lie in front of the viewpoint.
     boundary_cost : BoundaryCost, optional
         Cost of an edge, on which the tree rests.
     object_altitude : float, radians
@@ -112,8 +113,9 @@ def segment(
     Returns
     -------
     Segmentation
-        Every finite point has a supervoxel, every supervoxel is connected (26-neighbourhood of occupied voxels), the
-        same points give the same result in any order (up to the rounding of sums) and at any number of threads.
+        Every finite point has a supervoxel, every supervoxel is connected (26-neighbourhood of occupied
+        voxels), the same points give the same result in any order (up to the rounding of sums) and at any
+        number of threads.
 
     Raises
     ------
@@ -142,7 +144,9 @@ def segment(
     touching = contacts(grid, surface, leaf_of_voxel)
     edges = edge_features(nodes, touching)
     costs = (boundary_cost or BoundaryCost())(edges, touching.voxel_edges)
-    tree = segmentation_tree(touching.edges, costs, touching.voxels.sum(axis=1).astype(float), leaves, position)
+    tree = segmentation_tree(
+        touching.edges, costs, touching.voxels.sum(axis=1).astype(float), leaves, position
+    )
     supervoxels = cloud.spread(leaf_of_point)
     labels = cloud.spread(tree.cut(altitude=non_negative("object_altitude", object_altitude))[leaf_of_point])
     graph = AdjacencyGraph(touching.edges, edges, nodes)

@@ -24,11 +24,11 @@ class SegmentationTree:
     Attributes
     ----------
     parents : (k,) int32
-        Parent of each node, larger than the node's own number; the root (last node) is its own parent. The first
-        `n_leaves` nodes are the supervoxels, in their order. k = 2 n_leaves - 1.
+        Parent of each node, larger than the node's own number; the root (last node) is its own parent. The
+        first `n_leaves` nodes are the supervoxels, in their order. k = 2 n_leaves - 1.
     altitudes : (k,) float64, radians
-        Cost at which a node came to be: 0 for leaves, not decreasing with the node's number; infinite where parts
-        that do not touch were joined.
+        Cost at which a node came to be: 0 for leaves, not decreasing with the node's number; infinite where
+        parts that do not touch were joined.
     moments : Moments
         k rows: additive moments of the points below each node.
     viewpoint : (3,) float64, metres, the points' frame
@@ -69,7 +69,7 @@ class SegmentationTree:
         return rank[inverse]
 
     def cut_nodes(self, n: int | None = None, altitude: float | None = None) -> NDArray[np.int32]:
-        """Node of the tree that each leaf belongs to after a cut, (n_leaves,) int32; parameters as for `cut`."""
+        """Node of the tree above each leaf after a cut, (n_leaves,) int32; parameters as for `cut`."""
         last = self.n_leaves + self._merges(n, altitude)
         up = np.where(self.parents < last, self.parents, np.arange(len(self.parents), dtype=np.int32))
         while True:  # pointer jumping: as many rounds as the logarithm of the depth
@@ -83,7 +83,7 @@ class SegmentationTree:
         return node_features(self.moments, self.viewpoint)
 
     def to_networkx(self) -> networkx.DiGraph:
-        """The tree as ``networkx.DiGraph``, edges from parent to child, node attributes ``altitude`` and features."""
+        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features."""
         from networkx import DiGraph
 
         columns = {"altitude": self.altitudes, **self.features().columns()}
@@ -93,12 +93,12 @@ class SegmentationTree:
         return tree
 
     def _merges(self, n: int | None, altitude: float | None) -> int:
-        if (n is None) == (altitude is None):
-            raise ValueError(f"expected either n or altitude, got n={n} and altitude={altitude}")
-        if n is not None:
+        if n is not None and altitude is None:
             if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 1 <= n <= self.n_leaves:
                 raise ValueError(f"expected a whole number n of 1..{self.n_leaves} segments, got {n!r}")
             return self.n_leaves - int(n)
+        if altitude is None or n is not None:
+            raise ValueError(f"expected either n or altitude, got n={n} and altitude={altitude}")
         if np.isnan(altitude):
             raise ValueError("expected an altitude in radians, got NaN")
         return int(np.searchsorted(self.altitudes[self.n_leaves :], altitude, side="right"))

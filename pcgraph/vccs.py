@@ -24,8 +24,8 @@ class VccsWeights:
     Attributes
     ----------
     color, spatial, normal : float, >= 0
-        Their w_c (colours in 0..1), w_s (metres over the seed size) and w_n (one minus the cosine). The defaults
-        are those of PCL's header.
+        Their w_c (colours in 0..1), w_s (metres over the seed size) and w_n (one minus the cosine). The
+        defaults are those of PCL's header.
     """
 
     color: float = 0.1
@@ -50,15 +50,15 @@ def vccs(
     Returns
     -------
     (v,) int32
-        Numbered from 0 without gaps in the order of their first voxel. Every voxel has one, and every supervoxel is
-        connected in the 26-neighbourhood.
+        Numbered from 0 without gaps in the order of their first voxel. Every voxel has one, and every
+        supervoxel is connected in the 26-neighbourhood.
 
     Notes
     -----
     D = w_n (1 - n . n') + w_c |c - c'| + w_s |x - x'| / R_seed. Source: Papon et al. 2013, equation 7. Three
-    changes: the normals' cosine keeps its sign, so the two faces of a thin plate stay apart; growth does not stop at
-    a number of steps, so that all voxels are covered; sweeps propose first and commit afterwards, so that no result
-    depends on the order in which supervoxels are visited.
+    changes: the normals' cosine keeps its sign, so the two faces of a thin plate stay apart; growth does not
+    stop at a number of steps, so that all voxels are covered; sweeps propose first and commit afterwards, so
+    that no result depends on the order in which supervoxels are visited.
     """
     features, scale = _features(grid, normals, seed_size, weights)
     seeds = seed_voxels(grid, seed_size)
@@ -86,7 +86,7 @@ def _grow(
     seeds: NDArray[np.int32],
     greedy_sweeps: int,
 ) -> NDArray[np.int32]:
-    """Owners after growth from the seeds; in the first sweeps a voxel may also be taken from a worse owner."""
+    """Owners after growth from the seeds; early sweeps may also take a voxel from a worse owner."""
     n = len(features)
     owner, claim = np.full(n, -1, np.int32), np.full(n, -1, np.int32)
     best = np.full(n, np.inf)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pcgraph.warp import Warp
 
-# Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
+# Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points'
+# order.
 _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
 _MAX_KEY = float(1 << 62)
@@ -19,7 +20,7 @@ _MAX_KEY = float(1 << 62)
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Occupied voxels of a cloud in ascending order of their grid coordinates, so independent of the points' order.
+    """Occupied voxels of a cloud in ascending order of grid coordinates, whatever the points' order.
 
     Attributes
     ----------
@@ -39,7 +40,8 @@ class VoxelGrid:
         Mean colour of the voxel's points.
     indptr : (v + 1,) int64
     neighbours : (e,) int32
-        ``neighbours[indptr[i]:indptr[i + 1]]`` are the occupied among the 26 voxels around voxel i, ascending.
+        ``neighbours[indptr[i]:indptr[i + 1]]`` are the occupied among the 26 voxels around voxel i,
+        ascending.
     """
 
     size: float
@@ -81,7 +83,7 @@ def voxel_grid(
     scaled = warp.forward(points) / size
     cells = np.floor(scaled)
     keys, pitch = _keys(cells, size)
-    order = np.argsort(keys, kind="stable")
+    order = np.argsort(keys)
     ordered = keys[order]
     first = np.concatenate(([True], ordered[1:] != ordered[:-1]))
     voxel_of_point = np.empty(len(points), np.int32)
@@ -133,7 +135,7 @@ def _fits(span: NDArray[np.float64]) -> bool:
 
 
 def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Same order and same touching pairs, but no gap wider than one empty cell (far outliers make wide ones)."""
+    """Same order and same touching pairs, but no gap wider than one empty cell."""
     values, inverse = np.unique(cells, return_inverse=True)
     return np.concatenate(([0.0], np.cumsum(np.minimum(np.diff(values), 2.0))))[inverse]
 

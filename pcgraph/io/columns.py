@@ -25,8 +25,8 @@ def cloud_from_columns(
     Parameters
     ----------
     columns : mapping of field name to (n,) array
-        Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``), normals
-        and labels are picked up under the names that PCL, Open3D and MeshLab write.
+        Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``),
+        normals and labels are picked up under the names that PCL, Open3D and MeshLab write.
     shape : (n,) or (h, w)
         Leading shape of the result.
     viewpoint : (3,) float64, metres, optional
@@ -39,7 +39,8 @@ def cloud_from_columns(
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise CloudReadError(
-            f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)}"
+            f"expected the fields x, y and z, but {', '.join(missing)} is missing; "
+            f"found: {', '.join(columns)}"
         )
     return Cloud(
         points=_stack(columns, ("x", "y", "z"), shape),
@@ -69,11 +70,11 @@ def _colors(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.uint8] | Non
             return np.stack(channels, axis=-1).astype(np.uint8).reshape(*shape, 3)
     if not all(name in columns for name in ("red", "green", "blue")):
         return None
-    channels = [columns[name] for name in ("red", "green", "blue")]
-    if all(channel.dtype == np.uint8 for channel in channels):
-        return np.stack(channels, axis=-1).astype(np.uint8).reshape(*shape, 3)
-    top = 255.0 if all(channel.dtype.kind == "f" for channel in channels) else 255.0 / 65535.0
-    scaled = np.stack(channels, axis=-1).astype(np.float64) * top
+    stored = [columns[name] for name in ("red", "green", "blue")]
+    if all(channel.dtype == np.uint8 for channel in stored):
+        return np.stack(stored, axis=-1).astype(np.uint8).reshape(*shape, 3)
+    top = 255.0 if all(channel.dtype.kind == "f" for channel in stored) else 255.0 / 65535.0
+    scaled = np.stack(stored, axis=-1).astype(np.float64) * top
     return np.clip(np.nan_to_num(np.rint(scaled)), 0, 255).astype(np.uint8).reshape(*shape, 3)
 
 

@@ -28,7 +28,7 @@ def decompress(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
     read, wrote = 0, 0
     n_source, n_target = source.size, target.size
     while read < n_source:
-        control = np.int64(source[read])
+        control = int(source[read])
         read += 1
         if control < 32:
             length = control + 1
@@ -41,9 +41,9 @@ def decompress(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
             if read + (2 if length == 7 else 1) > n_source:
                 return -1
             if length == 7:
-                length += np.int64(source[read])
+                length += int(source[read])
                 read += 1
-            start = wrote - ((control & 31) << 8) - np.int64(source[read]) - 1
+            start = wrote - ((control & 31) << 8) - int(source[read]) - 1
             read += 1
             length += 2
             if start < 0 or wrote + length > n_target:

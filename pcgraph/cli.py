@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``pcgraph``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pcgraph.cloud import Cloud
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pcgraph.segmentation import Segmentation
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+
+
+@app.callback()
+def _pcgraph() -> None:
+    """Point clouds as supervoxels, an adjacency graph and a segmentation tree."""
+
+
+@app.command()
+def segment(
+    cloud: Annotated[Path, typer.Argument(help="Point cloud, .pcd or .ply, coordinates in metres.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="A .ply or .npz file, or a folder for both. Default: the current folder."),
+    ] = None,
+    voxel_size: Annotated[
+        float | None,
+        typer.Option(help="Voxel edge in metres. Default: 3.5 x the median spacing of the points."),
+    ] = None,
+    seed_size: Annotated[
+        float | None, typer.Option(help="Distance of supervoxels in metres. Default: 6 x the voxel edge.")
+    ] = None,
+    objects: Annotated[
+        int | None, typer.Option(help="Exact number of segments. Default: as many as concavity calls for.")
+    ] = None,
+    color: Annotated[
+        bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")
+    ] = True,
+    viewpoint: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="Sensor position x y z in metres. Default: the file's, else a guess from the cloud."
+        ),
+    ] = None,
+) -> None:
+    """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.
+
+    Writes NAME.segments.ply (points coloured by object, with labels and supervoxels) and NAME.segments.npz
+    (labels in the input's shape, graph and tree).
+
+    Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
+    """
+    start = time.perf_counter()
+    try:
+        targets = _targets(cloud, out)
+        read, result = _segmentation(cloud, voxel_size, seed_size, color, viewpoint)
+        labels = result.labels if objects is None else result.cut(n=objects)
+        _write(targets, read, result, labels)
+    except (PcgraphError, ValueError, MemoryError) as error:
+        message = (
+            " ".join(str(error).split()) or "the cloud does not fit into memory: choose a larger voxel size"
+        )
+        typer.echo(f"pcgraph: error: {message}", err=True)
+        raise typer.Exit(1) from None
+    _print_summary(result, labels, targets, time.perf_counter() - start)
+
+
+def main() -> None:
+    """Run the command line; the entry point of the script ``pcgraph``."""
+    app(prog_name="pcgraph")
+
+
+def _targets(cloud: Path, out: Path | None) -> list[Path]:
+    if out is not None and out.suffix and not out.is_dir():
+        if out.suffix.lower() not in (".ply", ".npz"):
+            raise CloudWriteError(f"expected --out as a .ply or .npz file or a folder, got {out.name!r}")
+        if not out.parent.is_dir():
+            raise CloudWriteError(f"cannot write {out}: there is no folder {out.parent}; create it first")
+        if out.resolve() == cloud.resolve():
+            raise CloudWriteError(f"--out is the input itself, {out}: choose another name")
+        return [out]
+    folder = Path() if out is None else out
+    return [folder / f"{cloud.stem}.segments{suffix}" for suffix in (".ply", ".npz")]
+
+
+def _segmentation(
+    path: Path,
+    voxel_size: float | None,
+    seed_size: float | None,
+    color: bool,
+    viewpoint: tuple[float, ...] | None,
+) -> tuple[Cloud, Segmentation]:
+    from pcgraph.io import read_cloud
+    from pcgraph.segmentation import segment as segment_points
+
+    cloud = read_cloud(path)
+    stored = cloud.viewpoint
+    if stored is not None and not stored.any():
+        stored = None  # PCD writers put zeros where they know nothing
+    position = stored if viewpoint is None else viewpoint
+    colors = cloud.colors if color else None
+    try:
+        result = segment_points(
+            cloud.points, colors, cloud.normals, position, voxel_size=voxel_size, seed_size=seed_size
+        )
+    except ValueError as error:
+        raise CloudReadError(f"cannot segment {path}: {error}") from None
+    return cloud, result
+
+
+def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:
+    from pcgraph.io import write_segmentation
+
+    folder = targets[0].parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CloudWriteError(
+            f"cannot create the folder {folder}: {error.strerror}; choose another --out"
+        ) from None
+    for target in targets:
+        write_segmentation(target, cloud, result, labels)
+
+
+def _print_summary(
+    result: Segmentation, labels: NDArray[np.int32], targets: list[Path], seconds: float
+) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    finite = int((result.supervoxels >= 0).sum())
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in (
+        ("points", f"{finite} of {result.labels.size} finite"),
+        ("voxel size", f"{result.voxel_size:.3g} m" + (" at the median depth" if result.camera else "")),
+        ("seed size", f"{result.seed_size:.3g} m"),
+        ("supervoxels", str(result.graph.n_nodes)),
+        ("edges", str(len(result.graph.edges))),
+        ("objects", f"{int(labels.max()) + 1}"),
+        ("seconds", f"{seconds:.2f}"),
+        ("written", ", ".join(str(target) for target in targets)),
+    ):
+        table.add_row(name, value)
+    Console(soft_wrap=True).print(table)
