@@ -2,8 +2,8 @@
 """Rigs from calibration files: procam-calibration's OpenCV XML, and our own JSON.
 
 OpenCV has pixel centres at integer coordinates, we have them at integer + 0.5: principal points move by 0.5.
-OpenCV's stereo calibration maps the first device's coordinates to the second's, X_projector = R X_camera + T, here
-in millimetres; our `T_camera_projector` is the inverse, in metres.
+OpenCV's stereo calibration maps the first device's coordinates to the second's, X_projector = R X_camera + T,
+here in millimetres; our `T_camera_projector` is the inverse, in metres.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ def load_calibration(
 
     Parameters
     ----------
-    path : `.xml`, OpenCV FileStorage as kamino410/procam-calibration writes it; or `.json`, as `save_calibration`.
-    projector_size : (width, height) of the coded area in cells of `code_step` pixels; XML files do not hold it, so it is
-        required for them.
-    code_step : int, projector pixels per cell of the Gray code at calibration (procam-calibration's graycode_step).
-        The rig's projector then has the cells for pixels.
+    path : `.xml`, OpenCV FileStorage as kamino410/procam-calibration writes it; or `.json`, as
+        `save_calibration`.
+    projector_size : (width, height) of the coded area in cells of `code_step` pixels; XML files do not hold
+        it, so it is required for them.
+    code_step : int, projector pixels per cell of the Gray code at calibration (procam-calibration's
+        graycode_step). The rig's projector then has the cells for pixels.
     unit_m : float, metres per unit of length of an XML file (there, of its chessboard's square); millimetres.
 
     Raises

@@ -21,7 +21,8 @@ class Capture:
 
     Parameters
     ----------
-    frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free capture.
+    frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free
+        capture.
     sensor : Sensor, the measuring principle the frames were taken with.
     rig : Rig, or None for an uncalibrated capture.
     detector : PhotoDetector, or None if unknown (a real capture) or noise-free.

@@ -66,7 +66,8 @@ def load_capture(directory: str | Path) -> Capture:
     Raises
     ------
     FileFormatError
-        Missing directory, sidecar or frame, broken JSON, unknown key, wrong size or type; the message names the file.
+        Missing directory, sidecar or frame, broken JSON, unknown key, wrong size or type; the message names
+        the file.
     """
     sidecar = Path(directory) / SIDECAR
     settings = _read_sidecar(sidecar)
@@ -90,7 +91,8 @@ def import_capture(
 
     Parameters
     ----------
-    folder : holds as many images (PNG, TIFF, JPEG, BMP, EXR; 8 or 16 bits; colour becomes grey) as the sensor has frames.
+    folder : holds as many images (PNG, TIFF, JPEG, BMP, EXR; 8 or 16 bits; colour becomes grey) as the sensor
+        has frames.
     sensor : Sensor, with the patterns in the order of `sensor.frame_names()`.
     rig : Rig, or None if uncalibrated. detector : PhotoDetector, or None if unknown.
 

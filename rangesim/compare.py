@@ -35,8 +35,8 @@ class ErrorStatistics:
     median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of |z - true z|, metres.
     outlier_rate : share of the measured pixels with |z - true z| > `outlier_m`.
     edge_pixels : int, measured pixels within 2 pixels of a depth edge.
-    flying_rate : share of them that fly: their z is farther than `outlier_m` from every true depth in the 5 x 5
-        window, so they lie on neither side of the edge.
+    flying_rate : share of them that fly: their z is farther than `outlier_m` from every true depth in the 5 x
+        5 window, so they lie on neither side of the edge.
     """
 
     material: str
@@ -102,8 +102,8 @@ def compare(image: RangeImage, truth: GroundTruth, outlier_m: float = OUTLIER_M)
 
     References
     ----------
-    Flying pixels: Sabov, Krüger: "Identification and correction of flying pixels in range camera data", SCCG (2008);
-    there detected from the image alone, here against the true depths.
+    Flying pixels: Sabov, Krüger: "Identification and correction of flying pixels in range camera data", SCCG
+    (2008); there detected from the image alone, here against the true depths.
     """
     if image.z.shape != truth.z.shape:
         raise ValueError(f"expected ground truth of shape {image.z.shape} as the image, got {truth.z.shape}.")
@@ -171,7 +171,10 @@ def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.nda
 def _has_step(depth: np.ndarray, outlier_m: float) -> np.ndarray:
     """(h, w) bool, pixels with a 4-neighbour across a depth edge; nothing (infinity) counts as far away."""
     result = np.zeros(depth.shape, dtype=bool)
-    for a, b in (((slice(None), slice(1, None)), (slice(None), slice(None, -1))), ((slice(1, None),), (slice(None, -1),))):
+    for a, b in (
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        ((slice(1, None),), (slice(None, -1),)),
+    ):
         one, two = np.minimum(depth[a], depth[b]), np.maximum(depth[a], depth[b])
         jump = (two > one * (1 + EDGE_SHARE)) & (two > one + outlier_m)
         result[a] |= jump

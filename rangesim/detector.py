@@ -2,9 +2,9 @@
 """Light to digital numbers: what every detector has in common, and integrating image sensors after EMVA 1288.
 
 A pixel of a camera with entrance pupil radius a and focal length f collects from radiance L the irradiance
-E = L pi (a/f)^2, so E A t lambda / (h c) photons on its area A in the exposure t. With f = fx sqrt(A) the pixel
-pitch drops out: photons = L pi a^2 / (fx fy) t lambda / (h c), radiance times etendue. The fall-off towards the
-corners (cos^4) is left out.
+E = L pi (a/f)^2, so E A t lambda / (h c) photons on its area A in the exposure t. With f = fx sqrt(A) the
+pixel pitch drops out: photons = L pi a^2 / (fx fy) t lambda / (h c), radiance times etendue. The fall-off
+towards the corners (cos^4) is left out.
 """
 
 from __future__ import annotations
@@ -43,9 +43,7 @@ class PhotoDetector(ABC):
         """(..., h, w) expected electrons (counts) of frames of `radiance` in W/m2/sr, dark ones included."""
 
     @abstractmethod
-    def read_out(
-        self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int
-    ) -> np.ndarray:
+    def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr."""
 
     @property
@@ -94,7 +92,8 @@ class Detector(PhotoDetector):
     wavelength_m : float, metres, of the projector's light [lambda].
     quantum_efficiency : float in (0, 1], fill factor and lens transmission included [eta].
     full_well_e : float, electrons, saturation capacity [mu_e.sat]; it maps to the largest digital number
-        (the well itself is a little deeper, so that a saturated pixel reads that number in spite of its noise).
+        (the well itself is a little deeper, so that a saturated pixel reads that number in spite of its
+        noise).
     read_noise_e : float, electrons rms, temporal dark noise [sigma_d].
     dark_current_e_s : float, electrons per second [mu_I].
     bits : int in 1..16, ADC resolution.
@@ -153,9 +152,7 @@ class Detector(PhotoDetector):
         signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * exposure_s)
         return np.asarray(signal + self.dark_current_e_s * exposure_s)
 
-    def read_out(
-        self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int
-    ) -> np.ndarray:
+    def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         if isinstance(sensor, DirectToF):
             raise ValueError("expected a SpadDetector for direct-tof, got an integrating Detector.")
         result = np.empty(radiance.shape, dtype=self.dtype)

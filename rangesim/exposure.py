@@ -34,16 +34,17 @@ def expose(
     ----------
     signals : Signals of a transport pass that this sensor was part of.
     sensor : Sensor.
-    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: a noise-free capture, float32
-        radiance in W/m2/sr, unfiltered ambient light included. `IdealToF` has no noise model: its frames are always
-        noise-free.
+    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: a noise-free capture,
+        float32 radiance in W/m2/sr, unfiltered ambient light included. `IdealToF` has no noise model: its
+        frames are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
     seed : int, of the noise. Every frame has its own stream; the same seed gives the same bytes.
 
     Raises
     ------
     ValueError
-        The pass lacks the sensor's signals, the exposure is not positive, or detector and sensor do not go together.
+        The pass lacks the sensor's signals, the exposure is not positive, or detector and sensor do not go
+        together.
     """
     if exposure_s is not None and not 0 < exposure_s < np.inf:
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
@@ -59,8 +60,8 @@ def expose(
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:
     """Exposure in seconds, one for all frames, that puts the bright pixels at 70 % of saturation.
 
-    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: the highlights of
-    mirrors and gloss may saturate. Limited by the detector's shortest and longest exposure.
+    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: the highlights
+    of mirrors and gloss may saturate. Limited by the detector's shortest and longest exposure.
 
     Parameters
     ----------

@@ -105,10 +105,12 @@ def from_range_image(image: RangeImage, frame: str = "camera") -> PointCloud:
 
 
 def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS) -> np.ndarray:
-    """(h, w, 3) unit normals towards the camera from depths on an image lattice; NaN where there is no surface.
+    """(h, w, 3) unit normals towards the camera from depths on an image lattice; NaN where there is no
+    surface.
 
-    On a plane n.X = 1 the inverse depth is linear in the image, 1/z = n.(x, y, 1). It is fitted by least squares to
-    the window around each pixel; pixels across a depth step are left out, so edges are not rounded off.
+    On a plane n.X = 1 the inverse depth is linear in the image, 1/z = n.(x, y, 1). It is fitted by least
+    squares to the window around each pixel; pixels across a depth step are left out, so edges are not rounded
+    off.
 
     Parameters
     ----------
@@ -127,9 +129,7 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
             x, y = rays[other][..., 0] - rays[at][..., 0], rays[other][..., 1] - rays[at][..., 1]
             value = np.where(used, inverse[other] - inverse[at], 0.0)
             x, y = x * used, y * used
-            for total, term in zip(
-                sums, (used, x, y, value, x * x, x * y, y * y, x * value, y * value), strict=True
-            ):
+            for total, term in zip(sums, (used, x, y, value, x * x, x * y, y * y, x * value, y * value), strict=True):
                 total[at] += term
     return _normals_of_fit(sums, rays, inverse)
 

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point clouds as binary PLY and PCD files.
 
-Fields: x y z, and where present normals, intensity, colour and confidence, under the names that Open3D, PCL and MeshLab
-know. The frame goes into a comment line.
+Fields: x y z, and where present normals, intensity, colour and confidence, under the names that Open3D, PCL
+and MeshLab know. The frame goes into a comment line.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 from pathlib import Path
@@ -48,7 +49,8 @@ def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
 
 
 def load_point_cloud(path: str | Path) -> PointCloud:
-    """A cloud from a binary little-endian PLY or uncompressed binary PCD of scalar fields, such as `save` writes.
+    """A cloud from a binary little-endian PLY or uncompressed binary PCD of scalar fields, such as `save`
+    writes.
 
     Raises
     ------
@@ -153,7 +155,7 @@ def _split(data: bytes, last: bytes) -> tuple[list[str], bytes]:
 
 def _frame(header: list[str]) -> str:
     words = " ".join(header).replace(",", " ").split()
-    named = [b for a, b in zip(words, words[1:], strict=False) if a == "frame" and b in FRAMES]
+    named = [b for a, b in itertools.pairwise(words) if a == "frame" and b in FRAMES]
     return named[0] if named else "camera"
 
 

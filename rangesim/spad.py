@@ -17,8 +17,8 @@ from rangesim.sensors import DirectToF, Sensor
 class SpadDetector(PhotoDetector):
     """Single-photon counter with a histogram memory per pixel.
 
-    The laser fires again as soon as the histogram is full, so an exposure holds exposure_s / (bins bin_s) pulses,
-    and ambient light and dark counts spread evenly over the bins.
+    The laser fires again as soon as the histogram is full, so an exposure holds exposure_s / (bins bin_s)
+    pulses, and ambient light and dark counts spread evenly over the bins.
 
     Parameters
     ----------
@@ -26,7 +26,8 @@ class SpadDetector(PhotoDetector):
     quantum_efficiency : float in (0, 1], photon detection efficiency, fill factor included.
     dark_counts_hz : float, counts per second per pixel.
     bits : int in 1..16, depth of the counter of a bin.
-    pile_up : bool; True: only the first photon after each pulse is counted (Coates 1968), False: every photon.
+    pile_up : bool; True: only the first photon after each pulse is counted (Coates 1968), False: every
+        photon.
     ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through.
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
     """
@@ -64,9 +65,7 @@ class SpadDetector(PhotoDetector):
         signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * open_s)
         return np.asarray(signal + self.dark_counts_hz * open_s / sensor.bins)
 
-    def read_out(
-        self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int
-    ) -> np.ndarray:
+    def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         pulses = self.pulses(sensor, exposure_s)
         result = np.empty(radiance.shape, dtype=self.dtype)
         unused = np.full(radiance.shape[1:], pulses, dtype=np.int64)

@@ -26,9 +26,7 @@ def stereo_rig(width: int = 160, height: int = 120, baseline_m: float = 0.2, **c
     return Rig(**(settings | changes))  # type: ignore[arg-type]
 
 
-def plane_depth(
-    rig: Rig, distance_m: float = 1.0, normal: tuple[float, float, float] = (0.2, 0.1, -1.0)
-) -> np.ndarray:
+def plane_depth(rig: Rig, distance_m: float = 1.0, normal: tuple[float, float, float] = (0.2, 0.1, -1.0)) -> np.ndarray:
     """(h, w) depth of a plane through (0, 0, distance_m) of the camera frame."""
     rays = rig.camera.directions(rig.camera.pixel_centres())
     return np.asarray(distance_m * normal[2] / (rays @ np.asarray(normal)))

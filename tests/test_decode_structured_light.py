@@ -133,7 +133,8 @@ def test_noise_of_phase_shift_is_that_of_theory(seed: int) -> None:
     image = decode(capture)
     phase = phase_of(capture.frames[-2 - sensor.steps : -2])
     noise = capture.noise(phase.mean)
-    assert noise is not None and image.projector_column is not None
+    assert noise is not None
+    assert image.projector_column is not None
     sigma = sensor.period_px / (2 * np.pi) * np.sqrt(2 / sensor.steps) * noise / phase.modulation
     inside = image.valid
     normalised = (image.projector_column - signals.truth.projector_uv[..., 0])[inside] / sigma[inside]
@@ -166,9 +167,7 @@ def test_triangulation_undoes_projection_through_distorted_lenses(axes: tuple[st
     z = rng.uniform(0.8, 1.5, len(rays))
     points = rays * z[:, None]
     uv = projector.project((points - pose[:3, 3]) @ pose[:3, :3])
-    result = triangulate(
-        rays, rig, uv[:, 0] if "columns" in axes else None, uv[:, 1] if "rows" in axes else None
-    )
+    result = triangulate(rays, rig, uv[:, 0] if "columns" in axes else None, uv[:, 1] if "rows" in axes else None)
     np.testing.assert_allclose(result.z, z, atol=1e-6)
     np.testing.assert_allclose(result.epipolar_px, 0, atol=1e-5)
 

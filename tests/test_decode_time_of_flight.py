@@ -103,7 +103,9 @@ def test_noise_of_amcw_is_that_of_theory(seed: int) -> None:
     signals = plane_signals(rig, sensor, ambient=0.05)
     capture = expose(signals, sensor, detector, seed=seed)
     image = decode(capture)
-    taps = detector.mean_electrons(signals.frames(sensor, detector.ambient_transmission), sensor, rig, capture.exposure_s)
+    taps = detector.mean_electrons(
+        signals.frames(sensor, detector.ambient_transmission), sensor, rig, capture.exposure_s
+    )
     phase = tap_phase(taps)
     variance = phase.mean + detector.read_noise_e**2 + 1 / 12 / detector.gain_dn_e**2
     sigma = SPEED_OF_LIGHT / (4 * np.pi * 50e6) * np.sqrt(variance / 2) / phase.modulation

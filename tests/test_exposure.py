@@ -88,9 +88,7 @@ def test_auto_exposure_puts_the_bright_pixels_at_its_target() -> None:
     ("sensor", "detector"),
     [(SENSOR, Detector()), (AmcwToF(), Detector.time_of_flight()), (DirectToF(bins=80), SpadDetector())],
 )
-def test_same_seed_same_bytes_and_every_frame_its_own_noise(
-    sensor: Sensor, detector: PhotoDetector
-) -> None:
+def test_same_seed_same_bytes_and_every_frame_its_own_noise(sensor: Sensor, detector: PhotoDetector) -> None:
     signals = plane_signals(stereo_rig(80, 60), sensor, ambient=0.05)
     one, two, other = (expose(signals, sensor, detector, seed=s).frames for s in (7, 7, 8))
     assert one.tobytes() == two.tobytes()

@@ -3,8 +3,8 @@
 
 References
 ----------
-Lange: "3D time-of-flight distance measurement with custom solid-state image sensors in CMOS/CCD technology", thesis,
-Siegen (2000): phase, amplitude and offset of four taps, and their shot noise.
+Lange: "3D time-of-flight distance measurement with custom solid-state image sensors in CMOS/CCD technology",
+thesis, Siegen (2000): phase, amplitude and offset of four taps, and their shot noise.
 Droeschel, Holz, Behnke: "Multi-frequency phase unwrapping for time-of-flight cameras", IROS (2010).
 """
 
@@ -49,9 +49,9 @@ def decode_amcw(capture: Capture, correct_wiggling: bool = True) -> RangeImage:
 
     Parameters
     ----------
-    correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a calibrated
-        camera does with a look-up table), False uses the sine formula and shows the raw wiggling error, up to 0.011
-        turns. Multipath sums triangles of different phase, for which neither is exact.
+    correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a
+        calibrated camera does with a look-up table), False uses the sine formula and shows the raw wiggling
+        error, up to 0.011 turns. Multipath sums triangles of different phase, for which neither is exact.
 
     Raises
     ------
@@ -83,8 +83,9 @@ def decode_amcw(capture: Capture, correct_wiggling: bool = True) -> RangeImage:
 def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
     """Phase of taps (4, h, w) at 0, 90, 180, 270 degrees, mean + modulation cos(phi - theta).
 
-    C = tap 0 - tap 180 and S = tap 90 - tap 270 give phi = atan2(S, C), modulation = hypot(C, S) / 2. For a triangle
-    correlation (`exact_square`) |C| + |S| is constant, and the phase is piecewise linear in S / (|C| + |S|).
+    C = tap 0 - tap 180 and S = tap 90 - tap 270 give phi = atan2(S, C), modulation = hypot(C, S) / 2. For a
+    triangle correlation (`exact_square`) |C| + |S| is constant, and the phase is piecewise linear in S / (|C|
+    + |S|).
     """
     tap = taps.astype(np.float32)
     cosine, sine = tap[0] - tap[2], tap[1] - tap[3]
@@ -102,13 +103,14 @@ def unwrap(
 ) -> Unwrapped:
     """Path length that agrees best with the phases of all frequencies.
 
-    Every wrap count of the highest frequency gives a candidate; the other frequencies take the wrap nearest to it, and
-    the candidate with the least weighted sum of squared differences between their lengths wins. The result is the
-    weighted mean of the unwrapped lengths.
+    Every wrap count of the highest frequency gives a candidate; the other frequencies take the wrap nearest
+    to it, and the candidate with the least weighted sum of squared differences between their lengths wins.
+    The result is the weighted mean of the unwrapped lengths.
 
     Parameters
     ----------
-    turns : per frequency (h, w) in [0, 1). weights : per frequency (h, w), inverse variance of its length (any scale).
+    turns : per frequency (h, w) in [0, 1). weights : per frequency (h, w), inverse variance of its length
+        (any scale).
     longest_m : float, metres, path length up to which candidates are searched.
     """
     wavelengths = [SPEED_OF_LIGHT / f for f in modulation_hz]

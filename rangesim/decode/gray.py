@@ -12,8 +12,8 @@ from rangesim.status import Status
 
 WHITE_BLACK_SHARE = 40 / 255
 PATTERN_INVERSE_SHARE = 5 / 255
-"""OpenCV's thresholds on white - black and |pattern - inverse|, of full scale: for digital captures of an unknown
-detector, where the noise is not known."""
+"""OpenCV's thresholds on white - black and |pattern - inverse|, of full scale: for digital captures of an
+unknown detector, where the noise is not known."""
 CONTRAST_SIGMAS = 5.0
 BIT_SIGMAS = 3.0
 """The same in standard deviations of the difference, where the detector is known."""
@@ -26,7 +26,8 @@ RELATIVE_BIT = 0.1
 class GrayCode:
     """Decoded Gray code along one axis.
 
-    coordinate : (h, w) float32, projector pixels: centre of the cell, or its edge where the camera pixel lies on it.
+    coordinate : (h, w) float32, projector pixels: centre of the cell, or its edge where the camera pixel lies
+        on it.
     status : (h, w) uint8, `Status`.
     cell_px : int, size of a cell, projector pixels (1, or coarser where a phase follows).
     """
@@ -53,9 +54,9 @@ def direct_contrast(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
 def decode_gray(capture: Capture, frames: np.ndarray, shift: int, size: int) -> GrayCode:
     """Projector coordinate of each pixel from Gray bits.
 
-    A bit is the sign of pattern - inverse; it is uncertain where the difference drowns in noise. One uncertain bit is
-    what a pixel on a stripe edge shows, and does no harm if flipping it leads to a neighbouring cell: then the edge
-    between the two is returned. Anything else is refused.
+    A bit is the sign of pattern - inverse; it is uncertain where the difference drowns in noise. One
+    uncertain bit is what a pixel on a stripe edge shows, and does no harm if flipping it leads to a
+    neighbouring cell: then the edge between the two is returned. Anything else is refused.
 
     Parameters
     ----------

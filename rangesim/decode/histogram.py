@@ -26,12 +26,14 @@ _CHUNK_VALUES = 8_000_000
 def decode_direct(capture: Capture) -> RangeImage:
     """Range image of a `DirectToF` capture: the strongest return of each pixel.
 
-    Pile-up is undone if the detector has it (Coates). A filter matched to the instrument response finds the peak; the
-    centroid of the counts above the background around it, re-centred once, gives the place within a bin.
+    Pile-up is undone if the detector has it (Coates). A filter matched to the instrument response finds the
+    peak; the centroid of the counts above the background around it, re-centred once, gives the place within a
+    bin.
 
     References
     ----------
-    Coates: "The correction for photon 'pile-up' in the measurement of radiative lifetimes", J. Phys. E 1 (1968).
+    Coates: "The correction for photon 'pile-up' in the measurement of radiative lifetimes", J. Phys. E 1
+    (1968).
 
     Raises
     ------
@@ -56,8 +58,8 @@ def decode_direct(capture: Capture) -> RangeImage:
 def find_peak(histogram: np.ndarray, sigma_bins: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Strongest peak of histograms (k, h, w): its place, its height and the background under it, each (h, w).
 
-    Place in bins from the start of the first bin (the centre of bin b is b + 0.5); height is the sum over the peak's
-    window less the background, background the sum under that window.
+    Place in bins from the start of the first bin (the centre of bin b is b + 0.5); height is the sum over the
+    peak's window less the background, background the sum under that window.
     """
     reach = max(1, int(np.ceil(2 * sigma_bins + 0.5)))
     highest = _matched(histogram, sigma_bins).argmax(axis=0)
@@ -110,9 +112,7 @@ def _window(histogram: np.ndarray, centre: np.ndarray, reach: int) -> list[tuple
     return result
 
 
-def _centroid(
-    inside: list[tuple[np.ndarray, np.ndarray]], level: np.ndarray, fallback: np.ndarray
-) -> np.ndarray:
+def _centroid(inside: list[tuple[np.ndarray, np.ndarray]], level: np.ndarray, fallback: np.ndarray) -> np.ndarray:
     above = [(index, np.maximum(counts - level, 0)) for index, counts in inside]
     total = np.sum([c for _, c in above], axis=0)
     moment = np.sum([(index + 0.5) * c for index, c in above], axis=0)

@@ -15,8 +15,9 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
     """(...) range in metres along camera rays at which the path emitter -> point -> camera has this length.
 
     With unit ray d and emitter centre b (camera frame) the length is l = r + |r d - b|. Squaring (l - r)^2 =
-    r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid with foci at
-    camera and emitter. NaN where the length is not larger than the baseline |b|: no such point is in front.
+    r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid
+    with foci at camera and emitter. NaN where the length is not larger than the baseline |b|: no such point
+    is in front.
 
     Parameters
     ----------
@@ -33,7 +34,8 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
 def range_image_from_path_length(
     capture: Capture, length_m: np.ndarray, status: np.ndarray, confidence: np.ndarray, intensity: np.ndarray
 ) -> RangeImage:
-    """Range image of decoded path lengths; lengths that lead to no point in front of the camera are OUT_OF_RANGE.
+    """Range image of decoded path lengths; lengths that lead to no point in front of the camera are
+    OUT_OF_RANGE.
 
     Without a rig, range is half the path length and z is NaN.
 

@@ -33,8 +33,8 @@ def phase_of(frames: np.ndarray) -> Phase:
 
     References
     ----------
-    Bruning et al.: "Digital wavefront measuring interferometer for testing optical surfaces and lenses", Applied
-    Optics 13 (1974); their least-squares solution for equal steps.
+    Bruning et al.: "Digital wavefront measuring interferometer for testing optical surfaces and lenses",
+    Applied Optics 13 (1974); their least-squares solution for equal steps.
     """
     n = len(frames)
     cosine = np.zeros(frames.shape[1:], dtype=np.float32)
@@ -69,9 +69,9 @@ def modulation_is_weak(capture: Capture, phase: Phase, steps: int) -> np.ndarray
 def refine_by_phase(capture: Capture, gray: GrayCode, frames: np.ndarray, period_px: float) -> GrayCode:
     """Sub-pixel coordinate: of all places with this phase, the one nearest to the Gray coordinate.
 
-    Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre of its
-    cell, and an eighth more is granted to noise and to camera pixels across a cell's edge. Farther off, code and phase
-    contradict each other (`CODE_ERROR`).
+    Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre
+    of its cell, and an eighth more is granted to noise and to camera pixels across a cell's edge. Farther
+    off, code and phase contradict each other (`CODE_ERROR`).
 
     Parameters
     ----------

@@ -18,17 +18,16 @@ EPIPOLAR_TOLERANCE_PX = 5.0
 """Projector pixels by which column and row may disagree with each other."""
 
 
-def decode_structured_light(
-    capture: Capture, epipolar_tolerance_px: float = EPIPOLAR_TOLERANCE_PX
-) -> RangeImage:
+def decode_structured_light(capture: Capture, epipolar_tolerance_px: float = EPIPOLAR_TOLERANCE_PX) -> RangeImage:
     """Range image of a Gray code or Gray code + phase shift capture.
 
-    Without a rig, only the projector coordinates are decoded: z is NaN everywhere, `status` is that of the code.
+    Without a rig, only the projector coordinates are decoded: z is NaN everywhere, `status` is that of the
+    code.
 
     Parameters
     ----------
-    epipolar_tolerance_px : float, projector pixels; where both axes are coded, pixels whose column and row miss the
-        epipolar line by more get `CODE_ERROR`.
+    epipolar_tolerance_px : float, projector pixels; where both axes are coded, pixels whose column and row
+        miss the epipolar line by more get `CODE_ERROR`.
 
     Raises
     ------
@@ -43,9 +42,7 @@ def decode_structured_light(
     z = np.full(status.shape, np.nan, dtype=np.float32)
     range_m = z.copy()
     if capture.rig is not None:
-        z[decoded], range_m[decoded], status[decoded] = _depth(
-            capture.rig, decoded, column, row, epipolar_tolerance_px
-        )
+        z[decoded], range_m[decoded], status[decoded] = _depth(capture.rig, decoded, column, row, epipolar_tolerance_px)
     contrast, _ = direct_contrast(capture)
     return RangeImage(
         z=z,

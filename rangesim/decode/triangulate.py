@@ -18,27 +18,27 @@ CONVERGED_PX = 1e-4
 class Triangulation:
     """z : (n,) float64, metres, camera frame; NaN if not in front of both devices.
 
-    epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected coordinate;
-        zero if only one axis was decoded.
+    epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected
+        coordinate; zero if only one axis was decoded.
     """
 
     z: np.ndarray
     epipolar_px: np.ndarray
 
 
-def triangulate(
-    directions: np.ndarray, rig: Rig, column: np.ndarray | None, row: np.ndarray | None
-) -> Triangulation:
+def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row: np.ndarray | None) -> Triangulation:
     """Depth of camera rays from projector coordinates.
 
-    With a = R^T d and b = -R^T t (camera ray d and camera centre in the projector frame), the point at depth z projects
-    to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z. Column x_p and row y_p each give an equation linear
-    in w (ray meets plane); with both, w is their least-squares solution in projector pixels.
+    With a = R^T d and b = -R^T t (camera ray d and camera centre in the projector frame), the point at depth
+    z projects to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z. Column x_p and row y_p each
+    give an equation linear in w (ray meets plane); with both, w is their least-squares solution in projector
+    pixels.
 
     Parameters
     ----------
     directions : (n, 3) float64, camera rays with z = 1 (lens distortion already undone), camera frame.
-    column, row : (n,) float, projector pixel coordinates, pixel centres at integer + 0.5; None where not coded.
+    column, row : (n,) float, projector pixel coordinates, pixel centres at integer + 0.5; None where not
+        coded.
 
     Raises
     ------
