@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pcgraph import metrics
     from pcgraph.boundary import BoundaryCost
     from pcgraph.cloud import Cloud
     from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
@@ -32,6 +33,7 @@ __all__ = [
     "PcgraphError",
     "Segmentation",
     "SegmentationTree",
+    "metrics",
     "read_cloud",
     "segment",
     "write_segmentation",
@@ -56,6 +58,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> object:
+    if name == "metrics":
+        return import_module("pcgraph.metrics")
     if name not in _HOMES:
         raise AttributeError(f"module 'pcgraph' has no attribute {name!r}")
     return getattr(import_module(f"pcgraph.{_HOMES[name]}"), name)

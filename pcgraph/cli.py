@@ -43,14 +43,10 @@ def segment(
     objects: Annotated[
         int | None, typer.Option(help="Exact number of segments. Default: as many as concavity calls for.")
     ] = None,
-    color: Annotated[
-        bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")
-    ] = True,
+    color: Annotated[bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")] = True,
     viewpoint: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(
-            help="Sensor position x y z in metres. Default: the file's, else a guess from the cloud."
-        ),
+        typer.Option(help="Sensor position x y z in metres. Default: the file's, else a guess from the cloud."),
     ] = None,
 ) -> None:
     """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.
@@ -67,9 +63,7 @@ def segment(
         labels = result.labels if objects is None else result.cut(n=objects)
         _write(targets, read, result, labels)
     except (PcgraphError, ValueError, MemoryError) as error:
-        message = (
-            " ".join(str(error).split()) or "the cloud does not fit into memory: choose a larger voxel size"
-        )
+        message = " ".join(str(error).split()) or "the cloud does not fit into memory: choose a larger voxel size"
         typer.echo(f"pcgraph: error: {message}", err=True)
         raise typer.Exit(1) from None
     _print_summary(result, labels, targets, time.perf_counter() - start)
@@ -125,30 +119,21 @@ def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDAr
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise CloudWriteError(
-            f"cannot create the folder {folder}: {error.strerror}; choose another --out"
-        ) from None
+        raise CloudWriteError(f"cannot create the folder {folder}: {error.strerror}; choose another --out") from None
     for target in targets:
         write_segmentation(target, cloud, result, labels)
 
 
-def _print_summary(
-    result: Segmentation, labels: NDArray[np.int32], targets: list[Path], seconds: float
-) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
+def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: list[Path], seconds: float) -> None:
     finite = int((result.supervoxels >= 0).sum())
-    table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in (
         ("points", f"{finite} of {result.labels.size} finite"),
         ("voxel size", f"{result.voxel_size:.3g} m" + (" at the median depth" if result.camera else "")),
         ("seed size", f"{result.seed_size:.3g} m"),
         ("supervoxels", str(result.graph.n_nodes)),
         ("edges", str(len(result.graph.edges))),
-        ("objects", f"{int(labels.max()) + 1}"),
+        ("objects", str(int(labels.max()) + 1)),
         ("seconds", f"{seconds:.2f}"),
-        ("written", ", ".join(str(target) for target in targets)),
+        *(("written", str(target)) for target in targets),
     ):
-        table.add_row(name, value)
-    Console(soft_wrap=True).print(table)
+        typer.echo(f"{name:<12} {value}")

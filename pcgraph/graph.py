@@ -85,9 +85,7 @@ class AdjacencyGraph:
         return graph
 
 
-def rows(
-    columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int
-) -> list[dict[str, object]]:
+def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int) -> list[dict[str, object]]:
     """One dict per row from one array per column; scalars become Python numbers, vectors stay arrays."""
     names = list(columns)
     lists = [column.tolist() if column.ndim == 1 else list(column) for column in columns.values()]

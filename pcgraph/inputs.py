@@ -56,18 +56,14 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
         raise ValueError("expected at least one point, got an empty cloud")
     finite = np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2])
     if not finite.any():
-        raise ValueError(
-            f"expected at least one finite point, but all {len(flat)} points are NaN or infinite"
-        )
+        raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
     kept = np.ascontiguousarray(flat[finite], dtype=np.float64)
     if np.abs(kept).max() > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {np.abs(kept).max():g} m")
     return CleanCloud(kept, _colors(colors, shape, finite), _normals(normals, shape, finite), shape, finite)
 
 
-def clean_viewpoint(
-    viewpoint: ArrayLike | None, points: NDArray[np.float64], organised: bool
-) -> NDArray[np.float64]:
+def clean_viewpoint(viewpoint: ArrayLike | None, points: NDArray[np.float64], organised: bool) -> NDArray[np.float64]:
     """The viewpoint, (3,) float64, metres: as given, or by the rule that `pcgraph.segment` documents."""
     if viewpoint is not None:
         position = _numbers("viewpoint", viewpoint).astype(np.float64)
@@ -105,9 +101,7 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
     try:
         array = np.asarray(values)
     except ValueError:
-        raise ValueError(
-            f"expected {name} as a regular array of numbers, got rows of different lengths"
-        ) from None
+        raise ValueError(f"expected {name} as a regular array of numbers, got rows of different lengths") from None
     if array.dtype.kind not in "fiu":
         raise ValueError(f"expected {name} of a floating-point or integer dtype, got {array.dtype}")
     return array
@@ -120,9 +114,7 @@ def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray
     return array.reshape(-1, 3)
 
 
-def _colors(
-    colors: ArrayLike | None, shape: tuple[int, ...], finite: NDArray[np.bool_]
-) -> NDArray[np.float64] | None:
+def _colors(colors: ArrayLike | None, shape: tuple[int, ...], finite: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     if colors is None:
         return None
     array = _same_shape("colors", colors, shape)[finite]

@@ -34,9 +34,7 @@ def seed_voxels(grid: VoxelGrid, seed_size: float) -> NDArray[np.int32]:
     components = component_of_voxel(grid)
     cell_of_voxel = _seed_cells(np.floor(grid.warped / seed_size), components)
     cell_counts = np.bincount(cell_of_voxel)
-    means = np.stack(
-        [np.bincount(cell_of_voxel, grid.warped[:, axis]) / cell_counts for axis in range(3)], axis=1
-    )
+    means = np.stack([np.bincount(cell_of_voxel, grid.warped[:, axis]) / cell_counts for axis in range(3)], axis=1)
     offset = grid.warped - means[cell_of_voxel]
     distance = np.einsum("ij,ij->i", offset, offset)
     order = np.lexsort((distance, cell_of_voxel))

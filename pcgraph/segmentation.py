@@ -144,9 +144,7 @@ def segment(
     touching = contacts(grid, surface, leaf_of_voxel)
     edges = edge_features(nodes, touching)
     costs = (boundary_cost or BoundaryCost())(edges, touching.voxel_edges)
-    tree = segmentation_tree(
-        touching.edges, costs, touching.voxels.sum(axis=1).astype(float), leaves, position
-    )
+    tree = segmentation_tree(touching.edges, costs, touching.voxels.sum(axis=1).astype(float), leaves, position)
     supervoxels = cloud.spread(leaf_of_point)
     labels = cloud.spread(tree.cut(altitude=non_negative("object_altitude", object_altitude))[leaf_of_point])
     graph = AdjacencyGraph(touching.edges, edges, nodes)

@@ -39,9 +39,7 @@ def _nearest(points: NDArray[np.float64]) -> NDArray[np.float64]:
     sample = points
     if len(points) > _SAMPLE:  # the smallest hashes: as good as random, yet a property of the points
         bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
-        hashes = (
-            bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-        ) >> 17
+        hashes = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)) >> 17
         mixed = (hashes[:, 0] ^ hashes[:, 1] ^ hashes[:, 2]) * np.uint64(0xD6E8FEB86659FD93)
         sample = points[np.argpartition(mixed, _SAMPLE)[:_SAMPLE]]
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)

@@ -33,9 +33,7 @@ class VccsWeights:
     normal: float = 1.0
 
 
-def vccs(
-    grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, weights: VccsWeights
-) -> NDArray[np.int32]:
+def vccs(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, weights: VccsWeights) -> NDArray[np.int32]:
     """Supervoxel of each voxel.
 
     Parameters

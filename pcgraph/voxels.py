@@ -60,9 +60,7 @@ class VoxelGrid:
         return len(self.counts)
 
 
-def voxel_grid(
-    points: NDArray[np.float64], colors: NDArray[np.float64] | None, size: float, warp: Warp
-) -> VoxelGrid:
+def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, size: float, warp: Warp) -> VoxelGrid:
     """Voxel grid over finite points.
 
     Parameters
@@ -141,9 +139,7 @@ def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _adjacency(
-    keys: NDArray[np.int64], pitch_x: int, pitch_y: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def _adjacency(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """CSR lists of touching voxels: nine pointers walk the sorted keys, each three voxels of a row wide."""
     n = keys.size
     indptr = np.zeros(n + 1, np.int64)

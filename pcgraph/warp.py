@@ -51,9 +51,7 @@ class CameraWarp(Warp):
         """Warped positions, (n, 3) float64; points must lie in front of the viewpoint."""
         local = points - self.viewpoint
         depth = local[:, 2]
-        warped = np.stack(
-            (local[:, 0] / depth, local[:, 1] / depth, np.log(depth / self.reference_depth)), axis=1
-        )
+        warped = np.stack((local[:, 0] / depth, local[:, 1] / depth, np.log(depth / self.reference_depth)), axis=1)
         return warped * self.reference_depth
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:

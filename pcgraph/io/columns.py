@@ -17,9 +17,7 @@ _NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 _LABEL_NAMES = ("label", "labels")
 
 
-def cloud_from_columns(
-    columns: Columns, shape: tuple[int, ...], viewpoint: NDArray[np.float64] | None = None
-) -> Cloud:
+def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDArray[np.float64] | None = None) -> Cloud:
     """Cloud built from one array per field.
 
     Parameters
@@ -39,8 +37,7 @@ def cloud_from_columns(
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise CloudReadError(
-            f"expected the fields x, y and z, but {', '.join(missing)} is missing; "
-            f"found: {', '.join(columns)}"
+            f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)}"
         )
     return Cloud(
         points=_stack(columns, ("x", "y", "z"), shape),

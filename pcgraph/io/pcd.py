@@ -101,18 +101,14 @@ def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
     dtypes = []
     for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True):
         if kind not in _KINDS or size not in _SIZES[kind] or not 1 <= count <= 4096:
-            raise CloudReadError(
-                f"field {name!r}: TYPE {kind}, SIZE {size}, COUNT {count} is not a PCD number type"
-            )
+            raise CloudReadError(f"field {name!r}: TYPE {kind}, SIZE {size}, COUNT {count} is not a PCD number type")
         dtypes.append(np.dtype(f"<{_KINDS[kind]}{size}"))
     width, height = _integers(entries, "WIDTH")[0], _integers(entries, "HEIGHT")[0]
     points = _integers(entries, "POINTS", default=[width * height])[0]
     if min(width, height) < 0 or points != width * height:
         raise CloudReadError(f"expected POINTS = WIDTH x HEIGHT, got {points} != {width} x {height}")
     viewpoint = _viewpoint(entries.get("VIEWPOINT", []))
-    return PcdHeader(
-        names, tuple(dtypes), tuple(counts), width, height, viewpoint, entries["DATA"][0].lower()
-    )
+    return PcdHeader(names, tuple(dtypes), tuple(counts), width, height, viewpoint, entries["DATA"][0].lower())
 
 
 def _integers(entries: dict[str, list[str]], key: str, default: list[int] | None = None) -> list[int]:
@@ -178,6 +174,5 @@ def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.
 def _check_length(available: int, needed: int, header: PcdHeader) -> None:
     if available < needed:
         raise CloudReadError(
-            f"the PCD header promises {header.n_points} points ({needed} bytes), "
-            f"but only {available} bytes follow"
+            f"the PCD header promises {header.n_points} points ({needed} bytes), but only {available} bytes follow"
         )

@@ -44,9 +44,7 @@ def read_ply(content: bytes) -> Cloud:
     code, elements, body = _parse_header(content)
     for element in elements:
         if element.has_list and (element.name == "vertex" or code != "ascii"):
-            raise CloudReadError(
-                f"expected scalar properties up to the vertices, but {element.name!r} has a list"
-            )
+            raise CloudReadError(f"expected scalar properties up to the vertices, but {element.name!r} has a list")
         if element.name == "vertex":
             break
         body = _skip(element, code, body)
@@ -130,8 +128,7 @@ def _binary_columns(element: PlyElement, code: str, body: bytes) -> dict[str, ND
     needed = element.count * record.itemsize
     if len(body) < needed:
         raise CloudReadError(
-            f"the PLY header promises {element.count} vertices ({needed} bytes), "
-            f"but only {len(body)} bytes follow"
+            f"the PLY header promises {element.count} vertices ({needed} bytes), but only {len(body)} bytes follow"
         )
     rows = np.frombuffer(body, record, count=element.count)
     return {name: rows[name].astype(kind) for name, kind in element.properties}

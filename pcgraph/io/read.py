@@ -30,9 +30,7 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise CloudReadError(
-            f"expected a file ending in {' or '.join(_READERS)}, got {path.name!r}: convert it first"
-        )
+        raise CloudReadError(f"expected a file ending in {' or '.join(_READERS)}, got {path.name!r}: convert it first")
     try:
         content = path.read_bytes()
     except OSError as error:

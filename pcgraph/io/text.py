@@ -27,9 +27,7 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.fl
         raise CloudReadError(f"the header promises {needed} numbers, but only {len(body)} bytes follow")
     words = body.split(None, needed)[:needed]
     if len(words) < needed:
-        raise CloudReadError(
-            f"the header promises {n_rows} points ({needed} numbers), but {len(words)} follow"
-        )
+        raise CloudReadError(f"the header promises {n_rows} points ({needed} numbers), but {len(words)} follow")
     try:
         return np.array(words, dtype="S").astype(np.float64).reshape(n_rows, n_columns)
     except ValueError as error:

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from clouds import two_boxes_on_a_plane
+from typer.testing import CliRunner
+
+import pcgraph
+from pcgraph.cli import app
+from pcgraph.io.ply import encode_ply
+
+
+def ply(points) -> bytes:
+    points = np.asarray(points, float).reshape(-1, 3)
+    return encode_ply({name: points[:, i] for i, name in enumerate("xyz")})
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["segment", *map(str, arguments)])
+
+
+@pytest.fixture
+def scene(tmp_path):
+    points, _, _ = two_boxes_on_a_plane()
+    path = tmp_path / "scene.ply"
+    path.write_bytes(ply(points))
+    return path
+
+
+VIEW = ("--viewpoint", "0.8", "-1", "3")
+
+
+def test_segment_writes_both_files_and_a_summary(scene, tmp_path):
+    done = run(scene, "--out", tmp_path / "new" / "folder", *VIEW)
+    assert done.exit_code == 0, done.output
+    summary = dict(line.split(maxsplit=1) for line in done.stdout.splitlines() if line.strip())
+    assert summary["objects"].strip() == "3"
+    assert "supervoxels" in summary
+    assert "seconds" in summary
+    names = sorted(path.name for path in (tmp_path / "new" / "folder").iterdir())
+    assert names == ["scene.segments.npz", "scene.segments.ply"]
+
+
+def test_number_of_objects_and_one_file(scene, tmp_path):
+    done = run(scene, "--out", tmp_path / "a.ply", "--objects", 7, "--no-color", *VIEW)
+    assert done.exit_code == 0, done.output
+    assert len(np.unique(pcgraph.read_cloud(tmp_path / "a.ply").labels)) == 7
+
+
+@pytest.mark.parametrize("points", [[[1, 2, 3]], [[1, 2, 3], [4, 5, 6]], np.ones((9, 3))])
+def test_few_points_work(points, tmp_path):
+    path = tmp_path / "few.ply"
+    path.write_bytes(ply(points))
+    done = run(path, "--out", tmp_path / "few.npz")
+    assert done.exit_code == 0, done.output
+    with np.load(tmp_path / "few.npz") as arrays:
+        assert (arrays["labels"] >= 0).all()
+
+
+def assert_refused(done, message, folder, files):
+    assert done.exit_code == 1
+    assert done.stdout == ""
+    assert done.stderr.startswith("pcgraph: error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert sorted(path.name for path in folder.iterdir()) == sorted(files)
+
+
+CONTENTS = {
+    "empty.ply": (ply(np.empty((0, 3))), "at least one point"),
+    "nan.ply": (ply(np.full((5, 3), np.nan)), "all 5 points are NaN"),
+    "short.ply": (ply(np.ones((5, 3)))[:-1], "promises 5 vertices"),
+    "text.ply": (b"hello", "PLY header"),
+    "text.pcd": (b"hello", "PCD header"),
+    "cloud.las": (b"LASF", "expected a file ending in .pcd or .ply"),
+}
+
+
+@pytest.mark.parametrize("name", CONTENTS)
+def test_bad_files(name, tmp_path):
+    content, message = CONTENTS[name]
+    (tmp_path / name).write_bytes(content)
+    assert_refused(run(tmp_path / name, "--out", tmp_path / "out.ply"), message, tmp_path, [name])
+
+
+def test_bad_options(scene, tmp_path):
+    for options, message in (
+        (("--objects", 0), "expected a whole number n"),
+        (("--objects", 10**6), "expected a whole number n"),
+        (("--voxel-size", -1), "voxel_size"),
+        (("--voxel-size", 0.1, "--seed-size", 0.01), "seed_size of at least"),
+        (("--voxel-size", "nan"), "voxel_size"),
+        (("--out", tmp_path / "a.txt"), ".ply or .npz"),
+        (("--out", tmp_path / "no" / "a.ply"), "no folder"),
+        (("--out", scene), "input itself"),
+        (("--out", scene / "below"), "cannot create the folder"),
+    ):
+        base = () if "--out" in options else ("--out", tmp_path / "out.npz")
+        assert_refused(run(scene, *base, *options), message, tmp_path, [scene.name])
+
+
+def test_missing_file_in_a_process_of_its_own(tmp_path):
+    command = [sys.executable, "-m", "pcgraph", "segment", str(tmp_path / "none.pcd")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert_refused_process = (done.returncode, done.stdout, list(tmp_path.iterdir()))
+    assert assert_refused_process == (1, "", [])
+    assert done.stderr == f"pcgraph: error: cannot read {tmp_path / 'none.pcd'}: No such file or directory\n"
+
+
+def test_help_names_units():
+    done = CliRunner().invoke(app, ["segment", "--help"])
+    assert done.exit_code == 0
+    assert "metres" in done.stdout

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wrong arguments get one clear sentence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pcgraph
+
+POINTS = np.random.default_rng(0).random((20, 3))
+
+BAD = {
+    "empty": ((np.empty((0, 3)),), {}, "at least one point"),
+    "all NaN": ((np.full((4, 3), np.nan),), {}, "all 4 points are NaN"),
+    "two columns": ((np.ones((4, 2)),), {}, r"shape \(n, 3\)"),
+    "one row": ((np.ones(3),), {}, r"shape \(n, 3\)"),
+    "strings": ((np.full((4, 3), "a"),), {}, "dtype"),
+    "bool": ((np.ones((4, 3), bool),), {}, "dtype"),
+    "complex": ((np.ones((4, 3), complex),), {}, "dtype"),
+    "ragged": (([[1, 2, 3], [1, 2]],), {}, "different lengths"),
+    "too large": ((POINTS * 1e200,), {}, "below"),
+    "few colours": ((POINTS, POINTS[:5]), {}, "points' shape"),
+    "bright colours": ((POINTS, POINTS * 255), {}, "within 0..1"),
+    "NaN colours": ((POINTS, POINTS * np.nan), {}, "within 0..1"),
+    "int colours": ((POINTS, np.ones((20, 3), np.int64)), {}, "uint8"),
+    "few normals": ((POINTS, None, POINTS[:5]), {}, "points' shape"),
+    "flat viewpoint": ((POINTS,), {"viewpoint": (0, 0)}, "viewpoint"),
+    "NaN viewpoint": ((POINTS,), {"viewpoint": (0, 0, np.nan)}, "viewpoint"),
+    "zero voxel": ((POINTS,), {"voxel_size": 0}, "voxel_size above 0"),
+    "negative voxel": ((POINTS,), {"voxel_size": -0.1}, "voxel_size"),
+    "NaN voxel": ((POINTS,), {"voxel_size": float("nan")}, "voxel_size"),
+    "word voxel": ((POINTS,), {"voxel_size": "small"}, "voxel_size"),
+    "small seed": ((POINTS,), {"voxel_size": 0.2, "seed_size": 0.1}, "seed_size of at least"),
+    "negative weight": ((POINTS,), {"color_weight": -1}, "color_weight"),
+    "behind the camera": ((POINTS - 0.5,), {"camera": True, "viewpoint": (0, 0, 0)}, "in front of"),
+    "NaN altitude": ((POINTS,), {"object_altitude": float("nan")}, "object_altitude"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_arguments(name):
+    arguments, options, message = BAD[name]
+    with pytest.raises(ValueError, match=message):
+        pcgraph.segment(*arguments, **options)
+
+
+def test_uint8_and_float_colours_agree():
+    colors = np.random.default_rng(1).integers(0, 256, (20, 3)).astype(np.uint8)
+    a = pcgraph.segment(POINTS, colors, voxel_size=0.2)
+    b = pcgraph.segment(POINTS, colors / 255.0, voxel_size=0.2)
+    assert np.array_equal(a.supervoxels, b.supervoxels)
+
+
+def test_default_viewpoint():
+    above = pcgraph.segment(POINTS - 0.5).viewpoint  # the origin lies inside
+    assert above[2] > 5
+    assert pcgraph.segment(POINTS + 1.0).viewpoint.tolist() == [0, 0, 0]
+    assert pcgraph.segment((POINTS - 0.5).reshape(4, 5, 3)).viewpoint.tolist() == [0, 0, 0]
+
+
+def test_inputs_are_left_alone():
+    points, normals = POINTS.copy(), POINTS.copy()
+    pcgraph.segment(points, normals=normals)
+    assert np.array_equal(points, POINTS)
+    assert np.array_equal(normals, POINTS)

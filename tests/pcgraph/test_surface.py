@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The public surface and the import rules."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pcgraph
+
+PACKAGE = Path(pcgraph.__file__).parent
+
+
+def test_public_names():
+    assert pcgraph.__all__ == [
+        "AdjacencyGraph",
+        "BoundaryCost",
+        "Cloud",
+        "CloudReadError",
+        "CloudWriteError",
+        "EdgeFeatures",
+        "Moments",
+        "NodeFeatures",
+        "PcgraphError",
+        "Segmentation",
+        "SegmentationTree",
+        "metrics",
+        "read_cloud",
+        "segment",
+        "write_segmentation",
+    ]
+    for name in pcgraph.__all__:
+        assert getattr(pcgraph, name) is not None
+    assert set(pcgraph.__all__) <= set(dir(pcgraph))
+
+
+def test_unknown_names_are_refused():
+    assert not hasattr(pcgraph, "supervoxelise")
+
+
+def imported_modules(path: Path) -> set[str]:
+    modules = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            modules.add(node.module or "")
+    return {module.split(".")[0] for module in modules}
+
+
+def test_pcgraph_never_imports_rangesim():
+    files = list(PACKAGE.rglob("*.py"))
+    assert len(files) > 20
+    for path in files:
+        assert not imported_modules(path) & {"rangesim", "mitsuba", "drjit"}, path
+
+
+def test_import_is_light():
+    code = "import sys, pcgraph; print(sorted({'numba', 'scipy', 'numpy', 'open3d'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_thread_count_does_not_change_labels():
+    code = (
+        "import numpy as np, pcgraph; r = pcgraph.segment(np.random.default_rng(2).random((3000, 3)));"
+        "print(hash(r.supervoxels.tobytes() + r.labels.tobytes() + r.tree.altitudes.tobytes()))"
+    )
+    outputs = set()
+    for threads in ("1", "2"):
+        environment = {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads, "PYTHONHASHSEED": "0"}
+        import os
+
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | environment
+        )
+        outputs.add(done.stdout)
+    assert len(outputs) == 1
