@@ -18,7 +18,7 @@ from rangesim.capture import DTYPES, Capture
 from rangesim.config import check_keys, from_dict, to_dict
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
-from rangesim.image_files import SUFFIXES, read_grey, write_grey
+from rangesim.image_files import SUFFIXES, read_stack, write_grey
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
 from rangesim.spad import SpadDetector
@@ -110,7 +110,7 @@ def import_capture(
             f"{folder}: expected {sensor.n_frames} images for {sensor.type_name} "
             f"({sensor.frame_names()[0]} ... {sensor.frame_names()[-1]}), got {len(paths)}."
         )
-    frames = _stack(paths)
+    frames = read_stack(paths)
     try:
         return Capture(frames, sensor, rig, detector)
     except ValueError as error:
@@ -168,30 +168,11 @@ def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor) -> np.
     for name in names:
         if not isinstance(name, str) or Path(name).name != name:
             raise ValueError(f"expected plain file names under frames, got {name!r}.")
-    frames = _stack([sidecar.parent / name for name in names])
+    frames = read_stack([sidecar.parent / name for name in names])
     stored = "uint16" if dtype == "uint32" else dtype
     if frames.dtype.name != stored:
         raise ValueError(f"expected frames of type {stored}, got {frames.dtype.name}.")
     return frames.astype(dtype, copy=False)
-
-
-def _stack(paths: list[Path]) -> np.ndarray:
-    """(k, h, w) images of one size and type."""
-    first: np.ndarray | None = None
-    for i, path in enumerate(paths):
-        if not path.is_file():
-            raise FileFormatError(f"frame {path} is missing.")
-        image = read_grey(path)
-        if first is None:
-            first = image
-            frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
-        if image.shape != first.shape or image.dtype != first.dtype:
-            raise FileFormatError(
-                f"{path}: expected {first.shape[1]} x {first.shape[0]} {first.dtype} as {paths[0].name}, "
-                f"got {image.shape[1]} x {image.shape[0]} {image.dtype}."
-            )
-        frames[i] = image
-    return frames
 
 
 def _natural(path: Path) -> list[tuple[int, int | str]]:

@@ -42,6 +42,31 @@ def read_grey(path: Path) -> np.ndarray:
         raise FileFormatError(f"{path} cannot be read as an image: {error}.") from error
 
 
+def read_stack(paths: list[Path]) -> np.ndarray:
+    """(k, h, w) uint8, uint16 or float32 images of files.
+
+    Raises
+    ------
+    FileFormatError
+        A file is missing or unreadable, or the images differ in size or type; the message names the file.
+    """
+    first: np.ndarray | None = None
+    for i, path in enumerate(paths):
+        if not path.is_file():
+            raise FileFormatError(f"frame {path} is missing.")
+        image = read_grey(path)
+        if first is None:
+            first = image
+            frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
+        if image.shape != first.shape or image.dtype != first.dtype:
+            raise FileFormatError(
+                f"{path}: expected {first.shape[1]} x {first.shape[0]} {first.dtype} as {paths[0].name}, "
+                f"got {image.shape[1]} x {image.shape[0]} {image.dtype}."
+            )
+        frames[i] = image
+    return frames
+
+
 def _read_exr(path: Path) -> np.ndarray:
     import OpenEXR
 

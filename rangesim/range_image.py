@@ -23,8 +23,9 @@ class RangeImage:
     ----------
     z : (h, w) float32, metres, along the optical axis of the camera; NaN where `status` is not OK.
     range_m : (h, w) float32, metres, Euclidean distance from the camera centre; NaN likewise.
-    confidence : (h, w) float32 in 0..1: modulation (structured light: direct contrast; AMCW: amplitude) as a
-        share of the largest the detector can hold.
+    confidence : (h, w) float32 in 0..1, strength of the useful signal as a share of the largest the capture can hold
+        (of a noise-free capture: does hold). Structured light: white - black; AMCW: twice the modulation amplitude;
+        direct ToF: counts in the peak, of the highest peak; ideal: radiance.
     status : (h, w) uint8, values of `Status`.
     intensity : (h, w) float32, mean signal in the capture's units, for colouring points.
     camera : Intrinsics, or None for an uncalibrated capture (then z and range_m are all NaN).
