@@ -15,6 +15,16 @@ from rangesim.sensors import Sensor
 DTYPES = ("uint8", "uint16", "uint32", "float32")
 
 
+BRIGHT_PERCENTILE = 99.0
+"""Percentile of the lit pixels that counts as bright: highlights of mirrors and gloss lie beyond."""
+
+
+def bright_level(values: np.ndarray) -> float:
+    """Level of bright pixels: the 99th percentile of the positive values; 0 if there are none."""
+    positive = values[values > 0]
+    return float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Capture:
     """A stack of frames of one sensor.
@@ -61,9 +71,9 @@ class Capture:
 
     @property
     def full_scale(self) -> float:
-        """Largest signal above black that a frame can hold; of a noise-free capture, the largest it does hold."""
+        """Largest signal above black that a frame can hold; of a noise-free capture, that of its bright pixels."""
         if not self.is_digital:
-            return float(max(self.frames.max(), np.finfo(np.float32).tiny))
+            return bright_level(self.frames.max(axis=0)) or 1.0
         return self._max_dn - self.black_level
 
     @property

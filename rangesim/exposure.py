@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Capture, bright_level
 from rangesim.detector import PhotoDetector
 from rangesim.rig import Rig
 from rangesim.sensors import IdealToF, Sensor
@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 TARGET_SHARE = 0.7
-"""Share of the saturation capacity that automatic exposure aims for."""
-TARGET_PERCENTILE = 99.0
-"""Percentile of the lit pixels, in their brightest frame, that automatic exposure puts there."""
+"""Share of the saturation capacity where automatic exposure puts the bright pixels (`bright_level`)."""
 
 
 def expose(
@@ -67,10 +65,8 @@ def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetecto
     ----------
     radiance : (k, h, w) float, W/m2/sr, mean of the frames.
     """
-    brightest = radiance.max(axis=0)
-    lit = brightest[brightest > 0]
-    if lit.size == 0:
+    level = bright_level(radiance.max(axis=0)) * detector.electrons_per_radiance(rig)
+    if level == 0:
         return detector.max_exposure_s
-    level = float(np.percentile(lit, TARGET_PERCENTILE)) * detector.electrons_per_radiance(rig)
     wanted = TARGET_SHARE * detector.capacity_e / level
     return float(np.clip(wanted, detector.min_exposure_s, detector.max_exposure_s))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
@@ -203,3 +204,14 @@ def test_nothing_in_view_is_low_signal_not_a_warning() -> None:
     assert (image.status[:60] == Status.LOW_SIGNAL).all()
     empty = decode(expose(signals_of_depth(rig, np.full_like(z, np.nan), [sensor]), sensor))
     assert (empty.status == Status.LOW_SIGNAL).all()
+
+
+@pytest.mark.parametrize("detector", [None, Detector()])
+@pytest.mark.parametrize("code", ["gray", "gray-phase"])
+def test_interreflection_alone_is_no_measurement(code: str, detector: Detector | None) -> None:
+    """A pixel that sees the patterns blurred over a wide area has contrast, but no code."""
+    rig, sensor = stereo_rig(), StructuredLight(code=code)  # type: ignore[arg-type]
+    signals = plane_signals(rig, sensor)
+    blurred = {r: np.stack([gaussian_filter(c, (0, 40)) for c in channels]) for r, channels in signals.channels.items()}
+    image = decode(expose(dataclasses.replace(signals, channels=blurred), sensor, detector))
+    assert image.valid.mean() < 0.02

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
+from rangesim.capture import BRIGHT_PERCENTILE
 from rangesim.config import from_dict, to_dict
 from rangesim.detector import Detector, PhotoDetector
-from rangesim.exposure import TARGET_PERCENTILE, TARGET_SHARE, expose
+from rangesim.exposure import TARGET_SHARE, expose
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 from rangesim.spad import SpadDetector
@@ -76,7 +77,7 @@ def test_auto_exposure_puts_the_bright_pixels_at_its_target() -> None:
     for ambient in (0.0, 5.0):
         capture = expose(plane_signals(rig, SENSOR, ambient=ambient), SENSOR, detector)
         brightest = (capture.frames.max(axis=0) - detector.offset_dn) / (detector.max_dn - detector.offset_dn)
-        assert abs(np.percentile(brightest, TARGET_PERCENTILE) - TARGET_SHARE) < 0.03
+        assert abs(np.percentile(brightest, BRIGHT_PERCENTILE) - TARGET_SHARE) < 0.03
         assert not capture.saturated(capture.frames).any()
     limited = dataclasses.replace(detector, min_exposure_s=0.05)
     assert expose(plane_signals(rig, SENSOR), SENSOR, limited).exposure_s == 0.05

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Capture, bright_level
 from rangesim.status import Status
 
 WHITE_BLACK_SHARE = 40 / 255
@@ -18,8 +18,10 @@ CONTRAST_SIGMAS = 5.0
 BIT_SIGMAS = 3.0
 """The same in standard deviations of the difference, where the detector is known."""
 RELATIVE_CONTRAST = 1e-4
+"""Least white - black of noise-free captures, as a share of that of the bright pixels."""
 RELATIVE_BIT = 0.1
-"""The same for noise-free captures: of the brightest contrast of the image; of the pixel's own contrast."""
+"""Least |pattern - inverse| as a share of the pixel's white - black, unless the detector is unknown: pixels in shadow
+that see the patterns by interreflection alone show fine stripes fainter than that, at whatever exposure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ def direct_contrast(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
     elif capture.is_digital:
         threshold = WHITE_BLACK_SHARE * capture.full_scale
     else:
-        threshold = RELATIVE_CONTRAST * max(float(contrast.max()), 0.0)
+        threshold = RELATIVE_CONTRAST * bright_level(contrast)
     return contrast, np.asarray(contrast > threshold)
 
 
@@ -96,7 +98,7 @@ def _bit_threshold(
 ) -> np.ndarray | float:
     noise = _difference_noise(capture, pattern, inverse)
     if noise is not None:
-        return BIT_SIGMAS * noise
+        return np.maximum(BIT_SIGMAS * noise, RELATIVE_BIT * contrast)
     if capture.is_digital:
         return PATTERN_INVERSE_SHARE * capture.full_scale
     return RELATIVE_BIT * contrast

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Capture, bright_level
 from rangesim.decode.path_length import range_image_from_path_length
 from rangesim.range_image import RangeImage
 from rangesim.response import SPEED_OF_LIGHT
@@ -19,7 +19,7 @@ PEAK_SIGMAS = 5.0
 MIN_COUNTS = 5.0
 """Least height of a peak over the background: standard deviations of the counts in its window, and counts."""
 RELATIVE_PEAK = 1e-4
-"""Least peak of the strongest one of the image, for noise-free captures."""
+"""Least peak as a share of the bright ones of the image, for noise-free captures."""
 _CHUNK_VALUES = 8_000_000
 
 
@@ -52,7 +52,7 @@ def decode_direct(capture: Capture) -> RangeImage:
     status = np.where(_is_weak(capture, peak, background), Status.LOW_SIGNAL, Status.OK)
     status[capture.saturated(capture.frames)] = Status.SATURATED
     intensity = capture.frames.sum(axis=0, dtype=np.float64)
-    return range_image_from_path_length(capture, length, status, peak / max(float(peak.max()), 1e-30), intensity)
+    return range_image_from_path_length(capture, length, status, peak / (bright_level(peak) or 1.0), intensity)
 
 
 def find_peak(histogram: np.ndarray, sigma_bins: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -121,7 +121,7 @@ def _centroid(inside: list[tuple[np.ndarray, np.ndarray]], level: np.ndarray, fa
 
 def _is_weak(capture: Capture, peak: np.ndarray, background: np.ndarray) -> np.ndarray:
     if not capture.is_digital:
-        return np.asarray(~(peak > RELATIVE_PEAK * max(float(peak.max()), 0.0)))
+        return np.asarray(~(peak > RELATIVE_PEAK * bright_level(peak)))
     return np.asarray(peak < np.maximum(MIN_COUNTS, PEAK_SIGMAS * np.sqrt(background)))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decode.gray import GrayCode
+from rangesim.decode.gray import RELATIVE_BIT, GrayCode, direct_contrast
 from rangesim.status import Status
 
 MAX_PHASE_SIGMA = 0.2
@@ -86,5 +86,12 @@ def refine_by_phase(capture: Capture, gray: GrayCode, frames: np.ndarray, period
     contradiction = np.abs(coordinate - gray.coordinate) > gray.cell_px / 2 + period_px / 8
     status[ok & contradiction] = Status.CODE_ERROR
     status[ok & modulation_is_weak(capture, phase, len(frames))] = Status.LOW_SIGNAL
+    status[ok & _is_washed_out(capture, phase)] = Status.LOW_SIGNAL
     status[ok & capture.saturated(frames)] = Status.SATURATED
     return GrayCode(coordinate, status, gray.cell_px)
+
+
+def _is_washed_out(capture: Capture, phase: Phase) -> np.ndarray:
+    """(h, w) bool, where the fringes are much fainter than white - black, as those seen by interreflection alone."""
+    contrast, _ = direct_contrast(capture)
+    return np.asarray(2 * phase.modulation < RELATIVE_BIT * contrast)
