@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 
-from rangesim.compare import compare
+from rangesim.comparison import compare
 from rangesim.range_image import RangeImage
 from rangesim.signals import GroundTruth
 from rangesim.status import Status
@@ -123,3 +123,11 @@ def test_impossible_comparisons_are_refused(scene: tuple[np.ndarray, GroundTruth
         compare(image_of(z), truth, outlier_m=0)
     with pytest.raises(ValueError, match="matte, glass, all"):
         compare(image_of(z), truth).row("wood")
+
+
+def test_functions_of_the_package_are_not_hidden_by_its_modules() -> None:
+    import rangesim
+
+    for _ in range(2):
+        assert callable(rangesim.compare)
+        assert callable(rangesim.decode)

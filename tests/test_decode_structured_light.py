@@ -13,10 +13,10 @@ from scipy.ndimage import gaussian_filter
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
-from rangesim.decode import decode
-from rangesim.decode.phase_shift import phase_of
-from rangesim.decode.structured_light import decode_structured_light
-from rangesim.decode.triangulate import triangulate
+from rangesim.decoding import decode
+from rangesim.decoding.phase_shift import phase_of
+from rangesim.decoding.structured_light import decode_structured_light
+from rangesim.decoding.triangulate import triangulate
 from rangesim.detector import Detector
 from rangesim.exposure import expose
 from rangesim.rig import Intrinsics, Rig

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
-from rangesim.decode import decode
-from rangesim.decode.amcw import decode_amcw, tap_phase
-from rangesim.decode.histogram import coates, decode_direct
-from rangesim.decode.path_length import range_from_path_length
+from rangesim.decoding import decode
+from rangesim.decoding.amcw import decode_amcw, tap_phase
+from rangesim.decoding.histogram import coates, decode_direct
+from rangesim.decoding.path_length import range_from_path_length
 from rangesim.detector import Detector
 from rangesim.exposure import expose
 from rangesim.response import SPEED_OF_LIGHT

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
-from rangesim.decode import decode
+from rangesim.decoding import decode
 from rangesim.detector import Detector
 from rangesim.errors import FileFormatError
 from rangesim.exposure import expose

@@ -12,8 +12,8 @@ import pytest
 from rangesim.calibration_files import load_calibration
 from rangesim.capture import Capture
 from rangesim.capture_files import import_capture
-from rangesim.decode import decode
-from rangesim.decode.structured_light import decode_structured_light
+from rangesim.decoding import decode
+from rangesim.decoding.structured_light import decode_structured_light
 from rangesim.range_image import RangeImage
 from rangesim.rig import Rig
 from rangesim.sensors import StructuredLight

@@ -109,7 +109,7 @@ class StructuredLight(Sensor):
         return self.frames(weights, np.ones_like(x), np.zeros_like(x))
 
     def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decode.structured_light import decode_structured_light
+        from rangesim.decoding.structured_light import decode_structured_light
 
         return decode_structured_light(capture)
 

@@ -36,7 +36,7 @@ class IdealToF(Sensor):
         return ["radiance", "radiance_x_length"]
 
     def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decode.path_length import decode_ideal
+        from rangesim.decoding.path_length import decode_ideal
 
         return decode_ideal(capture)
 
@@ -87,7 +87,7 @@ class AmcwToF(Sensor):
         return [f"{f / 1e6:g}MHz_{tap}deg" for f in self.modulation_hz for tap in (0, 90, 180, 270)]
 
     def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decode.amcw import decode_amcw
+        from rangesim.decoding.amcw import decode_amcw
 
         return decode_amcw(capture)
 
@@ -136,6 +136,6 @@ class DirectToF(Sensor):
         return [f"bin{b:04d}" for b in range(self.bins)]
 
     def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decode.histogram import decode_direct
+        from rangesim.decoding.histogram import decode_direct
 
         return decode_direct(capture)

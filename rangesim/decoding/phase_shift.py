@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decode.gray import RELATIVE_BIT, GrayCode, direct_contrast
+from rangesim.decoding.gray import RELATIVE_BIT, GrayCode, direct_contrast
 from rangesim.status import Status
 
 MAX_PHASE_SIGMA = 0.2

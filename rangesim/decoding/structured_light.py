@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decode.gray import GrayCode, decode_gray, direct_contrast
-from rangesim.decode.phase_shift import refine_by_phase
-from rangesim.decode.triangulate import triangulate
+from rangesim.decoding.gray import GrayCode, decode_gray, direct_contrast
+from rangesim.decoding.phase_shift import refine_by_phase
+from rangesim.decoding.triangulate import triangulate
 from rangesim.range_image import RangeImage
 from rangesim.rig import Rig
 from rangesim.sensors import StructuredLight

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decode.path_length import range_image_from_path_length
-from rangesim.decode.phase_shift import Phase, modulation_is_weak, phase_sigma
+from rangesim.decoding.path_length import range_image_from_path_length
+from rangesim.decoding.phase_shift import Phase, modulation_is_weak, phase_sigma
 from rangesim.range_image import RangeImage
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.sensors import AmcwToF

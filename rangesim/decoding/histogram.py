@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decode.path_length import range_image_from_path_length
+from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.range_image import RangeImage
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.sensors import DirectToF
