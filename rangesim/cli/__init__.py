@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `rangesim`. Heavy modules are imported inside the commands, so that `--help` is quick."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+import rangesim
+from rangesim.cli.decode import decode_command
+from rangesim.cli.results import compare_command, report_command
+from rangesim.cli.run import run_command
+from rangesim.doctor import doctor_command
+from rangesim.errors import RangesimError
+
+app = typer.Typer(
+    name="rangesim", no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False
+)
+app.command("run")(run_command)
+app.command("decode")(decode_command)
+app.command("compare")(compare_command)
+app.command("report")(report_command)
+app.command("doctor")(doctor_command)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"rangesim {rangesim.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Simulate, decode and compare range sensors: structured light and time of flight.
+
+    Lengths are metres, times seconds, power watts. Start with:
+
+      rangesim run scenes/tabletop.xml --out out/tabletop
+    """
+
+
+def main() -> None:
+    """Entry point: errors become one sentence on stderr and exit status 1."""
+    if "--debug" in sys.argv[1:]:
+        app()
+    try:
+        app()
+    except (RangesimError, ValueError, OSError) as error:
+        typer.echo(f"rangesim: {' '.join(str(error).split())}", err=True)
+        sys.exit(1)

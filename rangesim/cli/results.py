@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rangesim compare` and `rangesim report`: results that are there already."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def compare_command(
+    results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
+    markdown: Annotated[bool, typer.Option("--markdown", help="Markdown instead of a drawn table.")] = False,
+) -> None:
+    """Print errors per surface material and sensor; lengths in mm, shares in %.
+
+    Example:
+
+      rangesim compare out/tabletop out/matte
+    """
+    from rangesim.report.tables import markdown as in_markdown
+    from rangesim.result_files import read_rows, read_settings
+
+    tables = []
+    for folder in results:
+        for entry in read_settings(folder)["instruments"]:
+            name = entry["name"] if len(results) == 1 else f"{folder}: {entry['name']}"
+            tables.append((name, read_rows(folder / entry["name"])))
+    if markdown:
+        typer.echo(in_markdown(tables), nl=False)
+    else:
+        _print(in_markdown(tables))
+
+
+def report_command(
+    result: Annotated[Path, typer.Argument(help="A directory that `rangesim run` wrote.", show_default=False)],
+) -> None:
+    """Write report.html anew from the files of a result.
+
+    Example:
+
+      rangesim report out/tabletop
+    """
+    from rangesim.report import write_report
+    from rangesim.result_files import load_result
+
+    write_report(load_result(result), result / "report.html")
+    typer.echo(f"{result / 'report.html'}")
+
+
+def _print(markdown: str) -> None:
+    """Draw a Markdown table."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    head, _, *lines = ([cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines())
+    table = Table(box=box.SIMPLE_HEAD)
+    for i, name in enumerate(head):
+        table.add_column(name, justify="right" if i > 1 else "left", overflow="fold")
+    for before, line in zip([head, *lines], lines, strict=False):
+        table.add_row("" if line[0] == before[0] else line[0], *line[1:])
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=140)
+    console.print(table)

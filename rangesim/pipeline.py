@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole experiment: scene -> transport -> capture -> range image -> points -> comparison, segments, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import rangesim
+from rangesim.capture import Capture
+from rangesim.experiment import Experiment, Instrument
+from rangesim.provenance import provenance
+from rangesim.result_files import SETTINGS, load_result, new_result, save_range_image, write_json
+
+if TYPE_CHECKING:
+    from rangesim.point_cloud import PointCloud
+    from rangesim.rig import Rig
+    from rangesim.scene import Scene
+    from rangesim.signals import Signals
+
+Progress = Callable[[str, float], None]
+"""Called with the name of the stage and the share of the whole job done, 0..1."""
+_TRANSPORT_SHARE = 0.7
+FEWEST_POINTS = 3
+"""Fewer points are no cloud worth grouping."""
+
+
+def run(experiment: Experiment, out: str | Path, progress: Progress | None = None) -> None:
+    """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
+
+    The directory appears when all is done; a failure leaves nothing behind. An older result of that name is replaced.
+
+    Raises
+    ------
+    ValueError, FileFormatError, EnvironmentProblem
+        A setting out of range, a scene that cannot be loaded, foreign contents in `out`, or no suitable LLVM.
+    """
+    import mitsuba as mi
+
+    from rangesim.report import write_report
+
+    say = progress or (lambda stage, share: None)
+    with new_result(out) as folder:
+        times: dict[str, float] = {}
+        say("Loading the scene", 0.0)
+        with timed(times, "load"):
+            scene = rangesim.load_scene(experiment.scene, material=experiment.material)
+        passes = group_by_rig(experiment, scene)
+        for number, (rig, instruments) in enumerate(passes, 1):
+            signals = _trace(experiment, scene, rig, instruments, say, number, len(passes), times)
+            signals.save(str(folder / f"pass_{number}.npz"))
+            for one in instruments:
+                say(f"Measuring with {one.name}", _share(number, len(passes), 1.0))
+                measure(one, signals, folder / one.name, noise_seed(experiment, one))
+        write_json(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
+        say("Writing the report", 0.97)
+        result = load_result(folder)
+        _write_comparison(folder, [(m.name, m.rows) for m in result.measurements])
+        write_report(result, folder / "report.html")
+
+
+def measure(one: Instrument, signals: Signals, folder: Path, seed: int) -> None:
+    """Expose, decode, compare and segment for one instrument; write all of it to the new directory `folder`."""
+    folder.mkdir()
+    times: dict[str, float] = {}
+    with timed(times, "exposure"):
+        capture = rangesim.expose(signals, one.sensor, one.detector, one.exposure_s, seed)
+    capture.save(folder / "capture")
+    with timed(times, "decode"):
+        image = rangesim.decode(capture)
+    save_range_image(image, folder / "range.npz")
+    comparison = rangesim.compare(image, signals.truth)
+    write_json(folder / "comparison.json", {"outlier_m": comparison.outlier_m, "rows": comparison.rows()})
+    with timed(times, "points"):
+        cloud = image.to_point_cloud()
+    if cloud.valid.sum() >= FEWEST_POINTS:
+        cloud.save(folder / "cloud.ply")
+        with timed(times, "segmentation"):
+            segment(cloud, folder / "segmentation.npz")
+    write_json(
+        folder / "measurement.json", {**acquisition(capture), "points": int(cloud.valid.sum()), "times_s": times}
+    )
+
+
+def segment(cloud: PointCloud, path: Path) -> None:
+    """Write supervoxels, objects and the tree of an organised cloud in the camera frame to a .npz file."""
+    import pcgraph
+
+    result = pcgraph.segment(cloud.points, colors=cloud.colors, normals=cloud.normals, viewpoint=(0.0, 0.0, 0.0))
+    np.savez_compressed(
+        path,
+        supervoxels=result.supervoxels,
+        labels=result.labels,
+        parents=result.tree.parents,
+        altitudes=result.tree.altitudes,
+    )
+
+
+def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
+    """Instruments that share camera, emitter and power, and so one transport pass; in order of first appearance."""
+    groups: dict[Rig, list[Instrument]] = {}
+    for one in experiment.instruments:
+        rig = one.rig(scene, experiment.width, experiment.height)
+        groups.setdefault(rig, []).append(one)
+    return list(groups.items())
+
+
+def noise_seed(experiment: Experiment, one: Instrument) -> int:
+    """Seed of an instrument's noise: its own for each position in the experiment."""
+    position = experiment.instruments.index(one)
+    return int(np.random.SeedSequence([experiment.seed, position]).generate_state(1)[0])
+
+
+def acquisition(capture: Capture) -> dict[str, Any]:
+    """Frames and time of a capture; exposure None for a noise-free one, which takes no time."""
+    exposure = capture.exposure_s if np.isfinite(capture.exposure_s) else None
+    frames = len(capture.frames)
+    # all bins of a photon histogram fill during one exposure
+    shots = 1 if capture.sensor.type_name == "direct-tof" else frames
+    return {
+        "sensor": capture.sensor.type_name,
+        "frames": frames,
+        "exposure_s": exposure,
+        "acquisition_s": None if exposure is None else shots * exposure,
+        "pixels": int(capture.frames[0].size),
+    }
+
+
+@contextmanager
+def timed(times: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the seconds that the block takes to `times[stage]`."""
+    start = time.monotonic()
+    yield
+    times[stage] = times.get(stage, 0.0) + time.monotonic() - start
+
+
+def _trace(
+    experiment: Experiment,
+    scene: Scene,
+    rig: Rig,
+    instruments: list[Instrument],
+    say: Progress,
+    number: int,
+    passes: int,
+    times: dict[str, float],
+) -> Signals:
+    stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
+    say(stage, _share(number, passes, 0.0))
+    with timed(times, f"transport_{number}"):
+        return rangesim.transport(
+            scene,
+            rig,
+            [i.sensor for i in instruments],
+            spp=experiment.spp,
+            max_depth=experiment.max_depth,
+            seed=experiment.seed,
+            progress=lambda share: say(stage, _share(number, passes, share)),
+        )
+
+
+def _share(number: int, passes: int, of_pass: float) -> float:
+    return 0.05 + 0.9 * (number - 1 + _TRANSPORT_SHARE * of_pass) / passes
+
+
+def _write_comparison(folder: Path, tables: list[tuple[str, list[dict[str, Any]]]]) -> None:
+    from rangesim.report.tables import markdown
+
+    (folder / "comparison.md").write_text(markdown(tables), encoding="utf-8")

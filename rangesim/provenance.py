@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What made a result: resolved settings, the scene's fingerprint, versions."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rangesim.config import to_dict
+from rangesim.experiment import Experiment, Instrument, experiment_to_dict
+from rangesim.result_files import FORMAT
+
+if TYPE_CHECKING:
+    from rangesim.rig import Rig
+    from rangesim.scene import Scene
+
+PACKAGES = ("rangesim", "mitsuba", "drjit", "numpy", "scipy", "numba", "open3d")
+
+
+def provenance(
+    experiment: Experiment,
+    scene: Scene,
+    passes: Sequence[tuple[Rig, Sequence[Instrument]]],
+    variant: str,
+    times_s: dict[str, float],
+) -> dict[str, Any]:
+    """Contents of `experiment.json`."""
+    placed = {i.name: (number, rig) for number, (rig, ones) in enumerate(passes, 1) for i in ones}
+    return {
+        "format": FORMAT,
+        "experiment": experiment_to_dict(experiment),
+        "scene": {
+            "name": scene.name,
+            "sha256": hashlib.sha256(Path(experiment.scene).read_bytes()).hexdigest(),
+            "working_distance_m": scene.working_distance_m,
+            "shapes": [to_dict(i) for i in scene.instances],
+        },
+        "passes": len(passes),
+        "instruments": [
+            {"name": i.name, "pass": placed[i.name][0], "rig": to_dict(placed[i.name][1])}
+            for i in experiment.instruments
+        ],
+        "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        "variant": variant,
+        "times_s": times_s,
+    }
+
+
+def _version(package: str) -> str:
+    """Version of a package, or of its build for the CPU alone."""
+    for name in (package, f"{package}-cpu"):
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            continue
+    return "not installed"

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A result becomes one self-contained HTML file."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from rangesim.report import cloud, figures, palette, tables
+from rangesim.report.verdict import verdict
+from rangesim.result_files import Measurement, Result
+
+SCRIPTS = ("viewer.js", "report.js")
+
+
+def write_report(result: Result, path: Path) -> None:
+    """Write the report of a result; the file appears when it is complete."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(_asset("report.html.j2"))
+    staging = path.with_name(f".{path.name}.part")
+    staging.write_text(template.render(context(result)), encoding="utf-8")
+    staging.replace(path)
+
+
+def context(result: Result) -> dict[str, Any]:
+    """Everything the template shows."""
+    measurements = result.measurements
+    names = tables.titles(measurements)
+    camera = measurements[0].capture.frames.shape
+    materials, legend = figures.material_picture(measurements[0].truth)
+    depth, error = palette.color_table("viridis"), palette.color_table("RdBu_r")
+    limits = palette.depth_limits(measurements)
+    return {
+        "css": Markup(_asset("style.css")),  # our own files
+        "script": Markup("\n".join(_asset(name) for name in SCRIPTS)),
+        "scene": result.info["scene"],
+        "titles": names,
+        "settings_line": tables.settings_line(result.experiment, camera[2], camera[1]),
+        "verdict": verdict(measurements),
+        "scene_picture": figures.scene_picture(result.energy[0]),
+        "materials": materials,
+        "material_legend": legend,
+        "columns": tables.COLUMNS,
+        "comparison": tables.comparison_table(measurements),
+        "maps": [_maps(m, limits, depth, error) for m in measurements],
+        "depth_bar": {"uri": figures.color_bar(depth), "ticks": palette.depth_ticks(*limits)},
+        "error_bar": {"uri": figures.color_bar(error), "ticks": palette.error_ticks()},
+        "captures": [_frames(m) for m in measurements],
+        "light": [_light(result, number) for number in range(len(result.energy))],
+        "costs": tables.cost_table(measurements),
+        "transport": _transport(result),
+        "viewer": _viewer_data(result, names, error),
+        "hidden": {m.name: m for m in measurements},
+        "settings": _flat(result.info["experiment"]),
+        "versions": {**result.info["versions"], "Mitsuba variant": result.info["variant"]},
+    }
+
+
+def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -> dict[str, Any]:
+    status, legend = figures.status_map(m)
+    return {
+        "name": m.name,
+        "depth": figures.depth_map(m, limits, depth),
+        "error": figures.error_map(m, error),
+        "status": status,
+        "legend": legend,
+    }
+
+
+def _frames(m: Measurement) -> dict[str, Any]:
+    f = m.facts
+    taken = f"{f['frames']} frames"
+    if f["exposure_s"] is not None:
+        taken += (
+            f", {tables.seconds(f['exposure_s'])} each" if f["frames"] != 1 else f", {tables.seconds(f['exposure_s'])}"
+        )
+    else:
+        taken += ", noise-free"
+    return {
+        "name": m.name,
+        "taken": taken,
+        "details": tables.details(m.capture.sensor),
+        "frames": figures.captured_frames(m.capture),
+    }
+
+
+def _light(result: Result, number: int) -> dict[str, Any]:
+    of_pass = [m for m in result.measurements if m.light_pass == number + 1]
+    rig = of_pass[0].capture.rig
+    assert rig is not None
+    return {
+        "names": [m.name for m in of_pass],
+        "baseline_mm": f"{1e3 * rig.baseline_m:.0f}",
+        "power_w": f"{rig.projector_power_w:g}",
+        "pictures": figures.light_pictures(result.energy[number]),
+    }
+
+
+def _transport(result: Result) -> list[dict[str, str]]:
+    times = result.info["times_s"]
+    return [
+        {
+            "names": ", ".join(m.name for m in result.measurements if m.light_pass == number),
+            "frames": str(sum(m.facts["frames"] for m in result.measurements if m.light_pass == number)),
+            "time": tables.seconds(times[f"transport_{number}"]),
+        }
+        for number in range(1, len(result.energy) + 1)
+    ]
+
+
+def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str, Any]:
+    far = cloud.far_limit(result.measurements)
+    truth = result.measurements[0].truth
+    return {
+        "instruments": [cloud.packed_measurement(m, names[m.name], far) for m in result.measurements],
+        "errorColors": error.ravel().tolist(),
+        "errorKneeM": palette.ERROR_KNEE_M,
+        "errorLimitM": palette.ERROR_LIMIT_M,
+        "errorStepM": cloud.ERROR_STEP_M,
+        "status": list(palette.STATUS_NAMES.values()),
+        "materials": list(truth.material_names),
+        "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
+        "material": cloud.pack(truth.material.astype("int8")),
+    }
+
+
+def _flat(data: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """Dotted names and values of nested settings, in order."""
+    if isinstance(data, dict):
+        return [pair for key, value in data.items() for pair in _flat(value, f"{prefix}.{key}" if prefix else key)]
+    if isinstance(data, list) and data and isinstance(data[0], dict):
+        return [pair for i, value in enumerate(data) for pair in _flat(value, f"{prefix}[{i}]")]
+    return [(prefix, "default" if data is None else str(data))]
+
+
+def _asset(name: str) -> str:
+    return (files("rangesim.report") / name).read_text(encoding="utf-8")

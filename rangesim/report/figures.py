@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report's pictures, each as a PNG in a data URI."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesim.capture import Capture
+from rangesim.report import palette
+from rangesim.result_files import Measurement
+from rangesim.sensors import AmcwToF, DirectToF, StructuredLight
+from rangesim.signals import EnergySplit, GroundTruth
+
+GAMMA = 2.2
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image to show. uri : PNG as data URI. caption : plain text beneath it."""
+
+    uri: str
+    caption: str
+    alt: str = ""
+
+
+@dataclass(frozen=True)
+class Share:
+    """A legend entry: a class with its colour and its share of the pixels, in percent."""
+
+    name: str
+    color: str
+    percent: float
+
+
+def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
+    """Data URI of a grey (h, w) uint8 image, or of (h, w) uint8 indices into a colour table (n, 3) uint8."""
+    from PIL import Image
+
+    picture = Image.fromarray(np.ascontiguousarray(image))
+    if table is not None:
+        picture.putpalette(np.ascontiguousarray(table, dtype=np.uint8).tobytes())
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
+    """PNG of a linear image with display gamma; `white` is the value shown as white."""
+    share = (np.nan_to_num(image.astype(np.float64)) - black) / max(white - black, 1e-30)
+    return png(np.rint(255 * np.clip(share, 0, 1) ** (1 / GAMMA)).astype(np.uint8))
+
+
+def color_map(share: np.ndarray, table: np.ndarray) -> str:
+    """PNG of values 0..1 through a colour table of 256 entries; NaN becomes light grey."""
+    index = np.rint(np.clip(np.nan_to_num(share), 0, 1) * 254).astype(np.uint8)
+    index[~np.isfinite(share)] = 255
+    colors = table[np.rint(np.arange(256) / 254 * 255).clip(0, 255).astype(int)].copy()
+    colors[255] = palette.NO_DATA
+    return png(index, colors)
+
+
+def color_bar(table: np.ndarray) -> str:
+    """PNG of one row, a colour table from left to right."""
+    return png(np.arange(256, dtype=np.uint8)[None], table)
+
+
+def scene_picture(energy: EnergySplit) -> Picture:
+    """The scene in its own light, or lit by the emitter where it has none."""
+    own = bool(energy.ambient.max() > 0)
+    image = energy.ambient if own else energy.projector
+    light = "in its own light" if own else "lit by the emitter (it has no light of its own)"
+    return Picture(grey(image, _bright(image)), f"The scene from the camera, {light}.", "the scene")
+
+
+def material_picture(truth: GroundTruth) -> tuple[Picture, list[Share]]:
+    """Material class per pixel, and its legend."""
+    classes = np.where(truth.material >= 0, truth.material, len(truth.material_names)).astype(np.uint8)
+    colors = [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names]
+    table = np.array([*colors, palette.NO_DATA], dtype=np.uint8)
+    names = [*truth.material_names, "nothing"]
+    caption = "Material class of the first surface behind each pixel."
+    return Picture(png(classes, table), caption, "material classes"), _legend(classes, names, table)
+
+
+def depth_map(measurement: Measurement, limits: tuple[float, float], table: np.ndarray) -> str:
+    """PNG of the measured z."""
+    low, high = limits
+    return color_map((measurement.image.z - low) / (high - low), table)
+
+
+def error_map(measurement: Measurement, table: np.ndarray) -> str:
+    """PNG of z minus true z."""
+    return color_map(palette.error_share(measurement.image.z - measurement.truth.z), table)
+
+
+def status_map(measurement: Measurement) -> tuple[str, list[Share]]:
+    """PNG of why pixels have no measurement, and its legend."""
+    classes = palette.causes(measurement)
+    return png(classes, palette.STATUS_COLORS), _legend(
+        classes, list(palette.STATUS_NAMES.values()), palette.STATUS_COLORS
+    )
+
+
+def captured_frames(capture: Capture) -> list[Picture]:
+    """A few telling frames, all with the same white."""
+    names = capture.sensor.frame_names()
+    chosen = telling_frames(capture)
+    white = max(float(np.percentile(capture.frames[i], 99.5)) for i in chosen)
+    black = capture.black_level
+    return [Picture(grey(capture.frames[i], white, black), names[i].replace("_", " "), names[i]) for i in chosen]
+
+
+def telling_frames(capture: Capture) -> list[int]:
+    """Indices of three frames that show how the sensor works."""
+    sensor, names = capture.sensor, capture.sensor.frame_names()
+    if isinstance(sensor, StructuredLight):
+        bits = [i for i, n in enumerate(names) if "_bit" in n and "inverse" not in n]
+        phases = [i for i, n in enumerate(names) if "_phase" in n]
+        return [names.index("white"), bits[len(bits) // 2], *(phases[:1] or bits[-1:])]
+    if isinstance(sensor, AmcwToF):
+        last = 4 * (len(sensor.modulation_hz) - 1)
+        return sorted({0, last, last + 1})
+    if isinstance(sensor, DirectToF):
+        energy = np.cumsum(capture.frames.reshape(len(names), -1).sum(axis=1, dtype=np.float64))
+        return sorted({int(np.searchsorted(energy, share * energy[-1])) for share in (0.25, 0.5, 0.75)})
+    return [0]
+
+
+def light_pictures(energy: EnergySplit) -> list[Picture]:
+    """Radiance by the kind of light path, all with the same white, and each kind's share of the emitter's light."""
+    white = _bright(energy.projector)
+    total = float(energy.projector.sum())
+    kinds = {
+        "direct": ("emitter, surface, camera", energy.direct),
+        "multipath": ("by way of further surfaces", energy.multipath),
+        "via mirror or glass": ("the lit surface is seen off a mirror or through glass", energy.via_delta),
+        "caustic": ("the surface is lit off a mirror or through glass", energy.caustic),
+        "glint": ("the lamp itself is seen off a mirror or through glass", energy.glint),
+    }
+    pictures = [
+        Picture(
+            grey(image, white),
+            f"{name}: {meaning}; {100 * float(image.sum()) / total:.1f} % of the emitter’s light",
+            name,
+        )
+        for name, (meaning, image) in kinds.items()
+        if total > 0 and image.max() > 0
+    ]
+    if energy.ambient.max() > 0:
+        ratio = 100 * float(energy.ambient.sum()) / total if total > 0 else float("inf")
+        text = f"ambient: every other light, before the filter; {ratio:.1f} % of the emitter’s light"
+        pictures.append(Picture(grey(energy.ambient, white), text, "ambient"))
+    return pictures
+
+
+def _bright(image: np.ndarray) -> float:
+    lit = image[image > 0]
+    return float(np.percentile(lit, 99)) if lit.size else 1.0
+
+
+def _legend(classes: np.ndarray, names: list[str], table: np.ndarray) -> list[Share]:
+    counts = np.bincount(classes.ravel(), minlength=len(names))
+    return [
+        Share(name, "#{:02x}{:02x}{:02x}".format(*table[i]), 100 * float(counts[i]) / classes.size)
+        for i, name in enumerate(names)
+        if counts[i]
+    ]

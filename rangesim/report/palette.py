@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Colours of the report's maps, and the scales that are shared between sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesim.result_files import Measurement
+from rangesim.status import Status
+
+SHADOW = len(Status)
+"""Class beyond `Status`: no light arrives because the emitter does not see the point."""
+NO_DATA = (203, 206, 210)
+ERROR_KNEE_M = 1e-4
+"""Metres; the error scale is linear below and logarithmic beyond."""
+ERROR_LIMIT_M = 0.1
+
+STATUS_NAMES = {
+    Status.OK: "measured",
+    Status.LOW_SIGNAL: "too little light",
+    Status.SATURATED: "saturated",
+    Status.CODE_ERROR: "code error",
+    Status.WRAPPED: "phases disagree",
+    Status.OUT_OF_RANGE: "out of range",
+    SHADOW: "in the emitter's shadow",
+}
+STATUS_COLORS = np.array(
+    [(231, 234, 237), (52, 104, 176), (240, 171, 0), (196, 56, 45), (125, 79, 163), (40, 44, 52), (150, 180, 214)],
+    dtype=np.uint8,
+)
+MATERIAL_COLORS = {
+    "matte": (196, 178, 150),
+    "glossy": (221, 119, 60),
+    "mirror": (86, 102, 122),
+    "transparent": (86, 180, 210),
+    "translucent": (150, 196, 140),
+    "other": (170, 140, 180),
+}
+
+
+@dataclass(frozen=True)
+class Tick:
+    """A label of a colour bar. place : 0..1 along it."""
+
+    place: float
+    label: str
+
+
+def color_table(name: str) -> np.ndarray:
+    """(256, 3) uint8 of one of matplotlib's colour maps."""
+    from matplotlib import colormaps
+
+    return np.rint(colormaps[name](np.arange(256) / 255)[:, :3] * 255).astype(np.uint8)
+
+
+def depth_limits(measurements: tuple[Measurement, ...]) -> tuple[float, float]:
+    """Metres, z of the true surfaces from near to far, without the farthest and nearest percent."""
+    z = np.concatenate([m.truth.z[np.isfinite(m.truth.z)] for m in measurements])
+    if z.size == 0:
+        return 0.0, 1.0
+    low, high = (float(v) for v in np.percentile(z, [0.5, 99.5]))
+    margin = max(0.03 * (high - low), 1e-3 * high)
+    return low - margin, high + margin
+
+
+def depth_ticks(low: float, high: float, count: int = 5) -> list[Tick]:
+    """Round depths within the limits, in metres."""
+    step = 10.0 ** np.floor(np.log10(high - low))
+    step = next(step * f for f in (0.1, 0.2, 0.5, 1.0, 2.0) if (high - low) / (step * f) <= count + 1)
+    values = np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step
+    digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
+    return [Tick(float((v - low) / (high - low)), f"{v:.{digits}f}") for v in values]
+
+
+def error_share(error_m: np.ndarray) -> np.ndarray:
+    """Place on the error scale, 0..1, of signed errors in metres: 0.5 is none, 0 and 1 are the limits."""
+    decades = np.arcsinh(error_m / ERROR_KNEE_M / 2) / np.arcsinh(ERROR_LIMIT_M / ERROR_KNEE_M / 2)
+    return np.asarray(0.5 + 0.5 * np.clip(decades, -1, 1))
+
+
+def error_ticks() -> list[Tick]:
+    """Decades of the error scale, in millimetres."""
+    values = [-100, -10, -1, 0, 1, 10, 100]
+    places = error_share(np.array(values) / 1e3)
+    signs = [f"{v:+d}".replace("-", "−") if v else "0" for v in values]
+    return [Tick(float(p), s) for p, s in zip(places, signs, strict=True)]
+
+
+def causes(measurement: Measurement) -> np.ndarray:
+    """(h, w) uint8, `Status` of each pixel, or `SHADOW` where it is dark because the emitter does not see it."""
+    status = measurement.image.status.copy()
+    dark = np.isfinite(measurement.truth.z) & ~measurement.truth.projector_visible
+    status[dark & (status == Status.LOW_SIGNAL)] = SHADOW
+    return status

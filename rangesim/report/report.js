@@ -1,0 +1,198 @@
+"use strict";
+// Wires the page: unpacks the data, colours clouds and label images, reads out the maps.
+
+const DATA = JSON.parse(document.getElementById("data").textContent);
+const $ = (id) => document.getElementById(id);
+const all = (selector) => [...document.querySelectorAll(selector)];
+
+async function unpack(text, Type) {
+  const raw = atob(text), bytes = new Uint8Array(raw.length);
+  for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Type(await new Response(stream).arrayBuffer());
+}
+
+async function unpackInstrument(one) {
+  const s = one.segmentation;
+  const [z, error, intensity, status] = await Promise.all([
+    unpack(one.z, Uint16Array), unpack(one.error, Int16Array), unpack(one.intensity, Uint8Array), unpack(one.status, Uint8Array),
+  ]);
+  Object.assign(one, { z, error, intensity, status });
+  if (s) [s.supervoxel, s.parents, s.altitudes, s.colors] = await Promise.all([
+    unpack(s.supervoxel, s.wide ? Uint32Array : Uint16Array), unpack(s.parents, Int32Array),
+    unpack(s.altitudes, Float32Array), unpack(s.colors, Uint8Array)]);
+}
+
+// Number of merges of a tree up to and including an altitude.
+function merges(tree, altitude) {
+  let low = tree.leaves, high = tree.altitudes.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (tree.altitudes[middle] <= altitude) low = middle + 1; else high = middle;
+  }
+  return low - tree.leaves;
+}
+
+// Node of the tree that holds each node once all merges up to an altitude are done.
+function cut(tree, altitude) {
+  const last = tree.leaves + merges(tree, altitude), owner = new Int32Array(last);
+  for (let node = last - 1; node >= 0; node--) {
+    const parent = tree.parents[node];
+    owner[node] = parent < last && parent !== node ? owner[parent] : node;
+  }
+  return owner;
+}
+
+function errorIndex(metres) {
+  const share = Math.asinh(metres / DATA.errorKneeM / 2) / Math.asinh(DATA.errorLimitM / DATA.errorKneeM / 2);
+  return Math.round(255 * (0.5 + 0.5 * Math.max(-1, Math.min(1, share))));
+}
+
+const PAINT = {
+  intensity: (one, i) => [one.intensity[i], one.intensity[i], one.intensity[i]],
+  error: (one, i) => {
+    if (one.error[i] === -32768) return [203, 206, 210];
+    const k = 3 * errorIndex(one.error[i] * DATA.errorStepM);
+    return [DATA.errorColors[k], DATA.errorColors[k + 1], DATA.errorColors[k + 2]];
+  },
+  material: (one, i) => {
+    const color = DATA.materialColors[DATA.material[i]] || [203, 206, 210], shade = 0.35 + 0.65 * one.intensity[i] / 255;
+    return color.map((c) => c * shade);
+  },
+  segments: (one, i) => {
+    const s = one.segmentation;
+    if (!s || !s.supervoxel[i]) return [203, 206, 210];
+    const k = 3 * one.owner[s.supervoxel[i] - 1], shade = 0.7 + 0.3 * one.intensity[i] / 255;
+    return [s.colors[k] * shade, s.colors[k + 1] * shade, s.colors[k + 2] * shade];
+  },
+};
+
+function colors(one, mode) {
+  const rgb = new Uint8ClampedArray(3 * one.z.length);
+  for (let i = 0; i < one.z.length; i++) rgb.set(PAINT[mode](one, i), 3 * i);
+  return new Uint8Array(rgb.buffer);
+}
+
+function drawLabels(canvas, one) {
+  canvas.width = one.width;
+  canvas.height = one.height;
+  const rgb = colors(one, "segments"), context = canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
+  for (let i = 0; i < one.z.length; i++) {
+    image.data.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
+    image.data[4 * i + 3] = 255;
+  }
+  context.putImageData(image, 0, 0);
+}
+
+// The slider's altitudes: merges of all trees, highest first; logarithmic, so that coarse levels get room.
+class Levels {
+  constructor(trees) {
+    this.altitudes = trees.flatMap((t) => [...t.altitudes.subarray(t.leaves)]).filter(Number.isFinite).sort((a, b) => b - a);
+    // the highest merge of the default cut, of any tree: every tree then shows exactly its default cut
+    const done = trees.map((t) => t.leaves - t.objects).map((n, k) => n > 0 ? trees[k].altitudes[trees[k].leaves + n - 1] : 0);
+    this.usual = Math.max(0, ...done.filter(Number.isFinite));
+  }
+
+  altitude(level) {  // 0: everything joined, 1000: nothing joined
+    if (level <= 0) return Infinity;
+    if (level >= 1000) return -1;
+    return this.altitudes[Math.round(Math.exp(level / 1000 * Math.log(this.altitudes.length))) - 1] ?? -1;
+  }
+
+  level(altitude) {
+    const above = this.altitudes.findIndex((a) => a <= altitude);
+    if (altitude < 0 || above < 0) return 1000;
+    return Math.max(1, Math.round(1000 * Math.log(above + 1) / Math.log(Math.max(2, this.altitudes.length))));
+  }
+}
+
+class Page {
+  constructor() {
+    this.mode = "intensity";
+    this.levels = new Levels(DATA.instruments.map((one) => one.segmentation).filter(Boolean));
+    this.view = { ...START, depth: this.middle(), changed: () => this.redraw() };
+    this.clouds = all("canvas.cloud").map((c) => new CloudView(c, this.of(c), this.of(c).z, this.view));
+    $("level").addEventListener("input", () => { this.setMode("segments"); this.setAltitude(this.levels.altitude(+$("level").value)); });
+    all("input[name=mode]").forEach((input) => input.addEventListener("change", () => { this.setMode(input.value); this.paint(); }));
+    $("reset").addEventListener("click", () => { Object.assign(this.view, START); this.redraw(); });
+    window.addEventListener("resize", () => this.redraw());
+    all(".map").forEach((map) => {
+      map.addEventListener("pointermove", (e) => this.probe(map, e));
+      map.addEventListener("pointerleave", () => all(".map i").forEach((dot) => { dot.style.display = "none"; }));
+    });
+  }
+
+  of(element) { return DATA.instruments[+element.dataset.instrument]; }
+
+  middle() {  // metres, median depth of the first sensor that sees anything
+    const one = DATA.instruments.find((o) => o.z.some((v) => v > 0));
+    if (!one) return 1;
+    const seen = one.z.filter((v) => v > 0).sort();
+    return one.nearM + seen[seen.length >> 1] * one.stepM;
+  }
+
+  setMode(mode) {
+    this.mode = mode;
+    document.querySelector(`input[name=mode][value=${mode}]`).checked = true;
+  }
+
+  setAltitude(altitude, level) {
+    if (level !== undefined) $("level").value = level;
+    $("altitude").textContent = altitude < 0 ? "supervoxels" : altitude === Infinity ? "whole scene" : `${altitude.toPrecision(2)} rad`;
+    for (const one of DATA.instruments) if (one.segmentation) one.owner = cut(one.segmentation, altitude);
+    all("canvas.labels").forEach((canvas) => {
+      const one = this.of(canvas), s = one.segmentation;
+      drawLabels(canvas, one);
+      canvas.nextElementSibling.textContent = s ? `${s.leaves - merges(s, altitude)} segments of ${s.leaves} supervoxels` : "no points to segment";
+    });
+    if (this.mode === "segments") this.paint();
+  }
+
+  paint() {
+    this.clouds.forEach((cloud) => cloud.paint(colors(this.of(cloud.canvas), this.mode)));
+    this.redraw();
+  }
+
+  redraw() {
+    if (this.waiting) return;
+    this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.clouds.forEach((cloud) => cloud.draw()); });
+  }
+
+  probe(map, event) {
+    const box = map.getBoundingClientRect(), here = this.of(map);
+    const x = Math.floor((event.clientX - box.left) / box.width * here.width);
+    const y = Math.floor((event.clientY - box.top) / box.height * here.height), i = y * here.width + x;
+    if (!(i >= 0 && i < here.z.length)) return;
+    all(".map i").forEach((dot) => {
+      Object.assign(dot.style, { display: "block", left: `${100 * (x + 0.5) / here.width}%`, top: `${100 * (y + 0.5) / here.height}%` });
+    });
+    const material = DATA.materials[DATA.material[i]] || "nothing";
+    $("probe").innerHTML = `<b>(${x}, ${y})</b> ${material}: ` + DATA.instruments.map((one) => `<b>${one.title}</b> ${reading(one, i)}`).join(" · ");
+  }
+}
+
+function reading(one, i) {
+  if (!one.z[i]) return DATA.status[one.status[i]];
+  const z = `${(one.nearM + (one.z[i] - 1) * one.stepM).toFixed(4)} m`, mm = one.error[i] * DATA.errorStepM * 1e3;
+  if (one.error[i] === -32768) return z;
+  const sign = mm < 0 ? "−" : "+", size = Math.abs(mm);
+  return `${z}, error ${sign}${size > 327 ? "over 327" : size.toFixed(2)} mm`;
+}
+
+async function start() {
+  DATA.material = await unpack(DATA.material, Int8Array);
+  await Promise.all(DATA.instruments.map(unpackInstrument));
+  const wanted = new URLSearchParams(location.hash.slice(1));
+  const page = window.page = new Page();
+  const altitude = wanted.has("altitude") ? +wanted.get("altitude") : page.levels.usual;
+  page.setAltitude(altitude, page.levels.level(altitude));
+  if (PAINT[wanted.get("color")]) page.setMode(wanted.get("color"));
+  all("canvas.cloud").forEach((canvas) => {
+    const one = page.of(canvas), drawn = one.z.reduce((n, v) => n + (v > 0), 0);
+    canvas.nextElementSibling.textContent = `${drawn.toLocaleString("en")} points` + (one.hidden ? `; ${one.hidden} farther ones not drawn` : "");
+  });
+  page.paint();
+  page.clouds.forEach((cloud) => cloud.draw());
+  document.documentElement.dataset.ready = "yes";
+}
+start();

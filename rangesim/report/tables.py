@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers of the report as text: what was measured, per sensor and material."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rangesim.experiment import Experiment
+from rangesim.result_files import Measurement
+from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
+
+Rows = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the comparison. better : "high", "low", "near zero" or "" if no value is better than another."""
+
+    key: str
+    title: str
+    unit: str
+    meaning: str
+    better: str = "low"
+
+
+COLUMNS = (
+    Column(
+        "completeness", "complete", "%", "share of the pixels that the emitter lights which have a measurement", "high"
+    ),
+    Column("bias_m", "bias", "mm", "mean of measured minus true z; positive is too far", "near zero"),
+    Column("median_abs_m", "median error", "mm", "median of |z − true z|"),
+    Column("rmse_m", "RMSE", "mm", "root mean square of z − true z"),
+    Column("p95_abs_m", "95 % within", "mm", "95th percentile of |z − true z|"),
+    Column("outlier_rate", "outliers", "%", "share of the measurements off by more than 10 mm"),
+    Column("flying_rate", "flying", "%", "share of the measurements at depth edges that lie on neither side"),
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """text; best : of the real sensors on this material; bar : 0..1 for shares, else None."""
+
+    text: str
+    best: bool = False
+    bar: float | None = None
+
+
+def title(sensor: Sensor) -> str:
+    """What a sensor is called in running text."""
+    if isinstance(sensor, StructuredLight):
+        return "Structured light" if sensor.code == "gray-phase" else "Structured light (Gray code)"
+    if isinstance(sensor, AmcwToF):
+        return "Time of flight (AMCW)"
+    if isinstance(sensor, DirectToF):
+        return "Time of flight (direct)"
+    return "Ideal time of flight" if isinstance(sensor, IdealToF) else sensor.type_name
+
+
+def titles(measurements: Sequence[Measurement]) -> dict[str, str]:
+    """Title of each instrument by name; with the name added where two would share a title."""
+    plain = {m.name: title(m.capture.sensor) for m in measurements}
+    return {n: t if list(plain.values()).count(t) == 1 else f"{t}, {n}" for n, t in plain.items()}
+
+
+def details(sensor: Sensor) -> str:
+    """The settings of a sensor in a few words."""
+    if isinstance(sensor, StructuredLight):
+        fringes = f" and {sensor.steps}-step fringes of {sensor.period_px:g} px" if sensor.code == "gray-phase" else ""
+        size = f"{sensor.projector_width} × {sensor.projector_height}"
+        return f"Gray code{fringes} along {' and '.join(sensor.axes)}, projector {size}"
+    if isinstance(sensor, AmcwToF):
+        return f"{', '.join(f'{f / 1e6:g}' for f in sensor.modulation_hz)} MHz, 4 taps, {sensor.waveform} wave"
+    if isinstance(sensor, DirectToF):
+        return f"{sensor.bins} bins of {sensor.bin_s * 1e12:g} ps"
+    return "first return alone, no noise: the best any time-of-flight sensor could do"
+
+
+def is_reference(measurement: Measurement) -> bool:
+    """Whether the instrument is an ideal that nobody can buy."""
+    return isinstance(measurement.capture.sensor, IdealToF)
+
+
+def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
+    """Per material class, "all" first: name and cells of each instrument."""
+    names = list(dict.fromkeys(row["material"] for m in measurements for row in m.rows))
+    names.sort(key=lambda n: n != "all")
+    table = []
+    for material in names:
+        rows = {m.name: row for m in measurements for row in m.rows if row["material"] == material}
+        real = [rows[m.name] for m in measurements if m.name in rows and not is_reference(m)]
+        best = {c.key: _best(c, real) for c in COLUMNS}
+        lines = [(n, [_cell(c, row[c.key], best[c.key], row in real) for c in COLUMNS]) for n, row in rows.items()]
+        table.append((material, lines))
+    return table
+
+
+def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
+    """The same comparison in Markdown, one row per instrument and material."""
+    heads = ["material", "sensor", *(f"{c.title} ({c.unit})" for c in COLUMNS)]
+    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
+    materials = dict.fromkeys(row["material"] for _, rows in tables for row in rows)
+    for material in materials:
+        for name, rows in tables:
+            for row in rows:
+                if row["material"] == material:
+                    lines.append("| " + " | ".join([material, name, *(number(c, row[c.key]) for c in COLUMNS)]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def number(column: Column, value: float | None) -> str:
+    """A value in the column's unit, without it; a dash where it is not defined."""
+    if value is None:
+        return "–"
+    return f"{100 * value:.1f}" if column.unit == "%" else millimetres(value)
+
+
+def millimetres(metres: float) -> str:
+    """Millimetres with about three significant digits."""
+    mm = 1e3 * metres
+    digits = 3 if abs(mm) < 0.0995 else 2 if abs(mm) < 9.95 else 1 if abs(mm) < 99.5 else 0
+    return f"{mm:.{digits}f}".replace("-", "−")
+
+
+def seconds(value: float | None) -> str:
+    """A duration with its unit; a dash if there is none."""
+    if value is None:
+        return "–"
+    for unit, factor in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)):
+        if value * factor >= 0.9995:
+            return f"{value * factor:.3g} {unit}"
+    return f"{value * 1e6:.2g} µs"
+
+
+def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]]]:
+    """Per instrument: frames, exposure, acquisition, decoding, segmentation, points per pixel."""
+    table = []
+    for m in measurements:
+        f, times = m.facts, m.facts["times_s"]
+        cells = [str(f["frames"]), seconds(f["exposure_s"]), seconds(f["acquisition_s"])]
+        cells += [seconds(times.get(stage)) for stage in ("exposure", "decode", "points", "segmentation")]
+        table.append((m.name, [*cells, f"{f['points']:,}".replace(",", " "), f"{f['points'] / f['pixels']:.2f}"]))
+    return table
+
+
+def settings_line(experiment: Experiment, width: int, height: int) -> str:
+    """The settings of the light transport in one line."""
+    return (
+        f"{width} × {height} pixels, {experiment.spp} light paths per pixel of up to {experiment.max_depth} segments, "
+        f"seed {experiment.seed}"
+    )
+
+
+def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
+    values = [row[column.key] for row in rows if row[column.key] is not None]
+    if len(rows) < 2 or not values:
+        return None
+    return float(max(values) if column.better == "high" else min(values, key=abs))
+
+
+def _cell(column: Column, value: float | None, best: float | None, real: bool) -> Cell:
+    bar = value if column.unit == "%" else None
+    return Cell(number(column, value), best=real and value is not None and value == best, bar=bar)

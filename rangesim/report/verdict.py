@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the numbers say, in sentences; each is computed from the measurements and claims nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rangesim.report.tables import Rows, is_reference, millimetres, seconds, titles
+from rangesim.result_files import Measurement
+
+UNRELIABLE = 0.5
+"""Share of outliers or of missing pixels from which a material is called out."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A short paragraph. lead : its subject, shown first and in bold."""
+
+    lead: str
+    text: str
+
+
+def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
+    """Accuracy and failures of each real sensor, then who is best at what."""
+    names = titles(measurements)
+    real = [m for m in measurements if not is_reference(m)] or list(measurements)
+    findings = [Finding(names[m.name], f"{_accuracy(m.rows)}{_failures(m.rows)}") for m in real]
+    if len(real) > 1:
+        parts = [_best_error(real, names), _most_complete(real, names), _shortest_exposure(real, names)]
+        findings.append(Finding("Side by side", " ".join(filter(None, parts))))
+    return findings
+
+
+def _accuracy(rows: Rows) -> str:
+    total = _total(rows)
+    if total["median_abs_m"] is None:
+        return "measured nothing."
+    lit = f"{_percent(total['completeness'])} of the pixels that its emitter lights"
+    measured = lit if total["completeness"] is not None else "only pixels in shadow"
+    return (
+        f"measured {measured}. Half of its readings lie within {_mm(total['median_abs_m'])} of the true depth, "
+        f"{_glued('95 %')} within {_mm(total['p95_abs_m'])}."
+    )
+
+
+def _failures(rows: Rows) -> str:
+    """Materials on which most readings are wrong or missing."""
+    parts = []
+    for row in rows:
+        missing = 1 - row["completeness"] if row["completeness"] is not None else 0.0
+        wrong = row["outlier_rate"] or 0.0
+        if row["material"] != "all" and max(missing, wrong) >= UNRELIABLE:
+            parts.append(f"{row['material']} ({_percent(missing, 0)} missing, {_percent(wrong, 0)} of the rest off)")
+    listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+    return (
+        f" Not to be relied on, for missing readings or errors beyond 10\N{NO-BREAK SPACE}mm: {listed}."
+        if parts
+        else ""
+    )
+
+
+def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
+    errors = sorted((_total(m.rows)["median_abs_m"], names[m.name]) for m in real if _total(m.rows)["median_abs_m"])
+    return _ranked("Smallest median error", [(name, _mm(e)) for e, name in errors])
+
+
+def _most_complete(real: Sequence[Measurement], names: dict[str, str]) -> str:
+    shares = [(_total(m.rows)["completeness"], names[m.name]) for m in real if _total(m.rows)["completeness"]]
+    return _ranked("Most complete", [(name, _percent(s)) for s, name in sorted(shares, reverse=True)])
+
+
+def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> str:
+    times = [(m.facts["acquisition_s"], m) for m in real if m.facts["acquisition_s"]]
+    times.sort(key=lambda pair: pair[0])
+    return _ranked(
+        "Shortest exposure of all frames",
+        [(names[m.name], f"{m.facts['frames']} frames in {_glued(seconds(t))}") for t, m in times],
+    )
+
+
+def _ranked(what: str, entries: Sequence[tuple[str, str]]) -> str:
+    if len(entries) < 2:
+        return ""
+    (first, value), *others = entries
+    return f"{what}: {first}, {value} ({'; '.join(f'{n}: {v}' for n, v in others)})."
+
+
+def _total(rows: Rows) -> dict[str, Any]:
+    return next(row for row in rows if row["material"] == "all")
+
+
+def _percent(share: float | None, digits: int = 1) -> str:
+    return _glued(f"{100 * (share or 0.0):.{digits}f} %")
+
+
+def _mm(metres: float) -> str:
+    return _glued(f"{millimetres(metres)} mm")
+
+
+def _glued(quantity: str) -> str:
+    """Number and unit that no line break parts."""
+    return quantity.replace(" ", "\N{NO-BREAK SPACE}")
