@@ -69,12 +69,14 @@ def scene_around_mesh(path: Path, material: str, folder: Path) -> dict[str, Any]
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) float64 vertices in metres and (m, 3) faces of a mesh file."""
-    import open3d as o3d
+    """(n, 3) float64 vertices in metres and (m, 3) faces of a mesh file, parts of a scene graph put in their places."""
+    import trimesh
 
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh = o3d.io.read_triangle_mesh(str(path))
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # each of trimesh's parsers fails in its own way
+        raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {error}.") from error
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))
     if len(faces) == 0:
         raise FileFormatError(f"expected a triangle mesh in {path}, got {len(vertices)} vertices and no faces.")
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
@@ -84,9 +86,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _write(folder: Path, vertices: np.ndarray, faces: np.ndarray) -> str:
     """Name of a PLY file in `folder` with this mesh."""
-    import open3d as o3d
+    import trimesh
 
     target = folder / "mesh.ply"
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
-    o3d.io.write_triangle_mesh(str(target), mesh)
+    trimesh.Trimesh(vertices, faces, process=False).export(target)
     return str(target)

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The walls of the house: who may import whom, what is public, and how fast it opens."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import rangesim
+
+ROOT = Path(__file__).resolve().parent.parent
+RENDERER = {"mitsuba", "drjit"}
+RENDERING_PACKAGES = ("rangesim/light_transport/", "rangesim/scene/")
+
+
+def modules(package: str) -> list[Path]:
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def imports(path: Path, top_level_only: bool = False) -> Iterator[str]:
+    tree = ast.parse(path.read_text())
+    nodes = tree.body if top_level_only else list(ast.walk(tree))
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("path", modules("pcgraph"), ids=relative)
+def test_pcgraph_never_imports_rangesim_or_a_renderer(path: Path) -> None:
+    roots = {name.split(".")[0] for name in imports(path)}
+    assert not roots & ({"rangesim"} | RENDERER)
+
+
+@pytest.mark.parametrize("path", modules("rangesim"), ids=relative)
+def test_only_scenes_and_light_transport_import_the_renderer(path: Path) -> None:
+    rendering = relative(path).startswith(RENDERING_PACKAGES)
+    roots = {name.split(".")[0] for name in imports(path, top_level_only=True)}
+    assert rendering or not roots & RENDERER
+
+
+@pytest.mark.parametrize("path", modules("rangesim/decoders"), ids=relative)
+def test_decoders_know_neither_scene_nor_renderer(path: Path) -> None:
+    forbidden = ("rangesim.scene", "rangesim.light_transport", "rangesim.signals", "mitsuba", "drjit", "pcgraph")
+    assert not [name for name in imports(path) if name.startswith(forbidden)]
+
+
+@pytest.mark.parametrize("path", [*modules("rangesim"), *modules("pcgraph")], ids=relative)
+def test_open3d_is_imported_only_where_it_is_used(path: Path) -> None:
+    assert "open3d" not in {name.split(".")[0] for name in imports(path, top_level_only=True)}
+
+
+def test_the_public_surface_is_this() -> None:
+    assert rangesim.__all__ == [
+        "AmcwToF",
+        "Capture",
+        "Detector",
+        "DirectToF",
+        "IdealToF",
+        "Intrinsics",
+        "PointCloud",
+        "RangeImage",
+        "Rig",
+        "Scene",
+        "Sensor",
+        "Signals",
+        "SpadDetector",
+        "Status",
+        "StructuredLight",
+        "compare",
+        "decode",
+        "expose",
+        "import_capture",
+        "load_calibration",
+        "load_capture",
+        "load_scene",
+        "look_at",
+        "transport",
+    ]
+
+
+def test_every_public_name_resolves_and_says_what_it_is() -> None:
+    for name in rangesim.__all__:
+        thing = getattr(rangesim, name)
+        assert callable(thing), f"{name} is shadowed by a module"
+        assert thing.__doc__
+
+
+def run(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60).stdout
+
+
+def test_import_is_light() -> None:
+    loaded = run("import rangesim, sys; print(*sys.modules)").split()
+    assert not {"mitsuba", "drjit", "open3d", "numpy"} & set(loaded)
+
+
+def test_decoding_loads_no_renderer() -> None:
+    code = "from rangesim import decode, load_capture, StructuredLight, AmcwToF; import sys; print(*sys.modules)"
+    assert not (RENDERER | {"open3d"}) & set(run(code).split())
