@@ -36,8 +36,9 @@ def connect(
         The largest piece of each supervoxel keeps it; voxels of other pieces go, ring by ring, to the nearest
         supervoxel that touches them.
     """
-    kept = np.where(_largest_pieces(indptr, neighbours, owner), owner, np.int32(-1))
-    _adopt(features, scale, indptr, neighbours, kept)
+    n_supervoxels = int(owner.max()) + 1
+    kept = np.where(_largest_pieces(indptr, neighbours, owner, n_supervoxels), owner, np.int32(-1))
+    _adopt(features, scale, indptr, neighbours, kept, n_supervoxels)
     _, first, inverse = np.unique(kept, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int32)
     rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
@@ -46,14 +47,14 @@ def connect(
 
 @njit(cache=True)
 def _largest_pieces(
-    indptr: NDArray[np.int64], neighbours: NDArray[np.int32], owner: NDArray[np.int32]
+    indptr: NDArray[np.int64], neighbours: NDArray[np.int32], owner: NDArray[np.int32], n_supervoxels: int
 ) -> NDArray[np.bool_]:
     """Whether each voxel lies in the largest piece of its owner (the first one, if several are as large)."""
     n = len(owner)
     piece = np.full(n, -1, np.int32)
     stack = np.empty(n, np.int32)
     sizes = np.zeros(n, np.int64)
-    largest = np.full(owner.max() + 1, -1, np.int64)
+    largest = np.full(n_supervoxels, -1, np.int64)
     n_pieces = 0
     for start in range(n):
         if piece[start] >= 0:
@@ -88,22 +89,38 @@ def _adopt(
     indptr: NDArray[np.int64],
     neighbours: NDArray[np.int32],
     owner: NDArray[np.int32],
+    n_supervoxels: int,
 ) -> None:
     """Nothing; every voxel with owner -1 gets the nearest owner around it, ring by ring."""
-    n_supervoxels = owner.max() + 1
     sums, means = np.zeros((n_supervoxels, 10)), np.zeros((n_supervoxels, 9))
     update_means(features, owner, sums, means)
-    waiting = np.flatnonzero(owner < 0)
-    while len(waiting) > 0:
-        adopted = np.full(len(waiting), -1, np.int32)
-        for w in range(len(waiting)):
-            i = waiting[w]
-            least = np.inf
-            for a in range(indptr[i], indptr[i + 1]):
-                s = owner[neighbours[a]]
-                if s >= 0:
-                    d = distance(features, i, means, s, scale)
-                    if d < least or (d == least and s < adopted[w]):
-                        least, adopted[w] = d, s
-        owner[waiting] = adopted
-        waiting = waiting[adopted < 0]
+    waiting, adopted = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
+    n_waiting = 0
+    for i in range(len(owner)):
+        if owner[i] < 0:
+            waiting[n_waiting] = i
+            n_waiting += 1
+    while n_waiting > 0:
+        for w in range(n_waiting):
+            adopted[w] = _nearest_owner(waiting[w], features, scale, indptr, neighbours, owner, means)
+        left = 0
+        for w in range(n_waiting):
+            if adopted[w] >= 0:
+                owner[waiting[w]] = adopted[w]
+            else:
+                waiting[left] = waiting[w]
+                left += 1
+        n_waiting = left
+
+
+@njit(cache=True)
+def _nearest_owner(i, features, scale, indptr, neighbours, owner, means):  # type: ignore[no-untyped-def]
+    """Owner of a neighbour of voxel i with the least distance to it, the smaller of equals; -1 if there is none."""
+    nearest, least = -1, np.inf
+    for a in range(indptr[i], indptr[i + 1]):
+        s = owner[neighbours[a]]
+        if s >= 0:
+            d = distance(features, i, means, s, scale)
+            if d < least or (d == least and s < nearest):
+                nearest, least = s, d
+    return nearest

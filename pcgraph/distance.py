@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def distance(
     features: NDArray[np.float64], i: int, means: NDArray[np.float64], s: int, scale: NDArray[np.float64]
 ) -> float:

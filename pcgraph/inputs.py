@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.bounds import bounding_box
+
 _LARGEST = 1e100  # metres; beyond it squares of distances overflow
 
 
@@ -58,8 +60,9 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     if not finite.any():
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
     kept = np.ascontiguousarray(flat[finite], dtype=np.float64)
-    if np.abs(kept).max() > _LARGEST:
-        raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {np.abs(kept).max():g} m")
+    largest = float(np.abs(bounding_box(kept)).max())
+    if largest > _LARGEST:
+        raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
     return CleanCloud(kept, _colors(colors, shape, finite), _normals(normals, shape, finite), shape, finite)
 
 
@@ -70,7 +73,7 @@ def clean_viewpoint(viewpoint: ArrayLike | None, points: NDArray[np.float64], or
         if position.shape != (3,) or not np.isfinite(position).all():
             raise ValueError(f"expected a viewpoint of three finite coordinates in metres, got {viewpoint!r}")
         return position
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = bounding_box(points)
     if organised or (low > 0.0).any() or (high < 0.0).any():
         return np.zeros(3)
     above = (low + high) / 2.0

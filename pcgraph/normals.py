@@ -137,19 +137,28 @@ def oriented_normal(
             high = axis
     middle = 3 - low - high if low != high else low
     top = diagonal[high, high]
-    if low != high and diagonal[middle, middle] > 1e-9 * top:
-        normal[:] = vectors[:, low]
-    else:  # no plane: take the part of the viewing direction that is across the line, if there is a line
-        normal[:] = towards
-        if top > 0.0:
-            normal -= vectors[:, high] * np.dot(vectors[:, high].copy(), towards)
-    length = np.sqrt(np.dot(normal, normal))
-    if length <= 1e-12 * np.sqrt(np.dot(towards, towards)) or length == 0.0:
-        normal[:] = 0.0
-        normal[2] = 1.0
-        length = 1.0
-    normal /= length
-    facing = np.dot(normal, towards)
-    largest = np.argmax(np.abs(normal))
+    along = reach = squares = facing = 0.0
+    for axis in range(3):
+        along += vectors[axis, high] * towards[axis]
+        reach += towards[axis] ** 2
+    flat = low != high and diagonal[middle, middle] > 1e-9 * top
+    for axis in range(3):
+        if flat:
+            normal[axis] = vectors[axis, low]
+        else:  # no plane: take the part of the viewing direction that is across the line, if there is a line
+            normal[axis] = towards[axis] - (along * vectors[axis, high] if top > 0.0 else 0.0)
+        squares += normal[axis] ** 2
+    if squares <= 1e-24 * reach or squares == 0.0:  # the line goes through the viewpoint: any direction across it
+        for axis in range(3):
+            normal[axis] = vectors[axis, low]
+        squares = 1.0
+    for axis in range(3):
+        normal[axis] /= np.sqrt(squares)
+        facing += normal[axis] * towards[axis]
+    largest = 0
+    for axis in range(1, 3):
+        if abs(normal[axis]) > abs(normal[largest]):
+            largest = axis
     if facing < 0.0 or (facing == 0.0 and normal[largest] < 0.0):
-        normal *= -1.0
+        for axis in range(3):
+            normal[axis] = -normal[axis]

@@ -90,9 +90,8 @@ def _grow(
     best = np.full(n, np.inf)
     sums, means = np.zeros((len(seeds), 10)), np.zeros((len(seeds), 9))
     frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
-    frontier[: len(seeds)] = seeds
     for s in range(len(seeds)):
-        owner[seeds[s]] = s
+        frontier[s], owner[seeds[s]] = seeds[s], s
         best[seeds[s]] = 0.0
     n_frontier, sweep = len(seeds), 0
     while n_frontier > 0:
@@ -129,13 +128,18 @@ def _refine(
     n_supervoxels: int,
     sweeps: int,
 ) -> None:
-    """Nothing; voxels on a boundary go over to the nearest supervoxel that touches them, a few times."""
+    """Nothing; voxels on a boundary go over to the nearest supervoxel that touches them, a few times.
+
+    After the first sweep only voxels on a boundary, and those next to one that moved, are looked at again.
+    """
     sums, means = np.zeros((n_supervoxels, 10)), np.zeros((n_supervoxels, 9))
-    settled = owner.copy()
+    settled, active = owner.copy(), np.ones(len(owner), np.bool_)
     for _ in range(sweeps):
         update_means(features, settled, sums, means)
         moved = 0
         for i in range(len(settled)):
+            if not active[i]:
+                continue
             nearest, least = settled[i], -1.0
             for a in range(indptr[i], indptr[i + 1]):
                 s = settled[neighbours[a]]
@@ -145,8 +149,12 @@ def _refine(
                     d = distance(features, i, means, s, scale)
                     if d < least or (d == least and s < nearest):
                         nearest, least = s, d
-            owner[i] = nearest
+            owner[i], active[i] = nearest, least >= 0.0
             moved += nearest != settled[i]
-        settled[:] = owner
         if moved == 0:
             return
+        for i in range(len(settled)):
+            if owner[i] != settled[i]:
+                settled[i] = owner[i]
+                for a in range(indptr[i], indptr[i + 1]):
+                    active[neighbours[a]] = True

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.bounds import bounding_box
 from pcgraph.warp import Warp
 
 # Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points'
@@ -115,10 +116,10 @@ def _means(
 
 def _keys(cells: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
     """One whole number per point that sorts like (x, y, z), and what a step in x and in y adds to it."""
-    low, high = cells.min(axis=0), cells.max(axis=0)
+    low, high = bounding_box(cells)
     if not _fits(high - low):
         cells = np.stack([_without_gaps(cells[:, axis]) for axis in range(3)], axis=1)
-        low, high = cells.min(axis=0), cells.max(axis=0)
+        low, high = bounding_box(cells)
         if not _fits(high - low):
             raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
     # Two spare cells per axis keep a row's end from touching the next row's start.

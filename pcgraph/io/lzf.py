@@ -34,7 +34,8 @@ def decompress(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
             length = control + 1
             if read + length > n_source or wrote + length > n_target:
                 return -1
-            target[wrote : wrote + length] = source[read : read + length]
+            for offset in range(length):  # as a loop, for slices take the compiler seconds
+                target[wrote + offset] = source[read + offset]
             read += length
         else:
             length = control >> 5
