@@ -20,6 +20,7 @@ from rangesim.capture_files import SIDECAR, import_capture, load_capture
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
 from rangesim.exposure import expose
+from rangesim.image_files import write_grey
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 from rangesim.spad import SpadDetector
@@ -203,3 +204,32 @@ def test_broken_calibrations_are_refused(tmp_path: Path, name: str, text: str, m
     if name == "a.xml":
         with pytest.raises(ValueError, match="projector_size"):
             load_calibration(tmp_path / name)
+
+
+def test_deep_and_coloured_images_come_in_unharmed_or_are_refused(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    sensor = IdealToF()
+    deep = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
+    for suffix in (".tif", ".png"):
+        folder = tmp_path / suffix
+        folder.mkdir()
+        for i in range(2):
+            cv2.imwrite(str(folder / f"{i}{suffix}"), deep + i)
+        np.testing.assert_array_equal(import_capture(folder, sensor).frames, [deep, deep + 1])
+    cv2.imwrite(str(tmp_path / ".png" / "1.png"), np.repeat(deep[..., None], 3, axis=2))
+    with pytest.raises(FileFormatError, match="colour PNG of 16 bits"):
+        import_capture(tmp_path / ".png", sensor)
+    for i in range(2):
+        (tmp_path / ".tif" / f"{i}.tif").unlink()
+        write_grey(tmp_path / ".tif" / f"{i}.exr", deep.astype(np.float32))
+    np.testing.assert_array_equal(import_capture(tmp_path / ".tif", sensor).frames, [deep, deep])
+    (tmp_path / ".tif" / "1.exr").write_bytes(b"no picture")
+    with pytest.raises(FileFormatError, match="cannot be read as an image"):
+        import_capture(tmp_path / ".tif", sensor)
+
+
+def test_calibration_settings_must_be_positive(tmp_path: Path) -> None:
+    (tmp_path / "a.xml").write_text("<o/>")
+    for wrong in ({"code_step": 0}, {"unit_m": 0.0}):
+        with pytest.raises(ValueError, match="positive"):
+            load_calibration(tmp_path / "a.xml", (8, 8), **wrong)  # type: ignore[arg-type]
