@@ -83,23 +83,29 @@ def _merge(
         name[kept] = n_nodes + t
         t += 1
         _drop(e, ends, after, before, first, degree, version)
-        half = int(first[gone])
-        while half != _NONE:
-            following = int(after[half])
-            twin = _find(kept, ends[half ^ 1], ends, after, first, degree)
-            moved = half >> 1
-            if twin == _NONE:
-                _unhang(half, ends, after, before, first, degree)
-                ends[half] = kept
-                _hang(half, ends, after, before, first, degree)
-            else:
-                cost_sums[twin] += cost_sums[moved]
-                weights[twin] += weights[moved]
-                _drop(moved, ends, after, before, first, degree, version)
-                version[twin] += 1
-                heapq.heappush(heap, (cost_sums[twin] / weights[twin], np.int64(twin), version[twin]))
-            half = following
+        _absorb(kept, gone, ends, after, before, first, degree, version, cost_sums, weights, heap)
     return pairs[:t].copy(), altitudes[:t].copy()
+
+
+@njit(cache=True)
+def _absorb(kept, gone, ends, after, before, first, degree, version, cost_sums, weights, heap):  # type: ignore[no-untyped-def]
+    """Move the edges of one cluster to another; where both have one to the same third, the two become one."""
+    half = first[gone]
+    while half != _NONE:
+        following = after[half]
+        twin = _find(kept, ends[half ^ 1], ends, after, first, degree)
+        moved = half >> 1
+        if twin == _NONE:
+            _unhang(half, ends, after, before, first, degree)
+            ends[half] = kept
+            _hang(half, ends, after, before, first, degree)
+        else:
+            cost_sums[twin] += cost_sums[moved]
+            weights[twin] += weights[moved]
+            _drop(moved, ends, after, before, first, degree, version)
+            version[twin] += 1
+            heapq.heappush(heap, (cost_sums[twin] / weights[twin], np.int64(twin), version[twin]))
+        half = following
 
 
 @njit(cache=True)

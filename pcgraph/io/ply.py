@@ -85,7 +85,7 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
         words = line.split()
         if words[:1] == ["format"] and len(words) == 3:
             code = words[1]
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
             elements.append(PlyElement(words[1], int(words[2])))
         elif words[:1] == ["property"] and elements:
             _add_property(elements[-1], words)

@@ -168,6 +168,7 @@ PLY_LIES = {
     "no header": b"plywood",
     "truncated": PLY[:-3],
     "huge": PLY.replace(b"vertex 4", b"vertex 99999999999999"),
+    "a number too long": PLY.replace(b"vertex 4", b"vertex " + b"9" * 5000),
     "no vertex": PLY.replace(b"element vertex", b"element vortex"),
     "no x": PLY.replace(b"float x", b"float w"),
     "twice x": PLY.replace(b"float y", b"float x"),
