@@ -38,8 +38,8 @@ def main() -> None:
     args = parser.parse_args()
 
     scene = load_scene(args.scene)
-    import mitsuba as mi
     import mitransient  # noqa: F401  (registers its plugins with Mitsuba)
+    import mitsuba as mi
 
     rig = scene.rig(width=args.width, height=args.height)
     bins = LengthBins(start_m=0.0, width_m=0.04, channels=300)

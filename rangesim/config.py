@@ -88,7 +88,7 @@ def _required(field: dataclasses.Field[Any]) -> bool:
 
 def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     """`cls` itself, or the subclass that the key `type` names; removes that key from `values`."""
-    choices = {sub.type_name: sub for sub in cls.__subclasses__() if getattr(sub, "type_name", None)}
+    choices: dict[str, type[T]] = {sub.type_name: sub for sub in cls.__subclasses__() if hasattr(sub, "type_name")}  # type: ignore[attr-defined]
     own = getattr(cls, "type_name", None)
     if own:
         choices[own] = cls
@@ -108,6 +108,9 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         if value is None and type(None) in get_args(hint):
             return None
         hint = next(arg for arg in get_args(hint) if arg is not type(None))
+    if get_origin(hint) is typing.Literal and value not in get_args(hint):
+        valid = get_args(hint)
+        raise ValueError(f"{where}: expected one of {', '.join(valid)}, got {value!r}{nearest(value, valid)}.")
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_dict(hint, value, where)
     if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):

@@ -15,7 +15,8 @@ import rangesim
 from rangesim.capture import Capture
 from rangesim.experiment import Experiment, Instrument
 from rangesim.provenance import provenance
-from rangesim.result_files import SETTINGS, load_result, new_result, save_range_image, write_json
+from rangesim.result_files import FORMAT, SETTINGS, load_result, save_range_image
+from rangesim.staging import new_directory, write_json
 
 if TYPE_CHECKING:
     from rangesim.point_cloud import PointCloud
@@ -45,7 +46,7 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
     from rangesim.report import write_report
 
     say = progress or (lambda stage, share: None)
-    with new_result(out) as folder:
+    with new_directory(out, SETTINGS, FORMAT) as folder:
         times: dict[str, float] = {}
         say("Loading the scene", 0.0)
         with timed(times, "load"):

@@ -48,6 +48,7 @@ class Math(Protocol):
     def select(self, condition: Any, a: Any, b: Any) -> Any: ...
     def unsigned(self, x: Any) -> Any:
         """`x` (>= 0) truncated to a 32-bit unsigned integer."""
+
     def lookup(self, table: np.ndarray, index: Any) -> Any:
         """table[index] for a flat float32 table."""
 

@@ -14,10 +14,6 @@ DIR/experiment.json      resolved settings, versions, and which instruments shar
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -30,6 +26,7 @@ from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.range_image import RangeImage
 from rangesim.signals import EnergySplit, GroundTruth
+from rangesim.staging import read_sidecar
 
 SETTINGS = "experiment.json"
 FORMAT = "rangesim-result"
@@ -81,35 +78,6 @@ class Result:
     info: dict[str, Any]
 
 
-@contextmanager
-def new_result(directory: str | Path) -> Iterator[Path]:
-    """A directory to fill, beside `directory`; takes its place when the block ends well, vanishes if it fails.
-
-    Raises
-    ------
-    FileFormatError
-        `directory` exists and is neither empty nor a result of this package.
-    """
-    target = Path(directory)
-    _check_target(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    try:
-        inside = staging / "new"
-        inside.mkdir()
-        yield inside
-        if target.exists():
-            target.rename(staging / "old")
-        inside.rename(target)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write plain data, indented."""
-    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-
-
 def save_range_image(image: RangeImage, path: Path) -> None:
     """Write the arrays of a range image to a compressed .npz file; its camera is in the capture's sidecar."""
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
@@ -140,16 +108,7 @@ def load_result(directory: str | Path) -> Result:
 
 def read_settings(folder: Path) -> dict[str, Any]:
     """Contents of `experiment.json`; FileFormatError if there is none of ours."""
-    path = folder / SETTINGS
-    if not path.is_file():
-        raise FileFormatError(f"{folder} is no result of rangesim: it has no {SETTINGS}.")
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise FileFormatError(f"{path} is no valid JSON: {error}.") from error
-    if not isinstance(info, dict) or info.get("format") != FORMAT:
-        raise FileFormatError(f"{path} is no {FORMAT} file.")
-    return info
+    return read_sidecar(folder / SETTINGS, FORMAT)
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
@@ -179,17 +138,3 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int) -> Meas
             segmentation = Segmentation(**{f.name: data[f.name] for f in fields(Segmentation)})
     facts = json.loads((folder / "measurement.json").read_text(encoding="utf-8"))
     return Measurement(folder.name, capture, image, truth, read_rows(folder), segmentation, facts, light_pass)
-
-
-def _check_target(target: Path) -> None:
-    if not target.exists():
-        return
-    if not target.is_dir():
-        raise FileFormatError(f"{target} exists and is no directory; name another place for the results.")
-    if any(target.iterdir()):
-        try:
-            read_settings(target)
-        except FileFormatError as error:
-            raise FileFormatError(
-                f"{target} exists, is not empty and holds no result of rangesim; nothing was written."
-            ) from error

@@ -21,7 +21,7 @@ class Intrinsics:
     Parameters
     ----------
     width, height : int, pixels
-    fx, fy, cx, cy : float, pixels; pixel centres lie at integer + 0.5, so the centre of an image is (width/2, height/2).
+    fx, fy, cx, cy : float, pixels; pixel centres lie at integer + 0.5: the middle of an image is (width/2, height/2).
     distortion : tuple of 0 to 5 floats, OpenCV's order k1, k2, p1, p2, k3.
     """
 
@@ -108,7 +108,7 @@ def pose(matrix: ArrayLike, name: str) -> Array:
     rotation = result[:3, :3]
     rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(result[3], [0, 0, 0, 1]):
-        raise ValueError(f"expected {name} to be a rigid transform (rotation and translation in metres), got {result.tolist()}.")
+        raise ValueError(f"expected {name} to be rigid (a rotation and metres of translation), got {result.tolist()}.")
     result.setflags(write=False)
     return result
 

@@ -79,7 +79,9 @@ class Signals:
         """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass."""
         missing = [r for r in sensor.responses() if r not in self.channels]
         if missing:
-            raise ValueError(f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; trace it with this sensor.")
+            raise ValueError(
+                f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; trace it with this sensor."
+            )
         channels = [self.channels[r] for r in sensor.responses()]
         return sensor.frames(channels, self.energy.projector, ambient_transmission * self.energy.ambient)
 

@@ -49,7 +49,7 @@ def test_only_scenes_and_light_transport_import_the_renderer(path: Path) -> None
     assert rendering or not roots & RENDERER
 
 
-@pytest.mark.parametrize("path", modules("rangesim/decoders"), ids=relative)
+@pytest.mark.parametrize("path", modules("rangesim/decoding"), ids=relative)
 def test_decoders_know_neither_scene_nor_renderer(path: Path) -> None:
     forbidden = ("rangesim.scene", "rangesim.light_transport", "rangesim.signals", "mitsuba", "drjit", "pcgraph")
     assert not [name for name in imports(path) if name.startswith(forbidden)]

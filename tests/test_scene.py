@@ -63,7 +63,8 @@ def test_mitsuba_s_own_cornell_box_runs_as_it_is() -> None:
     select_variant()
     scene = rangesim.load_scene(mi.cornell_box())
     signals = rangesim.transport(scene, scene.rig(width=64, height=64), [rangesim.IdealToF()], spp=4)
-    assert signals.energy.ambient.max() > 0 and signals.energy.direct.mean() > 0
+    assert signals.energy.ambient.max() > 0
+    assert signals.energy.direct.mean() > 0
     assert np.isfinite(signals.truth.z).mean() > 0.8
 
 
@@ -80,7 +81,8 @@ def test_a_user_s_scene_with_integrator_and_shared_materials(tmp_path: Path) -> 
     scene = rangesim.load_scene(write(tmp_path / "user.xml", xml))
     assert [i.material for i in scene.instances] == ["glossy", "translucent", "matte", "mirror"]
     names = [i.name for i in scene.instances]
-    assert names[0] == "ball" and len(set(names)) == 4
+    assert names[0] == "ball"
+    assert len(set(names)) == 4
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.range_image import RangeImage
-    from rangesim.rig import Rig
+    from rangesim.sensors import StructuredLight
 
 CODES = ("gray", "gray-phase")
 
@@ -29,6 +30,8 @@ def decode_command(
     axes: Annotated[str, typer.Option(help="Of bare images: columns, rows, or both as columns,rows.")] = "columns,rows",
     period: Annotated[float, typer.Option(help="Of gray-phase images: fringe period, projector pixels.")] = 16.0,
     steps: Annotated[int, typer.Option(help="Of gray-phase images: phase steps per axis.")] = 4,
+    code_step: Annotated[int, typer.Option(help="Projector pixels per Gray cell when an .xml was calibrated.")] = 1,
+    unit: Annotated[float, typer.Option(help="Metres per unit of length of an .xml calibration.")] = 1e-3,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration: .json of rangesim, or .xml of procam-calibration (millimetres).")
     ] = None,
@@ -44,43 +47,48 @@ def decode_command(
 
       rangesim decode out/tabletop/gray-phase/capture --out out/decoded
 
-      rangesim decode images --code gray --projector 1024x768 --calibration calibration.xml --out out/board
+      rangesim decode images --projector 1024x768 --calibration board.xml --code-step 2 --out out/board
     """
     import rangesim
     from rangesim.cli.decoded_files import write_decoded
 
-    loaded = _load(capture, code, projector, axes, period, steps, calibration)
+    sensor = None if projector is None else _sensor(code, projector, axes, period, steps)
+    loaded = _load(capture, sensor)
+    if calibration:
+        loaded = _calibrated(loaded, calibration, code_step, unit)
     image = rangesim.decode(loaded)
     write_decoded(image, loaded, out)
     typer.echo(_summary(image, out))
 
 
-def _load(
-    folder: Path, code: str, projector: str | None, axes: str, period: float, steps: int, calibration: Path | None
-) -> Capture:
+def _load(folder: Path, sensor: StructuredLight | None) -> Capture:
     """The capture of a directory with a sidecar, or of bare images."""
     import rangesim
     from rangesim.capture_files import SIDECAR
     from rangesim.errors import FileFormatError
 
     if not folder.is_dir():
-        raise FileFormatError(f"{folder} does not exist; expected a capture or a folder of images.")
+        raise FileFormatError(f"{folder} is no directory; expected a capture or a folder of images.")
     if (folder / SIDECAR).is_file():
-        from dataclasses import replace
-
-        loaded = rangesim.load_capture(folder)
-        rig = _rig(calibration, None) if calibration else None
-        return replace(loaded, rig=rig) if rig else loaded
-    if projector is None:
+        return rangesim.load_capture(folder)
+    if sensor is None:
         raise ValueError(
             f"{folder} has no {SIDECAR}, so it holds bare images: expected --projector WIDTHxHEIGHT as well."
         )
-    sensor = _sensor(code, projector, axes, period, steps)
-    rig = _rig(calibration, (sensor.projector_width, sensor.projector_height)) if calibration else None
-    return rangesim.import_capture(folder, sensor, rig)
+    return rangesim.import_capture(folder, sensor)
 
 
-def _sensor(code: str, projector: str, axes: str, period: float, steps: int) -> Any:
+def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float) -> Capture:
+    """The capture with the rig of a calibration file."""
+    from rangesim.calibration_files import load_calibration
+    from rangesim.sensors import StructuredLight
+
+    sensor = capture.sensor
+    size = (sensor.projector_width, sensor.projector_height) if isinstance(sensor, StructuredLight) else None
+    return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
+
+
+def _sensor(code: str, projector: str, axes: str, period: float, steps: int) -> StructuredLight:
     from rangesim.config import nearest
     from rangesim.sensors import StructuredLight
 
@@ -99,17 +107,16 @@ def _sensor(code: str, projector: str, axes: str, period: float, steps: int) -> 
     )
 
 
-def _rig(calibration: Path, projector_size: tuple[int, int] | None) -> Rig:
-    from rangesim.calibration_files import load_calibration
-
-    return load_calibration(calibration, projector_size)
-
-
 def _summary(image: RangeImage, out: Path) -> str:
     """What came out, in a line."""
+    from rangesim.status import Status
+
     share = 100 * float(image.valid.mean())
     if image.camera is None:
         return f"{out}: {share:.1f} % of the pixels decoded; without --calibration there is no depth."
     z = image.z[image.valid]
     depth = f", z from {z.min():.3f} to {z.max():.3f} m" if z.size else ""
-    return f"{out}: {share:.1f} % of the pixels measured{depth}."
+    off = float((image.status == Status.CODE_ERROR).mean())
+    hint = f"; {100 * off:.1f} % of the codes miss their epipolar line or each other" if off > 0.1 else ""
+    doubt = ": check --calibration and --code-step" if hint and off > image.valid.mean() else ""
+    return f"{out}: {share:.1f} % of the pixels measured{depth}{hint}{doubt}."

@@ -4,48 +4,35 @@
 from __future__ import annotations
 
 import base64
-import shutil
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
+import rangesim
 from rangesim.capture import Capture
-from rangesim.errors import FileFormatError
+from rangesim.config import to_dict
 from rangesim.range_image import RangeImage
 from rangesim.report import figures, palette
 from rangesim.result_files import save_range_image
+from rangesim.staging import new_directory, write_json
 
-MARK = "range.npz"
+SIDECAR = "decoded.json"
+FORMAT = "rangesim-decoded"
 
 
 def write_decoded(image: RangeImage, capture: Capture, directory: Path) -> None:
-    """Write range.npz, pictures of its maps, and cloud.ply if there are points; the directory appears when complete.
+    """Write range.npz, pictures of its maps, the settings, and cloud.ply if there are points.
 
-    Raises
-    ------
-    FileFormatError
-        `directory` exists, is not empty and was not written by this function.
+    The directory appears when it is complete; FileFormatError if it exists and holds something else.
     """
-    if directory.exists() and (
-        not directory.is_dir() or (any(directory.iterdir()) and not (directory / MARK).is_file())
-    ):
-        raise FileFormatError(f"{directory} exists and holds something else; nothing was written.")
-    directory.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=f".{directory.name}-", dir=directory.parent))
-    try:
-        inside = staging / "new"
-        inside.mkdir()
-        save_range_image(image, inside / MARK)
+    settings = {"sensor": to_dict(capture.sensor), "rig": to_dict(capture.rig), "rangesim": rangesim.__version__}
+    with new_directory(directory, SIDECAR, FORMAT) as folder:
+        write_json(folder / SIDECAR, {"format": FORMAT, **settings})
+        save_range_image(image, folder / "range.npz")
         for name, uri in _pictures(image).items():
-            (inside / f"{name}.png").write_bytes(base64.b64decode(uri.partition(",")[2]))
+            (folder / f"{name}.png").write_bytes(base64.b64decode(uri.partition(",")[2]))
         if image.camera is not None and image.valid.any():
-            image.to_point_cloud().save(inside / "cloud.ply")
-        if directory.exists():
-            directory.rename(staging / "old")
-        inside.rename(directory)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+            image.to_point_cloud().save(folder / "cloud.ply")
 
 
 def _pictures(image: RangeImage) -> dict[str, str]:

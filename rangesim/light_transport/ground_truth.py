@@ -9,11 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.loop import Device, connect
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
 from rangesim.signals import GroundTruth
-from rangesim.light_transport.loop import Device, connect
 
 
 def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:

@@ -19,9 +19,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.response import LightPath
-from rangesim.rig import Intrinsics, Rig
 from rangesim.light_transport.responses import Accumulators
+from rangesim.response import LightPath
+from rangesim.rig import Intrinsics
 
 
 class Device:
@@ -69,7 +69,13 @@ class Radiance(NamedTuple):
 
 @dr.syntax
 def trace(
-    scene: Any, camera: Device, projector: Device, irradiance: Any, accumulators: Accumulators, pixel: Any, settings: Settings
+    scene: Any,
+    camera: Device,
+    projector: Device,
+    irradiance: Any,
+    accumulators: Accumulators,
+    pixel: Any,
+    settings: Settings,
 ) -> tuple[list[list[Any]], Radiance]:
     """Sums over all samples: dense channels, and radiance by kind of path; bins go to the accumulators' buffers.
 

@@ -10,14 +10,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.ground_truth import ground_truth
+from rangesim.light_transport.loop import Device, Radiance, Settings, trace
+from rangesim.light_transport.responses import Accumulators
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.sensors import Sensor
 from rangesim.signals import EnergySplit, Signals
-from rangesim.light_transport.ground_truth import ground_truth
-from rangesim.light_transport.loop import Device, Radiance, Settings, trace
-from rangesim.light_transport.responses import Accumulators
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
@@ -58,7 +58,8 @@ def transport(
     _check(rig, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
-    parts: dict[Response | None, list[np.ndarray]] = {r: [] for r in [*responses, None]}  # None: radiance by kind of path
+    channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
+    radiances: list[np.ndarray] = []
     camera, projector = Device(rig.camera, rig.T_world_camera), Device(rig.projector, rig.T_world_projector)
     settings = Settings(
         seed=dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
@@ -75,12 +76,12 @@ def transport(
         bins = accumulators.bins
         dr.eval(dense, list(radiance), list(bins.values()))  # all at once: one by one, the loop would run once for each
         for r, values in zip(responses, dense, strict=True):
-            parts[r].append(bins[r].numpy().reshape(-1, end - begin) if r in bins else _stack(values))
-        parts[None].append(_stack(radiance))
+            channels[r].append(bins[r].numpy().reshape(-1, end - begin) if r in bins else _stack(values))
+        radiances.append(_stack(radiance))
         if progress:
             progress(end / (h * w))
-    images = {r: (p[0] if len(p) == 1 else np.concatenate(p, axis=1)).reshape(-1, h, w) for r, p in parts.items()}
-    return _signals(scene, rig, Radiance(*images.pop(None)), images, spp)
+    images = {r: _join(tiles, h, w) for r, tiles in channels.items()}
+    return _signals(scene, rig, Radiance(*_join(radiances, h, w)), images, spp)
 
 
 def _signals(scene: Scene, rig: Rig, radiance: Radiance, channels: dict[Response, np.ndarray], spp: int) -> Signals:
@@ -94,6 +95,11 @@ def _signals(scene: Scene, rig: Rig, radiance: Radiance, channels: dict[Response
         ambient=radiance.ambient / np.float32(spp),
     )
     return Signals(rig, channels, split, ground_truth(scene, rig))
+
+
+def _join(tiles: list[np.ndarray], h: int, w: int) -> np.ndarray:
+    """(c, h, w) of tiles (c, pixels), without a copy where there is but one."""
+    return (tiles[0] if len(tiles) == 1 else np.concatenate(tiles, axis=1)).reshape(-1, h, w)
 
 
 def _stack(values: Sequence[Any]) -> np.ndarray:

@@ -43,6 +43,14 @@ function cut(tree, altitude) {
   return owner;
 }
 
+// Number of segments with more than 0.2 % of the points.
+function large(one) {
+  const sizes = new Uint32Array(one.owner.length);
+  let points = 0;
+  for (const s of one.segmentation.supervoxel) if (s) { sizes[one.owner[s - 1]]++; points++; }
+  return sizes.filter((n) => n > 0.002 * points).length;
+}
+
 function errorIndex(metres) {
   const share = Math.asinh(metres / DATA.errorKneeM / 2) / Math.asinh(DATA.errorLimitM / DATA.errorKneeM / 2);
   return Math.round(255 * (0.5 + 0.5 * Math.max(-1, Math.min(1, share))));
@@ -143,7 +151,9 @@ class Page {
     all("canvas.labels").forEach((canvas) => {
       const one = this.of(canvas), s = one.segmentation;
       drawLabels(canvas, one);
-      canvas.nextElementSibling.textContent = s ? `${s.leaves - merges(s, altitude)} segments of ${s.leaves} supervoxels` : "no points to segment";
+      canvas.nextElementSibling.textContent = s
+        ? `${s.leaves - merges(s, altitude)} segments, ${large(one)} of them larger than 0.2 % of the points; ${s.leaves} supervoxels`
+        : "no points to segment";
     });
     if (this.mode === "segments") this.paint();
   }

@@ -14,11 +14,11 @@ import numpy as np
 
 from rangesim.config import nearest
 from rangesim.errors import FileFormatError
+from rangesim.light_transport.backend import select_variant
 from rangesim.rig import Intrinsics
 from rangesim.scene.materials import MATERIAL_CLASSES, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.scene import Instance, Scene
-from rangesim.light_transport.backend import select_variant
 
 # Mitsuba's camera looks along +z with x to the left and y up; ours has x to the right and y down.
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -138,10 +138,14 @@ def _describe(name: str, scene: Any, names: list[str], classes: dict[str, str], 
     if not scene.shapes():
         raise FileFormatError(f"expected {label} to hold at least one shape, got an empty scene.")
     if not scene.sensors():
-        raise FileFormatError(f"expected {label} to hold a perspective sensor, got none; add <sensor type=\"perspective\">.")
+        raise FileFormatError(
+            f'expected {label} to hold a perspective sensor, got none; add <sensor type="perspective">.'
+        )
     unknown = [shape.id() for shape in scene.shapes() if shape.id() not in names]
     if unknown:
-        raise FileFormatError(f"{label}: shape {unknown[0]!r} is of a kind this package cannot name (instanced or merged).")
+        raise FileFormatError(
+            f"{label}: shape {unknown[0]!r} is of a kind this package cannot name (instanced or merged)."
+        )
     camera, T_world_camera = _camera(scene.sensors()[0], label)
     instances = tuple(Instance(shape.id(), classes[shape.id()]) for shape in scene.shapes())
     return Scene(name, scene, instances, camera, T_world_camera, _median_depth(scene, camera, T_world_camera))

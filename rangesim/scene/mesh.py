@@ -31,9 +31,8 @@ def scene_around_mesh(path: Path, material: str, folder: Path) -> dict[str, Any]
     than there are, so it gets a copy of the mesh in `folder`, which must live until the scene is instantiated.
     """
     if material not in MESH_MATERIALS:
-        raise ValueError(
-            f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{nearest(material, MESH_MATERIALS)}."
-        )
+        hint = nearest(material, MESH_MATERIALS)
+        raise ValueError(f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{hint}.")
     vertices, faces = _read(path)
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.range_image import RangeImage
 
+OVERSAMPLING = 4
+"""Bins of the transport pass per bin of a sensor with a pulse."""
+
 
 @dataclass(frozen=True)
 class IdealToF(Sensor):
@@ -103,7 +106,8 @@ class DirectToF(Sensor):
     bins : int, number of time bins.
     bin_s : float, seconds, width of a bin.
     start_s : float, seconds, delay of the first bin after the pulse.
-    pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response; 0 for none.
+    pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response; 0 for none. With a
+        pulse, paths are sorted into `OVERSAMPLING` times finer bins, so that the blur keeps their place within a bin.
     """
 
     bins: int = 256
@@ -121,16 +125,22 @@ class DirectToF(Sensor):
             )
 
     def responses(self) -> tuple[Response, ...]:
-        return (LengthBins(self.start_s * SPEED_OF_LIGHT, self.bin_s * SPEED_OF_LIGHT, self.bins),)
+        fine = self._fine
+        return (LengthBins(self.start_s * SPEED_OF_LIGHT, self.bin_s * SPEED_OF_LIGHT / fine, self.bins * fine),)
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         histogram = np.asarray(channels[0], dtype=np.float32)
         if self.pulse_fwhm_s > 0:
             from scipy.ndimage import gaussian_filter1d
 
-            sigma = self.pulse_fwhm_s / self.bin_s / np.sqrt(8 * np.log(2))
-            histogram = gaussian_filter1d(histogram, sigma, axis=0, mode="constant")
+            sigma = self._fine * self.pulse_fwhm_s / self.bin_s / np.sqrt(8 * np.log(2))
+            blurred = gaussian_filter1d(histogram, sigma, axis=0, mode="constant")
+            histogram = blurred.reshape(self.bins, self._fine, *blurred.shape[1:]).sum(axis=1)
         return np.asarray(histogram + (ambient / self.bins).astype(np.float32), dtype=np.float32)
+
+    @property
+    def _fine(self) -> int:
+        return OVERSAMPLING if self.pulse_fwhm_s > 0 else 1
 
     def frame_names(self) -> list[str]:
         return [f"bin{b:04d}" for b in range(self.bins)]
