@@ -32,8 +32,11 @@ def decode_command(
     steps: Annotated[int, typer.Option(help="Of gray-phase images: phase steps per axis.")] = 4,
     code_step: Annotated[int, typer.Option(help="Projector pixels per Gray cell when an .xml was calibrated.")] = 1,
     unit: Annotated[float, typer.Option(help="Metres per unit of length of an .xml calibration.")] = 1e-3,
+    bits: Annotated[
+        int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
+    ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration: .json of rangesim, or .xml of procam-calibration (millimetres).")
+        Path | None, typer.Option(help="Calibration: .json of rangesim, or .xml of procam-calibration.")
     ] = None,
 ) -> None:
     """Decode a capture. Needs no scene and no renderer.
@@ -53,7 +56,7 @@ def decode_command(
     from rangesim.cli.decoded_files import write_decoded
 
     sensor = None if projector is None else _sensor(code, projector, axes, period, steps)
-    loaded = _load(capture, sensor)
+    loaded = _load(capture, sensor, bits)
     if calibration:
         loaded = _calibrated(loaded, calibration, code_step, unit)
     image = rangesim.decode(loaded)
@@ -61,7 +64,7 @@ def decode_command(
     typer.echo(_summary(image, out))
 
 
-def _load(folder: Path, sensor: StructuredLight | None) -> Capture:
+def _load(folder: Path, sensor: StructuredLight | None, bits: int | None) -> Capture:
     """The capture of a directory with a sidecar, or of bare images."""
     import rangesim
     from rangesim.capture_files import SIDECAR
@@ -75,7 +78,21 @@ def _load(folder: Path, sensor: StructuredLight | None) -> Capture:
         raise ValueError(
             f"{folder} has no {SIDECAR}, so it holds bare images: expected --projector WIDTHxHEIGHT as well."
         )
-    return rangesim.import_capture(folder, sensor)
+    loaded = rangesim.import_capture(folder, sensor)
+    return loaded if bits is None else _full_scale(loaded, bits)
+
+
+def _full_scale(capture: Capture, bits: int) -> Capture:
+    """The capture with digital numbers of `bits` stretched to all bits of its type, so that white is white."""
+    import numpy as np
+
+    dtype = capture.frames.dtype
+    if not capture.is_digital or not 1 <= bits <= 8 * dtype.itemsize:
+        raise ValueError(f"expected --bits of 1 to {8 * dtype.itemsize} for {dtype} images, got {bits}.")
+    if int(capture.frames.max()) >= 2**bits:
+        raise ValueError(f"expected digital numbers below {2**bits} for --bits {bits}, got {capture.frames.max()}.")
+    stretch = np.iinfo(dtype).max / (2**bits - 1)
+    return replace(capture, frames=np.rint(capture.frames * stretch).astype(dtype))
 
 
 def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float) -> Capture:

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Directories that appear when they are complete, and never half-written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rangesim.errors import FileFormatError
+
+
+@contextmanager
+def new_directory(directory: str | Path, sidecar: str, kind: str) -> Iterator[Path]:
+    """A directory to fill, beside `directory`; takes its place when the block ends well, vanishes if it fails.
+
+    Parameters
+    ----------
+    directory : an older one of the same kind is replaced.
+    sidecar, kind : name of a JSON file and the `format` it states, by which a directory of ours is known.
+
+    Raises
+    ------
+    FileFormatError
+        `directory` exists and is neither empty nor of this kind.
+    """
+    target = Path(directory)
+    _check(target, sidecar, kind)
+    missing = [parent for parent in target.absolute().parents if not parent.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    done = False
+    try:
+        inside = staging / "new"
+        inside.mkdir()
+        yield inside
+        if target.exists():
+            target.rename(staging / "old")
+        inside.rename(target)
+        done = True
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if not done:
+            with suppress(OSError):  # somebody else put something there meanwhile
+                for parent in missing:
+                    parent.rmdir()
+
+
+def read_sidecar(path: Path, kind: str) -> dict[str, Any]:
+    """Contents of a JSON file that states `format` as `kind`; FileFormatError if it is missing or another."""
+    if not path.is_file():
+        raise FileFormatError(f"{path.parent} is no {kind} directory: it has no {path.name}.")
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FileFormatError(f"{path} is no valid JSON: {error}.") from error
+    if not isinstance(info, dict) or info.get("format") != kind:
+        raise FileFormatError(f"{path} is no {kind} file.")
+    return info
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """Write plain data, indented."""
+    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def _check(target: Path, sidecar: str, kind: str) -> None:
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise FileFormatError(f"{target} exists and is no directory; name another place with --out.")
+    if any(target.iterdir()):
+        try:
+            read_sidecar(target / sidecar, kind)
+        except FileFormatError as error:
+            raise FileFormatError(
+                f"{target} exists and holds something else than a {kind}; nothing was written, name another place."
+            ) from error

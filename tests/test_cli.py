@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `rangesim`: what works, and that what does not ends in one sentence and no files."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_result import ROOT, SCENES, SENSORS, small_result
+
+import rangesim
+from rangesim.calibration_files import save_calibration
+from rangesim.cli import main
+
+PLANE = str(SCENES / "plane.xml")
+TINY = ("--width", "48", "--height", "36", "--spp", "1")
+IDEAL = ("--sensor", "ideal-tof")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command left behind."""
+
+    status: int
+    out: str
+    err: str
+
+
+Command = Callable[..., Answer]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Calls the entry point with arguments."""
+
+    def call(*arguments: str | Path) -> Answer:
+        monkeypatch.setattr(sys, "argv", ["rangesim", *map(str, arguments)])
+        try:
+            main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+        text = capsys.readouterr()
+        return Answer(status, text.out, text.err)
+
+    return call
+
+
+def test_run_writes_a_report(command: Command, tmp_path: Path) -> None:
+    answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "new" / "result")
+    assert (answer.status, answer.err) == (0, "")
+    assert (tmp_path / "new" / "result" / "report.html").is_file()
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["result"]
+    again = command("run", PLANE, *IDEAL, *TINY, "--seed", "1", "--out", tmp_path / "new" / "result")
+    assert again.status == 0  # an older result is replaced
+
+
+def test_run_takes_an_experiment_file_that_options_override(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "one.toml").write_text(
+        f'scene = "{PLANE}"\nwidth = 640\nspp = 9\n[[instrument]]\nsensor = "amcw"\n', encoding="utf-8"
+    )
+    out = tmp_path / "out"
+    options = ("--baseline", "0.1", "--noise-free", "--max-depth", "2")
+    answer = command("run", "--config", tmp_path / "one.toml", *TINY, *options, "--out", out)
+    assert answer.status == 0, answer.err
+    info = (out / "experiment.json").read_text(encoding="utf-8")
+    for text in ('"width": 48', '"spp": 1', '"max_depth": 2', '"baseline_m": 0.1', '"noise": false'):
+        assert text in info
+    assert sorted((out / "amcw" / "capture").glob("*.exr"))  # noise-free frames are radiance
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.toml")), ids=lambda p: p.stem)
+def test_examples_run(command: Command, tmp_path: Path, example: Path) -> None:
+    answer = command("run", "--config", example, *TINY, "--out", tmp_path / "out")
+    assert answer.status == 0, answer.err
+
+
+def test_run_takes_a_bare_mesh(command: Command, tmp_path: Path) -> None:
+    corners = "0 0 0\n.1 0 0\n0 .1 0\n0 0 .1\n"
+    faces = "3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+    header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "tetrahedron.ply").write_text(header + corners + faces, encoding="ascii")
+    out = tmp_path / "out"
+    answer = command("run", tmp_path / "tetrahedron.ply", "--material", "glossy", *IDEAL, *TINY, "--out", out)
+    assert answer.status == 0, answer.err
+    assert "| glossy | ideal-tof |" in (out / "comparison.md").read_text(encoding="utf-8")
+
+
+def test_decode_gives_the_range_image_of_the_pipeline(command: Command, tmp_path: Path) -> None:
+    source = small_result() / "lines"
+    answer = command("decode", source / "capture", "--out", tmp_path / "out")
+    assert answer.status == 0, answer.err
+    assert "% of the pixels measured, z from" in answer.out
+    with np.load(tmp_path / "out" / "range.npz") as new, np.load(source / "range.npz") as old:
+        np.testing.assert_array_equal(new["z"], old["z"])
+    assert (tmp_path / "out" / "cloud.ply").read_bytes() == (source / "cloud.ply").read_bytes()
+    assert (tmp_path / "out" / "columns.png").is_file()
+
+
+def test_decode_of_bare_images(command: Command, tmp_path: Path) -> None:
+    """Without a calibration: maps and no cloud; with one: a cloud of the same depths as the capture's."""
+    (tmp_path / "images").mkdir()
+    for frame in (small_result() / "lines" / "capture").glob("*.png"):
+        shutil.copy(frame, tmp_path / "images")
+    options = ("--code", "gray-phase", "--projector", "256x160", "--axes", "columns", "--bits", "12")
+    answer = command("decode", tmp_path / "images", *options, "--out", tmp_path / "out")
+    assert answer.status == 0, answer.err
+    assert not (tmp_path / "out" / "cloud.ply").exists()
+    rig = rangesim.load_capture(small_result() / "lines" / "capture").rig
+    assert rig is not None
+    save_calibration(rig, tmp_path / "rig.json")
+    calibration = ("--calibration", tmp_path / "rig.json")
+    answer = command("decode", tmp_path / "images", *options, *calibration, "--out", tmp_path / "out")
+    assert answer.status == 0, answer.err
+    assert (tmp_path / "out" / "cloud.ply").is_file()
+    with np.load(tmp_path / "out" / "range.npz") as new, np.load(small_result() / "lines" / "range.npz") as old:
+        assert np.isfinite(new["z"]).sum() > 0.8 * np.isfinite(old["z"]).sum()
+        assert np.nanmedian(np.abs(new["z"] - old["z"])) < 1e-3
+
+
+def test_decode_of_a_real_capture(command: Command, tmp_path: Path, real_data: Path) -> None:
+    board = real_data / "graycode_board"
+    calibration = ("--calibration", board / "calibration_result.xml", "--code-step", "2")
+    answer = command("decode", board / "capture_0", "--projector", "1024x768", *calibration, "--out", tmp_path / "out")
+    assert answer.status == 0, answer.err
+    assert (tmp_path / "out" / "cloud.ply").stat().st_size > 1e6
+
+
+def test_compare_and_report(command: Command, tmp_path: Path) -> None:
+    answer = command("compare", small_result())
+    assert answer.status == 0
+    assert all(word in answer.out for word in (*SENSORS, "transparent", "median error"))
+    answer = command("compare", small_result(), "--markdown")
+    assert answer.out == (small_result() / "comparison.md").read_text(encoding="utf-8")
+    copy = tmp_path / "copy"
+    shutil.copytree(small_result(), copy)
+    (copy / "report.html").unlink()
+    assert command("report", copy).status == 0
+    assert (copy / "report.html").read_bytes() == (small_result() / "report.html").read_bytes()
+
+
+def _write_bad_files(folder: Path) -> None:
+    (folder / "broken.xml").write_text('<scene version="3.0.0"><shape', encoding="utf-8")
+    (folder / "blind.xml").write_text('<scene version="3.0.0"><shape type="sphere"/></scene>', encoding="utf-8")
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    (folder / "points.ply").write_text(header + "end_header\n0 0 0\n", encoding="ascii")
+    (folder / "key.toml").write_text('scene = "a.xml"\nmaxdepth = 3\n', encoding="utf-8")
+    (folder / "foreign").mkdir()
+    (folder / "foreign" / "thesis.txt").write_text("do not delete", encoding="utf-8")
+    (folder / "empty").mkdir()
+    shutil.copytree(small_result() / "lines" / "capture", folder / "gap")
+    next((folder / "gap").glob("*white.png")).unlink()
+    shutil.copytree(small_result() / "lines" / "capture", folder / "crop")
+    white = next((folder / "crop").glob("*white.png"))
+    with Image.open(white) as image:
+        smaller = image.crop((0, 0, 60, 60))
+    smaller.save(white)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["run", "none.xml"], "none.xml does not exist"),
+        (["run", "broken.xml"], "broken.xml is no scene Mitsuba can load"),
+        (["run", "blind.xml"], "perspective sensor, got none"),
+        (["run", "points.ply"], "1 vertices and no faces|0 vertices and no faces"),
+        (["run", PLANE, "--spp", "-3"], "spp .* at least 1, got -3"),
+        (["run", PLANE, "--width", "0"], "width .* at least 1, got 0"),
+        (["run", PLANE, "--sensor", "grey"], "did you mean 'gray'"),
+        (["run", PLANE, "--baseline", "-1"], "positive baseline_m"),
+        (["run", "points.ply", "--material", "glass"], "material"),
+        (["run", "--config", "none.toml"], "none.toml does not exist"),
+        (["run", "--config", "key.toml"], "did you mean 'max_depth'"),
+        (["decode", "none"], "none is no directory"),
+        (["decode", "empty"], "--projector"),
+        (["decode", "empty", "--projector", "wide"], "WIDTHxHEIGHT"),
+        (["decode", "empty", "--projector", "64x64", "--code", "grey"], "did you mean 'gray'"),
+        (["decode", "empty", "--projector", "64x64", "--axes", "row"], "columns, rows"),
+        (["decode", "empty", "--projector", "64x64"], "expected 26 images .* got 0"),
+        (["decode", "gap"], "white.png is missing"),
+        (["decode", "crop"], "expected 120 x 90 uint16 .* got 60 x 60"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_leaves_nothing(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], sentence: str
+) -> None:
+    _write_bad_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    answer = command(*arguments, "--out", "new/out")
+    assert answer.status == 1
+    assert re.search(sentence, answer.err)
+    assert answer.err.startswith("rangesim: ")
+    assert answer.err.count("\n") == 1
+    assert answer.out == ""
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["run", "decode"])
+def test_foreign_directories_are_left_alone(command: Command, tmp_path: Path, name: str) -> None:
+    (tmp_path / "thesis.txt").write_text("do not delete", encoding="utf-8")
+    source = PLANE if name == "run" else small_result() / "lines" / "capture"
+    answer = command(name, source, "--out", tmp_path)
+    assert answer.status == 1
+    assert "holds something else" in answer.err
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+    answer = command(name, source, "--out", tmp_path / "thesis.txt")
+    assert answer.status == 1
+    assert "is no directory" in answer.err
+
+
+@pytest.mark.parametrize("name", ["compare", "report"])
+def test_what_is_no_result_is_refused(command: Command, tmp_path: Path, name: str) -> None:
+    answer = command(name, tmp_path)
+    assert answer.status == 1
+    assert "it has no experiment.json" in answer.err
+
+
+@pytest.mark.parametrize(
+    "arguments", [["run", PLANE], ["run", PLANE, "--ssp", "3", "--out", "x"], ["run", "--out", "x"]]
+)
+def test_wrong_usage_ends_with_2(command: Command, arguments: list[str]) -> None:
+    assert command(*arguments).status == 2
+
+
+def test_a_failure_halfway_leaves_nothing(command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("rangesim.report.write_report", fail)
+    answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
+    assert (answer.status, answer.err) == (1, "rangesim: no space left on device\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_version_and_help(command: Command) -> None:
+    assert command("--version").out == f"rangesim {rangesim.__version__}\n"
+    for name in ("run", "decode", "compare", "report", "doctor"):
+        assert name in command("--help").out
+        assert command(name, "--help").status == 0
+
+
+def test_the_command_line_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, rangesim.cli; "
+        "print([m for m in ('mitsuba', 'drjit', 'open3d', 'numpy', 'matplotlib', 'numba') if m in sys.modules])"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert answer.stdout.strip() == "[]"

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Experiments as files, and what the pipeline makes of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_result import ROOT, SENSORS, small_experiment, small_result
+
+import rangesim
+from rangesim.detector import Detector
+from rangesim.errors import FileFormatError
+from rangesim.experiment import (
+    DEFAULT_SENSORS,
+    Experiment,
+    Instrument,
+    experiment_from_dict,
+    experiment_to_dict,
+    instrument,
+    load_experiment,
+)
+from rangesim.pipeline import group_by_rig, noise_seed, run
+from rangesim.result_files import load_result
+from rangesim.sensors import DirectToF, IdealToF
+from rangesim.spad import SpadDetector
+from rangesim.status import Status
+
+EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
+
+
+@pytest.mark.parametrize("experiment", [Experiment("a.xml"), small_experiment()])
+def test_what_is_written_reads_back_equal(experiment: Experiment) -> None:
+    assert experiment_from_dict(json.loads(json.dumps(experiment_to_dict(experiment)))) == experiment
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+def test_examples_are_valid(path: Path) -> None:
+    experiment = load_experiment(path)
+    assert Path(experiment.scene).is_file()
+
+
+def test_the_first_example_states_the_defaults() -> None:
+    example = load_experiment(ROOT / "examples" / "tabletop.toml")
+    usual = Experiment(example.scene)
+    assert replace(usual, instruments=example.instruments) == example
+    for given, default in zip(example.instruments, usual.instruments, strict=True):
+        assert (given.sensor, given.detector, given.power_w) == (default.sensor, default.detector, default.power_w)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({}, "missing 'scene'"),
+        ({"scene": "a", "ssp": 3}, "did you mean 'spp'"),
+        ({"scene": "a", "spp": -1}, "spp .* at least 1, got -1"),
+        ({"scene": "a", "spp": "many"}, "spp"),
+        ({"scene": "a", "seed": -1}, "seed"),
+        ({"scene": "a", "instrument": []}, "at least one instrument"),
+        ({"scene": "a", "instrument": {"sensor": "amcw"}}, "two brackets"),
+        ({"scene": "a", "instrument": [{"name": "x"}]}, "missing 'sensor'"),
+        ({"scene": "a", "instrument": [{"sensor": "grey"}]}, r"instrument\[0\].*did you mean 'gray'"),
+        ({"scene": "a", "instrument": [{"sensor": "amcw", "basline_m": 1.0}]}, "did you mean 'baseline_m'"),
+        ({"scene": "a", "instrument": [{"sensor": "amcw", "baseline_m": 0.0}]}, "positive baseline_m"),
+        ({"scene": "a", "instrument": [{"sensor": "amcw", "name": "../x"}]}, "name of letters"),
+        ({"scene": "a", "instrument": [{"sensor": "amcw"}, {"sensor": "amcw"}]}, "'amcw' twice"),
+        ({"scene": "a", "instrument": [{"name": "x", "sensor": {"type": "amcw"}}]}, "did you mean 'amcw-tof'"),
+        ({"scene": "a", "instrument": [{"sensor": "amcw", "detector": {"type": "ccd"}}]}, "emva1288"),
+    ],
+)
+def test_bad_settings_are_refused_with_what_was_meant(data: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        experiment_from_dict(data)
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="does not exist"):
+        load_experiment(tmp_path / "none.toml")
+    (tmp_path / "broken.toml").write_text("scene = ", encoding="utf-8")
+    with pytest.raises(FileFormatError, match=r"broken\.toml is no valid TOML"):
+        load_experiment(tmp_path / "broken.toml")
+
+
+def test_usual_detectors() -> None:
+    assert instrument("gray").detector == Detector()
+    assert instrument("amcw").detector == Detector.time_of_flight()
+    assert Instrument("d", DirectToF()).detector == SpadDetector()
+    assert Instrument("i", IdealToF()).detector is None
+    assert instrument("amcw", noise=False).detector is None
+
+
+def test_instruments_with_the_same_emitter_share_a_pass() -> None:
+    scene = rangesim.load_scene(ROOT / "scenes" / "plane.xml")
+    names = [*DEFAULT_SENSORS, "direct-tof", "gray"]
+    experiment = Experiment("plane.xml", width=32, height=24, instruments=tuple(instrument(n) for n in names))
+    groups = [[i.name for i in ones] for _, ones in group_by_rig(experiment, scene)]
+    assert groups == [["gray-phase", "gray"], ["amcw", "ideal-tof", "direct-tof"]]
+    far = replace(experiment, instruments=(instrument("amcw"), instrument("ideal-tof", baseline_m=0.1)))
+    assert len(group_by_rig(far, scene)) == 2
+
+
+def test_noise_differs_between_instruments_and_follows_the_seed() -> None:
+    experiment = small_experiment()
+    seeds = [noise_seed(experiment, i) for i in experiment.instruments]
+    assert len(set(seeds)) == len(seeds)
+    assert seeds == [noise_seed(experiment, i) for i in experiment.instruments]
+    assert noise_seed(replace(experiment, seed=4), experiment.instruments[0]) not in seeds
+
+
+def test_the_result_holds_every_stage() -> None:
+    result = load_result(small_result())
+    assert [m.name for m in result.measurements] == list(SENSORS)
+    assert result.experiment == small_experiment()
+    assert [m.light_pass for m in result.measurements] == [1, 2, 2, 2]
+    for m in result.measurements:
+        folder = small_result() / m.name
+        assert (folder / "cloud.ply").is_file()
+        assert m.image.z.shape == (90, 120) == m.truth.z.shape
+        assert (np.isfinite(m.image.z) == (m.image.status == Status.OK)).all()
+        assert m.segmentation is not None
+        assert (m.segmentation.supervoxels >= 0).sum() == m.facts["points"] == m.image.valid.sum()
+        assert {"exposure", "decode", "points", "segmentation"} == set(m.facts["times_s"])
+        assert m.rows[-1]["material"] == "all"
+    acquired = {m.name: m.facts["acquisition_s"] for m in result.measurements}
+    assert acquired["ideal"] is None
+    lines, histogram = result.measurements[0].facts, result.measurements[2].facts
+    assert lines["acquisition_s"] == pytest.approx(lines["frames"] * lines["exposure_s"])
+    assert histogram["acquisition_s"] == histogram["exposure_s"]  # all bins fill in one exposure
+    assert {"mitsuba", "drjit", "numpy", "python", "rangesim"} <= set(result.info["versions"])
+
+
+def test_the_captures_decode_to_the_same_range_images() -> None:
+    for m in load_result(small_result()).measurements:
+        again = rangesim.decode(rangesim.load_capture(small_result() / m.name / "capture"))
+        np.testing.assert_array_equal(again.z, m.image.z)
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+    experiment = replace(small_experiment(), instruments=small_experiment().instruments[:2])
+    run(experiment, tmp_path / "again")
+    for name in ("lines/cloud.ply", "amcw/cloud.ply", "amcw/comparison.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (small_result() / name).read_bytes()
+
+
+def test_a_sensor_that_sees_nothing_is_reported_as_such(tmp_path: Path) -> None:
+    """A detector without light: no points, no segments, and still a report."""
+    blind = Instrument("blind", SENSORS["lines"], exposure_s=1e-9)
+    run(replace(small_experiment(), instruments=(blind,), spp=1), tmp_path / "dark")
+    (measurement,) = load_result(tmp_path / "dark").measurements
+    assert measurement.facts["points"] == 0
+    assert measurement.segmentation is None
+    assert "measured nothing" in (tmp_path / "dark" / "report.html").read_text(encoding="utf-8")
+
+
+def test_progress_rises_to_the_end(tmp_path: Path) -> None:
+    seen: list[float] = []
+    one = replace(small_experiment(), instruments=(Instrument("ideal", IdealToF()),), spp=1)
+    run(one, tmp_path / "one", lambda stage, share: seen.append(share))
+    assert seen == sorted(seen)
+    assert 0.9 < seen[-1] <= 1

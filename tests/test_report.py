@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report: self-contained, true to the numbers, and looked at in a real browser."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_result import SENSORS, small_result
+
+from rangesim.doctor import find_browser
+from rangesim.report import cloud, palette, tables
+from rangesim.report.verdict import verdict
+from rangesim.result_files import load_result
+from rangesim.status import Status
+
+BROWSER = find_browser()
+CANVAS = (16, 21, 29)
+"""Background of the point clouds."""
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium found; apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def html() -> str:
+    return (small_result() / "report.html").read_text(encoding="utf-8")
+
+
+def test_it_is_one_file_that_needs_no_network(html: str) -> None:
+    without_data = re.sub(r'"data:image/png;base64,[^"]*"', '""', html)
+    assert not re.search(r"https?:|//[a-z]+\.[a-z]|@import|url\(|<link (?!rel=\"icon\" href=\"data:)", without_data)
+    assert not re.search(r"<script[^>]+src=|<iframe|<object|fetch\(|XMLHttpRequest", without_data)
+
+
+def test_every_part_is_there(html: str) -> None:
+    for part in ("scene", "numbers", "maps", "clouds", "captures", "light", "cost", "settings"):
+        assert f'id="{part}"' in html
+    for title in ("Structured light", "Time of flight (AMCW)", "Time of flight (direct)", "Ideal time of flight"):
+        assert f"<h3>{title}" in html
+    assert [int(n) for n in re.findall(r"<b>Figure (\d+)", html)] == list(range(1, 7))
+    assert html.count('class="cloud"') == html.count('class="labels"') == len(SENSORS)
+
+
+def test_the_table_shows_the_statistics(html: str) -> None:
+    for m in load_result(small_result()).measurements:
+        for row in m.rows:
+            assert f">{tables.number(tables.COLUMNS[2], row['median_abs_m'])}</span>" in html
+
+
+def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
+    result = load_result(small_result())
+    result.info["scene"]["name"] = "<script>alert(1)</script>"
+    from rangesim.report import write_report
+
+    write_report(result, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert" in text
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"), [(0.0, "0.000"), (12.34e-6, "0.012"), (-2.5e-3, "−2.50"), (0.0321, "32.1"), (1.5, "1500")]
+)
+def test_millimetres_have_three_digits(metres: float, text: str) -> None:
+    assert tables.millimetres(metres) == text
+
+
+@pytest.mark.parametrize(("value", "text"), [(None, "–"), (1.5, "1.5 s"), (0.0123, "12.3 ms"), (1e-5, "10 µs")])
+def test_seconds_have_units(value: float | None, text: str) -> None:
+    assert tables.seconds(value) == text
+
+
+def test_the_error_scale_is_odd_and_rises_to_its_limits() -> None:
+    errors = np.array([-1, -palette.ERROR_LIMIT_M, -1e-3, 0, 1e-3, palette.ERROR_LIMIT_M, 1])
+    share = palette.error_share(errors)
+    np.testing.assert_allclose(share, 1 - share[::-1])
+    np.testing.assert_allclose(share[[0, 1, 3, 5, 6]], [0, 0, 0.5, 1, 1])
+    assert (np.diff(palette.error_share(np.linspace(-0.1, 0.1, 99))) > 0).all()
+
+
+def test_dark_pixels_in_the_emitters_shadow_are_told_apart() -> None:
+    for m in load_result(small_result()).measurements:
+        found = palette.causes(m)
+        changed = found != m.image.status
+        assert (found[changed] == palette.SHADOW).all()
+        assert (m.image.status[changed] == Status.LOW_SIGNAL).all()
+        assert not m.truth.projector_visible[changed].any()
+
+
+def test_a_node_has_the_colour_of_its_largest_child() -> None:
+    """Leaves of 5, 3 and 4 points: the pair (1, 2) takes the colour of leaf 2, the root that of the pair."""
+    colors = cloud._colors(np.array([4, 3, 3, 4, 4]), np.array([5, 3, 4]))
+    assert (colors[3] == colors[2]).all()
+    assert (colors[4] == colors[3]).all()
+    assert len(np.unique(colors[:3], axis=0)) == 3
+
+
+def test_the_verdict_says_what_the_rows_say() -> None:
+    good = _measured("lines", 0.99, 1e-3, 0.01, acquisition_s=0.2)
+    poor = _measured("amcw", 0.4, 5e-3, 0.7, acquisition_s=0.1)
+    first, second, both = verdict([good, poor])
+    assert "99.0\xa0% of the pixels" in first.text
+    assert "1.00\xa0mm" in first.text
+    assert "relied" not in first.text
+    assert "glossy (60\xa0% missing, 70\xa0% of the rest off)" in second.text
+    assert "Smallest median error: Structured light, 1.00\xa0mm" in both.text
+    assert "Shortest exposure of all frames: Time of flight (AMCW)" in both.text
+
+
+def _measured(sensor: str, complete: float, median: float, outliers: float, acquisition_s: float) -> Any:
+    row = {"completeness": complete, "median_abs_m": median, "p95_abs_m": 3 * median, "outlier_rate": outliers}
+    rows = [{"material": name, **row} for name in ("glossy", "all")]
+    facts = {"acquisition_s": acquisition_s, "frames": 10}
+    return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, facts=facts)
+
+
+@needs_browser
+def test_it_draws_without_errors(tmp_path: Path) -> None:
+    """No message on the console, a picture that is not blank, and points in every cloud."""
+    picture = tmp_path / "report.png"
+    log = _browse(tmp_path, "color=error", f"--screenshot={picture}", "--window-size=1280,7000")
+    # software rendering remarks on its own speed when the picture is taken
+    said = [line for line in log.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+    assert said == []
+    with Image.open(picture) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    assert np.mean(pixels.std(axis=2) > 5) > 0.02  # colours
+    assert np.mean((pixels > 250).all(axis=2)) > 0.2  # on paper
+    background = (np.abs(pixels.astype(int) - CANVAS) <= 2).all(axis=2)
+    rows = np.flatnonzero(background.sum(axis=1) > 100)
+    assert len(rows) > 100, "no canvas of a point cloud found"
+    area = pixels[rows.min() : rows.max()]
+    for i in range(3):  # three clouds side by side; the fourth is below
+        panel = area[: len(area) // 3, 90 + i * 380 : 90 + i * 380 + 300]
+        drawn = (np.abs(panel.astype(int) - CANVAS) > 12).any(axis=2).mean()
+        assert 0.1 < drawn < 0.99, f"cloud {i + 1}: {100 * drawn:.0f} % drawn"
+
+
+@needs_browser
+@pytest.mark.parametrize("cut", ["Infinity", "usual", "-1"])
+def test_the_slider_cuts_the_trees(tmp_path: Path, cut: str) -> None:
+    """Numbers of segments in the page: one, those of the default cut, and all supervoxels."""
+    page = _browse(tmp_path, "" if cut == "usual" else f"altitude={cut}", "--dump-dom", console=False)
+    assert 'data-ready="yes"' in page
+    shown = [int(n) for n in re.findall(r'<div class="note">(\d+) segments', page)]
+    expected = []
+    for m in load_result(small_result()).measurements:
+        assert m.segmentation is not None
+        counts = {"Infinity": 0, "usual": m.segmentation.labels.max(), "-1": m.segmentation.supervoxels.max()}
+        expected.append(int(counts[cut]) + 1)
+    assert shown == expected
+    if cut == "Infinity":
+        assert 'id="altitude">whole scene<' in page
+
+
+def _browse(folder: Path, state: str, *options: str, console: bool = True) -> str:
+    """What headless Chromium prints about the report, on the console or of its document."""
+    assert BROWSER is not None
+    quiet = ("disable-background-networking", "disable-component-update", "disable-sync", "no-first-run", "no-sandbox")
+    command = [
+        BROWSER,
+        "--headless",
+        *(f"--{o}" for o in quiet),
+        "--disable-gpu",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--enable-logging=stderr",
+        "--hide-scrollbars",
+        "--virtual-time-budget=10000",
+        f"--user-data-dir={folder / 'profile'}",
+        *options,
+        f"file://{small_result() / 'report.html'}#{state}",
+    ]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr[-2000:]
+    return run.stderr if console else run.stdout
