@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the README promises runs as it stands, and so does every example."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def run(arguments: list[str], folder: Path) -> str:
+    result = subprocess.run(arguments, capture_output=True, text=True, cwd=folder, timeout=300)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len([line for line in code.splitlines() if line and not line.startswith("import")]) <= 10
+    assert "| mirror |" in run([sys.executable, "-c", code], tmp_path)
+    assert (tmp_path / "tabletop.ply").stat().st_size > 100_000
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
+def test_examples_run(path: Path, tmp_path: Path) -> None:
+    assert run([sys.executable, str(path)], tmp_path)
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    for document in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), ROOT / "CONTRIBUTING.md"]:
+        for target in re.findall(r"\]\(([^)#]+)", document.read_text()):
+            if "://" not in target:
+                assert (document.parent / target).exists(), f"{document.name} links to {target}"
