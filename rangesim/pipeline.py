@@ -31,10 +31,14 @@ FEWEST_POINTS = 3
 """Fewer points are no cloud worth grouping."""
 
 
-def run(experiment: Experiment, out: str | Path, progress: Progress | None = None) -> None:
+def run(experiment: Experiment, out: str | Path, progress: Progress | None = None, scene: Scene | None = None) -> None:
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
     The directory appears when all is done; a failure leaves nothing behind. An older result of that name is replaced.
+
+    Parameters
+    ----------
+    scene : a scene that is loaded already, for example from a dictionary; `experiment.scene` then only names it.
 
     Raises
     ------
@@ -50,7 +54,7 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
         times: dict[str, float] = {}
         say("Loading the scene", 0.0)
         with timed(times, "load"):
-            scene = rangesim.load_scene(experiment.scene, material=experiment.material)
+            scene = scene or rangesim.load_scene(experiment.scene, material=experiment.material)
         passes = group_by_rig(experiment, scene)
         for number, (rig, instruments) in enumerate(passes, 1):
             signals = _trace(experiment, scene, rig, instruments, say, number, len(passes), times)

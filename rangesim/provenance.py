@@ -35,7 +35,7 @@ def provenance(
         "experiment": experiment_to_dict(experiment),
         "scene": {
             "name": scene.name,
-            "sha256": hashlib.sha256(Path(experiment.scene).read_bytes()).hexdigest(),
+            "sha256": _checksum(Path(experiment.scene)),
             "working_distance_m": scene.working_distance_m,
             "shapes": [to_dict(i) for i in scene.instances],
         },
@@ -48,6 +48,11 @@ def provenance(
         "variant": variant,
         "times_s": times_s,
     }
+
+
+def _checksum(path: Path) -> str | None:
+    """SHA-256 of a file; None if the scene came from elsewhere."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
 def _version(package: str) -> str:

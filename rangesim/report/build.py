@@ -52,9 +52,8 @@ def context(result: Result) -> dict[str, Any]:
         "captures": [_frames(m) for m in measurements],
         "light": [_light(result, number) for number in range(len(result.energy))],
         "costs": tables.cost_table(measurements),
-        "transport": _transport(result),
+        "transport": _transport(result, names),
         "viewer": _viewer_data(result, names, error),
-        "hidden": {m.name: m for m in measurements},
         "settings": _flat(result.info["experiment"]),
         "versions": {**result.info["versions"], "Mitsuba variant": result.info["variant"]},
     }
@@ -100,11 +99,11 @@ def _light(result: Result, number: int) -> dict[str, Any]:
     }
 
 
-def _transport(result: Result) -> list[dict[str, str]]:
+def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
     times = result.info["times_s"]
     return [
         {
-            "names": ", ".join(m.name for m in result.measurements if m.light_pass == number),
+            "names": ", ".join(names[m.name] for m in result.measurements if m.light_pass == number),
             "frames": str(sum(m.facts["frames"] for m in result.measurements if m.light_pass == number)),
             "time": tables.seconds(times[f"transport_{number}"]),
         }

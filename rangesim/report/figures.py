@@ -152,7 +152,7 @@ def light_pictures(energy: EnergySplit) -> list[Picture]:
     ]
     if energy.ambient.max() > 0:
         ratio = 100 * float(energy.ambient.sum()) / total if total > 0 else float("inf")
-        text = f"ambient: every other light, before the filter; {ratio:.1f} % of the emitter’s light"
+        text = f"ambient: every other light, before any filter; {ratio:.0f} % of as much as the emitter’s"
         pictures.append(Picture(grey(energy.ambient, white), text, "ambient"))
     return pictures
 

@@ -56,37 +56,41 @@ function errorIndex(metres) {
   return Math.round(255 * (0.5 + 0.5 * Math.max(-1, Math.min(1, share))));
 }
 
+const NOTHING = [203, 206, 210];
+
+function put(rgb, i, from, k, shade) {
+  rgb[3 * i] = from[k] * shade;
+  rgb[3 * i + 1] = from[k + 1] * shade;
+  rgb[3 * i + 2] = from[k + 2] * shade;
+}
+
+// Each paints pixel i of an instrument into rgb bytes.
 const PAINT = {
-  intensity: (one, i) => [one.intensity[i], one.intensity[i], one.intensity[i]],
-  error: (one, i) => {
-    if (one.error[i] === -32768) return [203, 206, 210];
-    const k = 3 * errorIndex(one.error[i] * DATA.errorStepM);
-    return [DATA.errorColors[k], DATA.errorColors[k + 1], DATA.errorColors[k + 2]];
+  intensity: (one, i, rgb) => { rgb[3 * i] = rgb[3 * i + 1] = rgb[3 * i + 2] = one.intensity[i]; },
+  error: (one, i, rgb) => {
+    if (one.error[i] === -32768) put(rgb, i, NOTHING, 0, 1);
+    else put(rgb, i, DATA.errorColors, 3 * errorIndex(one.error[i] * DATA.errorStepM), 1);
   },
-  material: (one, i) => {
-    const color = DATA.materialColors[DATA.material[i]] || [203, 206, 210], shade = 0.35 + 0.65 * one.intensity[i] / 255;
-    return color.map((c) => c * shade);
-  },
-  segments: (one, i) => {
-    const s = one.segmentation;
-    if (!s || !s.supervoxel[i]) return [203, 206, 210];
-    const k = 3 * one.owner[s.supervoxel[i] - 1], shade = 0.7 + 0.3 * one.intensity[i] / 255;
-    return [s.colors[k] * shade, s.colors[k + 1] * shade, s.colors[k + 2] * shade];
+  material: (one, i, rgb) => put(rgb, i, DATA.materialColors[DATA.material[i]] || NOTHING, 0, 0.35 + 0.65 * one.intensity[i] / 255),
+  segments: (one, i, rgb) => {
+    const s = one.segmentation, node = s && s.supervoxel[i] ? one.owner[s.supervoxel[i] - 1] : -1;
+    if (node < 0) put(rgb, i, NOTHING, 0, 1);
+    else put(rgb, i, s.colors, 3 * node, 0.7 + 0.3 * one.intensity[i] / 255);
   },
 };
 
 function colors(one, mode) {
-  const rgb = new Uint8ClampedArray(3 * one.z.length);
-  for (let i = 0; i < one.z.length; i++) rgb.set(PAINT[mode](one, i), 3 * i);
-  return new Uint8Array(rgb.buffer);
+  const rgb = new Uint8Array(3 * one.z.length), paint = PAINT[mode];
+  for (let i = 0; i < one.z.length; i++) paint(one, i, rgb);
+  return rgb;
 }
 
-function drawLabels(canvas, one) {
+function drawLabels(canvas, one, rgb) {
   canvas.width = one.width;
   canvas.height = one.height;
-  const rgb = colors(one, "segments"), context = canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
+  const context = canvas.getContext("2d"), image = context.createImageData(one.width, one.height);
   for (let i = 0; i < one.z.length; i++) {
-    image.data.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
+    for (let c = 0; c < 3; c++) image.data[4 * i + c] = rgb[3 * i + c];
     image.data[4 * i + 3] = 255;
   }
   context.putImageData(image, 0, 0);
@@ -150,7 +154,8 @@ class Page {
     for (const one of DATA.instruments) if (one.segmentation) one.owner = cut(one.segmentation, altitude);
     all("canvas.labels").forEach((canvas) => {
       const one = this.of(canvas), s = one.segmentation;
-      drawLabels(canvas, one);
+      one.segments = colors(one, "segments");
+      drawLabels(canvas, one, one.segments);
       canvas.nextElementSibling.textContent = s
         ? `${s.leaves - merges(s, altitude)} segments, ${large(one)} of them larger than 0.2 % of the points; ${s.leaves} supervoxels`
         : "no points to segment";
@@ -159,7 +164,10 @@ class Page {
   }
 
   paint() {
-    this.clouds.forEach((cloud) => cloud.paint(colors(this.of(cloud.canvas), this.mode)));
+    this.clouds.forEach((cloud) => {
+      const one = this.of(cloud.canvas);
+      cloud.paint(this.mode === "segments" ? one.segments : colors(one, this.mode));
+    });
     this.redraw();
   }
 

@@ -32,7 +32,7 @@ COLUMNS = (
     Column("bias_m", "bias", "mm", "mean of measured minus true z; positive is too far", "near zero"),
     Column("median_abs_m", "median error", "mm", "median of |z − true z|"),
     Column("rmse_m", "RMSE", "mm", "root mean square of z − true z"),
-    Column("p95_abs_m", "95 % within", "mm", "95th percentile of |z − true z|"),
+    Column("p95_abs_m", "95\N{NO-BREAK SPACE}% within", "mm", "95th percentile of |z − true z|"),
     Column("outlier_rate", "outliers", "%", "share of the measurements off by more than 10 mm"),
     Column("flying_rate", "flying", "%", "share of the measurements at depth edges that lie on neither side"),
 )

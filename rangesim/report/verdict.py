@@ -47,18 +47,16 @@ def _accuracy(rows: Rows) -> str:
 
 def _failures(rows: Rows) -> str:
     """Materials on which most readings are wrong or missing."""
-    parts = []
+    parts: list[str] = []
     for row in rows:
         missing = 1 - row["completeness"] if row["completeness"] is not None else 0.0
         wrong = row["outlier_rate"] or 0.0
         if row["material"] != "all" and max(missing, wrong) >= UNRELIABLE:
-            parts.append(f"{row['material']} ({_percent(missing, 0)} missing, {_percent(wrong, 0)} of the rest off)")
+            limit = "" if parts else f" by over {_glued('10 mm')}"
+            found = f"{_percent(missing, 0)} missing, {_percent(wrong, 0)} of the rest wrong{limit}"
+            parts.append(f"{row['material']} ({found})")
     listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
-    return (
-        f" Not to be relied on, for missing readings or errors beyond 10\N{NO-BREAK SPACE}mm: {listed}."
-        if parts
-        else ""
-    )
+    return f" Unreliable on these surfaces: {listed}." if parts else ""
 
 
 def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:

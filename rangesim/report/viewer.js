@@ -73,7 +73,9 @@ class CloudView {
   // colors: RGB bytes per pixel of the image
   paint(colors) {
     const own = new Uint8Array(3 * this.pixels.length);
-    this.pixels.forEach((pixel, k) => own.set(colors.subarray(3 * pixel, 3 * pixel + 3), 3 * k));
+    for (let k = 0; k < this.pixels.length; k++) {
+      for (let c = 0; c < 3; c++) own[3 * k + c] = colors[3 * this.pixels[k] + c];
+    }
     const gl = this.gl, place = gl.getAttribLocation(this.program, "color");
     if (!this.colors) this.colors = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.colors);
