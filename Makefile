@@ -25,6 +25,7 @@ test-quick: $(VENV)/.installed-test ## the tests without those marked slow, with
 
 lint: $(VENV)/.installed-test ## ruff and mypy
 	$(BIN)/ruff check
+	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
 format: $(VENV)/.installed-test ## let ruff put the code in order

@@ -24,7 +24,7 @@ def main() -> None:
         signals = transport(scene, rig, list(sensors.values()), spp=64, max_depth=max_depth)
         for name, sensor in sensors.items():
             error = decode(expose(signals, sensor)).range_m - signals.truth.range_m
-            print(f"{max_depth - 2} bounces between the walls, {name:<18} median range error {1e3 * np.nanmedian(error):+.1f} mm")
+            print(f"{max_depth - 2} bounces, {name:<18} median range error {1e3 * np.nanmedian(error):+.1f} mm")
 
 
 if __name__ == "__main__":

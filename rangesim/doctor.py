@@ -37,9 +37,7 @@ values = dr.minimum(dr.sin(dr.arange(mi.Float, 64)), 0.5)
 print("a kernel runs" if abs(values[1] - 0.5) < 1e-6 else "a kernel gives wrong numbers")
 """
 _OPEN3D = "import open3d; print('Open3D', open3d.__version__)"
-_OPEN3D_FIX = (
-    "apt-get install libusb-1.0-0 libgomp1 libgl1 libegl1 libx11-6 libidn2-0 libudev1 (Debian, Ubuntu)"
-)
+_OPEN3D_FIX = "apt-get install libusb-1.0-0 libgomp1 libgl1 libegl1 libx11-6 libidn2-0 libudev1 (Debian, Ubuntu)"
 _FONT = """
 from matplotlib import font_manager as fonts
 wanted = fonts.FontProperties(family=["sans-serif"])

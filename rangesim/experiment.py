@@ -108,7 +108,7 @@ class Experiment:
     Parameters
     ----------
     scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...).
-    material : material class of a bare mesh; ignored for XML scenes.
+    material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
     spp : light paths per pixel.
     max_depth : longest path in segments up to the light; 2 is direct light alone.
@@ -117,7 +117,7 @@ class Experiment:
     """
 
     scene: str
-    material: str = "matte"
+    material: str | None = None
     width: int | None = None
     height: int | None = None
     spp: int = 64

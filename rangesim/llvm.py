@@ -38,9 +38,7 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 # libLLVM-15.so.1, libLLVM-18.so.18.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib, LLVM-C.dll; a private
 # build such as libLLVM.so.19.1-rust-1.80 is not meant for others and does not match.
-_NAME = re.compile(
-    r"libLLVM(?:-(?P<before>\d+(?:\.\d+)*))?\.(?:so(?:\.(?P<after>\d+(?:\.\d+)*))?|dylib)|LLVM-C\.dll"
-)
+_NAME = re.compile(r"libLLVM(?:-(?P<before>\d+(?:\.\d+)*))?\.(?:so(?:\.(?P<after>\d+(?:\.\d+)*))?|dylib)|LLVM-C\.dll")
 _ASK = """
 import ctypes, sys
 numbers = [ctypes.c_uint() for _ in range(3)]

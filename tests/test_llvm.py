@@ -83,9 +83,7 @@ def test_a_library_of_another_processor_is_passed_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("names", [[], ["libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1"]])
-def test_without_a_suitable_library_the_error_names_what_is_there_and_the_fix(
-    tmp_path: Path, names: list[str]
-) -> None:
+def test_without_a_suitable_library_the_error_names_what_is_there_and_the_fix(tmp_path: Path, names: list[str]) -> None:
     with pytest.raises(EnvironmentProblem) as caught:
         find_llvm([folder_with(tmp_path, *names)])
     message = str(caught.value)

@@ -130,6 +130,8 @@ def test_broken_files_get_one_clear_sentence(tmp_path: Path, name: str) -> None:
 def test_a_missing_file_and_an_unknown_material(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="does not exist"):
         rangesim.load_scene(tmp_path / "none.xml")
+    with pytest.raises(ValueError, match="names its own materials"):
+        rangesim.load_scene(SCENES / "plane.xml", material="mirror")
     with pytest.raises(ValueError, match="did you mean 'mirror'"):
         rangesim.load_scene(write(tmp_path / "mesh.obj", TETRAHEDRON), material="miror")
 

@@ -79,10 +79,12 @@ def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> st
 
 
 def _ranked(what: str, entries: Sequence[tuple[str, str]]) -> str:
-    if len(entries) < 2:
+    """Who is best, and by how much where there are two; nothing where the best are equal in the digits shown."""
+    if len(entries) < 2 or entries[0][1] == entries[1][1]:
         return ""
     (first, value), *others = entries
-    return f"{what}: {first}, {value} ({'; '.join(f'{n}: {v}' for n, v in others)})."
+    against = f" (against {others[0][1]})" if len(others) == 1 else f" (next: {others[0][0]}, {others[0][1]})"
+    return f"{what}: {first}, {value}{against}."
 
 
 def _total(rows: Rows) -> dict[str, Any]:

@@ -25,7 +25,9 @@ MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 _CLASS_KEY = "material_class"
 
 
-def load_scene(source: str | Path | Mapping[str, Any], *, material: str = "matte", variant: str | None = None) -> Scene:
+def load_scene(
+    source: str | Path | Mapping[str, Any], *, material: str | None = None, variant: str | None = None
+) -> Scene:
     """A scene to measure.
 
     Parameters
@@ -34,7 +36,7 @@ def load_scene(source: str | Path | Mapping[str, Any], *, material: str = "matte
         dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
         ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
-    material : material class of a bare mesh, one of matte, glossy, mirror, transparent.
+    material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.
     variant : Mitsuba variant; default CUDA where there is a GPU, else LLVM.
 
     Raises
@@ -42,8 +44,12 @@ def load_scene(source: str | Path | Mapping[str, Any], *, material: str = "matte
     FileFormatError
         Missing, broken or empty file, or a scene without a perspective sensor.
     ValueError
-        Unknown material class.
+        Unknown material class, or one for a scene that names its own.
     """
+    if material is not None and not _is_mesh(source):
+        raise ValueError(
+            f"a material can be chosen for a bare mesh alone, but {_label(source)} names its own materials."
+        )
     select_variant(variant)
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
@@ -60,14 +66,14 @@ def load_scene(source: str | Path | Mapping[str, Any], *, material: str = "matte
     return _describe(name, loaded[0] if isinstance(loaded, list) else loaded, names, classes, _label(source))
 
 
-def _parse(config: Any, source: str | Path | Mapping[str, Any], material: str, folder: Path) -> Any:
+def _parse(config: Any, source: str | Path | Mapping[str, Any], material: str | None, folder: Path) -> Any:
     if isinstance(source, Mapping):
         return mi.parser.parse_dict(config, dict(source))
     path = Path(source)
     if not path.is_file():
         raise FileFormatError(f"expected a scene or mesh file, but {path} does not exist.")
-    if path.suffix.lower() in MESH_SUFFIXES:
-        return mi.parser.parse_dict(config, scene_around_mesh(path, material, folder))
+    if _is_mesh(path):
+        return mi.parser.parse_dict(config, scene_around_mesh(path, material or "matte", folder))
     if path.suffix.lower() != ".xml":
         raise FileFormatError(f"expected a scene (.xml) or a mesh ({', '.join(MESH_SUFFIXES)}), got {path}.")
     mi.file_resolver().prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
@@ -173,6 +179,10 @@ def _median_depth(scene: Any, camera: Intrinsics, T_world_camera: np.ndarray, n:
     si = scene.ray_intersect_preliminary(ray, coherent=True)
     z = np.array(dr.select(si.is_valid(), si.t, dr.nan))  # directions have z = 1, so t is depth
     return float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0
+
+
+def _is_mesh(source: str | Path | Mapping[str, Any]) -> bool:
+    return not isinstance(source, Mapping) and Path(source).suffix.lower() in MESH_SUFFIXES
 
 
 def _label(source: str | Path | Mapping[str, Any]) -> str:
