@@ -134,6 +134,7 @@ class CloudView {
       }
       view.changed();
     });
+    canvas.addEventListener("dblclick", () => (document.fullscreenElement ? document.exitFullscreen() : canvas.requestFullscreen()));
     canvas.addEventListener("contextmenu", (e) => e.preventDefault());
     canvas.addEventListener("wheel", (e) => {
       e.preventDefault();
