@@ -19,6 +19,7 @@ from small_result import ROOT, SCENES, SENSORS, small_result
 import rangesim
 from rangesim.calibration_files import save_calibration
 from rangesim.cli import main
+from rangesim.cli.progress import progress_bar
 
 PLANE = str(SCENES / "plane.xml")
 TINY = ("--width", "48", "--height", "36", "--spp", "1")
@@ -178,6 +179,7 @@ def _write_bad_files(folder: Path) -> None:
         (["run", PLANE, "--sensor", "grey"], "did you mean 'gray'"),
         (["run", PLANE, "--baseline", "-1"], "positive baseline_m"),
         (["run", "points.ply", "--material", "glass"], "material"),
+        (["run", PLANE, "--material", "glossy"], "names its own materials"),
         (["run", "--config", "none.toml"], "none.toml does not exist"),
         (["run", "--config", "key.toml"], "did you mean 'max_depth'"),
         (["decode", "none"], "none is no directory"),
@@ -240,6 +242,20 @@ def test_a_failure_halfway_leaves_nothing(command: Command, tmp_path: Path, monk
     answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
     assert (answer.status, answer.err) == (1, "rangesim: no space left on device\n")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_shows_on_a_terminal_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress_bar() as progress:
+        assert progress is None
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with progress_bar() as progress:
+        assert progress is not None
+        progress("Tracing light", 0.5)
+    text = capsys.readouterr()
+    assert text.out == ""
+    assert "Tracing light" in text.err
 
 
 def test_version_and_help(command: Command) -> None:

@@ -39,6 +39,7 @@ def context(result: Result) -> dict[str, Any]:
         "script": Markup("\n".join(_asset(name) for name in SCRIPTS)),
         "scene": result.info["scene"],
         "titles": names,
+        "references": [m.name for m in measurements if tables.is_reference(m)],
         "settings_line": tables.settings_line(result.experiment, camera[2], camera[1]),
         "verdict": verdict(measurements),
         "scene_picture": figures.scene_picture(result.energy[0]),
