@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from typing import Annotated
 
@@ -48,10 +49,18 @@ def root(
 
 def main() -> None:
     """Entry point: errors become one sentence on stderr and exit status 1."""
-    if "--debug" in sys.argv[1:]:
-        app()
+    usual = signal.signal(signal.SIGTERM, _end)
     try:
         app()
     except (RangesimError, ValueError, OSError) as error:
+        if "--debug" in sys.argv:
+            raise
         typer.echo(f"rangesim: {' '.join(str(error).split())}", err=True)
         sys.exit(1)
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+
+
+def _end(number: int, _: object) -> None:
+    """Leave by an exception, so that half-written directories are removed."""
+    sys.exit(128 + number)
