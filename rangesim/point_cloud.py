@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -70,6 +71,21 @@ class PointCloud:
         from rangesim.point_cloud_files import save_point_cloud
 
         save_point_cloud(self, path)
+
+    def to_open3d(self) -> Any:
+        """`open3d.geometry.PointCloud` of the finite points, with normals and colours (of intensity, if none)."""
+        import open3d
+
+        finite = self.finite()
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(finite.points.astype(np.float64)))
+        if finite.normals is not None:
+            cloud.normals = open3d.utility.Vector3dVector(finite.normals.astype(np.float64))
+        if finite.colors is not None:
+            cloud.colors = open3d.utility.Vector3dVector(finite.colors / 255.0)
+        elif finite.intensity is not None:
+            grey = np.clip(finite.intensity / max(np.quantile(finite.intensity, 0.99), 1e-30), 0, 1)
+            cloud.colors = open3d.utility.Vector3dVector(np.repeat(grey[:, None], 3, axis=1).astype(np.float64))
+        return cloud
 
 
 def from_range_image(image: RangeImage, frame: str = "camera") -> PointCloud:

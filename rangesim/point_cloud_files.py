@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds as binary PLY and PCD files.
+"""Point clouds written as binary PLY and PCD files.
 
 Fields: x y z, and where present normals, intensity, colour and confidence, under the names that Open3D, PCL
-and MeshLab know. The frame goes into a comment line.
+and MeshLab know. The frame goes into a comment line. `pcgraph.read_cloud` reads them back.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from rangesim.errors import FileFormatError
-from rangesim.point_cloud import FRAMES, PointCloud
+from rangesim.point_cloud import PointCloud
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short",
               "u4": "uint", "i4": "int"}  # fmt: skip
-_PLY_DTYPES = {name: code for code, name in _PLY_TYPES.items()} | {"float32": "f4", "float64": "f8", "uint8": "u1"}
 
 
 def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
@@ -46,25 +43,6 @@ def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
         os.replace(staging, path)
     finally:
         Path(staging).unlink(missing_ok=True)
-
-
-def load_point_cloud(path: str | Path) -> PointCloud:
-    """A cloud from a binary little-endian PLY or uncompressed binary PCD of scalar fields, such as `save`
-    writes.
-
-    Raises
-    ------
-    FileFormatError
-        The file is missing, of another kind, cut short, or has no x, y, z.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileFormatError(f"{path} does not exist; expected a point cloud (.ply or .pcd).")
-    try:
-        readers = {".ply": _read_ply, ".pcd": _read_pcd}
-        return readers[path.suffix.lower()](path.read_bytes())
-    except (KeyError, IndexError, ValueError) as error:
-        raise FileFormatError(f"{path} is no binary PLY or PCD cloud of this kind: {error}.") from error
 
 
 def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:
@@ -116,71 +94,3 @@ def _pcd_bytes(cloud: PointCloud) -> bytes:
         "DATA binary\n",
     ]
     return "\n".join(lines).encode() + table.tobytes()
-
-
-def _read_ply(data: bytes) -> PointCloud:
-    header, body = _split(data, b"end_header")
-    words = [line.split() for line in header]
-    if ["format", "binary_little_endian", "1.0"] not in words:
-        raise ValueError("expected a header with 'format binary_little_endian 1.0'")
-    elements = [w for w in words if w[0] == "element"]
-    if not elements or elements[0][1] != "vertex":
-        raise ValueError("expected vertices as the first element")
-    end = words.index(elements[1]) if len(elements) > 1 else len(words)
-    kinds = [(w[2], "<" + _PLY_DTYPES[w[1]]) for w in words[:end] if w[0] == "property"]
-    table = np.frombuffer(body, dtype=np.dtype(kinds), count=int(elements[0][2]))
-    return _cloud(table, (len(table),), _frame(header))
-
-
-def _read_pcd(data: bytes) -> PointCloud:
-    header, body = _split(data, b"DATA binary")
-    fields = {line.split()[0]: line.split()[1:] for line in header}
-    kinds = [
-        (name, f"<{kind.lower()}{size}")
-        for name, kind, size in zip(fields["FIELDS"], fields["TYPE"], fields["SIZE"], strict=True)
-    ]
-    height, width = int(fields["HEIGHT"][0]), int(fields["WIDTH"][0])
-    table = np.frombuffer(body, dtype=np.dtype(kinds), count=height * width)
-    return _cloud(table, (height, width) if height > 1 else (width,), _frame(header))
-
-
-def _split(data: bytes, last: bytes) -> tuple[list[str], bytes]:
-    """Header lines, and the bytes after the line `last`."""
-    start = data.find(last + b"\n")
-    if start < 0:
-        raise ValueError(f"expected a header that ends with {last.decode()!r}")
-    lines = data[:start].decode("ascii").splitlines()
-    return [line for line in lines if line.strip()], data[start + len(last) + 1 :]
-
-
-def _frame(header: list[str]) -> str:
-    words = " ".join(header).replace(",", " ").split()
-    named = [b for a, b in itertools.pairwise(words) if a == "frame" and b in FRAMES]
-    return named[0] if named else "camera"
-
-
-def _cloud(table: np.ndarray, shape: tuple[int, ...], frame: str) -> PointCloud:
-    names = table.dtype.names or ()
-
-    def stack(*fields: str) -> np.ndarray | None:
-        if not all(f in names for f in fields):
-            return None
-        return np.stack([table[f] for f in fields], axis=-1).reshape(*shape, len(fields))
-
-    points = stack("x", "y", "z")
-    if points is None:
-        raise ValueError(f"expected fields x, y, z, got {', '.join(names)}")
-    colors = stack("red", "green", "blue")
-    if "rgb" in names:
-        packed = np.ascontiguousarray(table["rgb"]).view(np.uint32).reshape(shape)
-        colors = np.stack([packed >> 16, packed >> 8, packed], axis=-1).astype(np.uint8)
-    normals = stack("nx", "ny", "nz")
-    single = {n: np.array(table[n]).reshape(shape) for n in ("intensity", "confidence") if n in names}
-    return PointCloud(
-        points.astype(np.float32),
-        frame,
-        normals=stack("normal_x", "normal_y", "normal_z") if normals is None else normals,
-        intensity=single.get("intensity"),
-        colors=colors,
-        confidence=single.get("confidence"),
-    )
