@@ -3,12 +3,39 @@
 
 from __future__ import annotations
 
-from rangesim.capture import Capture
-from rangesim.range_image import RangeImage
+from collections.abc import Callable
 
-__all__ = ["decode"]
+from rangesim.capture import Capture
+from rangesim.decoding.amcw import decode_amcw
+from rangesim.decoding.histogram import decode_direct
+from rangesim.decoding.path_length import decode_ideal
+from rangesim.decoding.structured_light import decode_structured_light
+from rangesim.range_image import RangeImage
+from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
+
+__all__ = ["DECODERS", "decode"]
+
+DECODERS: dict[type[Sensor], Callable[[Capture], RangeImage]] = {
+    StructuredLight: decode_structured_light,
+    IdealToF: decode_ideal,
+    AmcwToF: decode_amcw,
+    DirectToF: decode_direct,
+}
+"""The decoder of each kind of sensor; a sensor of your own adds its own here."""
 
 
 def decode(capture: Capture) -> RangeImage:
-    """Range image of a capture, by the decoder of its sensor with the default thresholds (see docs/decoding.md)."""
-    return capture.sensor.decode(capture)
+    """Range image of a capture, by the decoder of its sensor with the default thresholds (see docs/decoding.md).
+
+    Raises
+    ------
+    ValueError
+        There is no decoder for this kind of sensor.
+    """
+    decoder = DECODERS.get(type(capture.sensor))
+    if decoder is None:
+        known = ", ".join(kind.__name__ for kind in DECODERS)
+        raise ValueError(
+            f"expected a capture of {known}, got one of {type(capture.sensor).__name__}; add it to DECODERS."
+        )
+    return decoder(capture)

@@ -5,21 +5,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from rangesim.response import Response
 
-if TYPE_CHECKING:
-    from rangesim.capture import Capture
-    from rangesim.range_image import RangeImage
-
 
 class Sensor(ABC):
-    """A measuring principle: which responses to light paths it reads, and how to decode its frames.
+    """A measuring principle: which responses to light paths it reads, and which frames it makes of them.
 
-    A sensor holds no geometry (that is the `Rig`) and no electronics (that is the `Detector`).
+    A sensor holds no geometry (that is the `Rig`), no electronics (the `Detector`) and no decoder (`rangesim.decoding`).
     Subclasses are frozen dataclasses.
     """
 
@@ -44,10 +40,6 @@ class Sensor(ABC):
     @abstractmethod
     def frame_names(self) -> list[str]:
         """One short name per frame, as used for files and plots."""
-
-    @abstractmethod
-    def decode(self, capture: Capture) -> RangeImage:
-        """Range image of a capture; needs neither scene nor renderer."""
 
     @property
     def n_frames(self) -> int:

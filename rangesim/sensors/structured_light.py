@@ -5,16 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
 from rangesim.sensors.base import Sensor
-
-if TYPE_CHECKING:
-    from rangesim.capture import Capture
-    from rangesim.range_image import RangeImage
 
 CODES = ("gray", "gray-phase")
 AXES = ("columns", "rows")
@@ -107,11 +103,6 @@ class StructuredLight(Sensor):
         path = LightPath(x, y, 0 * x, True)
         weights = [np.stack(r.weights(path, NumpyMath())) for r in self.responses()]  # type: ignore[arg-type]
         return self.frames(weights, np.ones_like(x), np.zeros_like(x))
-
-    def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decoding.structured_light import decode_structured_light
-
-        return decode_structured_light(capture)
 
     def _coded(self) -> Iterator[tuple[str, GrayBits | Fringes]]:
         """Axis and response of each run of frames before white and black."""

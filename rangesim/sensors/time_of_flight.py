@@ -5,16 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from rangesim.response import SPEED_OF_LIGHT, FirstReturn, LengthBins, Phasor, Response
 from rangesim.sensors.base import Sensor
-
-if TYPE_CHECKING:
-    from rangesim.capture import Capture
-    from rangesim.range_image import RangeImage
 
 OVERSAMPLING = 4
 """Bins of the transport pass per bin of a sensor with a pulse."""
@@ -37,11 +33,6 @@ class IdealToF(Sensor):
 
     def frame_names(self) -> list[str]:
         return ["radiance", "radiance_x_length"]
-
-    def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decoding.path_length import decode_ideal
-
-        return decode_ideal(capture)
 
 
 @dataclass(frozen=True)
@@ -88,11 +79,6 @@ class AmcwToF(Sensor):
 
     def frame_names(self) -> list[str]:
         return [f"{f / 1e6:g}MHz_{tap}deg" for f in self.modulation_hz for tap in (0, 90, 180, 270)]
-
-    def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decoding.amcw import decode_amcw
-
-        return decode_amcw(capture)
 
 
 @dataclass(frozen=True)
@@ -144,8 +130,3 @@ class DirectToF(Sensor):
 
     def frame_names(self) -> list[str]:
         return [f"bin{b:04d}" for b in range(self.bins)]
-
-    def decode(self, capture: Capture) -> RangeImage:
-        from rangesim.decoding.histogram import decode_direct
-
-        return decode_direct(capture)
