@@ -19,7 +19,7 @@ from rangesim.decoding.structured_light import decode_structured_light
 from rangesim.decoding.triangulate import triangulate
 from rangesim.detector import Detector
 from rangesim.exposure import expose
-from rangesim.rig import Intrinsics, Rig
+from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import IdealToF, StructuredLight
 from rangesim.status import Status
 
@@ -186,6 +186,39 @@ def test_points_behind_and_off_the_epipolar_line_are_refused() -> None:
     mirrored = dataclasses.replace(capture, frames=capture.frames[:, :, ::-1].copy())
     status = decode(mirrored).status
     assert (status == Status.OUT_OF_RANGE).any()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_relative_error_is_the_derivative_of_depth(axis: int) -> None:
+    rig = dataclasses.replace(stereo_rig(), T_camera_projector=stereo_rig().T_camera_projector @ translation(0, 0.1, 0))
+    rays = rig.camera.directions(rig.camera.pixel_centres()[::30, ::30].reshape(-1, 2))
+    z = np.linspace(0.8, 3, len(rays))
+    pose = rig.T_camera_projector
+    u = rig.projector.project((rays * z[:, None] - pose[:3, 3]) @ pose[:3, :3])[:, axis]
+    at, beside = (triangulate(rays, rig, *((c, None) if axis == 0 else (None, c))) for c in (u, u + 1e-4))
+    np.testing.assert_allclose(at.relative_error, np.abs(beside.z / at.z - 1) / 1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("distance_m", [1.0, 3.0])
+def test_rows_along_the_baseline_measure_nothing_and_say_so(distance_m: float) -> None:
+    rig, sensor = stereo_rig(), StructuredLight(code="gray", axes=("rows",))
+    signals = plane_signals(rig, sensor, distance_m=distance_m)
+    image = decode(expose(signals, sensor))
+    assert image.valid.mean() < 0.02
+    assert (image.status == Status.OUT_OF_RANGE).mean() > 0.98
+    error = np.abs(image.z / signals.truth.z - 1)[image.valid]
+    assert (error < 0.06).all()  # what is left keeps its promise
+
+
+@pytest.mark.parametrize("axes", [("columns",), BOTH])
+def test_depth_ends_where_half_a_projector_pixel_means_five_per_cent(axes: tuple[str, ...]) -> None:
+    """Parallel axes: 0.5 z / (f b) = 0.05 at 22.2 m, for f = 1108.5 px and b = 0.2 m."""
+    rig, sensor = stereo_rig(T_camera_projector=translation(0.2, 0, 0)), StructuredLight(axes=axes)  # type: ignore[arg-type]
+    limit = 0.1 * rig.projector.fx * rig.baseline_m
+    z = np.tile(np.concatenate([np.linspace(2, 0.98 * limit, 80), np.linspace(1.02 * limit, 150, 80)]), (120, 1))
+    capture = expose(signals_of_depth(rig, z, [sensor]), sensor)
+    np.testing.assert_array_equal(decode(capture).status, np.where(z < limit, Status.OK, Status.OUT_OF_RANGE))
+    assert decode_structured_light(capture, max_relative_error=np.inf).valid.all()
 
 
 def test_wrong_sensor_and_wrong_projector_are_refused() -> None:

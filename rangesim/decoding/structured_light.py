@@ -16,9 +16,16 @@ from rangesim.status import Status
 
 EPIPOLAR_TOLERANCE_PX = 5.0
 """Projector pixels by which column and row may disagree with each other."""
+COORDINATE_ERROR_PX = 0.5
+MAX_RELATIVE_ERROR = 0.05
+"""Where an error of half a projector pixel means a larger share of the depth, the geometry measures no depth."""
 
 
-def decode_structured_light(capture: Capture, epipolar_tolerance_px: float = EPIPOLAR_TOLERANCE_PX) -> RangeImage:
+def decode_structured_light(
+    capture: Capture,
+    epipolar_tolerance_px: float = EPIPOLAR_TOLERANCE_PX,
+    max_relative_error: float = MAX_RELATIVE_ERROR,
+) -> RangeImage:
     """Range image of a Gray code or Gray code + phase shift capture.
 
     Without a rig, only the projector coordinates are decoded: z is NaN everywhere, `status` is that of the
@@ -28,6 +35,9 @@ def decode_structured_light(capture: Capture, epipolar_tolerance_px: float = EPI
     ----------
     epipolar_tolerance_px : float, projector pixels; where both axes are coded, pixels whose column and row
         miss the epipolar line by more get `CODE_ERROR`.
+    max_relative_error : float; the working range: pixels where half a projector pixel of error would shift the
+        depth by a larger share get `OUT_OF_RANGE`. With parallel axes z may be at most 2 f b max_relative_error, f the
+        projector's focal length in pixels, b the baseline; light planes along the baseline measure nothing.
 
     Raises
     ------
@@ -42,7 +52,9 @@ def decode_structured_light(capture: Capture, epipolar_tolerance_px: float = EPI
     z = np.full(status.shape, np.nan, dtype=np.float32)
     range_m = z.copy()
     if capture.rig is not None:
-        z[decoded], range_m[decoded], status[decoded] = _depth(capture.rig, decoded, column, row, epipolar_tolerance_px)
+        z[decoded], range_m[decoded], status[decoded] = _depth(
+            capture.rig, decoded, column, row, epipolar_tolerance_px, max_relative_error
+        )
     contrast, _ = direct_contrast(capture)
     return RangeImage(
         z=z,
@@ -103,7 +115,12 @@ def _masked(code: GrayCode | None, decoded: np.ndarray) -> np.ndarray | None:
 
 
 def _depth(
-    rig: Rig, decoded: np.ndarray, column: np.ndarray | None, row: np.ndarray | None, tolerance_px: float
+    rig: Rig,
+    decoded: np.ndarray,
+    column: np.ndarray | None,
+    row: np.ndarray | None,
+    tolerance_px: float,
+    max_relative_error: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """z, range and status of the decoded pixels, (n,) each."""
     directions = rig.camera.directions(rig.camera.pixel_centres()[decoded])
@@ -114,7 +131,8 @@ def _depth(
         None if row is None else row[decoded],
     )
     status = np.zeros(len(directions), dtype=np.uint8)
-    status[~np.isfinite(result.z)] = Status.OUT_OF_RANGE
+    usable = result.relative_error * COORDINATE_ERROR_PX <= max_relative_error
+    status[~(np.isfinite(result.z) & usable)] = Status.OUT_OF_RANGE
     status[result.epipolar_px > tolerance_px] = Status.CODE_ERROR
     z = np.where(status == Status.OK, result.z, np.nan)
     return z, z * np.linalg.norm(directions, axis=-1), status

@@ -20,10 +20,12 @@ class Triangulation:
 
     epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected
         coordinate; zero if only one axis was decoded.
+    relative_error : (n,) float64, error of z as a share of z that one projector pixel of error means, |dz/dx_p| / z.
     """
 
     z: np.ndarray
     epipolar_px: np.ndarray
+    relative_error: np.ndarray
 
 
 def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row: np.ndarray | None) -> Triangulation:
@@ -32,7 +34,8 @@ def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row
     With a = R^T d and b = -R^T t (camera ray d and camera centre in the projector frame), the point at depth
     z projects to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z. Column x_p and row y_p each
     give an equation linear in w (ray meets plane); with both, w is their least-squares solution in projector
-    pixels.
+    pixels. The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w b_z), axes in
+    quadrature (lens distortion left out).
 
     Parameters
     ----------
@@ -57,7 +60,7 @@ def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for _ in range(rounds):
             xy = projector.normalise(np.stack([u, v], axis=-1))
-            w = _inverse_depth(a, b, xy, projector, column is not None, row is not None)
+            w, slope = _inverse_depth(a, b, xy, projector, column is not None, row is not None)
             if rounds == 1:
                 break
             u, v, change = _complete(a + w[:, None] * b, projector, u, v, column is None)
@@ -67,20 +70,21 @@ def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row
         z = np.where((w > 0) & np.isfinite(w) & (point[:, 2] > 0), 1 / w, np.nan)
         error = (point[:, :2] / point[:, 2:] - xy) * [projector.fx, projector.fy]
         epipolar = np.hypot(error[:, 0], error[:, 1]) if both else np.zeros(len(a))
-    return Triangulation(z, epipolar)
+        relative_error = z * point[:, 2] / slope
+    return Triangulation(z, epipolar, relative_error)
 
 
 def _inverse_depth(
     a: np.ndarray, b: np.ndarray, xy: np.ndarray, projector: Intrinsics, columns: bool, rows: bool
-) -> np.ndarray:
-    """(n,) w of the linear equations w (b_x - x b_z) = x a_z - a_x, weighted to projector pixels."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) w of the linear equations w (b_x - x b_z) = x a_z - a_x, weighted to projector pixels; norm of their slopes."""
     numerator, denominator = np.zeros(len(a)), np.zeros(len(a))
     for axis, used, focal in ((0, columns, projector.fx), (1, rows, projector.fy)):
         if used:
             slope = b[axis] - xy[:, axis] * b[2]
             numerator += focal**2 * slope * (xy[:, axis] * a[:, 2] - a[:, axis])
             denominator += focal**2 * slope**2
-    return np.asarray(numerator / denominator)
+    return numerator / denominator, np.sqrt(denominator)
 
 
 def _complete(
