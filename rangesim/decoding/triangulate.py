@@ -77,7 +77,7 @@ def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row
 def _inverse_depth(
     a: np.ndarray, b: np.ndarray, xy: np.ndarray, projector: Intrinsics, columns: bool, rows: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) w of the linear equations w (b_x - x b_z) = x a_z - a_x, weighted to projector pixels; norm of their slopes."""
+    """(n,) w of the linear equations w (b_x - x b_z) = x a_z - a_x, in projector pixels; norm of their slopes."""
     numerator, denominator = np.zeros(len(a)), np.zeros(len(a))
     for axis, used, focal in ((0, columns, projector.fx), (1, rows, projector.fy)):
         if used:
