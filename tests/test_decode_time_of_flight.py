@@ -48,6 +48,13 @@ def test_ideal_range_is_exact_for_an_emitter_at_any_pose() -> None:
         np.testing.assert_allclose(image.range_m[lit], signals.truth.range_m[lit], atol=2e-6)
 
 
+def test_confidence_of_ideal_range_is_radiance_over_the_bright_ones() -> None:
+    radiance = np.linspace(0.01, 1, 1000, dtype=np.float32).reshape(20, 50)
+    for length_m in (0.1, 40.0):
+        image = decode(Capture(np.stack([radiance, length_m * radiance]), IdealToF()))
+        np.testing.assert_allclose(image.confidence, np.clip(radiance / 0.99, 0, 1), rtol=1e-3)
+
+
 @pytest.mark.parametrize("waveform", ["sine", "square"])
 @pytest.mark.parametrize("frequencies", [(20e6,), (20e6, 80e6, 100e6), (80e6, 16e6, 120e6)])
 def test_amcw_is_exact_without_noise(waveform: str, frequencies: tuple[float, ...]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesim.capture import Capture
+from rangesim.capture import Capture, bright_level
 from rangesim.range_image import RangeImage
 from rangesim.rig import Rig
 from rangesim.status import Status
@@ -71,4 +71,5 @@ def decode_ideal(capture: Capture) -> RangeImage:
     dark = ~(radiance > 0)
     length = weighted / np.where(dark, 1.0, radiance)
     status = np.where(dark, Status.LOW_SIGNAL, Status.OK)
-    return range_image_from_path_length(capture, length, status, radiance / capture.full_scale, radiance)
+    confidence = radiance / (bright_level(radiance) or 1.0)
+    return range_image_from_path_length(capture, length, status, confidence, radiance)
