@@ -13,6 +13,9 @@ from rangesim.config import to_dict
 
 Array = NDArray[np.float64]
 
+RESIDUAL_PX = 1e-3
+"""Where the inverse of a lens model reprojects worse than this, there is none."""
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -61,20 +64,27 @@ class Intrinsics:
         return np.stack([x, y], axis=-1)
 
     def normalise(self, pixels: ArrayLike) -> Array:
-        """(..., 2) undistorted image-plane coordinates x/z, y/z of pixel coordinates (..., 2)."""
+        """(..., 2) undistorted image-plane coordinates x/z, y/z of pixel coordinates (..., 2).
+
+        NaN where the distortion has no inverse: beyond the radius at which its polynomial turns round.
+        """
         distorted = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         if not any(self.distortion):
             return distorted
         target_x, target_y = np.ascontiguousarray(distorted[..., 0]), np.ascontiguousarray(distorted[..., 1])
         x, y = target_x, target_y
-        for _ in range(50):  # fixed point of Brown-Conrady, as there is no closed inverse
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for _ in range(50):  # fixed point of Brown-Conrady, as there is no closed inverse
+                radial, tangential_x, tangential_y = self._distortion_terms(x, y)
+                next_x, next_y = (target_x - tangential_x) / radial, (target_y - tangential_y) / radial
+                step = max(np.abs(next_x - x).max(initial=0), np.abs(next_y - y).max(initial=0))
+                x, y = next_x, next_y
+                if step < 1e-12:
+                    break
             radial, tangential_x, tangential_y = self._distortion_terms(x, y)
-            next_x, next_y = (target_x - tangential_x) / radial, (target_y - tangential_y) / radial
-            step = max(np.abs(next_x - x).max(initial=0), np.abs(next_y - y).max(initial=0))
-            x, y = next_x, next_y
-            if step < 1e-12:
-                break
-        return np.stack([x, y], axis=-1)
+            off_x, off_y = x * radial + tangential_x - target_x, y * radial + tangential_y - target_y
+            inverse = np.hypot(off_x * self.fx, off_y * self.fy) <= RESIDUAL_PX
+        return np.where(inverse[..., None], np.stack([x, y], axis=-1), np.nan)
 
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) pixel coordinates of points (..., 3) in this device's frame; NaN behind it."""
@@ -88,7 +98,8 @@ class Intrinsics:
         return xy * [self.fx, self.fy] + [self.cx, self.cy]
 
     def directions(self, pixels: ArrayLike) -> Array:
-        """(..., 3) ray directions with z = 1 (not unit length) through pixel coordinates (..., 2)."""
+        """(..., 3) ray directions with z = 1 (not unit length) through pixel coordinates (..., 2); NaN where
+        `normalise` is."""
         xy = self.normalise(pixels)
         return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
 

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels and rays are inverse, and where a lens model has no inverse, nothing is made up."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from synthetic import plane_signals, stereo_rig
+
+from rangesim.decoding import decode
+from rangesim.exposure import expose
+from rangesim.point_cloud import from_range_image
+from rangesim.rig import Intrinsics
+from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
+from rangesim.status import Status
+
+FOLDED = Intrinsics(640, 480, 500, 500, 320, 240, (-0.45,))
+"""r (1 - 0.45 r^2) turns round at r = 0.861, where the image ends: 0.5738 f = 286.9 px from the centre."""
+FOLD_PX = 500 * np.sqrt(1 / (3 * 0.45)) * 2 / 3
+
+
+@pytest.mark.parametrize("distortion", [(), (0.1,), (-0.3, 0.1, 1e-3, -2e-3, 0.01), (-0.45,)])
+def test_rays_project_back_to_their_pixels_or_are_nan(distortion: tuple[float, ...]) -> None:
+    lens = dataclasses.replace(FOLDED, distortion=distortion)
+    pixels = lens.pixel_centres()
+    error = np.linalg.norm(lens.project(lens.directions(pixels)) - pixels, axis=-1)
+    assert np.nanmax(error) < 2e-3
+    if distortion != FOLDED.distortion:
+        assert np.isfinite(error).all()
+
+
+def test_pixels_beyond_the_fold_of_a_lens_model_have_no_ray() -> None:
+    pixels = FOLDED.pixel_centres()
+    radius = np.linalg.norm(pixels - [FOLDED.cx, FOLDED.cy], axis=-1)
+    nan = np.isnan(FOLDED.normalise(pixels)).all(axis=-1)
+    assert nan[radius > FOLD_PX].all()
+    assert not nan[radius < FOLD_PX - 2].any()
+
+
+@pytest.mark.parametrize("sensor", [StructuredLight(), IdealToF(), AmcwToF(), DirectToF()])
+def test_camera_pixels_without_a_ray_are_out_of_range(sensor: Sensor) -> None:
+    rig = stereo_rig()
+    capture = expose(plane_signals(rig, sensor), sensor)
+    before = decode(capture)
+    camera = dataclasses.replace(rig.camera, distortion=(-1.0,))
+    image = decode(dataclasses.replace(capture, rig=dataclasses.replace(rig, camera=camera)))
+    lost = np.isnan(camera.directions(camera.pixel_centres())).any(axis=-1)
+    assert 0.02 < lost.mean() < 0.5
+    expected = np.where(before.status == Status.OK, Status.OUT_OF_RANGE, before.status)
+    np.testing.assert_array_equal(image.status[lost], expected[lost])
+    assert (np.isfinite(from_range_image(image).points).all(axis=-1) == image.valid).all()
+
+
+@pytest.mark.parametrize("axes", [("columns",), ("columns", "rows")])
+def test_projector_pixels_without_a_ray_are_out_of_range(axes: tuple[str, ...]) -> None:
+    rig, sensor = stereo_rig(), StructuredLight(axes=axes)  # type: ignore[arg-type]
+    capture = expose(plane_signals(rig, sensor), sensor)
+    projector = dataclasses.replace(rig.projector, distortion=(-2.0,))
+    image = decode(dataclasses.replace(capture, rig=dataclasses.replace(rig, projector=projector)))
+    column = image.projector_column
+    assert column is not None
+    reach = projector.fx * np.sqrt(1 / (3 * 2.0)) * 2 / 3
+    lost = np.abs(column - projector.cx) > reach
+    assert lost.mean() > 0.02
+    assert (image.status[lost] == Status.OUT_OF_RANGE).all()
