@@ -46,6 +46,10 @@ class PhotoDetector(ABC):
     def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr."""
 
+    def ambient_share(self, sensor: Sensor) -> float:
+        """Share of ambient light that counts: what passes the filter."""
+        return self.ambient_transmission
+
     @property
     def max_dn(self) -> int:
         """Largest digital number; a pixel that reads it is saturated."""

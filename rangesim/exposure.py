@@ -48,7 +48,7 @@ def expose(
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
     if detector is None or isinstance(sensor, IdealToF):
         return Capture(signals.frames(sensor), sensor, signals.rig)
-    radiance = signals.frames(sensor, ambient_transmission=detector.ambient_transmission)
+    radiance = signals.frames(sensor, ambient_transmission=detector.ambient_share(sensor))
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor, signals.rig, exposure_s, seed)

@@ -17,8 +17,9 @@ from rangesim.sensors import DirectToF, Sensor
 class SpadDetector(PhotoDetector):
     """Single-photon counter with a histogram memory per pixel.
 
-    The laser fires again as soon as the histogram is full, so an exposure holds exposure_s / (bins bin_s)
-    pulses, and ambient light and dark counts spread evenly over the bins.
+    The laser fires again as soon as the histogram is full, so an exposure holds exposure_s / (start_s + bins
+    bin_s) pulses of the laser's mean power. Ambient light and dark counts spread evenly over the bins; before
+    start_s nothing is counted.
 
     Parameters
     ----------
@@ -54,16 +55,18 @@ class SpadDetector(PhotoDetector):
 
     def pulses(self, sensor: Sensor, exposure_s: float) -> int:
         """Number of laser pulses in an exposure."""
-        if not isinstance(sensor, DirectToF):
-            raise ValueError(f"expected a direct-tof sensor for a SpadDetector, got {sensor.type_name}.")
-        return max(1, round(exposure_s / (sensor.bins * sensor.bin_s)))
+        period_s, _ = _gate_s(sensor)
+        return max(1, round(exposure_s / period_s))
+
+    def ambient_share(self, sensor: Sensor) -> float:
+        """Share of ambient light that counts: what passes the filter while the histogram is open."""
+        period_s, open_s = _gate_s(sensor)
+        return self.ambient_transmission * open_s / period_s
 
     def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
-        pulses = self.pulses(sensor, exposure_s)
-        assert isinstance(sensor, DirectToF)
-        open_s = pulses * sensor.bins * sensor.bin_s
-        signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * open_s)
-        return np.asarray(signal + self.dark_counts_hz * open_s / sensor.bins)
+        pulses, (period_s, open_s) = self.pulses(sensor, exposure_s), _gate_s(sensor)
+        signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * pulses * period_s)
+        return np.asarray(signal + self.dark_counts_hz * pulses * open_s / sensor.n_frames)
 
     def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         pulses = self.pulses(sensor, exposure_s)
@@ -78,3 +81,11 @@ class SpadDetector(PhotoDetector):
                 counts = rng.poisson(np.minimum(mean, 1e9))
             out[:] = np.minimum(counts, self.max_dn)
         return result
+
+
+def _gate_s(sensor: Sensor) -> tuple[float, float]:
+    """Seconds from pulse to pulse, and seconds of them during which photons are counted."""
+    if not isinstance(sensor, DirectToF):
+        raise ValueError(f"expected a direct-tof sensor for a SpadDetector, got {sensor.type_name}.")
+    open_s = sensor.bins * sensor.bin_s
+    return sensor.start_s + open_s, open_s

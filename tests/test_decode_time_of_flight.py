@@ -184,10 +184,11 @@ def test_coates_undoes_pile_up() -> None:
     sensor = histogram_sensor(bins=64)
     rig = stereo_rig(64, 48, baseline_m=0.0)
     signals = plane_signals(rig, sensor, distance_m=0.7, ambient=0.5)
-    detector = SpadDetector(pile_up=True, bits=16, ambient_transmission=1.0, quantum_efficiency=1.0)
+    detector = SpadDetector(pile_up=True, bits=16, ambient_transmission=1.0, quantum_efficiency=0.6)
     exposure = 2e-4
     capture = expose(signals, sensor, detector, exposure_s=exposure)
-    mean = detector.mean_electrons(signals.frames(sensor), sensor, rig, exposure)
+    radiance = signals.frames(sensor, detector.ambient_share(sensor))
+    mean = detector.mean_electrons(radiance, sensor, rig, exposure)
     pulses = detector.pulses(sensor, exposure)
     assert capture.frames.sum(axis=0).max() <= pulses
     restored = coates(capture.frames.astype(np.float64), pulses)

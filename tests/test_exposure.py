@@ -13,6 +13,7 @@ from rangesim.capture import BRIGHT_PERCENTILE
 from rangesim.config import from_dict, to_dict
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.exposure import TARGET_SHARE, expose
+from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 from rangesim.spad import SpadDetector
@@ -117,6 +118,22 @@ def test_photon_counts_are_poisson() -> None:
     counts = detector.read_out(np.full((4, 200, 200), radiance), sensor, rig, 1e-3, seed=0)
     assert abs(counts.mean() / 50 - 1) < 0.01
     assert abs(counts.var() / 50 - 1) < 0.02
+
+
+@pytest.mark.parametrize("start_s", [0.0, 6e-9, 24e-9])
+def test_the_laser_fires_again_only_when_the_histogram_is_full(start_s: float) -> None:
+    """Per second: signal at the mean power of the laser, ambient and dark counts while the histogram is open."""
+    rig, sensor = stereo_rig(), DirectToF(bins=80, bin_s=100e-12, start_s=start_s)
+    signals = signals_of_depth(rig, np.full((120, 160), (start_s + 5e-9) * SPEED_OF_LIGHT / 2), [sensor], ambient=2.0)
+    detector = SpadDetector(bits=16, dark_counts_hz=2e5, ambient_transmission=0.5)
+    exposure = 1e-3
+    assert detector.pulses(sensor, exposure) == round(exposure / (start_s + 8e-9))
+    open_s = exposure * 8e-9 / (start_s + 8e-9)
+    counts = expose(signals, sensor, detector, exposure).frames.sum(axis=0).mean()
+    per_second = detector.electrons_per_radiance(rig)
+    signal = signals.channels[sensor.responses()[0]].sum(axis=0).mean() * per_second * exposure
+    expected = signal + (0.5 * 2.0 * per_second + 2e5) * open_s
+    assert abs(counts / expected - 1) < 0.01
 
 
 def test_without_a_detector_frames_are_the_radiance() -> None:
