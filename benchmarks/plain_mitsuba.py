@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rangesim import Intrinsics, Rig, Scene
-from rangesim.scene.load import MITSUBA_FROM_OPENCV
+from rangesim.scene.camera import MITSUBA_FROM_OPENCV
 
 TILE = 40
 T = TypeVar("T")

@@ -74,6 +74,9 @@ class Response(ABC):
     channels: int
     """Number of channels (dense) or bins (sparse)."""
 
+    def check(self, width: int, height: int) -> None:  # noqa: B027 (most responses fit any projector)
+        """Raise ValueError if a projector of that many pixels cannot show this response."""
+
 
 class DenseResponse(Response):
     """Every path counts in every channel, with a weight."""
@@ -133,6 +136,13 @@ class Images(DenseResponse):
     @property
     def channels(self) -> int:  # type: ignore[override]
         return len(self.patterns)
+
+    def check(self, width: int, height: int) -> None:
+        if self.patterns.ndim != 3 or self.patterns.shape[1:] != (height, width):
+            raise ValueError(
+                f"expected patterns of shape (k, {height}, {width}) for a projector of {width} x {height} pixels, "
+                f"got {self.patterns.shape}."
+            )
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
         _, height, width = self.patterns.shape

@@ -162,6 +162,8 @@ def test_patterns_agree_with_a_projector_that_shows_them() -> None:
     for k, (pattern, frame) in enumerate(zip(patterns, frames, strict=True)):
         show(plain, pattern)
         reference = render(plain, integrator, spp=64, seed=k)
+        assert np.isfinite(reference).all(), f"pattern {k}"
+        assert np.isfinite(frame).all(), f"pattern {k}"
         assert abs(z_score(frame, reference)) < 5, f"pattern {k}"
         lit = reference > np.quantile(reference, 0.2)
         assert np.corrcoef(frame[lit], reference[lit])[0, 1] > 0.99, f"pattern {k}"
@@ -245,6 +247,79 @@ def test_independent_seeds_are_unbiased(corner: rangesim.Scene) -> None:
     assert (np.abs(short.mean(axis=0) - long)[lit] < 5 * error[lit]).all()
 
 
+def test_a_mirror_beside_the_view_is_multipath_not_via_delta() -> None:
+    """The camera sees matte surfaces only; some of their light has come over the mirror."""
+    import mitsuba as mi
+
+    select_variant()
+    T = mi.ScalarTransform4f
+    matte = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    side = T().translate([1.2, 0, 1.5]).rotate([0, 1, 0], -90).scale(2)
+    scene = rangesim.load_scene(
+        {
+            "type": "scene",
+            "sensor": perspective(T().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])),
+            "wall": {"type": "rectangle", "to_world": T().translate([0, 0, 2]).scale(3), "bsdf": matte},
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().translate([0, -0.8, 1]).rotate([1, 0, 0], -90).scale(2),
+                "bsdf": matte,
+            },
+            "mirror": {"type": "rectangle", "to_world": side, "bsdf": {"type": "conductor"}},
+        }
+    )
+    energy = transport(scene, scene.rig(), [], spp=64).energy
+    assert energy.multipath.mean() > 0
+    assert not energy.via_delta.any()
+
+
+def test_a_cut_out_hole_is_seen_through() -> None:
+    import mitsuba as mi
+
+    select_variant()
+    T = mi.ScalarTransform4f
+    hole = {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}}
+    sensor = IdealToF()
+    scene = rangesim.load_scene(
+        {
+            "type": "scene",
+            "sensor": perspective(T().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])),
+            "wall": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, 2]).scale([3, 3, -1]),
+                "bsdf": {"type": "diffuse"},
+            },
+            "hole": {"type": "rectangle", "to_world": T().translate([-0.05, 0, 0.3]).scale(0.04), "bsdf": hole},
+        }
+    )
+    signals = transport(scene, scene.rig(baseline_m=0.3), [sensor], spp=16)
+    np.testing.assert_allclose(signals.truth.z, 2.0, atol=1e-3)
+    image = rangesim.decode(rangesim.expose(signals, sensor))
+    lit = signals.energy.direct > 0
+    assert lit.mean() > 0.8
+    np.testing.assert_allclose(image.z[lit], 2.0, atol=2e-3)
+    assert not signals.energy.via_delta.any()
+
+
+def test_the_back_of_a_thin_sheet_is_not_lit() -> None:
+    import mitsuba as mi
+
+    select_variant()
+    T = mi.ScalarTransform4f
+    sheet = T().translate([0.1, 0, 1]).rotate([0, 1, 0], 90).scale(0.3)  # between the camera and the projector
+    scene = rangesim.load_scene(
+        {
+            "type": "scene",
+            "sensor": perspective(T().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])),
+            "sheet": {"type": "rectangle", "to_world": sheet, "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}},
+        }
+    )
+    poses = [look_at((x, 0, 0), (x, 0, 1), (0, -1, 0)) for x in (-0.3, 0.3)]
+    rigs = [Rig(scene.camera, Intrinsics.from_fov(100, 100, 80), scene.T_world_camera, pose) for pose in poses]
+    visible = [transport(scene, rig, [], spp=1).truth.projector_visible.mean() for rig in rigs]
+    assert sorted(v > 0 for v in visible) == [False, True]
+
+
 # ---- Ground truth -----------------------------------------------------------------------------------
 
 
@@ -284,3 +359,25 @@ def test_distorted_lenses_are_refused(corner: rangesim.Scene) -> None:
     lens = Intrinsics(64, 48, 60, 60, 32, 24, distortion=(0.1,))
     with pytest.raises(ValueError, match="not implemented"):
         transport(corner, Rig(lens, lens, corner.T_world_camera), [], spp=1)
+
+
+def test_a_seed_is_a_whole_number_and_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
+    rig = corner.rig(**SIZE)
+    with pytest.raises(ValueError, match=r"expected seed to be a whole number, got 1\.5"):
+        transport(corner, rig, [], spp=1, seed=1.5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="projector of 1280 x 800"):
+        transport(corner, rig, [Images(np.ones((2, 10, 10), np.float32))], spp=1)
+    with pytest.raises(ValueError, match="a rig whose projector has 1280 x 800"):
+        transport(corner, rig, [StructuredLight(640, 400)], spp=1)
+
+
+def test_unlit_pixels_never_reach_a_response(tabletop: rangesim.Scene) -> None:
+    """Where the projector does not reach, u and v may be anything; patterns must not be looked up there."""
+    images = Images(np.ones((1, 800, 1280), np.float32))
+    rig = tabletop.rig(**SIZE)
+    away = Rig(rig.camera, rig.projector, rig.T_world_camera, look_at((0, 0, 0.5), (1, 0, 0.5), (0, -1, 0)))
+    for seed in range(4):
+        signals = transport(tabletop, away, [images, *all_sensors()], spp=16, seed=seed)
+        for values in signals.channels.values():
+            assert np.isfinite(values).all()
+        np.testing.assert_allclose(signals.channels[images][0], signals.energy.projector, rtol=1e-5)

@@ -114,6 +114,20 @@ BROKEN: dict[str, tuple[str, str]] = {
         '<scene version="3.0.0"><sensor type="orthographic"/><shape type="sphere"/></scene>',
         "to be perspective",
     ),
+    "mirrored.xml": (
+        f'<scene version="3.0.0">{SENSOR}<shape type="sphere"/></scene>'.replace("<lookat", "<scale x='-1'/><lookat"),
+        "negative scale",
+    ),
+    "instance.xml": (
+        f'<scene version="3.0.0">{SENSOR}<shape type="shapegroup" id="g"><shape type="sphere"/></shape>'
+        '<shape type="instance"><ref id="g"/></shape></scene>',
+        "put in copies",
+    ),
+    "fog.xml": (
+        f'<scene version="3.0.0">{SENSOR}<shape type="cube"><bsdf type="null"/>'
+        '<medium type="homogeneous" name="interior"/></shape></scene>',
+        "participating medium",
+    ),
     "points.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
     "notes.txt": ("hello", "expected a scene"),
 }
@@ -136,17 +150,101 @@ def test_a_missing_file_and_an_unknown_material(tmp_path: Path) -> None:
         rangesim.load_scene(write(tmp_path / "mesh.obj", TETRAHEDRON), material="miror")
 
 
-@pytest.mark.parametrize(
-    ("bsdf", "properties", "nested", "expected"),
-    [
-        ("diffuse", {}, None, "matte"),
-        ("roughconductor", {"alpha": 0.01}, None, "mirror"),
-        ("roughconductor", {"alpha": 0.3}, None, "glossy"),
-        ("roughdielectric", {"alpha": 0.02}, None, "transparent"),
-        ("roughdielectric", {}, None, "translucent"),
-        ("twosided", {}, "glossy", "glossy"),
-        ("hair", {}, None, "other"),
-    ],
+CLASSES: list[tuple[dict[str, Any], str]] = [
+    ({"type": "diffuse"}, "matte"),
+    ({"type": "twosided", "b": {"type": "roughplastic"}}, "glossy"),
+    ({"type": "plastic"}, "glossy"),
+    ({"type": "roughconductor", "alpha": 0.01}, "mirror"),
+    ({"type": "roughconductor", "alpha_u": 0.01, "alpha_v": 0.02}, "mirror"),
+    ({"type": "roughconductor", "alpha": 0.3}, "glossy"),
+    ({"type": "mask", "opacity": 0.5, "b": {"type": "conductor"}}, "mirror"),
+    ({"type": "dielectric"}, "transparent"),
+    ({"type": "thindielectric"}, "transparent"),
+    ({"type": "roughdielectric", "alpha": 0.02}, "transparent"),
+    ({"type": "roughdielectric"}, "translucent"),
+    ({"type": "principled"}, "glossy"),
+    ({"type": "principled", "spec_trans": 1.0, "roughness": 0.01}, "transparent"),
+    ({"type": "principled", "metallic": 1.0, "roughness": 0.01}, "mirror"),
+    ({"type": "null"}, "other"),
+]
+
+
+@pytest.mark.parametrize(("bsdf", "expected"), CLASSES, ids=lambda x: x if isinstance(x, str) else x["type"])
+def test_material_classes(bsdf: dict[str, Any], expected: str) -> None:
+    import mitsuba as mi
+
+    select_variant()
+    assert material_class(mi.load_dict(bsdf)) == expected
+
+
+# ---- Cameras as Mitsuba means them ------------------------------------------------------------------
+
+
+def film(extra: str = "") -> str:
+    return f'<film type="hdrfilm"><integer name="width" value="64"/><integer name="height" value="48"/>{extra}</film>'
+
+
+OFFSET = '<float name="principal_point_offset_x" value="0.2"/><float name="principal_point_offset_y" value="-0.1"/>'
+CROP = "".join(
+    f'<integer name="crop_{name}" value="{value}"/>'
+    for name, value in {"width": 24, "height": 32, "offset_x": 8, "offset_y": 4}.items()
 )
-def test_material_classes(bsdf: str, properties: dict[str, Any], nested: str | None, expected: str) -> None:
-    assert material_class(bsdf, properties, nested) == expected
+CAMERAS = {
+    "plain": f'<sensor type="perspective"><float name="fov" value="40"/>{film()}</sensor>',
+    "offset": f'<sensor type="perspective"><float name="fov" value="40"/>{OFFSET}{film()}</sensor>',
+    "crop": f'<sensor type="perspective"><float name="fov" value="40"/>{OFFSET}{film(CROP)}</sensor>',
+    "fov_axis": '<sensor type="perspective"><float name="fov" value="40"/><string name="fov_axis" value="y"/>'
+    f"{film()}</sensor>",
+    "thinlens": '<sensor type="thinlens"><float name="fov" value="40"/><float name="aperture_radius" value="1e-6"/>'
+    f'<float name="focus_distance" value="2"/>{film()}</sensor>',
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_rays_through_pixels_are_those_of_mitsuba_s_sensor(tmp_path: Path, name: str) -> None:
+    import mitsuba as mi
+
+    xml = f'<scene version="3.0.0">{CAMERAS[name]}<shape type="sphere"/></scene>'
+    scene = rangesim.load_scene(write(tmp_path / "scene.xml", xml))
+    for x, y in ((0.1, 0.2), (0.5, 0.5), (0.9, 0.7)):
+        theirs = scene.mitsuba.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5, 0.5))[0].d
+        pixel = [x * scene.camera.width, y * scene.camera.height]
+        ours = scene.T_world_camera[:3, :3] @ scene.camera.directions(pixel)
+        np.testing.assert_allclose(ours / np.linalg.norm(ours), np.array(theirs).ravel(), atol=2e-6)
+
+
+def test_the_projector_covers_an_off_centre_view(tmp_path: Path) -> None:
+    to_world = '<transform name="to_world"><scale value="20"/><translate z="2"/></transform>'
+    xml = f'<scene version="3.0.0">{CAMERAS["offset"]}<shape type="rectangle">{to_world}</shape></scene>'
+    scene = rangesim.load_scene(write(tmp_path / "scene.xml", xml))
+    assert rangesim.transport(scene, scene.rig(), [], spp=1).truth.projector_visible.mean() > 0.99
+
+
+def test_one_side_alone_keeps_the_aspect_ratio() -> None:
+    scene = rangesim.load_scene(SCENES / "plane.xml")
+    for rig in (scene.rig(width=320), scene.rig(height=240)):
+        assert (rig.camera.width, rig.camera.height) == (320, 240)
+    with pytest.raises(ValueError, match="positive image size"):
+        scene.rig(width=0, height=4)
+
+
+def test_a_second_sensor_can_be_the_camera(tmp_path: Path) -> None:
+    xml = f'<scene version="3.0.0">{SENSOR}{CAMERAS["offset"]}<shape type="sphere"/></scene>'
+    path = write(tmp_path / "scene.xml", xml)
+    assert rangesim.load_scene(path).camera.cx == pytest.approx(32)
+    assert rangesim.load_scene(path, sensor=1).camera.cx == pytest.approx(32 - 0.2 * 64)
+    with pytest.raises(ValueError, match="sensor from 0 to 1"):
+        rangesim.load_scene(path, sensor=2)
+
+
+def test_a_scene_finds_no_files_of_another(tmp_path: Path) -> None:
+    import trimesh
+
+    xml = f'<scene version="3.0.0">{SENSOR}<shape type="ply"><string name="filename" value="m.ply"/></shape></scene>'
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write(tmp_path / name / "scene.xml", xml)
+    trimesh.creation.box().export(tmp_path / "a" / "m.ply")
+    rangesim.load_scene(tmp_path / "a" / "scene.xml")
+    with pytest.raises(FileFormatError, match=r"m\.ply"):
+        rangesim.load_scene(tmp_path / "b" / "scene.xml")

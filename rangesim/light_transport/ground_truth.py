@@ -9,27 +9,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.loop import Device, connect
+from rangesim.light_transport.loop import Device, connect, mono
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
 from rangesim.signals import GroundTruth
+
+MOST_CUTOUTS = 8
+"""Holes behind each other that a camera ray is followed through."""
 
 
 def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
     h, w = rig.camera.height, rig.camera.width
     camera, projector = Device(rig.camera, rig.T_world_camera), Device(rig.projector, rig.T_world_projector)
-    pixel = dr.arange(mi.UInt32, h * w)
-    centre = mi.Point2f(mi.Float(pixel % w) + 0.5, mi.Float(pixel // w) + 0.5)
-    ray = mi.Ray3f(mi.Point3f(camera.centre), camera.ray_direction(centre))
-    si = scene.mitsuba.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    pixel, width = dr.arange(mi.UInt32, h * w), dr.opaque(mi.UInt32, w)
+    centre = mi.Point2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5)
+    si = _first_surface(scene, mi.Ray3f(mi.Point3f(camera.centre), camera.ray_direction(centre)))
     hit = si.is_valid()
-    uv, _, _, _, visible = connect(scene.mitsuba, projector, si, hit)
-    z = dr.dot(mi.Vector3f(si.p) - camera.centre, camera.z)
-    normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+    to_camera = camera.centre - mi.Vector3f(si.p)
+    normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
+    uv, to_projector, _, _, unoccluded = connect(scene.mitsuba, projector, si, hit)
+    transmits = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
+    visible = unoccluded & (transmits | (dr.dot(normal, to_projector) > 0))
+    z, distance = -dr.dot(to_camera, camera.z), dr.norm(to_camera)
     index = dr.gather(mi.Int32, _index_of_shape(scene), dr.reinterpret_array(mi.UInt32, si.shape), hit)
-    dr.eval(hit, uv, visible, z, normal, index, si.t)
+    dr.eval(hit, uv, visible, z, normal, index, distance)
 
     inside = _image(hit, h, w)
     masked = lambda x: np.where(inside, _image(x, h, w), np.float32(np.nan))  # noqa: E731
@@ -37,7 +42,7 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
     return GroundTruth(
         z=masked(z),
-        range_m=masked(si.t),
+        range_m=masked(distance),
         normal=np.stack([masked(normal[i]) for i in range(3)], axis=-1),
         instance=instance,
         material=np.where(instance >= 0, materials[instance], -1).astype(np.int32),
@@ -46,6 +51,18 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
         instance_names=tuple(i.name for i in scene.instances),
         material_names=MATERIAL_CLASSES,
     )
+
+
+def _first_surface(scene: Scene, ray: Any) -> Any:
+    """Where the ray meets the first surface that lets less than half of the light pass unchanged."""
+    si = scene.mitsuba.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    for _ in range(MOST_CUTOUTS if scene.has_cutouts else 0):
+        bsdf = si.bsdf()
+        is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+        passes = si.is_valid() & ~is_glass & (mono(bsdf.eval_null_transmission(si)) > 0.5)
+        behind = scene.mitsuba.ray_intersect(si.spawn_ray(ray.d), mi.RayFlags.All, coherent=True, active=passes)
+        si = dr.select(passes, behind, si)
+    return si
 
 
 def _index_of_shape(scene: Scene) -> Any:

@@ -100,7 +100,7 @@ def trace(
     length = dr.zeros(mi.Float, lanes)  # optical length from the camera to `previous.p`, metres
     ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
     first = dr.full(mi.Bool, True, lanes)  # no non-delta surface so far
-    delta_seen = dr.full(mi.Bool, False, lanes)  # some delta surface so far
+    via = dr.full(mi.Bool, False, lanes)  # some delta surface so far
     previous = dr.zeros(mi.Interaction3f, lanes)
     previous_pdf = dr.zeros(mi.Float, lanes)  # of the BSDF sample that made the ray; for MIS with ambient light
     previous_delta = dr.full(mi.Bool, True, lanes)
@@ -134,11 +134,12 @@ def trace(
             hit,
         )
         radiance = dr.select(lit, throughput * mono(value) * geometry * irradiance, 0)
-        path = LightPath(uv.x, uv.y, length + distance, first)
+        # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
+        path = LightPath(*(dr.select(lit, x, 0) for x in (uv.x, uv.y, length + distance)), first)
         channels = accumulators.add(channels, path, radiance, lane, lit)
-        direct += dr.select((depth == 1) & ~delta_seen, radiance, 0)
-        via_delta += dr.select(delta_seen, radiance, 0)
-        multipath += dr.select((depth > 1) & ~delta_seen, radiance, 0)
+        direct += dr.select(first & ~via, radiance, 0)
+        via_delta += dr.select(first & via, radiance, 0)
+        multipath += dr.select(first, 0, radiance)
 
         # ---- Caustic photons: gather around si.p here ------------------------------------------------
         # ---- Glint: does a segment off a delta surface meet the projector's lens? here ---------------
@@ -157,8 +158,10 @@ def trace(
         survival = dr.select(depth > settings.rr_depth, dr.minimum(throughput * dr.square(ior), 0.95), 1)
         survives = rng.next_float32() < survival
         throughput /= survival
-        first &= ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        delta_seen |= is_delta
+        is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+        passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) & ~is_glass  # through a hole, as if nothing were there
+        first &= passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        via |= is_delta & ~passes
         previous = mi.Interaction3f(si)
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = mi.Bool(is_delta)
@@ -174,7 +177,7 @@ def trace(
         length = dr.select(ends, 0, length)
         ior = dr.select(ends, 1, ior)
         first |= ends
-        delta_seen &= ~ends
+        via &= ~ends
         previous_delta |= ends
         active = sample < settings.spp
 

@@ -53,9 +53,9 @@ def transport(
     Raises
     ------
     ValueError
-        A number out of its range, a distorted lens, or no memory for a single row.
+        A number out of its range, a distorted lens, patterns that do not fit the projector, or too little memory.
     """
-    _check(rig, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    _check(rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
@@ -117,7 +117,11 @@ def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, at_lea
         yield begin, min(begin + size, pixels)
 
 
-def _check(rig: Rig, **counts: int) -> None:
+def _check(rig: Rig, sensors: Sequence[Sensor | Response], seed: int, **counts: int) -> None:
+    if not isinstance(seed, (int, np.integer)):
+        raise ValueError(f"expected seed to be a whole number, got {seed!r}.")
+    for sensor in sensors:
+        sensor.check(rig.projector.width, rig.projector.height)
     for name, value in counts.items():
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"expected {name} to be a whole number of at least 1, got {value!r}.")

@@ -39,6 +39,7 @@ class Accumulators:
     def __init__(self, responses: Sequence[Response], lanes: int) -> None:
         self.responses = tuple(responses)
         self.lanes = lanes
+        self.stride = dr.opaque(mi.UInt32, lanes)
         self.bins = {r: dr.zeros(mi.Float, lanes * r.channels) for r in responses if isinstance(r, SparseResponse)}
 
     def zeros(self) -> list[list[Any]]:
@@ -58,7 +59,7 @@ class Accumulators:
                 values = [dr.fma(radiance, w, v) for v, w in zip(values, weights, strict=True)]
             elif isinstance(response, SparseResponse):
                 index = response.bin(path, math)
-                target = dr.fma(index, mi.UInt32(self.lanes), lane)
+                target = dr.fma(index, self.stride, lane)
                 inside = active & (index < response.channels)
                 dr.scatter_add(self.bins[response], radiance, target, inside, mode=dr.ReduceMode.NoConflicts)
             result.append(values)

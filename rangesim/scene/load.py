@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +13,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.config import nearest
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
 from rangesim.rig import Intrinsics
-from rangesim.scene.materials import MATERIAL_CLASSES, material_class
+from rangesim.scene.camera import camera_of
+from rangesim.scene.materials import is_cutout, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
+from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.scene import Instance, Scene
 
-# Mitsuba's camera looks along +z with x to the left and y up; ours has x to the right and y down.
-MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-_CLASS_KEY = "material_class"
+Source = str | Path | Mapping[str, Any]
 
 
-def load_scene(
-    source: str | Path | Mapping[str, Any], *, material: str | None = None, variant: str | None = None
-) -> Scene:
+def load_scene(source: Source, *, material: str | None = None, sensor: int = 0, variant: str | None = None) -> Scene:
     """A scene to measure.
 
     Parameters
@@ -37,108 +35,77 @@ def load_scene(
         ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
     material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.
+    sensor : which of the scene's sensors becomes the camera.
     variant : Mitsuba variant; default CUDA where there is a GPU, else LLVM.
 
     Raises
     ------
     FileFormatError
-        Missing, broken or empty file, or a scene without a perspective sensor.
+        Missing, broken or empty file, a scene without a perspective sensor, or with shapes that cannot be traced
+        (instances, participating media).
     ValueError
-        Unknown material class, or one for a scene that names its own.
+        Unknown material class, or one for a scene that names its own; no such sensor.
     """
+    label = "the scene dictionary" if isinstance(source, Mapping) else str(source)
     if material is not None and not _is_mesh(source):
-        raise ValueError(
-            f"a material can be chosen for a bare mesh alone, but {_label(source)} names its own materials."
-        )
+        raise ValueError(f"a material can be chosen for a bare mesh alone, but {label} names its own materials.")
     select_variant(variant)
+    loaded, ids, classes = _instantiate(source, material or "matte", label)
+    _check(loaded, ids, sensor, label)
+    camera, T_world_camera = camera_of(loaded.sensors()[sensor], label)
+    return Scene(
+        name="scene" if isinstance(source, Mapping) else Path(source).stem,
+        mitsuba=loaded,
+        instances=tuple(Instance(s.id(), classes.get(s.id()) or material_class(s.bsdf())) for s in loaded.shapes()),
+        camera=camera,
+        T_world_camera=T_world_camera,
+        working_distance_m=_median_depth(loaded, camera, T_world_camera),
+        has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
+    )
+
+
+def _instantiate(source: Source, material: str, label: str) -> tuple[Any, set[str], dict[str, str]]:
+    """The Mitsuba scene, the ids of its shapes, and the material classes that the file states."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
-    name = "scene" if isinstance(source, Mapping) else Path(source).stem
     try:
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder, _own_file_resolver():
             state = _parse(config, source, material, Path(folder))
             mi.parser.transform_all(config, state)
-            names = _name_shapes(state)
-            classes = _take_classes(state)
+            ids, classes = ids_of_shapes(state, label), take_material_classes(state)
             loaded = mi.parser.instantiate(config, state)
     except RuntimeError as error:
-        raise FileFormatError(f"{_label(source)} is no scene Mitsuba can load: {_one_line(error)}") from error
-    return _describe(name, loaded[0] if isinstance(loaded, list) else loaded, names, classes, _label(source))
+        reason = " ".join(str(error).split())[:400]
+        raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
+    return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
 
 
-def _parse(config: Any, source: str | Path | Mapping[str, Any], material: str | None, folder: Path) -> Any:
+def _parse(config: Any, source: Source, material: str, folder: Path) -> Any:
     if isinstance(source, Mapping):
         return mi.parser.parse_dict(config, dict(source))
     path = Path(source)
     if not path.is_file():
         raise FileFormatError(f"expected a scene or mesh file, but {path} does not exist.")
     if _is_mesh(path):
-        return mi.parser.parse_dict(config, scene_around_mesh(path, material or "matte", folder))
+        return mi.parser.parse_dict(config, scene_around_mesh(path, material, folder))
     if path.suffix.lower() != ".xml":
         raise FileFormatError(f"expected a scene (.xml) or a mesh ({', '.join(MESH_SUFFIXES)}), got {path}.")
     mi.file_resolver().prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
     return mi.parser.parse_file(config, str(path))
 
 
-def _name_shapes(state: Any) -> list[str]:
-    """Give every anonymous shape a unique id; ids of all shapes in file order."""
-    taken = {node.props.id() for node in state.nodes}
-    names = []
-    for index, node in enumerate(state.nodes):
-        if node.type != mi.ObjectType.Shape:
-            continue
-        name = node.props.id()
-        if not name or name.startswith("_arg_"):
-            name = f"{node.props.plugin_name()}_{index}"
-            while name in taken:
-                name += "_"
-            node.props.set_id(name)
-            taken.add(name)
-        names.append(name)
-    return names
+@contextmanager
+def _own_file_resolver() -> Iterator[None]:
+    """Search paths of this scene, forgotten afterwards, so that no scene finds another's files."""
+    before = mi.file_resolver()
+    mi.set_file_resolver(mi.FileResolver(before))
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(before)
 
 
-def _take_classes(state: Any) -> dict[str, str]:
-    """Material class per shape id; removes `material_class` entries, which Mitsuba does not know."""
-    explicit: dict[int, str] = {}
-    for index, node in enumerate(state.nodes):
-        if _CLASS_KEY in node.props:
-            value = node.props[_CLASS_KEY]
-            if value not in MATERIAL_CLASSES:
-                raise FileFormatError(
-                    f"expected material_class to be one of {', '.join(MATERIAL_CLASSES)}, "
-                    f"got {value!r}{nearest(str(value), MATERIAL_CLASSES)}."
-                )
-            explicit[index] = value
-            del node.props[_CLASS_KEY]
-    return {
-        node.props.id(): explicit.get(index) or _class_of(state, _first_bsdf(state, index), explicit) or "matte"
-        for index, node in enumerate(state.nodes)
-        if node.type == mi.ObjectType.Shape
-    }
-
-
-def _children(state: Any, index: int) -> list[int]:
-    references = [v for _, v in state.nodes[index].props.items() if isinstance(v, mi.Properties.ResolvedReference)]
-    return [reference.index() for reference in references]
-
-
-def _first_bsdf(state: Any, index: int) -> int | None:
-    return next((c for c in _children(state, index) if state.nodes[c].type == mi.ObjectType.BSDF), None)
-
-
-def _class_of(state: Any, index: int | None, explicit: dict[int, str]) -> str | None:
-    if index is None:
-        return None
-    if index in explicit:
-        return explicit[index]
-    props = state.nodes[index].props
-    nested = _class_of(state, _first_bsdf(state, index), explicit)
-    scalars = {key: value for key, value in props.items() if isinstance(value, (int, float))}
-    return material_class(props.plugin_name(), scalars, nested)
-
-
-def _describe(name: str, scene: Any, names: list[str], classes: dict[str, str], label: str) -> Scene:
+def _check(scene: Any, ids: set[str], sensor: int, label: str) -> None:
     if not isinstance(scene, mi.Scene):
         raise FileFormatError(f"expected {label} to hold a scene, got a {type(scene).__name__}.")
     if not scene.shapes():
@@ -147,47 +114,28 @@ def _describe(name: str, scene: Any, names: list[str], classes: dict[str, str], 
         raise FileFormatError(
             f'expected {label} to hold a perspective sensor, got none; add <sensor type="perspective">.'
         )
-    unknown = [shape.id() for shape in scene.shapes() if shape.id() not in names]
-    if unknown:
-        raise FileFormatError(
-            f"{label}: shape {unknown[0]!r} is of a kind this package cannot name (instanced or merged)."
-        )
-    camera, T_world_camera = _camera(scene.sensors()[0], label)
-    instances = tuple(Instance(shape.id(), classes[shape.id()]) for shape in scene.shapes())
-    return Scene(name, scene, instances, camera, T_world_camera, _median_depth(scene, camera, T_world_camera))
+    if not 0 <= sensor < len(scene.sensors()):
+        raise ValueError(f"expected a sensor from 0 to {len(scene.sensors()) - 1} of {label}, got {sensor}.")
+    for shape in scene.shapes():
+        if shape.id() not in ids:
+            raise FileFormatError(
+                f"expected shapes of {label} as dictionaries, got a loaded object; give its dictionary."
+            )
+        if shape.is_medium_transition():
+            raise FileFormatError(
+                f"{label}: shape {shape.id()!r} bounds a participating medium, which is not traced yet."
+            )
 
 
-def _camera(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
-    """Intrinsics and pose of a Mitsuba perspective (or thin lens) sensor."""
-    params = mi.traverse(sensor)
-    if "x_fov" not in params:
-        raise FileFormatError(f"expected the sensor of {label} to be perspective, got {sensor.class_name()}.")
-    width, height = (int(n) for n in sensor.film().size())
-    f = float(0.5 * width / np.tan(np.radians(float(np.array(params["x_fov"]).item())) / 2))
-    offset = [float(np.array(params[f"principal_point_offset_{a}"]).item()) for a in "xy"]
-    camera = Intrinsics(width, height, f, f, width * (0.5 + offset[0]), height * (0.5 + offset[1]))
-    matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ MITSUBA_FROM_OPENCV
-    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)  # a scaled to_world scales no camera
-    return camera, matrix
+def _is_mesh(source: Source) -> bool:
+    return not isinstance(source, Mapping) and Path(source).suffix.lower() in MESH_SUFFIXES
 
 
-def _median_depth(scene: Any, camera: Intrinsics, T_world_camera: np.ndarray, n: int = 64) -> float:
-    """Median z over an n x n grid of camera rays; 1 where the camera sees nothing."""
-    grid = camera.resized(n, n)
+def _median_depth(scene: Any, camera: Intrinsics, T_world_camera: np.ndarray, columns: int = 64) -> float:
+    """Median z over a coarse grid of camera rays; 1 where the camera sees nothing."""
+    grid = camera.resized(columns, max(1, round(columns * camera.height / camera.width)))
     directions = grid.directions(grid.pixel_centres()).reshape(-1, 3) @ T_world_camera[:3, :3].T
     ray = mi.Ray3f(o=mi.Point3f(*map(float, T_world_camera[:3, 3])), d=mi.Vector3f(directions.T.astype(np.float32)))
     si = scene.ray_intersect_preliminary(ray, coherent=True)
     z = np.array(dr.select(si.is_valid(), si.t, dr.nan))  # directions have z = 1, so t is depth
     return float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0
-
-
-def _is_mesh(source: str | Path | Mapping[str, Any]) -> bool:
-    return not isinstance(source, Mapping) and Path(source).suffix.lower() in MESH_SUFFIXES
-
-
-def _label(source: str | Path | Mapping[str, Any]) -> str:
-    return "the scene dictionary" if isinstance(source, Mapping) else str(source)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:400]

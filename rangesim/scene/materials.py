@@ -1,50 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Material classes: how a surface treats the light of a range sensor."""
+"""Material classes: how a surface treats the light of a range sensor, read off its BSDF."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
+import numpy as np
+
 MATERIAL_CLASSES = ("matte", "glossy", "mirror", "transparent", "translucent", "other")
 """matte: diffuse. glossy: a diffuse or wide lobe under a specular one. mirror: (nearly) specular reflection only.
 transparent: (nearly) specular refraction. translucent: scattered transmission. other: none of these."""
 
-ROUGHNESS_OF_MIRROR = 0.05
-"""Rough conductors and dielectrics below this alpha look, to a range sensor, like polished ones."""
+SMOOTH = 0.05
+"""Microfacet roughness alpha up to which a surface looks polished to a range sensor."""
 
-_CLASSES = {
-    "diffuse": "matte",
-    "measured": "other",
-    "plastic": "glossy",
-    "roughplastic": "glossy",
-    "pplastic": "glossy",
-    "principled": "glossy",
-    "principledthin": "translucent",
-    "conductor": "mirror",
-    "roughconductor": "glossy",
-    "dielectric": "transparent",
-    "thindielectric": "transparent",
-    "roughdielectric": "translucent",
-    "null": "transparent",
-}
-_WRAPPERS = ("twosided", "mask", "bumpmap", "normalmap", "blendbsdf")
+_ROUGHNESS = ("alpha", "alpha_u", "alpha_v", "roughness")
 
 
-def material_class(bsdf_type: str, properties: dict[str, Any], nested: str | None) -> str:
-    """One of `MATERIAL_CLASSES` for a Mitsuba BSDF plugin.
+def material_class(bsdf: Any) -> str:
+    """One of `MATERIAL_CLASSES`, from the lobes of a mitsuba.BSDF and its roughness.
 
-    Parameters
-    ----------
-    bsdf_type : name of the plugin.
-    properties : its scalar parameters (only `alpha` matters).
-    nested : class of the first BSDF inside, for wrappers such as `twosided`.
+    Wrappers (`twosided`, `mask`, `bumpmap`) count as what they wrap; a blend has the lobes of all its parts.
     """
-    if bsdf_type in _WRAPPERS and nested is not None:
-        return nested
-    alpha = properties.get("alpha", 0.1)
-    if isinstance(alpha, (int, float)) and alpha <= ROUGHNESS_OF_MIRROR:
-        if bsdf_type == "roughconductor":
-            return "mirror"
-        if bsdf_type == "roughdielectric":
-            return "transparent"
-    return _CLASSES.get(bsdf_type, "other")
+    parameters = _numbers(bsdf)
+    polished = all(parameters[key] <= SMOOTH for key in _ROUGHNESS if key in parameters)
+    delta = _has(bsdf, "DeltaReflection") or (polished and _has(bsdf, "GlossyReflection"))
+    if _has(bsdf, "DeltaTransmission", "GlossyTransmission") or (_is_thin_glass(bsdf) and "opacity" not in parameters):
+        return "transparent" if polished else "translucent"
+    if _has(bsdf, "DiffuseTransmission"):
+        return "translucent"
+    if parameters.get("metallic", 0.0) > 0.5:  # principled: the diffuse lobe has no weight
+        return "mirror" if polished else "glossy"
+    if _has(bsdf, "DiffuseReflection"):
+        return "glossy" if _has(bsdf, "DeltaReflection", "GlossyReflection") else "matte"
+    if delta:
+        return "mirror"
+    return "glossy" if _has(bsdf, "GlossyReflection") else "other"
+
+
+def is_cutout(bsdf: Any) -> bool:
+    """Whether light can pass this surface unchanged (`mask`, `null`); thin glass, which reflects as well, is none."""
+    return _has(bsdf, "Null") and not _is_thin_glass(bsdf)
+
+
+def _is_thin_glass(bsdf: Any) -> bool:
+    return _has(bsdf, "Null") and _has(bsdf, "DeltaReflection")
+
+
+def _has(bsdf: Any, *lobes: str) -> bool:
+    return any(bool(mi.has_flag(bsdf.flags(), getattr(mi.BSDFFlags, lobe))) for lobe in lobes)
+
+
+def _numbers(bsdf: Any) -> dict[str, float]:
+    """Parameters that hold one number, by their last name: `nested_bsdf.alpha.value` is `alpha`."""
+    result: dict[str, float] = {}
+    for key, value in mi.traverse(bsdf):
+        array = np.array(value, dtype=np.float64).ravel() if isinstance(value, (float, mi.Float)) else np.empty(0)
+        if array.size == 1:
+            result[key.removesuffix(".value").rsplit(".", 1)[-1]] = float(array[0])
+    return result

@@ -30,6 +30,7 @@ class Scene:
     instances : one per shape, in the order of `mitsuba.shapes()`.
     camera, T_world_camera : the scene's own sensor.
     working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
+    has_cutouts : bool, whether some surface lets light pass unchanged (`mask`, `null`).
     """
 
     name: str
@@ -38,6 +39,7 @@ class Scene:
     camera: Intrinsics
     T_world_camera: np.ndarray
     working_distance_m: float
+    has_cutouts: bool = False
 
     @property
     def has_ambient(self) -> bool:
@@ -60,9 +62,14 @@ class Scene:
             optical axis meets at the working distance.
         projector_size : (width, height) in projector pixels.
         power_w : radiant power of white.
-        width, height : camera pixels; default as in the scene file. The horizontal field of view is kept.
+        width, height : camera pixels; default as in the scene file; one alone keeps the aspect ratio. The
+            horizontal field of view is kept.
         """
-        camera = self.camera.resized(width or self.camera.width, height or self.camera.height)
+        if width is None:
+            width = self.camera.width if height is None else round(height * self.camera.width / self.camera.height)
+        if height is None:
+            height = round(width * self.camera.height / self.camera.width)
+        camera = self.camera.resized(width, height)
         if baseline_m is None:
             baseline_m = float(f"{0.2 * self.working_distance_m:.1g}")
         if not baseline_m > 0:
@@ -79,7 +86,7 @@ class Scene:
 
 def covering(camera: Intrinsics, width: int, height: int, margin: float = 1.1) -> Intrinsics:
     """Projector of the given pixel count, square pixels, whose field covers the camera's with a margin."""
-    half_x = margin * 0.5 * camera.width / camera.fx
-    half_y = margin * 0.5 * camera.height / camera.fy
+    half_x = margin * max(camera.cx, camera.width - camera.cx) / camera.fx
+    half_y = margin * max(camera.cy, camera.height - camera.cy) / camera.fy
     f = min(0.5 * width / half_x, 0.5 * height / half_y)
     return Intrinsics(width, height, f, f, width / 2, height / 2)

@@ -15,7 +15,7 @@ from rangesim.response import Response
 class Sensor(ABC):
     """A measuring principle: which responses to light paths it reads, and which frames it makes of them.
 
-    A sensor holds no geometry (that is the `Rig`), no electronics (the `Detector`) and no decoder (`rangesim.decoding`).
+    A sensor holds no geometry (that is the `Rig`), no electronics (`Detector`) and no decoder (`rangesim.decoding`).
     Subclasses are frozen dataclasses.
     """
 
@@ -40,6 +40,11 @@ class Sensor(ABC):
     @abstractmethod
     def frame_names(self) -> list[str]:
         """One short name per frame, as used for files and plots."""
+
+    def check(self, width: int, height: int) -> None:
+        """Raise ValueError if this sensor does not fit a projector of that many pixels."""
+        for response in self.responses():
+            response.check(width, height)
 
     @property
     def n_frames(self) -> int:

@@ -87,6 +87,13 @@ class StructuredLight(Sensor):
         result += [steady, np.zeros_like(steady)]
         return np.stack(result).astype(np.float32) + ambient.astype(np.float32)
 
+    def check(self, width: int, height: int) -> None:
+        if (width, height) != (self.projector_width, self.projector_height):
+            raise ValueError(
+                f"expected a projector of {self.projector_width} x {self.projector_height} pixels as the sensor codes, "
+                f"got a rig whose projector has {width} x {height}."
+            )
+
     def frame_names(self) -> list[str]:
         names: list[str] = []
         for axis, response in self._coded():

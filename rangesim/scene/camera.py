@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera of a scene: Mitsuba's sensor in OpenCV's terms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from rangesim.errors import FileFormatError
+from rangesim.rig import Intrinsics
+
+# Mitsuba's camera looks along +z with x to the left and y up; ours has x to the right and y down.
+MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def camera_of(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
+    """Intrinsics and T_world_camera (4, 4) of a `perspective` or `thinlens` sensor, as of a sharp pinhole.
+
+    A film's crop window becomes the image. Mitsuba's principal point offset moves the image, hence the minus.
+
+    Raises
+    ------
+    FileFormatError
+        Another kind of sensor, or one whose `to_world` mirrors.
+    """
+    params = dict(mi.traverse(sensor))
+    if "x_fov" not in params:
+        raise FileFormatError(f"expected the sensor of {label} to be perspective, got {sensor.class_name()}.")
+    width, height = (int(n) for n in sensor.film().size())
+    crop_width, crop_height = (int(n) for n in sensor.film().crop_size())
+    left, top = (int(n) for n in sensor.film().crop_offset())
+    f = float(0.5 * width / np.tan(np.radians(_number(params["x_fov"])) / 2))
+    x, y = (_number(params.get(f"principal_point_offset_{axis}", 0.0)) for axis in "xy")
+    camera = Intrinsics(crop_width, crop_height, f, f, width * (0.5 - x) - left, height * (0.5 - y) - top)
+    matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ MITSUBA_FROM_OPENCV
+    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)  # a scaled to_world scales no camera
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        raise FileFormatError(f"the sensor of {label} is mirrored; remove the negative scale from its to_world.")
+    return camera, matrix
+
+
+def _number(value: Any) -> float:
+    return float(np.array(value).item())

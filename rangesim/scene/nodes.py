@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scene file says of its shapes, read and completed before Mitsuba makes objects of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import mitsuba as mi
+
+from rangesim.config import nearest
+from rangesim.errors import FileFormatError
+from rangesim.scene.materials import MATERIAL_CLASSES
+
+CLASS_KEY = "material_class"
+COMPOSITES = ("instance", "shapegroup", "merge")
+"""Shapes that stand for others, whose parts would have neither name nor material."""
+
+
+def ids_of_shapes(state: Any, label: str) -> set[str]:
+    """Ids of all shapes; an anonymous one gets a unique id first.
+
+    Raises
+    ------
+    FileFormatError
+        There are composite shapes.
+    """
+    taken = {node.props.id() for node in state.nodes}
+    ids = set()
+    for index, node in _shapes(state):
+        kind, name = node.props.plugin_name(), node.props.id()
+        if kind in COMPOSITES:
+            raise FileFormatError(
+                f"{label}: shapes of type {kind!r} are not supported; put in copies of the shapes they hold."
+            )
+        if not name or name.startswith("_arg_"):
+            name = f"{kind}_{index}"
+            while name in taken:
+                name += "_"
+            node.props.set_id(name)
+            taken.add(name)
+        ids.add(name)
+    return ids
+
+
+def take_material_classes(state: Any) -> dict[str, str]:
+    """Shape id -> class, where the shape or its BSDF states one; removes the entries, which Mitsuba does not know."""
+    stated: dict[int, str] = {}
+    for index, node in enumerate(state.nodes):
+        if CLASS_KEY in node.props:
+            value = str(node.props[CLASS_KEY])
+            if value not in MATERIAL_CLASSES:
+                hint = nearest(value, MATERIAL_CLASSES)
+                raise FileFormatError(
+                    f"expected {CLASS_KEY} to be one of {', '.join(MATERIAL_CLASSES)}, got {value!r}{hint}."
+                )
+            stated[index] = value
+            del node.props[CLASS_KEY]
+    found = {node.props.id(): _stated_class(state, index, stated) for index, node in _shapes(state)}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _shapes(state: Any) -> Iterator[tuple[int, Any]]:
+    return ((i, node) for i, node in enumerate(state.nodes) if node.type == mi.ObjectType.Shape)
+
+
+def _stated_class(state: Any, index: int, stated: dict[int, str]) -> str | None:
+    """Class stated at a node, or at the nearest BSDF inside."""
+    if index in stated:
+        return stated[index]
+    for _, value in state.nodes[index].props.items():
+        if isinstance(value, mi.Properties.ResolvedReference) and state.nodes[value.index()].type == mi.ObjectType.BSDF:
+            return _stated_class(state, value.index(), stated)
+    return None
