@@ -24,7 +24,8 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     ----------
     columns : mapping of field name to (n,) array
         Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``),
-        normals and labels are picked up under the names that PCL, Open3D and MeshLab write.
+        normals and labels are picked up under the names that PCL, Open3D and MeshLab write. Colours run to
+        65535 in unsigned 16 bits, to 1 in floats none of which is larger, else to 255.
     shape : (n,) or (h, w)
         Leading shape of the result.
     viewpoint : (3,) float64, metres, optional
@@ -70,9 +71,17 @@ def _colors(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.uint8] | Non
     stored = [columns[name] for name in ("red", "green", "blue")]
     if all(channel.dtype == np.uint8 for channel in stored):
         return np.stack(stored, axis=-1).astype(np.uint8).reshape(*shape, 3)
-    top = 255.0 if all(channel.dtype.kind == "f" for channel in stored) else 255.0 / 65535.0
-    scaled = np.stack(stored, axis=-1).astype(np.float64) * top
-    return np.clip(np.nan_to_num(np.rint(scaled)), 0, 255).astype(np.uint8).reshape(*shape, 3)
+    values = np.stack(stored, axis=-1).astype(np.float64)
+    scaled = np.rint(values * (255.0 / _white(stored, values)))
+    return np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8).reshape(*shape, 3)
+
+
+def _white(stored: list[NDArray[np.generic]], values: NDArray[np.float64]) -> float:
+    """The number that means white: 65535 in unsigned 16 bits, 1 in floats of at most 1, else 255."""
+    if all(channel.dtype.kind == "u" and channel.dtype.itemsize == 2 for channel in stored):
+        return 65535.0
+    floats = all(channel.dtype.kind == "f" for channel in stored)
+    return 1.0 if floats and values.max(initial=0.0, where=np.isfinite(values)) <= 1.0 else 255.0
 
 
 def _normals(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.floating] | None:

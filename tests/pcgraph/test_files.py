@@ -93,6 +93,30 @@ def test_ply_both_codes_and_byte_orders():
     assert np.array_equal(cloud.normals, normals)
 
 
+@pytest.mark.parametrize(
+    ("kind", "stored", "expected"),
+    [
+        ("uchar", [255, 128, 1], [255, 128, 1]),
+        ("ushort", [65535, 32896, 257], [255, 128, 1]),
+        ("ushort", [257, 0, 0], [1, 0, 0]),
+        ("int", [255, 128, 0], [255, 128, 0]),
+        ("int", [300, -5, 1], [255, 0, 1]),
+        ("short", [1, 0, 1], [1, 0, 1]),
+        ("uint", [255, 128, 3], [255, 128, 3]),
+        ("float", [255, 128, 3], [255, 128, 3]),
+        ("double", [255, 127.6, "nan"], [255, 128, 0]),
+        ("float", [1, 0.5, 0], [255, 128, 0]),
+        ("float", ["nan", 0.2, "inf"], [0, 51, 255]),
+    ],
+)
+def test_ply_colours_of_any_type(kind, stored, expected):
+    names = "".join(f"property float {c}\n" for c in "xyz")
+    names += "".join(f"property {kind} {c}\n" for c in ("red", "green", "blue"))
+    values = " ".join(map(str, stored))
+    text = f"ply\nformat ascii 1.0\nelement vertex 1\n{names}end_header\n0 0 1 {values}\n"
+    assert read_ply(text.encode()).colors.tolist() == [expected]
+
+
 def test_open3d_files_are_read_and_ours_read_back(tmp_path):
     o3d = pytest.importorskip("open3d")
     points = np.random.default_rng(0).random((50, 3))
