@@ -3,17 +3,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
-import shutil
-import tempfile
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rangesim import __version__
 from rangesim.capture import DTYPES, Capture
 from rangesim.config import check_keys, from_dict, to_dict
 from rangesim.detector import Detector, PhotoDetector
@@ -22,6 +19,7 @@ from rangesim.image_files import SUFFIXES, read_stack, write_grey
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
 from rangesim.spad import SpadDetector
+from rangesim.staging import new_directory, read_sidecar, write_json
 
 SIDECAR = "capture.json"
 FORMAT = "rangesim-capture"
@@ -39,25 +37,18 @@ def save_capture(capture: Capture, directory: str | Path) -> None:
     Raises
     ------
     FileFormatError
-        `directory` exists and is no capture, or the frames do not fit 16 bits.
+        `directory` exists and is neither empty nor a capture, or the frames do not fit 16 bits.
     """
-    target = Path(directory)
-    _check_target(target)
     if capture.is_digital and capture.frames.dtype.itemsize > 2 and capture.frames.max() > 65535:
         raise FileFormatError(
-            f"{target}: the frames hold counts up to {capture.frames.max()}, the files at most 65535; expose shorter."
+            f"{directory}: the frames hold counts up to {capture.frames.max()}, the files at most 65535; "
+            "expose shorter."
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    try:
+    with new_directory(directory, SIDECAR, FORMAT) as folder:
         names = _file_names(capture)
         for name, frame in zip(names, capture.frames, strict=True):
-            write_grey(staging / name, frame.astype(np.uint16) if frame.dtype == np.uint32 else frame)
-        (staging / SIDECAR).write_text(json.dumps(_sidecar(capture, names), indent=1) + "\n", encoding="utf-8")
-        staging.chmod(0o755)
-        _replace(staging, target)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+            write_grey(folder / name, frame.astype(np.uint16) if frame.dtype == np.uint32 else frame)
+        write_json(folder / SIDECAR, _sidecar(capture, names))
 
 
 def load_capture(directory: str | Path) -> Capture:
@@ -70,7 +61,11 @@ def load_capture(directory: str | Path) -> Capture:
         the file.
     """
     sidecar = Path(directory) / SIDECAR
-    settings = _read_sidecar(sidecar)
+    settings = read_sidecar(sidecar, FORMAT)
+    if settings.get("format_version") != FORMAT_VERSION:
+        raise FileFormatError(
+            f"{sidecar}: expected format version {FORMAT_VERSION}, got {settings.get('format_version')!r}."
+        )
     try:
         check_keys(settings, _KEYS, str(sidecar))
         sensor = from_dict(Sensor, settings.get("sensor"), "sensor")  # type: ignore[type-abstract]
@@ -126,7 +121,7 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "rangesim": _package_version(),
+        "rangesim": __version__,
         "dtype": capture.frames.dtype.name,
         "sensor": to_dict(capture.sensor),
         "rig": to_dict(capture.rig),
@@ -134,29 +129,6 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
         "exposure_s": None if math.isnan(capture.exposure_s) else capture.exposure_s,
         "frames": names,
     }
-
-
-def _package_version() -> str:
-    try:
-        return version("rangesim")
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def _read_sidecar(sidecar: Path) -> dict[str, Any]:
-    if not sidecar.is_file():
-        raise FileFormatError(f"{sidecar.parent} is no capture: it has no {SIDECAR}.")
-    try:
-        settings = json.loads(sidecar.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{sidecar} is no valid JSON: {error}.") from error
-    if not isinstance(settings, dict) or settings.get("format") != FORMAT:
-        raise FileFormatError(f"{sidecar} is no {FORMAT} file.")
-    if settings.get("format_version") != FORMAT_VERSION:
-        raise FileFormatError(
-            f"{sidecar}: expected format version {FORMAT_VERSION}, got {settings.get('format_version')!r}."
-        )
-    return settings
 
 
 def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor) -> np.ndarray:
@@ -177,23 +149,3 @@ def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor) -> np.
 
 def _natural(path: Path) -> list[tuple[int, int | str]]:
     return [(0, int(s)) if s.isdigit() else (1, s) for s in re.split(r"(\d+)", path.name.lower())]
-
-
-def _check_target(target: Path) -> None:
-    if not target.exists():
-        return
-    if not target.is_dir():
-        raise FileFormatError(f"{target} exists and is no directory; a capture is one.")
-    if any(target.iterdir()) and not (target / SIDECAR).is_file():
-        raise FileFormatError(f"{target} exists and is no capture (it has no {SIDECAR}); nothing was overwritten.")
-
-
-def _replace(staging: Path, target: Path) -> None:
-    """Put `staging` in the place of `target`, which may exist."""
-    if not target.exists():
-        staging.rename(target)
-        return
-    old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-    target.rename(old / "capture")
-    staging.rename(target)
-    shutil.rmtree(old)

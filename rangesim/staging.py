@@ -43,6 +43,8 @@ def new_directory(directory: str | Path, sidecar: str, kind: str) -> Iterator[Pa
         inside.rename(target)
         done = True
     finally:
+        if not done and (staging / "old").exists():
+            (staging / "old").rename(target)
         shutil.rmtree(staging, ignore_errors=True)
         if not done:
             with suppress(OSError):  # somebody else put something there meanwhile
@@ -72,7 +74,7 @@ def _check(target: Path, sidecar: str, kind: str) -> None:
     if not target.exists():
         return
     if not target.is_dir():
-        raise FileFormatError(f"{target} exists and is no directory; name another place with --out.")
+        raise FileFormatError(f"{target} exists and is no directory; name another place.")
     if any(target.iterdir()):
         try:
             read_sidecar(target / sidecar, kind)

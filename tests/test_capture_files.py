@@ -81,7 +81,7 @@ def test_a_capture_is_replaced_and_nothing_else_is(tmp_path: Path) -> None:
     precious = tmp_path / "precious"
     precious.mkdir()
     (precious / "thesis.txt").write_text("all my work")
-    with pytest.raises(FileFormatError, match="nothing was overwritten"):
+    with pytest.raises(FileFormatError, match="nothing was written"):
         small_capture().save(precious)
     with pytest.raises(FileFormatError, match="no directory"):
         small_capture().save(precious / "thesis.txt")
@@ -107,7 +107,7 @@ FIRST = "000_columns_bit2.png"
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda d: (d / SIDECAR).unlink(), "is no capture: it has no capture.json"),
+        (lambda d: (d / SIDECAR).unlink(), "is no rangesim-capture directory: it has no capture.json"),
         (lambda d: (d / SIDECAR).write_text("{"), "is no valid JSON"),
         (lambda d: (d / SIDECAR).write_text("[]"), "is no rangesim-capture file"),
         (lambda d: (d / FIRST).unlink(), f"{FIRST} is missing"),
@@ -142,10 +142,29 @@ def test_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytes
     def full(*_: object, **__: object) -> None:
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("rangesim.capture_files.json.dumps", full)
-    with pytest.raises(OSError, match="No space"):
+    small_capture().save(tmp_path / "old")
+    monkeypatch.setattr("rangesim.staging.json.dumps", full)
+    for name in ("c", "not/yet/there", "old"):
+        with pytest.raises(OSError, match="No space"):
+            small_capture(Detector()).save(tmp_path / name)
+    assert [p.name for p in tmp_path.iterdir()] == ["old"]
+    assert load_capture(tmp_path / "old").frames.dtype == np.float32
+
+
+def test_the_older_capture_survives_a_failing_replacement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small_capture().save(tmp_path / "c")
+    rename = Path.rename
+
+    def fails_for_the_new(self: Path, target: Path) -> Path:
+        if self.name == "new":
+            raise OSError("Device is gone")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fails_for_the_new)
+    with pytest.raises(OSError, match="gone"):
         small_capture(Detector()).save(tmp_path / "c")
-    assert list(tmp_path.iterdir()) == []
+    assert load_capture(tmp_path / "c").frames.dtype == np.float32
+    assert [p.name for p in tmp_path.iterdir()] == ["c"]
 
 
 def test_real_images_come_in_by_number(tmp_path: Path) -> None:
