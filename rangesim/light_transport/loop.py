@@ -49,13 +49,18 @@ class Device:
 
 
 class Settings(NamedTuple):
-    """Sampling of the loop. `seed`, `spp` and `max_depth` are opaque; the others shape the kernel."""
+    """Sampling of the loop. Numbers are opaque; the two flags shape the kernel.
+
+    ambient : whether the scene has light of its own.
+    lamps : whether that light has a direction worth sampling; uniform surroundings are found best by the BSDF alone.
+    """
 
     seed: Any
     spp: Any
     max_depth: Any
     rr_depth: Any
     ambient: bool
+    lamps: bool
 
 
 class Radiance(NamedTuple):
@@ -146,9 +151,11 @@ def trace(
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
-            emitted = emission(scene, si, previous, previous_pdf, previous_delta, active)
-            xi = mi.Point2f(rng.next_float32(), rng.next_float32())
-            ambient += throughput * (emitted + sampled_emission(scene, bsdf, si, xi, may_connect))
+            alone = previous_delta | (not settings.lamps)  # no other strategy finds this light
+            ambient += throughput * emission(scene, si, previous, previous_pdf, alone, active)
+            if dr.hint(settings.lamps, mode="scalar"):
+                xi = mi.Point2f(rng.next_float32(), rng.next_float32())
+                ambient += throughput * sampled_emission(scene, bsdf, si, xi, may_connect)
 
         # ---- Next direction --------------------------------------------------------------------------
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -209,12 +216,12 @@ def connect(scene: Any, projector: Device, si: Any, active: Any) -> tuple[Any, A
     return uv, to_projector, distance, geometry, inside & ~scene.ray_test(shadow_ray, coherent=False, active=inside)
 
 
-def emission(scene: Any, si: Any, previous: Any, pdf: Any, is_delta: Any, active: Any) -> Any:
+def emission(scene: Any, si: Any, previous: Any, pdf: Any, alone: Any, active: Any) -> Any:
     """Radiance that a scene emitter sends along the ray, weighted against having been sampled at `previous`."""
     emitter = si.emitter(scene, active)
     ds = mi.DirectionSample3f(scene, si, previous)
-    emitter_pdf = scene.pdf_emitter_direction(previous, ds, active & ~is_delta)
-    weight = dr.select(is_delta, 1, power_heuristic(pdf, emitter_pdf))
+    emitter_pdf = scene.pdf_emitter_direction(previous, ds, active & ~alone)
+    weight = dr.select(alone, 1, power_heuristic(pdf, emitter_pdf))
     return dr.select(active, weight * mono(emitter.eval(si, active)), 0)
 
 

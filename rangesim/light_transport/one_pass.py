@@ -67,6 +67,7 @@ def transport(
         max_depth=dr.opaque(mi.UInt32, max_depth),
         rr_depth=dr.opaque(mi.UInt32, rr_depth),
         ambient=scene.has_ambient,
+        lamps=scene.has_lamps,
     )
     irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
     for begin, end in _tiles(h * w, responses, memory_bytes, PROGRESS_STEPS if progress else 1):

@@ -46,6 +46,11 @@ class Scene:
         """Whether the scene has light sources of its own."""
         return len(self.mitsuba.emitters()) > 0
 
+    @property
+    def has_lamps(self) -> bool:
+        """Whether some of that light comes from somewhere, rather than evenly from all around."""
+        return any(emitter.class_name() != "ConstantBackgroundEmitter" for emitter in self.mitsuba.emitters())
+
     def rig(
         self,
         baseline_m: float | None = None,
