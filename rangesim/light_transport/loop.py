@@ -140,7 +140,8 @@ def trace(
         )
         radiance = dr.select(lit, throughput * mono(value) * geometry * irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
-        path = LightPath(*(dr.select(lit, x, 0) for x in (uv.x, uv.y, length + distance)), first)
+        u, v, path_length = (dr.select(lit, x, 0) for x in (uv.x, uv.y, length + distance))
+        path = LightPath(u, v, path_length, first)
         channels = accumulators.add(channels, path, radiance, lane, lit)
         direct += dr.select(first & ~via, radiance, 0)
         via_delta += dr.select(first & via, radiance, 0)
