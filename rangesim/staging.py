@@ -26,13 +26,20 @@ def new_directory(directory: str | Path, sidecar: str, kind: str) -> Iterator[Pa
     Raises
     ------
     FileFormatError
-        `directory` exists and is neither empty nor of this kind.
+        `directory` exists and is neither empty nor of this kind, or no directory can be made there.
     """
     target = Path(directory)
-    _check(target, sidecar, kind)
-    missing = [parent for parent in target.absolute().parents if not parent.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    missing: list[Path] = []
+    try:
+        _check(target, sidecar, kind)
+        missing = [parent for parent in target.absolute().parents if not parent.exists()]
+        target.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        _remove_empty(missing)
+        in_the_way = isinstance(error, (FileExistsError, NotADirectoryError))
+        reason = "a file is in the way" if in_the_way else error.strerror or str(error)
+        raise FileFormatError(f"cannot create the directory {target}: {reason}; name another place.") from error
     done = False
     try:
         inside = staging / "new"
@@ -47,9 +54,7 @@ def new_directory(directory: str | Path, sidecar: str, kind: str) -> Iterator[Pa
             (staging / "old").rename(target)
         shutil.rmtree(staging, ignore_errors=True)
         if not done:
-            with suppress(OSError):  # somebody else put something there meanwhile
-                for parent in missing:
-                    parent.rmdir()
+            _remove_empty(missing)
 
 
 def read_sidecar(path: Path, kind: str) -> dict[str, Any]:
@@ -68,6 +73,13 @@ def read_sidecar(path: Path, kind: str) -> dict[str, Any]:
 def write_json(path: Path, data: dict[str, Any]) -> None:
     """Write plain data, indented."""
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def _remove_empty(directories: list[Path]) -> None:
+    """Remove directories, the innermost first, up to the first that cannot go."""
+    with suppress(OSError):  # never made, or somebody else put something there meanwhile
+        for directory in directories:
+            directory.rmdir()
 
 
 def _check(target: Path, sidecar: str, kind: str) -> None:

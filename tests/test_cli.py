@@ -220,6 +220,17 @@ def test_foreign_directories_are_left_alone(command: Command, tmp_path: Path, na
     assert "is no directory" in answer.err
 
 
+@pytest.mark.parametrize("name", ["run", "decode"])
+def test_a_directory_that_cannot_be_made_is_named(command: Command, tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    source = PLANE if name == "run" else small_result() / "lines" / "capture"
+    answer = command(name, source, "--out", tmp_path / "file" / "out")
+    out = tmp_path / "file" / "out"
+    message = f"rangesim: cannot create the directory {out}: a file is in the way; name another place.\n"
+    assert (answer.status, answer.err) == (1, message)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
 @pytest.mark.parametrize("name", ["compare", "report"])
 def test_what_is_no_result_is_refused(command: Command, tmp_path: Path, name: str) -> None:
     answer = command(name, tmp_path)
