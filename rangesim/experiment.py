@@ -109,6 +109,7 @@ class Experiment:
     ----------
     scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...).
     material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
+    unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
     spp : light paths per pixel.
     max_depth : longest path in segments up to the light; 2 is direct light alone.
@@ -118,6 +119,7 @@ class Experiment:
 
     scene: str
     material: str | None = None
+    unit_m: float | None = None
     width: int | None = None
     height: int | None = None
     spp: int = 64

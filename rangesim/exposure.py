@@ -44,6 +44,8 @@ def expose(
         The pass lacks the sensor's signals, the exposure is not positive, or detector and sensor do not go
         together.
     """
+    if detector is not None and not isinstance(detector, PhotoDetector):
+        raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     if exposure_s is not None and not 0 < exposure_s < np.inf:
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
     if detector is None or isinstance(sensor, IdealToF):

@@ -54,7 +54,9 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
         times: dict[str, float] = {}
         say("Loading the scene", 0.0)
         with timed(times, "load"):
-            scene = scene or rangesim.load_scene(experiment.scene, material=experiment.material)
+            scene = scene or rangesim.load_scene(
+                experiment.scene, material=experiment.material, unit_m=experiment.unit_m
+            )
         passes = group_by_rig(experiment, scene)
         for number, (rig, instruments) in enumerate(passes, 1):
             signals = _trace(experiment, scene, rig, instruments, say, number, len(passes), times)

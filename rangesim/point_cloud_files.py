@@ -35,6 +35,7 @@ def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
     if not cloud.valid.any():
         raise ValueError(f"expected at least one finite point to write to {path.name}, got none.")
     data = _ply_bytes(cloud.finite()) if path.suffix.lower() == ".ply" else _pcd_bytes(cloud)
+    path.parent.mkdir(parents=True, exist_ok=True)
     handle, staging = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:

@@ -381,3 +381,24 @@ def test_unlit_pixels_never_reach_a_response(tabletop: rangesim.Scene) -> None:
         for values in signals.channels.values():
             assert np.isfinite(values).all()
         np.testing.assert_allclose(signals.channels[images][0], signals.energy.projector, rtol=1e-5)
+
+
+def test_wrong_kinds_of_arguments_get_one_clear_sentence(corner: rangesim.Scene) -> None:
+    rig, sensor = corner.rig(**SIZE), AmcwToF(20e6)  # type: ignore[arg-type]
+    assert sensor.modulation_hz == (20e6,)
+    signals = transport(corner, rig, [sensor], spp=1)
+    wrong = {
+        "a Scene": lambda: transport("corner.xml", rig, []),  # type: ignore[arg-type]
+        "a Rig": lambda: transport(corner, None, []),  # type: ignore[arg-type]
+        "a list of sensors": lambda: transport(corner, rig, sensor),  # type: ignore[arg-type]
+        "list of sensors": lambda: transport(corner, rig, ["amcw"]),  # type: ignore[list-item]
+        "a Detector": lambda: rangesim.expose(signals, sensor, "x"),
+        "a Capture": lambda: rangesim.decode(None),
+        "a path or a scene": lambda: rangesim.load_scene(3),
+        "whole numbers": lambda: corner.rig(width=1.5),  # type: ignore[arg-type]
+        "a positive baseline": lambda: corner.rig(baseline_m="a"),  # type: ignore[arg-type]
+    }
+    for message, call in wrong.items():
+        with pytest.raises(ValueError, match=message):
+            call()
+    assert repr(corner) == "Scene('corner', 2 shapes, camera 640 x 480)"

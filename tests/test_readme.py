@@ -25,7 +25,17 @@ def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len([line for line in code.splitlines() if line and not line.startswith("import")]) <= 10
     assert "| mirror |" in run([sys.executable, "-c", code], tmp_path)
-    assert (tmp_path / "tabletop.ply").stat().st_size > 100_000
+    assert (tmp_path / "out" / "tabletop.ply").stat().st_size > 100_000
+
+
+def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    (block,) = [b for b in re.findall(r"```sh\n(.*?)```", README, re.DOTALL) if "rangesim run" in b]
+    for line in block.replace("--out out/compare", "--out out/compare --width 160 --height 120 --spp 8").splitlines():
+        program, *arguments = line.split("#")[0].split()
+        run([str(Path(sys.executable).parent / program), *arguments], tmp_path)
+    assert (tmp_path / "out" / "decoded" / "cloud.ply").exists()
+    assert list((tmp_path / "out" / "segments").glob("*.ply"))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)

@@ -100,6 +100,16 @@ def test_a_bare_mesh_stands_on_a_table(tmp_path: Path, suffix: str) -> None:
     assert (truth.instance == [i.name for i in scene.instances].index("mesh")).mean() > 0.02
 
 
+def test_a_mesh_in_millimetres(tmp_path: Path) -> None:
+    path = write(tmp_path / "mesh.obj", TETRAHEDRON)
+    metres, millimetres = rangesim.load_scene(path), rangesim.load_scene(path, unit_m=0.001)
+    assert millimetres.working_distance_m == pytest.approx(0.001 * metres.working_distance_m, rel=1e-3)
+    with pytest.raises(ValueError, match="positive number of metres"):
+        rangesim.load_scene(path, unit_m=0.0)
+    with pytest.raises(ValueError, match="scale the shapes"):
+        rangesim.load_scene(SCENES / "plane.xml", unit_m=0.001)
+
+
 BROKEN: dict[str, tuple[str, str]] = {
     "broken.xml": ("<scene version='3.0.0'><shape", "no scene Mitsuba can load"),
     "no_sensor.xml": ('<scene version="3.0.0"><shape type="sphere"/></scene>', "a perspective sensor, got none"),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,6 +59,9 @@ def run_command(
     material: Annotated[
         str | None, typer.Option(help="Of a bare mesh: matte, glossy, mirror, transparent. (default: matte)")
     ] = None,
+    unit_m: Annotated[
+        float | None, typer.Option(help="Metres per unit of a bare mesh: 0.001 if it is in millimetres. (default: 1)")
+    ] = None,
     noise_free: Annotated[
         bool, typer.Option("--noise-free", help="Ideal electronics: no noise, no quantisation.")
     ] = False,
@@ -72,7 +76,8 @@ def run_command(
 
       rangesim run --config examples/tabletop.toml --spp 16 --width 320 --height 240 --out out/quick
     """
-    given = {"width": width, "height": height, "spp": spp, "max_depth": max_depth, "seed": seed, "material": material}
+    given: dict[str, Any] = {"width": width, "height": height, "spp": spp, "max_depth": max_depth, "seed": seed}
+    given |= {"material": material, "unit_m": unit_m}
     experiment = _experiment(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
     if baseline is not None:
         experiment = replace(
@@ -84,7 +89,23 @@ def run_command(
 
     with progress_bar() as progress:
         run(experiment, out, progress)
+    _say_what_measured_nothing(out)
     typer.echo(f"{out / 'report.html'}")
+
+
+def _say_what_measured_nothing(out: Path) -> None:
+    """A line on stderr if some instrument has not a single point: most often the scene is not in metres."""
+    from rangesim.result_files import SETTINGS
+
+    distance = json.loads((out / SETTINGS).read_text(encoding="utf-8"))["scene"]["working_distance_m"]
+    results = {p.parent.name: json.loads(p.read_text(encoding="utf-8")) for p in out.glob("*/measurement.json")}
+    blind = sorted(name for name, result in results.items() if result["points"] == 0)
+    if blind:
+        typer.echo(
+            f"rangesim: {', '.join(blind)} measured no pixel at all, at a working distance of {distance:g} m; coordinates are "
+            "metres (a mesh in millimetres needs --unit-m 0.001), and more --spp or power helps in the dark.",
+            err=True,
+        )
 
 
 def _experiment(

@@ -30,8 +30,10 @@ def decode(capture: Capture) -> RangeImage:
     Raises
     ------
     ValueError
-        There is no decoder for this kind of sensor.
+        Not a capture, or there is no decoder for this kind of sensor.
     """
+    if not isinstance(capture, Capture):
+        raise ValueError(f"expected a Capture, as expose, load_capture or import_capture return, got {capture!r}.")
     decoder = DECODERS.get(type(capture.sensor))
     if decoder is None:
         known = ", ".join(kind.__name__ for kind in DECODERS)

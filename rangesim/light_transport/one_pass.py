@@ -42,7 +42,7 @@ def transport(
     ----------
     scene : Scene
     rig : Rig; its lenses must be free of distortion (rendering distorted lenses is not implemented).
-    sensors : sensors, or bare responses.
+    sensors : sensors, or bare responses; none for energy split and ground truth alone.
     spp : int >= 1, samples (camera paths) per pixel.
     max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba.
     rr_depth : int >= 1, surfaces after which Russian roulette may end a path.
@@ -55,7 +55,7 @@ def transport(
     ValueError
         A number out of its range, a distorted lens, patterns that do not fit the projector, or too little memory.
     """
-    _check(rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    _check(scene, rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
@@ -118,7 +118,13 @@ def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, at_lea
         yield begin, min(begin + size, pixels)
 
 
-def _check(rig: Rig, sensors: Sequence[Sensor | Response], seed: int, **counts: int) -> None:
+def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], seed: int, **counts: int) -> None:
+    if not isinstance(scene, Scene):
+        raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
+    if not isinstance(rig, Rig):
+        raise ValueError(f"expected a Rig, as scene.rig() returns, got {type(rig).__name__}.")
+    if not isinstance(sensors, Sequence) or not all(isinstance(s, (Sensor, Response)) for s in sensors):
+        raise ValueError(f"expected a list of sensors, for example [StructuredLight()], got {sensors!r}.")
     if not isinstance(seed, (int, np.integer)):
         raise ValueError(f"expected seed to be a whole number, got {seed!r}.")
     for sensor in sensors:

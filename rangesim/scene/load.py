@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,7 +26,14 @@ from rangesim.scene.scene import Instance, Scene
 Source = str | Path | Mapping[str, Any]
 
 
-def load_scene(source: Source, *, material: str | None = None, sensor: int = 0, variant: str | None = None) -> Scene:
+def load_scene(
+    source: Source,
+    *,
+    material: str | None = None,
+    unit_m: float | None = None,
+    sensor: int = 0,
+    variant: str | None = None,
+) -> Scene:
     """A scene to measure.
 
     Parameters
@@ -35,6 +43,7 @@ def load_scene(source: Source, *, material: str | None = None, sensor: int = 0, 
         ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
     material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.
+    unit_m : metres per unit of length of a bare mesh, 0.001 for one in millimetres; default 1.
     sensor : which of the scene's sensors becomes the camera.
     variant : Mitsuba variant; default CUDA where there is a GPU, else LLVM.
 
@@ -46,11 +55,20 @@ def load_scene(source: Source, *, material: str | None = None, sensor: int = 0, 
     ValueError
         Unknown material class, or one for a scene that names its own; no such sensor.
     """
+    if not isinstance(source, (str, Path, Mapping)):
+        raise ValueError(f"expected a path or a scene dictionary, got {type(source).__name__} {source!r}.")
     label = "the scene dictionary" if isinstance(source, Mapping) else str(source)
-    if material is not None and not _is_mesh(source):
-        raise ValueError(f"a material can be chosen for a bare mesh alone, but {label} names its own materials.")
+    if not _is_mesh(source):
+        if material is not None:
+            raise ValueError(f"a material can be chosen for a bare mesh alone, but {label} names its own materials.")
+        if unit_m is not None:
+            raise ValueError(
+                f"a unit can be chosen for a bare mesh alone; scale the shapes of {label} to metres instead."
+            )
+    if unit_m is not None and not 0 < unit_m < np.inf:
+        raise ValueError(f"expected a positive number of metres per unit, got {unit_m}.")
     select_variant(variant)
-    loaded, ids, classes = _instantiate(source, material or "matte", label)
+    loaded, ids, classes = _instantiate(source, material or "matte", unit_m or 1.0, label)
     _check(loaded, ids, sensor, label)
     camera, T_world_camera = camera_of(loaded.sensors()[sensor], label)
     return Scene(
@@ -64,30 +82,30 @@ def load_scene(source: Source, *, material: str | None = None, sensor: int = 0, 
     )
 
 
-def _instantiate(source: Source, material: str, label: str) -> tuple[Any, set[str], dict[str, str]]:
+def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tuple[Any, set[str], dict[str, str]]:
     """The Mitsuba scene, the ids of its shapes, and the material classes that the file states."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
     try:
         with tempfile.TemporaryDirectory() as folder, _own_file_resolver():
-            state = _parse(config, source, material, Path(folder))
+            state = _parse(config, source, material, unit_m, Path(folder))
             mi.parser.transform_all(config, state)
             ids, classes = ids_of_shapes(state, label), take_material_classes(state)
             loaded = mi.parser.instantiate(config, state)
     except RuntimeError as error:
-        reason = " ".join(str(error).split())[:400]
+        reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))[:400]
         raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
 
 
-def _parse(config: Any, source: Source, material: str, folder: Path) -> Any:
+def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Path) -> Any:
     if isinstance(source, Mapping):
         return mi.parser.parse_dict(config, dict(source))
     path = Path(source)
     if not path.is_file():
         raise FileFormatError(f"expected a scene or mesh file, but {path} does not exist.")
     if _is_mesh(path):
-        return mi.parser.parse_dict(config, scene_around_mesh(path, material, folder))
+        return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, folder))
     if path.suffix.lower() != ".xml":
         raise FileFormatError(f"expected a scene (.xml) or a mesh ({', '.join(MESH_SUFFIXES)}), got {path}.")
     mi.file_resolver().prepend(str(path.resolve().parent))  # type: ignore[attr-defined]

@@ -24,16 +24,18 @@ MESH_MATERIALS: dict[str, dict[str, Any]] = {
 }
 
 
-def scene_around_mesh(path: Path, material: str, folder: Path) -> dict[str, Any]:
+def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path) -> dict[str, Any]:
     """Mitsuba scene dictionary with the mesh standing on a table, camera 640 x 480, 57 degrees wide.
 
-    Coordinates are taken as metres; table and camera distance follow the size of the mesh. Mitsuba reads fewer formats
-    than there are, so it gets a copy of the mesh in `folder`, which must live until the scene is instantiated.
+    `unit_m` is the length of the mesh's unit in metres; table and camera distance follow the size of the mesh.
+    Mitsuba reads fewer formats than there are, so it gets a copy of the mesh in `folder`, which must live until the
+    scene is instantiated.
     """
     if material not in MESH_MATERIALS:
         hint = nearest(material, MESH_MATERIALS)
         raise ValueError(f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{hint}.")
     vertices, faces = _read(path)
+    vertices = vertices * unit_m
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -77,7 +79,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {error}.") from error
     vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))
     if len(faces) == 0:
-        raise FileFormatError(f"expected a triangle mesh in {path}, got {len(vertices)} vertices and no faces.")
+        raise FileFormatError(f"expected a triangle mesh in {path}, which has no faces.")
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
         raise FileFormatError(f"expected finite vertices and valid face indices in {path}; repair the mesh first.")
     return vertices, faces

@@ -21,7 +21,7 @@ class Instance:
     material: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Geometry and materials to measure.
 
@@ -40,6 +40,10 @@ class Scene:
     T_world_camera: np.ndarray
     working_distance_m: float
     has_cutouts: bool = False
+
+    def __repr__(self) -> str:
+        c = self.camera
+        return f"Scene({self.name!r}, {len(self.instances)} shapes, camera {c.width} x {c.height})"
 
     @property
     def has_ambient(self) -> bool:
@@ -74,10 +78,12 @@ class Scene:
             width = self.camera.width if height is None else round(height * self.camera.width / self.camera.height)
         if height is None:
             height = round(width * self.camera.height / self.camera.width)
+        if not all(isinstance(n, (int, np.integer)) for n in (width, height)):
+            raise ValueError(f"expected whole numbers of camera pixels, got {width} x {height}.")
         camera = self.camera.resized(width, height)
         if baseline_m is None:
             baseline_m = float(f"{0.2 * self.working_distance_m:.1g}")
-        if not baseline_m > 0:
+        if not isinstance(baseline_m, (int, float)) or not baseline_m > 0:
             raise ValueError(f"expected a positive baseline in metres, got {baseline_m}.")
         target = (0.0, 0.0, self.working_distance_m)
         return Rig(

@@ -44,7 +44,7 @@ class AmcwToF(Sensor):
 
     Parameters
     ----------
-    modulation_hz : tuple of floats, hertz.
+    modulation_hz : tuple of floats, hertz; or one float.
     contrast : float in (0, 1], demodulation contrast.
     waveform : "sine", or "square" for a square source against a square reference (triangle correlation, "wiggling").
     """
@@ -56,6 +56,8 @@ class AmcwToF(Sensor):
     type_name: ClassVar[str] = "amcw-tof"
 
     def __post_init__(self) -> None:
+        if isinstance(self.modulation_hz, (int, float)):
+            object.__setattr__(self, "modulation_hz", (float(self.modulation_hz),))
         if not self.modulation_hz or not all(f > 0 for f in self.modulation_hz):
             raise ValueError(f"expected positive modulation frequencies in hertz, got {self.modulation_hz}.")
         if not 0 < self.contrast <= 1:
