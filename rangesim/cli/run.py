@@ -102,8 +102,8 @@ def _say_what_measured_nothing(out: Path) -> None:
     blind = sorted(name for name, result in results.items() if result["points"] == 0)
     if blind:
         typer.echo(
-            f"rangesim: {', '.join(blind)} measured no pixel at all, at a working distance of {distance:g} m; coordinates are "
-            "metres (a mesh in millimetres needs --unit-m 0.001), and more --spp or power helps in the dark.",
+            f"rangesim: {', '.join(blind)} measured no pixel at all, at a working distance of {distance:g} m; "
+            "coordinates are metres (a mesh in millimetres needs --unit-m 0.001), and --spp or power helps in the dark.",
             err=True,
         )
 
