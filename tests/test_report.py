@@ -64,7 +64,8 @@ def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("metres", "text"), [(0.0, "0.000"), (12.34e-6, "0.012"), (-2.5e-3, "−2.50"), (0.0321, "32.1"), (1.5, "1500")]
+    ("metres", "text"),
+    [(0.0, "0.000"), (-1e-9, "0.000"), (12.34e-6, "0.012"), (-2.5e-3, "−2.50"), (0.0321, "32.1"), (1.5, "1500")],
 )
 def test_millimetres_have_three_digits(metres: float, text: str) -> None:
     assert tables.millimetres(metres) == text
@@ -87,9 +88,23 @@ def test_dark_pixels_in_the_emitters_shadow_are_told_apart() -> None:
     for m in load_result(small_result()).measurements:
         found = palette.causes(m)
         changed = found != m.image.status
-        assert (found[changed] == palette.SHADOW).all()
+        assert (found[changed] >= palette.SHADOW).all()
         assert (m.image.status[changed] == Status.LOW_SIGNAL).all()
-        assert not m.truth.projector_visible[changed].any()
+        assert not m.truth.projector_visible[found == palette.SHADOW].any()
+        assert np.isfinite(m.truth.z[found == palette.SHADOW]).all()
+        assert np.isnan(m.truth.z[found == palette.NOTHING]).all()
+
+
+def test_dark_pixels_without_a_surface_are_told_apart() -> None:
+    status = np.array([[Status.LOW_SIGNAL, Status.LOW_SIGNAL, Status.LOW_SIGNAL, Status.CODE_ERROR]], dtype=np.uint8)
+    truth = SimpleNamespace(
+        z=np.array([[1.0, 1.0, np.nan, np.nan]]), projector_visible=np.array([[True, False, False, False]])
+    )
+    measurement: Any = SimpleNamespace(image=SimpleNamespace(status=status), truth=truth)
+    assert palette.causes(measurement).tolist() == [
+        [Status.LOW_SIGNAL, palette.SHADOW, palette.NOTHING, Status.CODE_ERROR]
+    ]
+    assert len(palette.STATUS_NAMES) == len(palette.STATUS_COLORS)
 
 
 def test_a_node_has_the_colour_of_its_largest_child() -> None:
@@ -103,18 +118,39 @@ def test_a_node_has_the_colour_of_its_largest_child() -> None:
 def test_the_verdict_says_what_the_rows_say() -> None:
     good = _measured("lines", 0.99, 1e-3, 0.01, acquisition_s=0.2)
     poor = _measured("amcw", 0.4, 5e-3, 0.7, acquisition_s=0.1)
-    first, second, both = verdict([good, poor])
+    fair = _measured("histogram", 0.9, 2e-3, 0.02, acquisition_s=0.3)
+    first, second, _, both = verdict([good, poor, fair])
     assert "99.0\xa0% of the pixels" in first.text
     assert "1.00\xa0mm" in first.text
     assert "Unreliable" not in first.text
     assert "glossy (60\xa0% missing, 70\xa0% of the rest wrong by over 10\xa0mm)" in second.text
     assert "Smallest median error: Structured light, 1.00\xa0mm" in both.text
     assert "Shortest exposure of all frames: Time of flight (AMCW)" in both.text
+    assert "Smallest median error" not in verdict([good, poor])[-1].text  # on the few pixels that are left
+
+
+def test_no_bold_where_a_sensor_is_unreliable() -> None:
+    good = _measured("lines", 0.99, 5e-3, 0.01, acquisition_s=0.2)
+    fair = _measured("histogram", 0.9, 6e-3, 0.02, acquisition_s=0.2)
+    few = _measured("amcw", 0.1, 1e-3, 0.0, acquisition_s=0.1)  # the best error, on the tenth that is left
+
+    def bold(*measurements: Any) -> list[str]:
+        (_, lines), *_ = tables.comparison_table(measurements)
+        return [name for name, cells in lines if any(cell.best for cell in cells)]
+
+    assert bold(good, fair, few) == ["lines"]
+    assert bold(good, few) == []
 
 
 def _measured(sensor: str, complete: float, median: float, outliers: float, acquisition_s: float) -> Any:
-    row = {"completeness": complete, "median_abs_m": median, "p95_abs_m": 3 * median, "outlier_rate": outliers}
-    rows = [{"material": name, **row} for name in ("glossy", "all")]
+    row: dict[str, Any] = {
+        "completeness": complete,
+        "median_abs_m": median,
+        "p95_abs_m": 3 * median,
+        "outlier_rate": outliers,
+    }
+    row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
+    rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
     facts = {"acquisition_s": acquisition_s, "frames": 10}
     return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, facts=facts)
 

@@ -12,6 +12,8 @@ from rangesim.status import Status
 
 SHADOW = len(Status)
 """Class beyond `Status`: no light arrives because the emitter does not see the point."""
+NOTHING = SHADOW + 1
+"""Class beyond `Status`: no light arrives because the scene has no surface there."""
 NO_DATA = (203, 206, 210)
 ERROR_KNEE_M = 1e-4
 """Metres; the error scale is linear below and logarithmic beyond."""
@@ -25,9 +27,19 @@ STATUS_NAMES = {
     Status.WRAPPED: "phases disagree",
     Status.OUT_OF_RANGE: "out of range",
     SHADOW: "in the emitter's shadow",
+    NOTHING: "nothing there",
 }
 STATUS_COLORS = np.array(
-    [(231, 234, 237), (52, 104, 176), (240, 171, 0), (196, 56, 45), (125, 79, 163), (40, 44, 52), (150, 180, 214)],
+    [
+        (231, 234, 237),
+        (52, 104, 176),
+        (240, 171, 0),
+        (196, 56, 45),
+        (125, 79, 163),
+        (40, 44, 52),
+        (150, 180, 214),
+        (176, 158, 130),
+    ],
     dtype=np.uint8,
 )
 MATERIAL_COLORS = {
@@ -89,8 +101,10 @@ def error_ticks() -> list[Tick]:
 
 
 def causes(measurement: Measurement) -> np.ndarray:
-    """(h, w) uint8, `Status` of each pixel, or `SHADOW` where it is dark because the emitter does not see it."""
+    """(h, w) uint8, `Status` per pixel; dark ones `SHADOW` where the emitter does not see, `NOTHING` off surfaces."""
     status = measurement.image.status.copy()
-    dark = np.isfinite(measurement.truth.z) & ~measurement.truth.projector_visible
-    status[dark & (status == Status.LOW_SIGNAL)] = SHADOW
+    dark = status == Status.LOW_SIGNAL
+    surface = np.isfinite(measurement.truth.z)
+    status[dark & surface & ~measurement.truth.projector_visible] = SHADOW
+    status[dark & ~surface] = NOTHING
     return status

@@ -13,6 +13,9 @@ from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLig
 
 Rows = list[dict[str, Any]]
 
+UNRELIABLE = 0.5
+"""Share of outliers or of missing pixels from which a sensor is called unreliable on a material."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -40,7 +43,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Cell:
-    """text; best : of the real sensors on this material; bar : 0..1 for shares, else None."""
+    """text; best : of the real sensors that are reliable on this material; bar : 0..1 for shares, else None."""
 
     text: str
     best: bool = False
@@ -74,12 +77,22 @@ def details(sensor: Sensor) -> str:
         return f"{', '.join(f'{f / 1e6:g}' for f in sensor.modulation_hz)} MHz, 4 taps, {sensor.waveform} wave"
     if isinstance(sensor, DirectToF):
         return f"{sensor.bins} bins of {sensor.bin_s * 1e12:g} ps"
-    return "first return alone, no noise: the best any time-of-flight sensor could do"
+    return "no noise, first return alone"
 
 
 def is_reference(measurement: Measurement) -> bool:
     """Whether the instrument is an ideal that nobody can buy."""
     return isinstance(measurement.capture.sensor, IdealToF)
+
+
+def missing_share(row: dict[str, Any]) -> float:
+    """Share of the lit pixels without a measurement; 0 where none is lit."""
+    return 1.0 - row["completeness"] if row["completeness"] is not None else 0.0
+
+
+def is_unreliable(row: dict[str, Any]) -> bool:
+    """Whether half of the lit pixels or more have no measurement, or half of the measurements or more are outliers."""
+    return max(missing_share(row), row["outlier_rate"] or 0.0) >= UNRELIABLE
 
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
@@ -90,8 +103,9 @@ def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, lis
     for material in names:
         rows = {m.name: row for m in measurements for row in m.rows if row["material"] == material}
         real = [rows[m.name] for m in measurements if m.name in rows and not is_reference(m)]
-        best = {c.key: _best(c, real) for c in COLUMNS}
-        lines = [(n, [_cell(c, row[c.key], best[c.key], row in real) for c in COLUMNS]) for n, row in rows.items()]
+        rivals = [row for row in real if not is_unreliable(row)]  # the few pixels left of the others prove nothing
+        best = {c.key: _best(c, rivals) for c in COLUMNS}
+        lines = [(n, [_cell(c, row[c.key], best[c.key], row in rivals) for c in COLUMNS]) for n, row in rows.items()]
         table.append((material, lines))
     return table
 
@@ -120,7 +134,8 @@ def millimetres(metres: float) -> str:
     """Millimetres with about three significant digits."""
     mm = 1e3 * metres
     digits = 3 if abs(mm) < 0.0995 else 2 if abs(mm) < 9.95 else 1 if abs(mm) < 99.5 else 0
-    return f"{mm:.{digits}f}".replace("-", "−")
+    text = f"{mm:.{digits}f}"
+    return text.replace("-", "" if float(text) == 0.0 else "−")
 
 
 def seconds(value: float | None) -> str:
@@ -159,6 +174,6 @@ def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
     return float(max(values) if column.better == "high" else min(values, key=abs))
 
 
-def _cell(column: Column, value: float | None, best: float | None, real: bool) -> Cell:
+def _cell(column: Column, value: float | None, best: float | None, rival: bool) -> Cell:
     bar = value if column.unit == "%" else None
-    return Cell(number(column, value), best=real and value is not None and value == best, bar=bar)
+    return Cell(number(column, value), best=rival and value is not None and value == best, bar=bar)

@@ -7,11 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rangesim.report.tables import Rows, is_reference, millimetres, seconds, titles
+from rangesim.report.tables import Rows, is_reference, is_unreliable, millimetres, missing_share, seconds, titles
 from rangesim.result_files import Measurement
-
-UNRELIABLE = 0.5
-"""Share of outliers or of missing pixels from which a material is called out."""
 
 
 @dataclass(frozen=True)
@@ -49,18 +46,19 @@ def _failures(rows: Rows) -> str:
     """Materials on which most readings are wrong or missing."""
     parts: list[str] = []
     for row in rows:
-        missing = 1 - row["completeness"] if row["completeness"] is not None else 0.0
-        wrong = row["outlier_rate"] or 0.0
-        if row["material"] != "all" and max(missing, wrong) >= UNRELIABLE:
+        if row["material"] != "all" and is_unreliable(row):
             limit = "" if parts else f" by over {_glued('10 mm')}"
-            found = f"{_percent(missing, 0)} missing, {_percent(wrong, 0)} of the rest wrong{limit}"
+            missing, wrong = _percent(missing_share(row), 0), _percent(row["outlier_rate"], 0)
+            found = f"{missing} missing, {wrong} of the rest wrong{limit}"
             parts.append(f"{row['material']} ({found})")
     listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
     return f" Unreliable on these surfaces: {listed}." if parts else ""
 
 
 def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    errors = sorted((_total(m.rows)["median_abs_m"], names[m.name]) for m in real if _total(m.rows)["median_abs_m"])
+    """Of the sensors that are reliable on the whole: what is left of the others proves nothing."""
+    rows = [(_total(m.rows), names[m.name]) for m in real if not is_unreliable(_total(m.rows))]
+    errors = sorted((row["median_abs_m"], name) for row, name in rows if row["median_abs_m"])
     return _ranked("Smallest median error", [(name, _mm(e)) for e, name in errors])
 
 
