@@ -189,6 +189,8 @@ def _write_bad_files(folder: Path) -> None:
         (["decode", "empty", "--projector", "64x64", "--axes", "row"], "columns, rows"),
         (["decode", "empty", "--projector", "64x64"], "expected 26 images .* got 0"),
         (["decode", "gap"], "white.png is missing"),
+        (["decode", "gap", "--axes", "rows", "--bits", "12"], "how it was taken: leave out --axes, --bits"),
+        (["decode", "empty", "--projector", "64x64", "--unit", "1"], "expected --calibration FILE.xml with --unit"),
         (["decode", "crop"], "expected 120 x 90 uint16 .* got 60 x 60"),
     ],
 )
@@ -252,6 +254,18 @@ def test_a_failure_halfway_leaves_nothing(command: Command, tmp_path: Path, monk
     monkeypatch.setattr("rangesim.report.write_report", fail)
     answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
     assert (answer.status, answer.err) == (1, "rangesim: no space left on device\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interruption_is_said_and_leaves_nothing(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rangesim.report.write_report", interrupt)
+    answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
+    assert (answer.status, answer.err) == (130, "rangesim: interrupted; nothing was written.\n")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -16,9 +16,12 @@ if TYPE_CHECKING:
     from rangesim.sensors import StructuredLight
 
 CODES = ("gray", "gray-phase")
+OF_BARE_IMAGES = ("code", "projector", "axes", "period", "steps", "bits")
+OF_XML_CALIBRATIONS = ("code_step", "unit")
 
 
 def decode_command(
+    context: typer.Context,
     capture: Annotated[
         Path, typer.Argument(help="A capture that rangesim wrote, or a folder of images.", show_default=False)
     ],
@@ -55,6 +58,7 @@ def decode_command(
     import rangesim
     from rangesim.cli.decoded_files import write_decoded
 
+    _refuse_what_would_be_ignored(context, capture, calibration)
     sensor = None if projector is None else _sensor(code, projector, axes, period, steps)
     loaded = _load(capture, sensor, bits)
     if calibration:
@@ -62,6 +66,27 @@ def decode_command(
     image = rangesim.decode(loaded)
     write_decoded(image, loaded, out)
     typer.echo(_summary(image, out))
+
+
+def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
+    """ValueError if an option was given that has no effect on this input."""
+    from rangesim.capture_files import SIDECAR
+
+    given = {name for name in context.params if _from_command_line(context, name)}
+    if (capture / SIDECAR).is_file() and (surplus := _options(OF_BARE_IMAGES, given)):
+        raise ValueError(f"{capture} is a capture whose {SIDECAR} says how it was taken: leave out {surplus}.")
+    if calibration is None and (surplus := _options(OF_XML_CALIBRATIONS, given)):
+        raise ValueError(f"expected --calibration FILE.xml with {surplus}.")
+
+
+def _from_command_line(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def _options(names: tuple[str, ...], given: set[str]) -> str:
+    """Those of the names that were given, as they are written on the command line."""
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names if name in given)
 
 
 def _load(folder: Path, sensor: StructuredLight | None, bits: int | None) -> Capture:
