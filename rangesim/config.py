@@ -123,4 +123,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     try:
         return msgspec.convert(value, hint)
     except msgspec.ValidationError as error:
-        raise ValueError(f"{where}: {error}, got {value!r}.") from error
+        expected, _, rest = str(error).partition(", got ")
+        inner = rest.partition(" - at `$")[2].rstrip("`")  # such as [1]
+        wanted = expected.replace("`", "").replace("Expected", "expected")
+        raise ValueError(f"{where}{inner}: {wanted}, got {value!r}.") from error

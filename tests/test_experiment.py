@@ -58,7 +58,7 @@ def test_the_first_example_states_the_defaults() -> None:
         ({}, "missing 'scene'"),
         ({"scene": "a", "ssp": 3}, "did you mean 'spp'"),
         ({"scene": "a", "spp": -1}, "spp .* at least 1, got -1"),
-        ({"scene": "a", "spp": "many"}, "spp"),
+        ({"scene": "a", "spp": "many"}, "^spp: expected int, got 'many'\\.$"),
         ({"scene": "a", "seed": -1}, "seed"),
         ({"scene": "a", "instrument": []}, "at least one instrument"),
         ({"scene": "a", "instrument": {"sensor": "amcw"}}, "two brackets"),

@@ -16,6 +16,9 @@ from rangesim.cli.run import run_command
 from rangesim.doctor import doctor_command
 from rangesim.errors import RangesimError
 
+INTERRUPTED = 130
+"""Exit status that Typer gives to Ctrl-C."""
+
 app = typer.Typer(
     name="rangesim", no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False
 )
@@ -52,6 +55,11 @@ def main() -> None:
     usual = signal.signal(signal.SIGTERM, _end)
     try:
         app()
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            writes = {"run", "decode"} & set(sys.argv[1:3])  # their directories appear when they are complete
+            typer.echo(f"rangesim: interrupted{'; nothing was written' if writes else ''}.", err=True)
+        raise
     except (RangesimError, ValueError, OSError) as error:
         if "--debug" in sys.argv:
             raise
