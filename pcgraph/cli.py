@@ -64,7 +64,7 @@ def segment(
         _write(targets, read, result, labels)
     except (PcgraphError, ValueError, MemoryError) as error:
         message = " ".join(str(error).split()) or "the cloud does not fit into memory: choose a larger voxel size"
-        typer.echo(f"pcgraph: error: {message}", err=True)
+        typer.echo(f"pcgraph: {message.rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
     _print_summary(result, labels, targets, time.perf_counter() - start)
 

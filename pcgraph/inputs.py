@@ -83,21 +83,26 @@ def clean_viewpoint(viewpoint: ArrayLike | None, points: NDArray[np.float64], or
 
 def positive(name: str, value: float) -> float:
     """The value as float, if it is a finite number of metres above zero; ValueError otherwise."""
-    number = non_negative(name, value)
-    if number == 0.0:
-        raise ValueError(f"expected {name} above 0 metres, got {value!r}")
+    number = _number(value)
+    if not 0.0 < number < float("inf"):
+        raise ValueError(f"expected a finite {name} above 0 metres, got {value!r}")
     return number
 
 
 def non_negative(name: str, value: float) -> float:
     """The value as float, if it is a finite number of at least zero; ValueError otherwise."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = float("nan")
+    number = _number(value)
     if not 0.0 <= number < float("inf"):
         raise ValueError(f"expected {name} to be a finite number, not negative, got {value!r}")
     return number
+
+
+def _number(value: float) -> float:
+    """The value as float; NaN if it is no number."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
 
 
 def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:

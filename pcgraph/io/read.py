@@ -25,9 +25,11 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     Raises
     ------
     CloudReadError
-        No such file, another extension, or content that is truncated or contradicts its header.
+        No such file, a directory, another extension, or content that is truncated or contradicts its header.
     """
     path = Path(path)
+    if path.is_dir():
+        raise CloudReadError(f"{path} is a directory: expected a file ending in {' or '.join(_READERS)}")
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise CloudReadError(f"expected a file ending in {' or '.join(_READERS)}, got {path.name!r}: convert it first")

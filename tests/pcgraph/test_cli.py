@@ -66,7 +66,8 @@ def test_few_points_work(points, tmp_path):
 def assert_refused(done, message, folder, files):
     assert done.exit_code == 1
     assert done.stdout == ""
-    assert done.stderr.startswith("pcgraph: error: ")
+    assert done.stderr.startswith("pcgraph: ")
+    assert done.stderr.endswith(".\n")
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
     assert "Traceback" not in done.stderr
@@ -94,7 +95,8 @@ def test_bad_options(scene, tmp_path):
     for options, message in (
         (("--objects", 0), "expected a whole number n"),
         (("--objects", 10**6), "expected a whole number n"),
-        (("--voxel-size", -1), "voxel_size"),
+        (("--voxel-size", -1), "finite voxel_size above 0 metres, got -1"),
+        (("--voxel-size", 0), "above 0 metres, got 0"),
         (("--voxel-size", 0.1, "--seed-size", 0.01), "seed_size of at least"),
         (("--voxel-size", "nan"), "voxel_size"),
         (("--out", tmp_path / "a.txt"), ".ply or .npz"),
@@ -111,7 +113,15 @@ def test_missing_file_in_a_process_of_its_own(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert_refused_process = (done.returncode, done.stdout, list(tmp_path.iterdir()))
     assert assert_refused_process == (1, "", [])
-    assert done.stderr == f"pcgraph: error: cannot read {tmp_path / 'none.pcd'}: No such file or directory\n"
+    assert done.stderr == f"pcgraph: cannot read {tmp_path / 'none.pcd'}: No such file or directory.\n"
+
+
+def test_a_directory_is_no_cloud(tmp_path):
+    folder = tmp_path / "scans.pcd"
+    folder.mkdir()
+    for path in (tmp_path, folder):
+        with pytest.raises(pcgraph.CloudReadError, match="is a directory: expected a file"):
+            pcgraph.read_cloud(path)
 
 
 def test_help_names_units():
