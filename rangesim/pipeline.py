@@ -47,6 +47,7 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
     """
     import mitsuba as mi
 
+    from pcgraph.warmup import compile_kernels
     from rangesim.report import write_report
 
     say = progress or (lambda stage, share: None)
@@ -57,6 +58,8 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
             scene = scene or rangesim.load_scene(
                 experiment.scene, material=experiment.material, unit_m=experiment.unit_m
             )
+        with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
+            compile_kernels()
         passes = group_by_rig(experiment, scene)
         for number, (rig, instruments) in enumerate(passes, 1):
             signals = _trace(experiment, scene, rig, instruments, say, number, len(passes), times)

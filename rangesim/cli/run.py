@@ -103,7 +103,7 @@ def _say_what_measured_nothing(out: Path) -> None:
     if blind:
         typer.echo(
             f"rangesim: {', '.join(blind)} measured no pixel at all, at a working distance of {distance:g} m; "
-            "coordinates are metres (a mesh in millimetres needs --unit-m 0.001), and --spp or power helps in the dark.",
+            "coordinates are metres (a mesh in millimetres needs --unit-m 0.001); in the dark, --spp or power helps.",
             err=True,
         )
 
