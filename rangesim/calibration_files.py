@@ -17,6 +17,7 @@ import numpy as np
 from rangesim.config import from_dict, to_dict
 from rangesim.errors import FileFormatError
 from rangesim.rig import Intrinsics, Rig
+from rangesim.staging import write_file
 
 _SHAPES = {
     "img_shape": 2,
@@ -72,10 +73,7 @@ def load_calibration(
 
 def save_calibration(rig: Rig, path: str | Path) -> None:
     """Write a rig as JSON; `load_calibration` reads it back equal."""
-    path = Path(path)
-    staging = path.with_name(f".{path.name}.part")
-    staging.write_text(json.dumps(to_dict(rig), indent=1) + "\n", encoding="utf-8")
-    staging.replace(path)
+    write_file(Path(path), (json.dumps(to_dict(rig), indent=1) + "\n").encode())
 
 
 def _load_json(path: Path) -> Rig:

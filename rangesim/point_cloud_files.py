@@ -7,13 +7,12 @@ and MeshLab know. The frame goes into a comment line. `pcgraph.read_cloud` reads
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from rangesim.point_cloud import PointCloud
+from rangesim.staging import write_file
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short",
               "u4": "uint", "i4": "int"}  # fmt: skip
@@ -34,16 +33,7 @@ def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
         raise ValueError(f"expected a file name ending in .ply or .pcd, got {path.name!r}.")
     if not cloud.valid.any():
         raise ValueError(f"expected at least one finite point to write to {path.name}, got none.")
-    data = _ply_bytes(cloud.finite()) if path.suffix.lower() == ".ply" else _pcd_bytes(cloud)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, staging = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(staging, 0o644)
-        os.replace(staging, path)
-    finally:
-        Path(staging).unlink(missing_ok=True)
+    write_file(path, _ply_bytes(cloud.finite()) if path.suffix.lower() == ".ply" else _pcd_bytes(cloud))
 
 
 def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:

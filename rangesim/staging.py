@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directories that appear when they are complete, and never half-written."""
+"""Files and directories that appear when they are complete, and never half-written."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -55,6 +56,19 @@ def new_directory(directory: str | Path, sidecar: str, kind: str) -> Iterator[Pa
         shutil.rmtree(staging, ignore_errors=True)
         if not done:
             _remove_empty(missing)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write `path`, making its directories; a reader finds the old content or the new, never a part."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, staging = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(staging, 0o644)
+        os.replace(staging, path)
+    finally:
+        Path(staging).unlink(missing_ok=True)
 
 
 def read_sidecar(path: Path, kind: str) -> dict[str, Any]:

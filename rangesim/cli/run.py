@@ -95,9 +95,9 @@ def run_command(
 
 def _say_what_measured_nothing(out: Path) -> None:
     """A line on stderr if some instrument has not a single point: most often the scene is not in metres."""
-    from rangesim.result_files import SETTINGS
+    from rangesim.result_files import read_settings
 
-    distance = json.loads((out / SETTINGS).read_text(encoding="utf-8"))["scene"]["working_distance_m"]
+    distance = read_settings(out)["scene"]["working_distance_m"]
     results = {p.parent.name: json.loads(p.read_text(encoding="utf-8")) for p in out.glob("*/measurement.json")}
     blind = sorted(name for name, result in results.items() if result["points"] == 0)
     if blind:
