@@ -24,18 +24,28 @@ SPEED_OF_LIGHT = 299_792_458.0
 """Metres per second in vacuum, exact."""
 
 
+KINDS = ("direct", "multipath", "via_delta", "caustic", "glint")
+"""Kinds of projector light, in the order of `rangesim.signals.EnergySplit`; a path's `kind` is an index."""
+DIRECT, MULTIPATH, VIA_DELTA, CAUSTIC, GLINT = range(len(KINDS))
+
+
 class LightPath(NamedTuple):
     """One light path, or arrays of them.
 
     u, v : projector pixel coordinates, 0 <= u <= width, 0 <= v <= height.
     path_length_m : optical length from projector to camera, metres (refractive index included).
     is_first : whether the camera sees the lit point directly or through delta surfaces only.
+    kind : unsigned, index into `KINDS`.
+    blur_px : standard deviation of the light's spread over the projector's image plane (defocus), projector pixels;
+        None: sharp.
     """
 
     u: Any
     v: Any
     path_length_m: Any
     is_first: Any
+    kind: Any = DIRECT
+    blur_px: Any = None
 
 
 class Math(Protocol):

@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.loop import Device, connect, mono
+from rangesim.light_transport.device import Device, connect
+from rangesim.light_transport.loop import mono
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
@@ -29,9 +30,10 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     hit = si.is_valid()
     to_camera = camera.centre - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
-    uv, to_projector, _, _, unoccluded = connect(scene.mitsuba, projector, si, hit)
+    link = connect(scene.mitsuba, projector, si, hit)
+    uv = link.uv
     transmits = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
-    visible = unoccluded & (transmits | (dr.dot(normal, to_projector) > 0))
+    visible = link.lit & (transmits | (dr.dot(normal, link.direction) > 0))
     z, distance = -dr.dot(to_camera, camera.z), dr.norm(to_camera)
     index = dr.gather(mi.Int32, _index_of_shape(scene), dr.reinterpret_array(mi.UInt32, si.shape), hit)
     dr.eval(hit, uv, visible, z, normal, index, distance)

@@ -17,35 +17,10 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
+from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.responses import Accumulators
-from rangesim.response import LightPath
-from rangesim.rig import Intrinsics
-
-
-class Device:
-    """A pinhole of the rig on the renderer's side: intrinsics, centre, axes; all opaque to the kernel cache."""
-
-    def __init__(self, intrinsics: Intrinsics, T_world_device: np.ndarray) -> None:
-        opaque = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731
-        self.f = mi.Vector2f(opaque(intrinsics.fx), opaque(intrinsics.fy))
-        self.c = mi.Vector2f(opaque(intrinsics.cx), opaque(intrinsics.cy))
-        self.size = mi.Vector2f(opaque(intrinsics.width), opaque(intrinsics.height))
-        self.x, self.y, self.z, self.centre = (
-            mi.Vector3f(*map(opaque, T_world_device[:3, column])) for column in range(4)
-        )
-
-    def ray_direction(self, pixel: Any) -> Any:
-        """Unit world direction through pixel coordinates."""
-        p = (pixel - self.c) / self.f
-        return dr.normalize(self.x * p.x + self.y * p.y + self.z)
-
-    def project(self, point: Any) -> tuple[Any, Any]:
-        """Pixel coordinates of a world point, and its depth z in metres."""
-        d = mi.Vector3f(point) - self.centre
-        z = dr.dot(d, self.z)
-        return mi.Point2f(dr.dot(d, self.x), dr.dot(d, self.y)) / z * self.f + self.c, z
+from rangesim.response import DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
 
 class Settings(NamedTuple):
@@ -115,9 +90,12 @@ def trace(
         # ---- A new sample starts at the camera -------------------------------------------------------
         starts = depth == 0
         jitter = stratified(shift, sample)
-        ray.o = dr.select(starts, mi.Point3f(camera.centre), ray.o)
-        ray.d = dr.select(starts, camera.ray_direction(corner + jitter), ray.d)
-        previous.p = dr.select(starts, mi.Point3f(camera.centre), previous.p)
+        lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(camera.has_lens, mode="scalar") else None
+        primary = camera.sample_ray(corner + jitter, lens)
+        ray.o = dr.select(starts, primary.origin, ray.o)
+        ray.d = dr.select(starts, primary.direction, ray.d)
+        length = dr.select(starts, primary.lead, length)
+        previous.p = dr.select(starts, primary.origin, previous.p)
 
         # ---- Next surface ----------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
@@ -129,23 +107,24 @@ def trace(
         may_connect = hit & (depth < settings.max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
-        uv, to_projector, distance, geometry, lit = connect(scene, projector, si, may_connect)
+        link = connect(scene, projector, si, may_connect)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
-            si.to_local(to_projector),
+            si.to_local(link.direction),
             rng.next_float32(),
             mi.Point2f(rng.next_float32(), rng.next_float32()),
             hit,
         )
-        radiance = dr.select(lit, throughput * mono(value) * geometry * irradiance, 0)
+        radiance = dr.select(link.lit, throughput * mono(value) * link.geometry * irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
-        u, v, path_length = (dr.select(lit, x, 0) for x in (uv.x, uv.y, length + distance))
-        path = LightPath(u, v, path_length, first)
-        channels = accumulators.add(channels, path, radiance, lane, lit)
-        direct += dr.select(first & ~via, radiance, 0)
-        via_delta += dr.select(first & via, radiance, 0)
-        multipath += dr.select(first, 0, radiance)
+        u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, length + link.distance))
+        kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
+        path = LightPath(u, v, path_length, first, kind, link.blur_px)
+        channels = accumulators.add(channels, path, radiance, lane, link.lit)
+        direct += dr.select(kind == DIRECT, radiance, 0)
+        via_delta += dr.select(kind == VIA_DELTA, radiance, 0)
+        multipath += dr.select(kind == MULTIPATH, radiance, 0)
 
         # ---- Caustic photons: gather around si.p here ------------------------------------------------
         # ---- Glint: does a segment off a delta surface meet the projector's lens? here ---------------
@@ -197,24 +176,6 @@ def stratified(shift: Any, sample: Any) -> Any:
     n = mi.Float(sample)
     p = shift + mi.Point2f(n * 0.7548776662466927, n * 0.5698402909980532)
     return p - dr.floor(p)
-
-
-def connect(scene: Any, projector: Device, si: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Projector pixel, direction, distance, geometry factor and visibility of the straight connection to the projector.
-
-    The geometry factor times the irradiance at z = 1 m is the irradiance on a surface that faces the projector:
-    the pattern is uniform per projector pixel, so the radiant intensity is E / cos^3 and falls as
-    cos^2 / z^2, which leaves E / (z^2 cos).
-    """
-    uv, z = projector.project(si.p)
-    to_projector = projector.centre - mi.Vector3f(si.p)
-    distance = dr.norm(to_projector)
-    to_projector /= distance
-    inside = (uv.x >= 0) & (uv.x < projector.size.x) & (uv.y >= 0) & (uv.y < projector.size.y) & (z > 0)
-    geometry = dr.rcp(dr.square(z) * -dr.dot(projector.z, to_projector))
-    inside &= active
-    shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
-    return uv, to_projector, distance, geometry, inside & ~scene.ray_test(shadow_ray, coherent=False, active=inside)
 
 
 def emission(scene: Any, si: Any, previous: Any, pdf: Any, alone: Any, active: Any) -> Any:

@@ -10,8 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.device import Device
 from rangesim.light_transport.ground_truth import ground_truth
-from rangesim.light_transport.loop import Device, Radiance, Settings, trace
+from rangesim.light_transport.loop import Radiance, Settings, trace
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import Response
 from rangesim.rig import Rig
