@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangesim.config import to_dict
+from rangesim.distortion import distort, fold_radius2, undistort
 
 Array = NDArray[np.float64]
 
@@ -72,29 +73,24 @@ class Intrinsics:
         if not any(self.distortion):
             return distorted
         target_x, target_y = np.ascontiguousarray(distorted[..., 0]), np.ascontiguousarray(distorted[..., 1])
-        x, y = target_x, target_y
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for _ in range(50):  # fixed point of Brown-Conrady, as there is no closed inverse
-                radial, tangential_x, tangential_y = self._distortion_terms(x, y)
-                next_x, next_y = (target_x - tangential_x) / radial, (target_y - tangential_y) / radial
-                step = max(np.abs(next_x - x).max(initial=0), np.abs(next_y - y).max(initial=0))
-                x, y = next_x, next_y
-                if step < 1e-12:
-                    break
-            radial, tangential_x, tangential_y = self._distortion_terms(x, y)
-            off_x, off_y = x * radial + tangential_x - target_x, y * radial + tangential_y - target_y
-            inverse = np.hypot(off_x * self.fx, off_y * self.fy) <= RESIDUAL_PX
+            x, y = undistort(self.coefficients, target_x, target_y)
+            image = distort(self.coefficients, x, y)
+            off = np.hypot((image.x - target_x) * self.fx, (image.y - target_y) * self.fy)
+            inverse = (off <= RESIDUAL_PX) & (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
         return np.where(inverse[..., None], np.stack([x, y], axis=-1), np.nan)
 
     def project(self, points: ArrayLike) -> Array:
-        """(..., 2) pixel coordinates of points (..., 3) in this device's frame; NaN behind it."""
+        """(..., 2) pixel coordinates of points (..., 3) in this device's frame; NaN behind it and beyond the
+        radius at which the distortion turns round."""
         points = np.asarray(points, dtype=np.float64)
         z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
         xy = points[..., :2] / z
         if any(self.distortion):
             x, y = xy[..., 0], xy[..., 1]
-            radial, tangential_x, tangential_y = self._distortion_terms(x, y)
-            xy = np.stack([x * radial + tangential_x, y * radial + tangential_y], axis=-1)
+            image = distort(self.coefficients, x, y)
+            appears = (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
+            xy = np.where(appears[..., None], np.stack([image.x, image.y], axis=-1), np.nan)
         return xy * [self.fx, self.fy] + [self.cx, self.cy]
 
     def directions(self, pixels: ArrayLike) -> Array:
@@ -103,12 +99,15 @@ class Intrinsics:
         xy = self.normalise(pixels)
         return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
 
-    def _distortion_terms(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        k1, k2, p1, p2, k3 = (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-        xx, yy, xy = x * x, y * y, x * y
-        r2 = xx + yy
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return radial, 2 * p1 * xy + p2 * (r2 + 2 * xx), p1 * (r2 + 2 * yy) + 2 * p2 * xy
+    @property
+    def coefficients(self) -> tuple[float, float, float, float, float]:
+        """k1, k2, p1, p2, k3, the missing ones 0."""
+        return (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]  # type: ignore[return-value]
+
+    @property
+    def fold_radius2(self) -> float:
+        """See `rangesim.distortion.fold_radius2`."""
+        return fold_radius2(self.coefficients)
 
 
 def pose(matrix: ArrayLike, name: str) -> Array:
@@ -156,6 +155,10 @@ class Rig:
     T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres.
     camera_aperture_radius_m, projector_aperture_radius_m : float, metres, radius of the entrance (exit) pupil.
     projector_power_w : float, mean radiant power that leaves the projector when it shows white.
+    camera_focus_m, projector_focus_m : float, metres, depth z of the plane in focus of a thin lens with the aperture
+        above; None: sharp everywhere. See docs/optics.md for what a projector out of focus does to its patterns.
+    camera_vignetting, projector_vignetting : float >= 0, exponent n of the relative illumination cos^n of the angle to
+        the optical axis: 4 is the natural law, 0 an even image. It takes from `projector_power_w` what it darkens.
     """
 
     camera: Intrinsics
@@ -165,6 +168,10 @@ class Rig:
     camera_aperture_radius_m: float = 0.75e-3
     projector_aperture_radius_m: float = 2e-3
     projector_power_w: float = 1.0
+    camera_focus_m: float | None = None
+    projector_focus_m: float | None = None
+    camera_vignetting: float = 0.0
+    projector_vignetting: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
@@ -172,6 +179,13 @@ class Rig:
         for name in ("camera_aperture_radius_m", "projector_aperture_radius_m", "projector_power_w"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"expected {name} to be positive, got {getattr(self, name)}.")
+        for name in ("camera_focus_m", "projector_focus_m"):
+            focus = getattr(self, name)
+            if focus is not None and not 0 < focus < np.inf:
+                raise ValueError(f"expected {name} to be positive and finite, or None for a sharp lens, got {focus}.")
+        for name in ("camera_vignetting", "projector_vignetting"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"expected {name} to be an exponent of at least 0, got {getattr(self, name)}.")
 
     def __eq__(self, other: Any) -> bool:
         return isinstance(other, Rig) and to_dict(self) == to_dict(other)
@@ -194,3 +208,10 @@ class Rig:
         """Irradiance in W/m2 that white casts on a fronto-parallel plane at z = 1 m."""
         p = self.projector
         return self.projector_power_w * p.fx * p.fy / (p.width * p.height)
+
+    @property
+    def camera_illumination(self) -> NDArray[np.float32]:
+        """(h, w) float32 in 0..1, share of the light that vignetting leaves a pixel: cos^n of its ray to the axis."""
+        rays = self.camera.directions(self.camera.pixel_centres())
+        share = np.linalg.norm(rays, axis=-1) ** -self.camera_vignetting
+        return np.nan_to_num(share, nan=0.0).astype(np.float32)  # no ray, no light

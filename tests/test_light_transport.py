@@ -355,12 +355,6 @@ def test_bad_numbers_get_one_clear_sentence(corner: rangesim.Scene, option: str,
         transport(corner, corner.rig(**SIZE), [], **{option: value})
 
 
-def test_distorted_lenses_are_refused(corner: rangesim.Scene) -> None:
-    lens = Intrinsics(64, 48, 60, 60, 32, 24, distortion=(0.1,))
-    with pytest.raises(ValueError, match="not implemented"):
-        transport(corner, Rig(lens, lens, corner.T_world_camera), [], spp=1)
-
-
 def test_a_seed_is_a_whole_number_and_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
     rig = corner.rig(**SIZE)
     with pytest.raises(ValueError, match=r"expected seed to be a whole number, got 1\.5"):

@@ -9,7 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.rig import Intrinsics
+from rangesim.distortion import distort, undistort
+from rangesim.rig import Intrinsics, Rig
+
+NO_RAY_PX = 1e-2
+"""Where the inverse of a lens model reprojects worse than this in single precision, there is none."""
+FAR = 1e30
+"""Stands for an infinite squared radius in single precision."""
 
 
 class PrimaryRay(NamedTuple):
@@ -18,17 +24,38 @@ class PrimaryRay(NamedTuple):
     origin, direction : world, metres and unit.
     lead : Float, metres, what the path length from the device's centre has ahead of that from `origin`: all paths
         through a lens to a point in focus are optically as long as the one through its centre.
+    exists : Bool, false where the distortion has no inverse and the lens sends no ray (the direction is then that of
+        the axis); None: everywhere.
     """
 
     origin: Any
     direction: Any
     lead: Any
+    exists: Any = None
 
 
 class Device:
-    """A pinhole of the rig on the renderer's side: intrinsics, centre, axes; all opaque to the kernel cache."""
+    """A lens of the rig on the renderer's side: intrinsics, centre, axes; all numbers opaque to the kernel cache.
 
-    def __init__(self, intrinsics: Intrinsics, T_world_device: np.ndarray) -> None:
+    Distortion, a finite lens and vignetting shape the kernel: without them it is that of a pinhole.
+
+    Parameters
+    ----------
+    intrinsics : Intrinsics
+    T_world_device : (4, 4) float, maps device coordinates to world coordinates, metres.
+    aperture_radius_m : float, metres, of the lens; counts where `focus_m` is set.
+    focus_m : float, metres, depth z of the plane in focus; None: a sharp pinhole.
+    vignetting : float, exponent n of the relative illumination cos^n.
+    """
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        T_world_device: np.ndarray,
+        aperture_radius_m: float = 0.0,
+        focus_m: float | None = None,
+        vignetting: float = 0.0,
+    ) -> None:
         opaque = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731
         self.f = mi.Vector2f(opaque(intrinsics.fx), opaque(intrinsics.fy))
         self.c = mi.Vector2f(opaque(intrinsics.cx), opaque(intrinsics.cy))
@@ -36,24 +63,121 @@ class Device:
         self.x, self.y, self.z, self.centre = (
             mi.Vector3f(*map(opaque, T_world_device[:3, column])) for column in range(4)
         )
+        self.distortion = None
+        if any(intrinsics.distortion):
+            self.distortion = [opaque(k) for k in intrinsics.coefficients]
+            self.fold_radius2 = opaque(min(intrinsics.fold_radius2, FAR))
+        self.has_lens = focus_m is not None
+        """Whether rays start on a lens of finite size, and `sample_ray` needs a sample."""
+        if focus_m is not None:
+            self.aperture, self.focus = opaque(aperture_radius_m), opaque(focus_m)
+        self.vignetting = opaque(vignetting) if vignetting else None
+
+    @classmethod
+    def camera(cls, rig: Rig) -> Device:
+        """The rig's camera. Its vignetting is left to the exposure: signals are radiance."""
+        return cls(rig.camera, rig.T_world_camera, rig.camera_aperture_radius_m, rig.camera_focus_m)
+
+    @classmethod
+    def projector(cls, rig: Rig) -> Device:
+        """The rig's projector."""
+        aperture, focus = rig.projector_aperture_radius_m, rig.projector_focus_m
+        return cls(rig.projector, rig.T_world_projector, aperture, focus, rig.projector_vignetting)
+
+    # ---- From pixels to rays -----------------------------------------------------------------------------
 
     def ray_direction(self, pixel: Any) -> Any:
-        """Unit world direction through pixel coordinates."""
-        p = (pixel - self.c) / self.f
-        return dr.normalize(self.x * p.x + self.y * p.y + self.z)
+        """Unit world direction through pixel coordinates from the centre of the lens."""
+        return self._direction(self._undistorted(pixel)[0])
 
-    has_lens = False
-    """Whether rays start on a lens of finite size, and `sample_ray` needs a sample; shapes the kernel."""
+    def centre_ray(self, pixel: Any) -> PrimaryRay:
+        """The ray through pixel coordinates and the centre of the lens."""
+        p, exists = self._undistorted(pixel)
+        return PrimaryRay(mi.Point3f(self.centre), self._direction(p), mi.Float(0), exists)
 
     def sample_ray(self, pixel: Any, lens: Any) -> PrimaryRay:
-        """The ray through pixel coordinates; `lens` Point2f in the unit square, None where `has_lens` is not set."""
-        return PrimaryRay(mi.Point3f(self.centre), self.ray_direction(pixel), mi.Float(0))
+        """The ray through pixel coordinates; `lens` Point2f in the unit square, None where `has_lens` is not set.
+
+        A thin lens: rays of one pixel start anywhere on the aperture and meet in the plane z = `focus_m`.
+        """
+        if not self.has_lens:
+            return self.centre_ray(pixel)
+        p, exists = self._undistorted(pixel)
+        start = mi.warp.square_to_uniform_disk_concentric(lens) * self.aperture
+        to_focus = mi.Vector3f(p.x, p.y, 1) * self.focus
+        ray = to_focus - mi.Vector3f(start.x, start.y, 0)
+        length = dr.norm(ray)
+        direction = self._world(ray) / length
+        origin = mi.Point3f(self.centre + self.x * start.x + self.y * start.y)
+        return PrimaryRay(origin, direction, dr.norm(to_focus) - length, exists)
+
+    def _direction(self, p: Any) -> Any:
+        return dr.normalize(self.x * p.x + self.y * p.y + self.z)
+
+    def _world(self, v: Any) -> Any:
+        return self.x * v.x + self.y * v.y + self.z * v.z
+
+    def _undistorted(self, pixel: Any) -> tuple[Any, Any]:
+        """Image-plane coordinates x/z, y/z of pixel coordinates, and whether there are any (None: always)."""
+        p = (pixel - self.c) / self.f
+        if self.distortion is None:
+            return p, None
+        x, y = undistort(self.distortion, p.x, p.y)
+        image, exists = self._distorted(x, y)
+        off = dr.norm(mi.Vector2f(image.x - p.x, image.y - p.y) * self.f)
+        exists &= off <= NO_RAY_PX
+        return dr.select(exists, mi.Point2f(x, y), 0), exists
+
+    # ---- From points to pixels ---------------------------------------------------------------------------
 
     def project(self, point: Any) -> tuple[Any, Any]:
-        """Pixel coordinates of a world point, and its depth z in metres."""
+        """Pixel coordinates of a world point, and its depth z in metres; NaN where the distortion folds the image."""
         d = mi.Vector3f(point) - self.centre
         z = dr.dot(d, self.z)
-        return mi.Point2f(dr.dot(d, self.x), dr.dot(d, self.y)) / z * self.f + self.c, z
+        p = mi.Point2f(dr.dot(d, self.x), dr.dot(d, self.y)) / z
+        if self.distortion is not None:
+            image, appears = self._distorted(p.x, p.y)
+            p = dr.select(appears, mi.Point2f(image.x, image.y), dr.nan)
+        return p * self.f + self.c, z
+
+    def _distorted(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """The image of a ray, and whether it lies where the image is not folded."""
+        assert self.distortion is not None
+        image = distort(self.distortion, x, y)
+        return image, (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
+
+    # ---- How bright, how sharp ---------------------------------------------------------------------------
+
+    def relative_illumination(self, direction: Any) -> Any:
+        """Share of a pixel's light that vignetting leaves along a unit world direction away from the device.
+
+        The Python number 1 where there is no vignetting.
+        """
+        if self.vignetting is None:
+            return 1.0
+        return dr.power(dr.maximum(dr.dot(direction, self.z), 0), self.vignetting)
+
+    def pixel_density(self, direction: Any) -> Any:
+        """Pixels per area of the plane z = 1 along a unit world direction, relative to an undistorted lens.
+
+        Every pixel of a projector sends out the same power, so its irradiance there has this factor. The Python number
+        1 without distortion; 0 where the lens sends no light.
+        """
+        if self.distortion is None:
+            return 1.0
+        image, appears = self._distorted(
+            dr.dot(direction, self.x) / dr.dot(direction, self.z), dr.dot(direction, self.y) / dr.dot(direction, self.z)
+        )
+        return dr.select(appears, image.jacobian, 0)
+
+    def blur_px(self, z: Any) -> Any:
+        """Standard deviation in pixels of the disc through which a point at depth z meets the image; None: sharp.
+
+        The disc's diameter is 2 a f |1/z - 1/z_focus|; a uniform disc has the standard deviation diameter / 4 per axis.
+        """
+        if not self.has_lens:
+            return None
+        return 0.5 * self.aperture * dr.sqrt(self.f.x * self.f.y) * dr.abs(dr.rcp(z) - dr.rcp(self.focus))
 
 
 class Connection(NamedTuple):
@@ -79,7 +203,7 @@ def connect(scene: Any, projector: Device, si: Any, active: Any) -> Connection:
     """Straight connection of the surface point `si` to the projector.
 
     The pattern is uniform per projector pixel, so the radiant intensity is E / cos^3 and falls as
-    cos^2 / z^2, which leaves E / (z^2 cos).
+    cos^2 / z^2, which leaves E / (z^2 cos), with E of the lens: its pixels' density and relative illumination.
     """
     uv, z = projector.project(si.p)
     to_projector = projector.centre - mi.Vector3f(si.p)
@@ -87,7 +211,11 @@ def connect(scene: Any, projector: Device, si: Any, active: Any) -> Connection:
     to_projector /= distance
     inside = (uv.x >= 0) & (uv.x < projector.size.x) & (uv.y >= 0) & (uv.y < projector.size.y) & (z > 0)
     geometry = dr.rcp(dr.square(z) * -dr.dot(projector.z, to_projector))
+    if projector.distortion is not None:
+        geometry *= projector.pixel_density(-to_projector)
+    if projector.vignetting is not None:
+        geometry *= projector.relative_illumination(-to_projector)
     inside &= active
     shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
     lit = inside & ~scene.ray_test(shadow_ray, coherent=False, active=inside)
-    return Connection(uv, to_projector, distance, geometry, lit)
+    return Connection(uv, to_projector, distance, geometry, lit, projector.blur_px(z))

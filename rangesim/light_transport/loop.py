@@ -96,6 +96,8 @@ def trace(
         ray.d = dr.select(starts, primary.direction, ray.d)
         length = dr.select(starts, primary.lead, length)
         previous.p = dr.select(starts, primary.origin, previous.p)
+        if dr.hint(camera.distortion is not None, mode="scalar"):
+            throughput = dr.select(starts & ~primary.exists, 0, throughput)  # no ray, no light
 
         # ---- Next surface ----------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)

@@ -42,7 +42,7 @@ def transport(
     Parameters
     ----------
     scene : Scene
-    rig : Rig; its lenses must be free of distortion (rendering distorted lenses is not implemented).
+    rig : Rig
     sensors : sensors, or bare responses; none for energy split and ground truth alone.
     spp : int >= 1, samples (camera paths) per pixel.
     max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba.
@@ -54,14 +54,14 @@ def transport(
     Raises
     ------
     ValueError
-        A number out of its range, a distorted lens, patterns that do not fit the projector, or too little memory.
+        A number out of its range, patterns that do not fit the projector, or too little memory.
     """
     _check(scene, rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
     radiances: list[np.ndarray] = []
-    camera, projector = Device(rig.camera, rig.T_world_camera), Device(rig.projector, rig.T_world_projector)
+    camera, projector = Device.camera(rig), Device.projector(rig)
     settings = Settings(
         seed=dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
         spp=dr.opaque(mi.UInt32, spp),
@@ -133,5 +133,3 @@ def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], seed: i
     for name, value in counts.items():
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"expected {name} to be a whole number of at least 1, got {value!r}.")
-    if any(rig.camera.distortion) or any(rig.projector.distortion):
-        raise ValueError("expected lenses without distortion: rendering distorted lenses is not implemented yet.")
