@@ -68,7 +68,8 @@ def undistort(coefficients: Sequence[Any], x: Any, y: Any) -> tuple[Any, Any]:
 def fold_radius2(coefficients: Sequence[float]) -> float:
     """Square of the image-plane radius at which the radial polynomial turns round; infinite if it does not.
 
-    d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6, whose first positive root ends the image:
+    d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6, and its first positive root ends the
+    image:
     a point beyond it would appear a second time, where nearer ones are already.
     """
     k1, k2, _, _, k3 = coefficients

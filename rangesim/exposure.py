@@ -49,12 +49,17 @@ def expose(
     if exposure_s is not None and not 0 < exposure_s < np.inf:
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
     if detector is None or isinstance(sensor, IdealToF):
-        return Capture(signals.frames(sensor), sensor, signals.rig)
-    radiance = signals.frames(sensor, ambient_transmission=detector.ambient_share(sensor))
+        return Capture(_through_lens(signals.frames(sensor), signals.rig), sensor, signals.rig)
+    radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor)), signals.rig)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor, signals.rig, exposure_s, seed)
     return Capture(frames, sensor, signals.rig, detector, exposure_s)
+
+
+def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
+    """Frames (k, h, w) as the camera's vignetting leaves them."""
+    return frames * rig.camera_illumination if rig.camera_vignetting else frames
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:
