@@ -68,12 +68,15 @@ class Signals:
     channels : response -> (c, h, w) float32, W/m2/sr.
     energy : EnergySplit
     truth : GroundTruth
+    motion_m : (h, w) float32, metres, how far what a pixel sees moves while its frames are taken, see
+        `rangesim.motion`; None: nothing moves.
     """
 
     rig: Rig
     channels: dict[Response, np.ndarray]
     energy: EnergySplit
     truth: GroundTruth
+    motion_m: np.ndarray | None = None
 
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0) -> np.ndarray:
         """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass."""
@@ -89,4 +92,6 @@ class Signals:
         """Write energy split and ground truth to a compressed .npz file (for later comparison)."""
         arrays = {f"energy_{f.name}": getattr(self.energy, f.name) for f in fields(self.energy)}
         arrays |= {f"truth_{f.name}": np.asarray(getattr(self.truth, f.name)) for f in fields(self.truth)}
+        if self.motion_m is not None:
+            arrays["motion_m"] = self.motion_m
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
