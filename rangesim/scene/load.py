@@ -17,6 +17,7 @@ import numpy as np
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
 from rangesim.rig import Intrinsics
+from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import is_cutout, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
@@ -24,6 +25,10 @@ from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.scene import Instance, Scene
 
 Source = str | Path | Mapping[str, Any]
+
+_INSTALLED = Path(__file__).resolve().parent / "catalogue"
+CATALOGUE = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[2] / "scenes"
+"""Directory that holds `materials/`: in an installed package the copy that the wheel carries, in a checkout `scenes`."""
 
 
 def load_scene(
@@ -42,6 +47,8 @@ def load_scene(
         dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
         ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
+        `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md); files
+        beside the scene come first. BSDFs of type `retroreflector` are known (`rangesim.scene.retroreflector`).
     material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.
     unit_m : metres per unit of length of a bare mesh, 0.001 for one in millimetres; default 1.
     sensor : which of the scene's sensors becomes the camera.
@@ -68,6 +75,7 @@ def load_scene(
     if unit_m is not None and not 0 < unit_m < np.inf:
         raise ValueError(f"expected a positive number of metres per unit, got {unit_m}.")
     select_variant(variant)
+    retroreflector.register()
     loaded, ids, classes = _instantiate(source, material or "matte", unit_m or 1.0, label)
     _check(loaded, ids, sensor, label)
     camera, T_world_camera = camera_of(loaded.sensors()[sensor], label)
@@ -108,7 +116,9 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
         return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, folder))
     if path.suffix.lower() != ".xml":
         raise FileFormatError(f"expected a scene (.xml) or a mesh ({', '.join(MESH_SUFFIXES)}), got {path}.")
-    mi.file_resolver().prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
+    resolver = mi.file_resolver()
+    resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
+    resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
     return mi.parser.parse_file(config, str(path))
 
 
