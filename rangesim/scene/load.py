@@ -7,6 +7,7 @@ import re
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ Source = str | Path | Mapping[str, Any]
 
 _INSTALLED = Path(__file__).resolve().parent / "catalogue"
 CATALOGUE = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[2] / "scenes"
-"""Directory that holds `materials/`: in an installed package the copy that the wheel carries, in a checkout `scenes`."""
+"""Directory that holds `materials/`: a copy inside an installed package, `scenes` in a checkout."""
 
 
 def load_scene(
@@ -47,8 +48,8 @@ def load_scene(
         dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
         ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
-        `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md); files
-        beside the scene come first. BSDFs of type `retroreflector` are known (`rangesim.scene.retroreflector`).
+        `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md);
+        files beside the scene come first. BSDFs of type `retroreflector` are known (`rangesim.scene.retroreflector`).
     material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.
     unit_m : metres per unit of length of a bare mesh, 0.001 for one in millimetres; default 1.
     sensor : which of the scene's sensors becomes the camera.
@@ -76,7 +77,8 @@ def load_scene(
         raise ValueError(f"expected a positive number of metres per unit, got {unit_m}.")
     select_variant(variant)
     retroreflector.register()
-    loaded, ids, classes = _instantiate(source, material or "matte", unit_m or 1.0, label)
+    instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, label)
+    loaded, ids, classes = instantiate()
     _check(loaded, ids, sensor, label)
     camera, T_world_camera = camera_of(loaded.sensors()[sensor], label)
     return Scene(
@@ -87,6 +89,7 @@ def load_scene(
         T_world_camera=T_world_camera,
         working_distance_m=_median_depth(loaded, camera, T_world_camera),
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
+        reload=lambda: instantiate()[0],
     )
 
 

@@ -15,7 +15,7 @@ transparent: (nearly) specular refraction. translucent: scattered transmission. 
 SMOOTH = 0.05
 """Microfacet roughness alpha up to which a surface looks polished to a range sensor."""
 
-_ROUGHNESS = ("alpha", "alpha_u", "alpha_v", "roughness")
+_ALPHAS = ("alpha", "alpha_u", "alpha_v")
 
 
 def material_class(bsdf: Any) -> str:
@@ -24,7 +24,9 @@ def material_class(bsdf: Any) -> str:
     Wrappers (`twosided`, `mask`, `bumpmap`) count as what they wrap; a blend has the lobes of all its parts.
     """
     parameters = _numbers(bsdf)
-    polished = all(parameters[key] <= SMOOTH for key in _ROUGHNESS if key in parameters)
+    alphas = [parameters[key] for key in _ALPHAS if key in parameters]
+    alphas += [parameters["roughness"] ** 2] if "roughness" in parameters else []  # principled (Burley 2012)
+    polished = all(alpha <= SMOOTH for alpha in alphas)
     delta = _has(bsdf, "DeltaReflection") or (polished and _has(bsdf, "GlossyReflection"))
     if _has(bsdf, "DeltaTransmission", "GlossyTransmission") or (_is_thin_glass(bsdf) and "opacity" not in parameters):
         return "transparent" if polished else "translucent"

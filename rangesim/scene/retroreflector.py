@@ -6,13 +6,13 @@
         <bsdf type="roughconductor"> ... </bsdf>
     </bsdf>
 
-The nested BSDF is evaluated with the incident direction mirrored about the normal ("back vector"), so that what it would
-send off in the mirror direction comes back to where the light came from. This keeps reciprocity, energy and sampling of the nested
-BSDF (Portsmouth, Raab, Belcour, Liu, The Minimal Retroreflective Microfacet Model, JCGT 15(1), 2026; Belcour et al. 2014).
-`alpha` of the nested BSDF sets the observation angle: light returns within about alpha radians, twice the slope of the facets.
+The nested BSDF is evaluated with the incident direction mirrored about the normal ("back vector"): what it would send
+off in the mirror direction comes back to where the light came from. Reciprocity, energy and sampling stay those of the
+nested BSDF (Portsmouth, Raab, Belcour, Liu, The Minimal Retroreflective Microfacet Model, JCGT 15(1), 2026). Its
+`alpha` sets the observation angle: most light returns within a few times alpha radians.
 
-`falloff` (>= 0, default 0) p: real sheeting returns less light that comes in at an angle; the lobe is weighed with
-(cos theta_i cos theta_o)^(p / 2), which is reciprocal, takes energy only, and is cos^p of the entrance angle on the axis.
+`falloff` p >= 0, default 0: real sheeting returns less of the light that comes in at an angle. The lobe is weighed with
+(cos theta_i cos theta_o)^(p / 2): reciprocal, at most 1, and cos^p of the entrance angle on the axis.
 """
 
 from __future__ import annotations
