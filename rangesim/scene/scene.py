@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +32,7 @@ class Scene:
     camera, T_world_camera : the scene's own sensor.
     working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
     has_cutouts : bool, whether some surface lets light pass unchanged (`mask`, `null`).
+    reload : makes another mitsuba.Scene of the same source, for shapes to be moved in.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Scene:
     T_world_camera: np.ndarray
     working_distance_m: float
     has_cutouts: bool = False
+    reload: Callable[[], Any] | None = None
 
     def __repr__(self) -> str:
         c = self.camera

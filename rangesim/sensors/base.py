@@ -41,6 +41,13 @@ class Sensor(ABC):
     def frame_names(self) -> list[str]:
         """One short name per frame, as used for files and plots."""
 
+    def frames_per_exposure(self, single_tap: bool = False) -> int:
+        """How many frames, one after another in the capture, one and the same exposure fills.
+
+        `single_tap` : pixels have but one charge store, so that frames which could share an exposure do not.
+        """
+        return 1
+
     def check(self, width: int, height: int) -> None:
         """Raise ValueError if this sensor does not fit a projector of that many pixels."""
         for response in self.responses():

@@ -14,6 +14,8 @@ from rangesim.sensors.base import Sensor
 
 OVERSAMPLING = 4
 """Bins of the transport pass per bin of a sensor with a pulse."""
+TAPS = 4
+"""Frames of an AMCW camera per frequency."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,9 @@ class IdealToF(Sensor):
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         return np.asarray(channels[0], dtype=np.float32)
+
+    def frames_per_exposure(self, single_tap: bool = False) -> int:
+        return self.n_frames
 
     def frame_names(self) -> list[str]:
         return ["radiance", "radiance_x_length"]
@@ -78,6 +83,9 @@ class AmcwToF(Sensor):
         offset = steady + ambient
         taps = [s * self.contrast * c[i] for c in channels for s, i in ((1, 0), (1, 1), (-1, 0), (-1, 1))]
         return np.stack([0.5 * (offset + t) for t in taps]).astype(np.float32)
+
+    def frames_per_exposure(self, single_tap: bool = False) -> int:
+        return 1 if single_tap else TAPS
 
     def frame_names(self) -> list[str]:
         return [f"{f / 1e6:g}MHz_{tap}deg" for f in self.modulation_hz for tap in (0, 90, 180, 270)]
@@ -129,6 +137,9 @@ class DirectToF(Sensor):
     @property
     def _fine(self) -> int:
         return OVERSAMPLING if self.pulse_fwhm_s > 0 else 1
+
+    def frames_per_exposure(self, single_tap: bool = False) -> int:
+        return self.n_frames
 
     def frame_names(self) -> list[str]:
         return [f"bin{b:04d}" for b in range(self.bins)]

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where things are at a time: pose tracks, and which object follows which."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation, Slerp
+
+from rangesim.config import nearest
+from rangesim.rig import Array, Rig, pose
+
+
+class Track(ABC):
+    """A rigid motion: a world transform T(t), applied to a thing as it stands in the scene file.
+
+    The identity means at rest. A world point x of the thing is at T(t) x at time t. Subclasses are frozen dataclasses.
+    """
+
+    @abstractmethod
+    def at(self, time_s: float) -> Array:
+        """(4, 4) float64, rigid, the world transform at a time in seconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTrack(Track):
+    """A motion given at some times; between them linear in translation and in angle (slerp), constant beyond the ends.
+
+    Parameters
+    ----------
+    times_s : (n,) float64, seconds, increasing.
+    poses : (n, 4, 4) float64, rigid world transforms T(t), metres; the identity is the place in the scene file.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, times that do not increase, or a pose that is not rigid.
+
+    References
+    ----------
+    Shoemake: "Animating rotation with quaternion curves", SIGGRAPH (1985).
+    """
+
+    times_s: np.ndarray
+    poses: np.ndarray
+
+    def __post_init__(self) -> None:
+        times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
+        if times.ndim != 1 or len(times) == 0 or poses.shape != (len(times), 4, 4):
+            raise ValueError(
+                f"expected times (n,) and as many poses (n, 4, 4), got shapes {times.shape} and {poses.shape}."
+            )
+        if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise ValueError(f"expected times that increase, in seconds, got {times.tolist()}.")
+        poses = np.stack([pose(p, f"pose {i} of the track") for i, p in enumerate(poses)])
+        for name, value in (("times_s", times), ("poses", poses)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def at(self, time_s: float) -> Array:
+        time = float(np.clip(time_s, self.times_s[0], self.times_s[-1]))
+        result = np.eye(4)
+        result[:3, 3] = [np.interp(time, self.times_s, self.poses[:, i, 3]) for i in range(3)]
+        rotations = Rotation.from_matrix(self.poses[:, :3, :3])
+        result[:3, :3] = (rotations[0] if len(self.times_s) == 1 else Slerp(self.times_s, rotations)(time)).as_matrix()
+        return result
+
+
+@dataclass(frozen=True)
+class SteadyTrack(Track):
+    """A motion of constant velocity and rotation rate, without end; at its place in the scene file at time 0.
+
+    Parameters
+    ----------
+    velocity_m_s : (vx, vy, vz), metres per second, world.
+    rotation_rad_s : (wx, wy, wz), radians per second about these world axes (a rotation vector per second).
+    centre_m : (x, y, z), metres, world, a point of the axis of rotation at time 0; it moves with the velocity.
+    """
+
+    velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("velocity_m_s", "rotation_rad_s", "centre_m"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (3,) or not np.isfinite(value).all():
+                raise ValueError(f"expected {name} to be three finite numbers, got {getattr(self, name)!r}.")
+            object.__setattr__(self, name, tuple(map(float, value)))
+
+    def at(self, time_s: float) -> Array:
+        result = np.eye(4)
+        result[:3, :3] = Rotation.from_rotvec(np.multiply(self.rotation_rad_s, time_s)).as_matrix()
+        centre = np.asarray(self.centre_m)
+        result[:3, 3] = centre - result[:3, :3] @ centre + np.multiply(self.velocity_m_s, time_s)
+        return result
+
+
+class Placement(NamedTuple):
+    """Where everything that moves is at one time.
+
+    objects : shape name -> (4, 4) world transform. rig : (4, 4) world transform of camera and projector.
+    """
+
+    objects: dict[str, Array]
+    rig: Array
+
+    @property
+    def key(self) -> bytes:
+        """Equal for equal placements."""
+        return b"".join((T + 0.0).tobytes() for T in (*self.objects.values(), self.rig))  # + 0.0: -0.0 becomes 0.0
+
+    def place(self, rig: Rig) -> Array:
+        """(4, 4) T_world_camera of a rig that moves."""
+        return np.array(rig.T_world_camera) if np.array_equal(self.rig, np.eye(4)) else self.rig @ rig.T_world_camera
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What moves, and how.
+
+    Parameters
+    ----------
+    objects : shape name (id in the scene file) -> Track.
+    rig : Track of camera and projector together, or None: they stand. Like that of an object it is a world
+        transform of the rig as it stands: T_world_camera(t) = T(t) @ rig.T_world_camera. Hence moving the rig by T is
+        the same as moving all objects by the inverse of T. A recorded camera trajectory (n, 4, 4) becomes a track as
+        `PoseTrack(times_s, trajectory @ np.linalg.inv(rig.T_world_camera))`.
+    """
+
+    objects: Mapping[str, Track] = field(default_factory=dict)
+    rig: Track | None = None
+
+    def __post_init__(self) -> None:
+        for what, track in (*self.objects.items(), *((("rig", self.rig),) if self.rig is not None else ())):
+            if not isinstance(track, Track):
+                raise ValueError(f"expected a PoseTrack or a SteadyTrack for {what!r}, got {track!r}.")
+
+    def check(self, names: Iterable[str]) -> None:
+        """Raise ValueError if an object that moves is none of these shapes."""
+        valid = list(names)
+        for name in self.objects:
+            if name not in valid:
+                raise ValueError(
+                    f"expected moving objects out of {', '.join(valid)}, got {name!r}{nearest(name, valid)}."
+                )
+
+    def at(self, time_s: float) -> Placement:
+        """Where everything that moves is at a time in seconds."""
+        rig = np.eye(4) if self.rig is None else self.rig.at(time_s)
+        return Placement({name: track.at(time_s) for name, track in self.objects.items()}, rig)
+
+
+def apply(T: ArrayLike, points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) under a rigid transform (4, 4)."""
+    matrix = np.asarray(T)
+    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
