@@ -4,7 +4,7 @@
 A pixel of a camera with entrance pupil radius a and focal length f collects from radiance L the irradiance
 E = L pi (a/f)^2, so E A t lambda / (h c) photons on its area A in the exposure t. With f = fx sqrt(A) the
 pixel pitch drops out: photons = L pi a^2 / (fx fy) t lambda / (h c), radiance times etendue. The fall-off
-towards the corners (cos^4) is left out.
+towards the corners is the rig's (`camera_vignetting`), and comes before the detector.
 """
 
 from __future__ import annotations

@@ -69,8 +69,7 @@ def fold_radius2(coefficients: Sequence[float]) -> float:
     """Square of the image-plane radius at which the radial polynomial turns round; infinite if it does not.
 
     d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6, and its first positive root ends the
-    image:
-    a point beyond it would appear a second time, where nearer ones are already.
+    image: what lies beyond would appear where nearer points are already.
     """
     k1, k2, _, _, k3 = coefficients
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])

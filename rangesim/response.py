@@ -16,9 +16,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
+
+from rangesim.defocus import BlurredImage, blurred_stripes, fringe_contrast
 
 SPEED_OF_LIGHT = 299_792_458.0
 """Metres per second in vacuum, exact."""
@@ -55,26 +58,39 @@ class Math(Protocol):
     def sin(self, x: Any) -> Any: ...
     def floor(self, x: Any) -> Any: ...
     def abs(self, x: Any) -> Any: ...
+    def exp(self, x: Any) -> Any: ...
+    def erf(self, x: Any) -> Any: ...
     def select(self, condition: Any, a: Any, b: Any) -> Any: ...
     def unsigned(self, x: Any) -> Any:
         """`x` (>= 0) truncated to a 32-bit unsigned integer."""
 
-    def lookup(self, table: np.ndarray, index: Any) -> Any:
-        """table[index] for a flat float32 table."""
+    def array(self, table: np.ndarray) -> Any:
+        """A flat float32 table that is read more than once."""
+
+    def lookup(self, table: Any, index: Any) -> Any:
+        """table[index] for a flat float32 table, from `array` or not."""
 
 
 class NumpyMath:
     """`Math` on NumPy arrays."""
 
-    cos, sin, floor, abs = np.cos, np.sin, np.floor, np.abs
+    cos, sin, floor, abs, exp = np.cos, np.sin, np.floor, np.abs, np.exp
     select = staticmethod(np.where)
+
+    @staticmethod
+    def erf(x: Any) -> Any:
+        from scipy.special import erf
+
+        return erf(x)
 
     @staticmethod
     def unsigned(x: Any) -> Any:
         return np.asarray(x).astype(np.uint32)
 
+    array = staticmethod(np.asarray)
+
     @staticmethod
-    def lookup(table: np.ndarray, index: Any) -> Any:
+    def lookup(table: Any, index: Any) -> Any:
         return table[index]
 
 
@@ -106,7 +122,10 @@ class SparseResponse(Response):
 
 @dataclass(frozen=True)
 class GrayBits(DenseResponse):
-    """Bits of the Gray code of the projector column or row, most significant first; pixels are squares."""
+    """Bits of the Gray code of the projector column or row, most significant first; pixels are squares.
+
+    Out of focus, the edges of the stripes become error functions.
+    """
 
     axis: int
     """0: columns (u), 1: rows (v)."""
@@ -119,6 +138,9 @@ class GrayBits(DenseResponse):
         return self.bits - self.shift
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
+        if path.blur_px is not None:
+            bits = reversed(range(self.shift, self.bits))
+            return [blurred_stripes(path[self.axis], 4.0 * 2**b, path.blur_px, m) for b in bits]
         coordinate = m.unsigned(path[self.axis])
         gray = coordinate ^ (coordinate >> 1)
         return [m.select((gray >> b) & 1 == 1, 1.0, 0.0) for b in reversed(range(self.shift, self.bits))]
@@ -126,7 +148,10 @@ class GrayBits(DenseResponse):
 
 @dataclass(frozen=True)
 class Fringes(DenseResponse):
-    """cos and sin of the phase 2 pi x / period along the projector columns or rows, x continuous."""
+    """cos and sin of the phase 2 pi x / period along the projector columns or rows, x continuous.
+
+    Out of focus, and where the projector's pixels are finite, they lose contrast.
+    """
 
     axis: int
     period_px: float
@@ -134,12 +159,18 @@ class Fringes(DenseResponse):
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
         phase = path[self.axis] * (2 * np.pi / self.period_px)
-        return [m.cos(phase), m.sin(phase)]
+        if path.blur_px is None:
+            return [m.cos(phase), m.sin(phase)]
+        contrast = fringe_contrast(self.period_px, path.blur_px, m)
+        return [contrast * m.cos(phase), contrast * m.sin(phase)]
 
 
 @dataclass(frozen=True, eq=False)
 class Images(DenseResponse):
-    """Arbitrary patterns, (k, height, width) float32 in 0..1, each projector pixel a uniform square."""
+    """Arbitrary patterns, (k, height, width) float32 in 0..1, each projector pixel a uniform square.
+
+    Out of focus, they are read from blurred copies.
+    """
 
     patterns: np.ndarray
 
@@ -156,10 +187,16 @@ class Images(DenseResponse):
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
         _, height, width = self.patterns.shape
+        if path.blur_px is not None:
+            return [image.at(path.u, path.v, path.blur_px, m) for image in self._blurred]
         column = m.unsigned(m.select(path.u < width, path.u, width - 1.0))
         row = m.unsigned(m.select(path.v < height, path.v, height - 1.0))
         index = row * width + column
         return [m.lookup(np.ascontiguousarray(p, dtype=np.float32).ravel(), index) for p in self.patterns]
+
+    @cached_property
+    def _blurred(self) -> list[BlurredImage]:
+        return [BlurredImage(pattern) for pattern in self.patterns]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from rangesim.response import DenseResponse, LightPath, Response, SparseResponse
 class DrjitMath:
     """`rangesim.response.Math` on Dr.Jit arrays."""
 
-    cos, sin, floor, abs = dr.cos, dr.sin, dr.floor, dr.abs
+    cos, sin, floor, abs, exp, erf = dr.cos, dr.sin, dr.floor, dr.abs, dr.exp, dr.erf
     select = staticmethod(dr.select)
 
     @staticmethod
@@ -24,7 +24,11 @@ class DrjitMath:
         return mi.UInt32(x)
 
     @staticmethod
-    def lookup(table: np.ndarray, index: Any) -> Any:
+    def array(table: np.ndarray) -> Any:
+        return mi.Float(table)
+
+    @staticmethod
+    def lookup(table: Any, index: Any) -> Any:
         return dr.gather(mi.Float, mi.Float(table), index)
 
 

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Patterns of a projector out of focus, in closed form.
+
+A surface point out of focus sees the pattern through a disc of the projector's image plane. The disc is approximated by
+a Gaussian of its standard deviation sigma (a quarter of its diameter), in projector pixels; the pattern is then
+filtered before it is read, instead of sampled over the lens. The functions work over `rangesim.response.Math`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from rangesim.response import Math
+
+SHARPEST = 1e-5
+"""Smallest sigma, in periods or pixels: keeps an edge that is read at its place from 0 / 0."""
+SWITCH = 0.2
+"""Sigma in periods from which on the first harmonic stands for the stripes; both forms are then within 2e-4."""
+
+
+def blurred_stripes(x: Any, period: float, sigma: Any, m: Math) -> Any:
+    """Stripes 0 1 1 0 of the given period, dark first, blurred by a Gaussian of standard deviation `sigma`.
+
+    Little blur: the three nearest edges, each an error function; what is left out is below Q(0.75 / SWITCH), the
+    Gaussian's tail. Much blur: mean and first harmonic, 1/2 - 2/pi exp(-2 pi^2 sigma^2 / P^2) cos(2 pi x / P); the
+    third harmonic is below 2 / (3 pi) exp(-18 pi^2 SWITCH^2).
+    """
+    turns = x * (1 / period)
+    turns = turns - m.floor(turns)
+    into = 0.25 - m.abs(turns - 0.5)  # periods from the nearest edge, > 0 inside the bright stripe
+    spread = sigma * (1 / period)
+    scale = np.sqrt(0.5) / m.select(spread > SHARPEST, spread, SHARPEST)
+    edges = m.erf(into * scale) - m.erf((into - 0.5) * scale) - m.erf((into + 0.5) * scale)
+    harmonic = m.exp(-2 * np.pi**2 * spread * spread) * m.cos(2 * np.pi * turns)
+    return m.select(spread < SWITCH, 0.5 + 0.5 * edges, 0.5 - 2 / np.pi * harmonic)
+
+
+def fringe_contrast(period: float, sigma: Any, m: Math) -> Any:
+    """Factor on the modulation of a sinusoid: exp(-2 pi^2 sigma^2 / P^2) of the blur, sinc(1 / P) of the pixels.
+
+    Pixels hold the value at their centre over their width (zero-order hold). The steps' own harmonics, near one per
+    pixel, are neglected.
+    """
+    spread = sigma * (1 / period)
+    return m.exp(-2 * np.pi**2 * spread * spread) * float(np.sinc(1 / period))
+
+
+FINEST = 0.5
+"""Sigma in pixels up to which the nine nearest pixels are read, each with the Gaussian's share on it."""
+STEP = 2.0
+"""Ratio of variances between blurred copies."""
+COPIES = 9
+
+
+class BlurredImage:
+    """A pattern and Gaussian-blurred copies of it, dark outside.
+
+    A blur of up to `FINEST` is read exactly, but for the Gaussian's tails beyond the neighbouring pixels. A stronger
+    one is split: the reading blurs by `FINEST`, and the copies hold the rest, so that their variances are FINEST^2
+    times 1, 2, 4 ... 256 (sigma 0.5 ... 8 pixels; a stronger blur reads the last copy). Between copies the value is
+    linear in the variance, as the heat equation has it for small steps. 36 bytes per pixel.
+
+    Parameters
+    ----------
+    pattern : (height, width) float32; each pixel a uniform square.
+    """
+
+    def __init__(self, pattern: np.ndarray) -> None:
+        sharp = np.pad(np.asarray(pattern, dtype=np.float32), 1)  # what is blurred reaches beyond the pattern's edge
+        self.height, self.width = sharp.shape
+        self.copies = np.stack([_smooth(sharp, FINEST**2 * (STEP**k - 1)) for k in range(COPIES)]).ravel()
+
+    def at(self, u: Any, v: Any, sigma: Any, m: Math) -> Any:
+        """Value at pixel coordinates (u, v) with a blur of standard deviation `sigma` pixels."""
+        variance = sigma * sigma * (1 / FINEST**2)
+        copy, base = 0.0 * variance, 1.0 + 0.0 * variance  # the copy below, and its variance
+        for k in range(1, COPIES - 1):
+            beyond = variance >= STEP**k
+            copy, base = m.select(beyond, float(k), copy), m.select(beyond, STEP**k, base)
+        share = m.select(variance < STEP ** (COPIES - 1), variance / base, STEP) - 1
+        share = m.select(share > 0, share * (1 / (STEP - 1)), 0.0)
+        sigma = m.select(sigma < FINEST, sigma, FINEST)
+        columns, rows = _taps(u + 1, self.width, sigma, m), _taps(v + 1, self.height, sigma, m)
+        copies, offset = m.array(self.copies), m.unsigned(copy) * (self.height * self.width)
+        total = 0.0 * u
+        for row, row_weight in rows:
+            for column, weight in columns:
+                index = offset + row * self.width + column
+                below, above = m.lookup(copies, index), m.lookup(copies, index + self.height * self.width)
+                total = total + row_weight * weight * (below + share * (above - below))
+        return total
+
+
+def _taps(x: Any, size: int, sigma: Any, m: Math) -> list[tuple[Any, Any]]:
+    """Indices and weights of the three pixels about `x`: the shares of a Gaussian on each, 0 outside the image."""
+    pixel = m.floor(x)
+    scale = np.sqrt(0.5) / m.select(sigma > SHARPEST, sigma, SHARPEST)
+    before, after = (0.5 + 0.5 * m.erf((pixel + edge - x) * scale) for edge in (0.0, 1.0))
+    taps = []
+    for place, weight in ((pixel - 1, before), (pixel, after - before), (pixel + 1, 1 - after)):
+        inside = (place >= 0) & (place < size)
+        taps.append((m.unsigned(m.select(inside, place, 0.0)), m.select(inside, weight, 0.0)))
+    return taps
+
+
+def _smooth(image: np.ndarray, variance: float) -> np.ndarray:
+    """`image` convolved with the taps whose frequency response is the Gaussian's up to half a cycle per pixel.
+
+    Sampled Gaussians narrower than a pixel have neither its variance nor its response.
+    """
+    from scipy.ndimage import correlate1d
+
+    reach = int(np.ceil(5 * np.sqrt(variance))) + 8
+    response = np.exp(-2 * np.pi**2 * variance * np.fft.rfftfreq(2 * reach) ** 2)
+    kernel = np.fft.fftshift(np.fft.irfft(response))[1:]
+    for axis in (0, 1):
+        image = correlate1d(image, kernel / kernel.sum(), axis=axis, mode="constant")
+    return image
