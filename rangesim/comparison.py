@@ -161,10 +161,10 @@ def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.nda
     far = np.where(np.isfinite(true_z), true_z, np.inf)
     nearest = np.full(z.shape, np.inf)
     measured = np.where(np.isfinite(z), z, np.nan)
-    for shifted in _neighbours(far, EDGE_RADIUS):
+    for shifted in neighbours(far, EDGE_RADIUS):
         np.fmin(nearest, np.abs(measured - shifted), out=nearest)
     step = _has_step(far, outlier_m)
-    edge = np.any(list(_neighbours(step, EDGE_RADIUS)), axis=0) & np.isfinite(true_z)
+    edge = np.any(list(neighbours(step, EDGE_RADIUS)), axis=0) & np.isfinite(true_z)
     return edge, edge & np.isfinite(measured) & (nearest > outlier_m)
 
 
@@ -182,7 +182,7 @@ def _has_step(depth: np.ndarray, outlier_m: float) -> np.ndarray:
     return result
 
 
-def _neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:
+def neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:
     """The array shifted to every offset of the window, edges repeated."""
     padded = np.pad(values, radius, mode="edge")
     h, w = values.shape

@@ -1,0 +1,7 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why a pixel has no reading, or a wrong one. Definitions and test scenes: docs/causes.md."""
+
+from rangesim.causes.cause import Cause, CauseMap
+from rangesim.causes.explain import explain
+
+__all__ = ["Cause", "CauseMap", "explain"]

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a range image and the light that made it to the cause of every failed pixel."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rangesim.capture import Capture
+from rangesim.causes.cause import Cause, CauseMap
+from rangesim.causes.evidence import Evidence
+from rangesim.causes.light_budget import light_budget
+from rangesim.comparison import OUTLIER_M
+from rangesim.decoding import decode
+from rangesim.range_image import RangeImage
+from rangesim.response import CAUSTIC, GLINT, MULTIPATH, VIA_DELTA
+
+if TYPE_CHECKING:
+    from rangesim.signals import Signals
+
+Rule = tuple[np.ndarray, Cause]
+
+OTHER = range(MULTIPATH, GLINT + 1)
+"""Kinds of light that carry no depth of the surface a pixel sees."""
+
+
+def explain(
+    image: RangeImage,
+    capture: Capture,
+    signals: Signals,
+    motion_m: np.ndarray | None = None,
+    tolerance_m: float = OUTLIER_M,
+) -> CauseMap:
+    """The cause of every failed pixel, from the energy split and the ground truth of its pass.
+
+    A pixel fails if there is a surface behind it and no reading, or one off by more than `tolerance_m`. The cause
+    is the first thing that goes wrong on the way of the light: at the surface, at the pixel, in the detector, in
+    the decoder. To part optics from electronics, the same signals are decoded once more without noise and
+    without ambient light.
+
+    Parameters
+    ----------
+    image : RangeImage, decoded from `capture`.
+    capture : Capture, as `rangesim.expose` made it from `signals`.
+    signals : Signals of the pass; the sensor of the capture must have been part of it.
+    motion_m : (h, w) float, metres that the first surface moves during the acquisition; None: nothing moves.
+    tolerance_m : float, metres.
+
+    Raises
+    ------
+    ValueError
+        Image, capture, signals and motion differ in size, the pass lacks the sensor's signals, or `tolerance_m` is
+        not positive.
+    """
+    shape = signals.truth.z.shape
+    sizes = [image.z.shape, capture.frames.shape[1:], *([] if motion_m is None else [np.shape(motion_m)])]
+    if any(size != shape for size in sizes):
+        raise ValueError(f"expected image, capture and motion of shape {shape} as the signals, got {sizes}.")
+    if not tolerance_m > 0:
+        raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
+    clean = decode(Capture(signals.frames(capture.sensor, ambient_transmission=0.0), capture.sensor, signals.rig))
+    budget = light_budget(signals, capture)
+    evidence = Evidence(image, clean, capture, signals.truth, signals.energy, budget, motion_m, tolerance_m)
+    masks, causes = zip(*rules(evidence), strict=True)
+    cause = np.select(masks, causes)
+    return CauseMap(np.where(evidence.failed, cause, Cause.NONE).astype(np.uint8), tolerance_m)
+
+
+def rules(e: Evidence) -> list[Rule]:
+    """Causes in the order in which they are considered; for a failed pixel the first that holds is the cause.
+
+    The order is that of the light, except that saturation comes first: it hides everything else. The last rule
+    holds wherever it is asked, so no failed pixel is without a cause: with enough light, nothing that disturbs
+    it, and a right reading without noise, it was the noise.
+    """
+    too_dark, disturbed = ~e.enough, e.optical & e.disturbed
+    glossy = e.is_a("glossy") & e.faint  # as far as the projector's light goes, a mirror
+    return [
+        # ---- The detector, blinded
+        (e.saturated | e.mostly(GLINT), Cause.GLINT),
+        # ---- Surfaces that pass the light on: whether they are lit does not matter
+        (e.is_a("transparent") | (e.is_a("translucent") & too_dark), Cause.SEEN_THROUGH),
+        (e.is_a("mirror") & (~e.missing | e.enough), Cause.MIRRORED_GHOST),
+        (e.is_a("mirror"), Cause.SPECULAR_AWAY),
+        # ---- No straight way for the light
+        (e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC),
+        (e.unlit & e.enough & e.mostly(VIA_DELTA), Cause.MIRRORED_GHOST),
+        (e.unlit, Cause.SHADOWED),
+        # ---- Too little of it comes back, or less than of other light
+        (glossy & (too_dark | e.missing | ~e.optical), Cause.SPECULAR_AWAY),
+        (glossy & disturbed, Cause.MIRRORED_GHOST),
+        (too_dark & e.swamped, Cause.AMBIENT),
+        (too_dark, Cause.LOW_SIGNAL),
+        # ---- The distance itself
+        (e.beyond_range, Cause.WRAPPED),
+        (e.optical & e.coarse, Cause.RESOLUTION),
+        # ---- The pixel holds more than one distance
+        (e.moving, Cause.MOTION),
+        (e.at_edge & ~(disturbed & e.fails_off_edge), Cause.DEPTH_EDGE),
+        (e.in_shadow, Cause.SHADOWED),
+        (disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC),
+        (disturbed & e.mostly(VIA_DELTA, OTHER), Cause.MIRRORED_GHOST),
+        (disturbed & e.mostly(MULTIPATH, OTHER), Cause.MULTIPATH),
+        (disturbed, Cause.GLINT),
+        # ---- The decoder, and noise
+        (e.wrong_period, Cause.WRAPPED),
+        (e.optical, Cause.RESOLUTION),
+        (e.swamped, Cause.AMBIENT),
+        (np.ones_like(too_dark), Cause.LOW_SIGNAL),
+    ]
