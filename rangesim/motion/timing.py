@@ -93,7 +93,7 @@ class Timing:
     def exposure_times_s(self, sensor: Sensor) -> Array:
         """(e,) float64, seconds, middle of each exposure in line 0."""
         exposures = int(self.exposure_of_frames(sensor)[-1]) + 1
-        return self.start_s + self.frame_period_s * np.arange(exposures)
+        return np.asarray(self.start_s + self.frame_period_s * np.arange(exposures), dtype=np.float64)
 
     def reference_s(self, sensor: Sensor, camera: Intrinsics) -> float:
         """Middle of the acquisition, seconds: between the first line of the first exposure and the last of the last."""

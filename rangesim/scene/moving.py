@@ -71,6 +71,8 @@ class MovingScene:
         return moved
 
     def _load(self) -> Scene:
+        if self.scene.reload is None:
+            raise ValueError("expected a scene of load_scene, which can be loaded again, to move shapes in.")
         self._moved = replace(self.scene, mitsuba=self.scene.reload())
         self._parameters = mi.traverse(self._moved.mitsuba)
         for name in self.names:

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals whose frames were taken at different times, and how they are put together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rangesim.motion.displacement import displacement
+from rangesim.motion.passes import Pass
+from rangesim.motion.timing import Timing
+from rangesim.rig import Rig
+from rangesim.sensors import Sensor
+from rangesim.signals import Signals
+
+
+@dataclass(frozen=True, eq=False)
+class MovingSignals(Signals):
+    """Signals of one sensor whose frames were taken while something moved.
+
+    `rig`, `energy` and `truth` are those at the middle of the acquisition; `channels` is empty, as there is no one
+    time for them.
+
+    sensor : the one sensor these signals are of.
+    lit : (k, h, w) float32, W/m2/sr, the frames without ambient light.
+    ambient : (e, h, w) float32, W/m2/sr, ambient light during each exposure, before any filter.
+    ambient_gain : (k,) float32, how much of it a frame holds.
+    exposure_of_frames : (k,) int, index into `ambient`.
+    """
+
+    sensor: Sensor = field(kw_only=True)
+    lit: np.ndarray = field(kw_only=True)
+    ambient: np.ndarray = field(kw_only=True)
+    ambient_gain: np.ndarray = field(kw_only=True)
+    exposure_of_frames: np.ndarray = field(kw_only=True)
+
+    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0) -> np.ndarray:
+        if sensor != self.sensor:
+            raise ValueError(f"expected {self.sensor}, whose frames these are, got {sensor}.")
+        gain = np.float32(ambient_transmission) * self.ambient_gain
+        parts = zip(self.lit, gain, self.exposure_of_frames, strict=True)
+        return np.stack([lit + g * self.ambient[exposure] for lit, g, exposure in parts])
+
+
+class FrameStack:
+    """The frames of one sensor, filled while pass after pass comes in; holds them and nothing of earlier passes.
+
+    Parameters
+    ----------
+    sensor, timing : whose frames, and which exposures they share.
+    rig : Rig, where it stands without motion.
+    middle, at_middle : the pass at the middle of the acquisition, and its signals.
+    """
+
+    def __init__(self, sensor: Sensor, timing: Timing, rig: Rig, middle: Pass, at_middle: Signals) -> None:
+        self.sensor, self.rig = sensor, rig
+        self.middle, self.at_middle = middle, replace(at_middle, channels={})
+        self.exposure_of_frames = timing.exposure_of_frames(sensor)
+        image = (rig.camera.height, rig.camera.width)
+        self.lit = np.zeros((sensor.n_frames, *image), dtype=np.float32)
+        self.ambient = np.zeros((len(timing.exposure_times_s(sensor)), *image), dtype=np.float32)
+        self.motion_m = np.zeros(image, dtype=np.float32)
+
+    def add(self, one: Pass, signals: Signals) -> None:
+        """Take what a pass has for this sensor."""
+        frames = signals.frames(self.sensor, ambient_transmission=0.0)
+        for share in one.shares:
+            if share.sensor == self.sensor:
+                one.window.of(self.lit)[share.frames] += np.float32(share.share) * frames[share.frames]
+                one.window.of(self.ambient)[share.exposure] += np.float32(share.share) * signals.energy.ambient
+        cropped = replace(self.rig, camera=signals.rig.camera)
+        leaves = displacement(self.at_middle.truth, self.rig, self.middle.placement, one.placement)
+        comes = displacement(signals.truth, cropped, one.placement, self.middle.placement)
+        moved = one.window.of(self.motion_m)
+        np.maximum(moved, np.maximum(one.window.of(leaves), comes), out=moved)
+
+    def signals(self) -> MovingSignals:
+        """The signals, when all passes are in."""
+        return MovingSignals(
+            rig=self.at_middle.rig,
+            channels={},
+            energy=self.at_middle.energy,
+            truth=self.at_middle.truth,
+            motion_m=self.motion_m,
+            sensor=self.sensor,
+            lit=self.lit,
+            ambient=self.ambient,
+            ambient_gain=_ambient_gain(self.sensor),
+            exposure_of_frames=self.exposure_of_frames,
+        )
+
+
+def _ambient_gain(sensor: Sensor) -> np.ndarray:
+    """(k,) float32: frames are affine in ambient light, so those of a pixel in ambient light of 1 alone tell all."""
+    dark = [np.zeros((r.channels, 1, 1), dtype=np.float32) for r in sensor.responses()]
+    return sensor.frames(dark, np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32))[:, 0, 0]

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which transport passes a set of captures needs: what is taken at equal places of everything shares one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rangesim.motion.timing import Instant, Timing, Window
+from rangesim.motion.track import Motion, Placement
+from rangesim.rig import Rig
+from rangesim.sensors import Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Share:
+    """What one sensor takes from a pass: a share (0..1) of the light of these frames, which one exposure fills.
+
+    The pass at the middle of the acquisition may have no frames to give.
+    """
+
+    sensor: Sensor
+    exposure: int
+    frames: np.ndarray
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """Light transport with everything at one place, for a window of the image.
+
+    reference_of : the sensors whose middle of the acquisition this is.
+    """
+
+    placement: Placement
+    window: Window
+    shares: list[Share] = field(default_factory=list)
+    reference_of: list[Sensor] = field(default_factory=list)
+
+    @property
+    def sensors(self) -> list[Sensor]:
+        """Those that take frames from this pass, in order of first appearance."""
+        return list(dict.fromkeys(s.sensor for s in self.shares))
+
+    def rig(self, rig: Rig) -> Rig:
+        """The rig where it is, its camera cropped to the window."""
+        camera, window = rig.camera, self.window
+        if window != Window.whole(camera):
+            camera = replace(
+                camera,
+                width=window.right - window.left,
+                height=window.bottom - window.top,
+                cx=camera.cx - window.left,
+                cy=camera.cy - window.top,
+            )
+        return replace(rig, camera=camera, T_world_camera=self.placement.place(rig))
+
+    def seed(self, seed: int) -> int:
+        """The seed itself for the whole image, so that what stands still has the same noise at all times; another
+        one for each window, as otherwise every band of a scan would repeat the noise of the first."""
+        corner = (self.window.top, self.window.left)
+        return (
+            seed if not any(corner) else int(np.random.SeedSequence([seed & 0xFFFFFFFF, *corner]).generate_state(1)[0])
+        )
+
+
+def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pass]:
+    """Passes for the captures of all sensors; those at the middle of an acquisition come first."""
+    passes: dict[tuple[bytes, Window], Pass] = {}
+
+    def at(time_s: float, window: Window) -> Pass:
+        placement = motion.at(time_s)
+        return passes.setdefault((placement.key, window), Pass(placement, window))
+
+    for sensor, timing in timings.items():
+        at(timing.reference_s(sensor, rig.camera), Window.whole(rig.camera)).reference_of.append(sensor)
+    for sensor, timing in timings.items():
+        exposures = timing.exposure_of_frames(sensor)
+        for exposure, time_s in enumerate(timing.exposure_times_s(sensor)):
+            frames = np.flatnonzero(exposures == exposure)
+            for instant in _joined(timing.instants(time_s, rig.camera), motion):
+                share = Share(sensor, exposure, frames, instant.share)
+                at(instant.time_s, instant.window).shares.append(share)
+    return list(passes.values())
+
+
+def _joined(instants: Sequence[Instant], motion: Motion) -> list[Instant]:
+    """Fewer instants: bands that see everything at one place become one window, equal windows one share."""
+    keys = [motion.at(instant.time_s).key for instant in instants]
+    shares: dict[tuple[bytes, Window], Instant] = {}
+    for key, instant in zip(keys, instants, strict=True):
+        before = shares.get((key, instant.window))
+        shares[key, instant.window] = instant._replace(share=instant.share + (before.share if before else 0.0))
+    joined: dict[bytes, Instant] = {}
+    result: list[Instant] = []
+    for (key, window), instant in shares.items():
+        last = joined.get(key)
+        if last is not None and np.isclose(last.share, instant.share) and _touch(last.window, window):
+            result.remove(last)
+            instant = last._replace(window=_union(last.window, window))
+        joined[key] = instant
+        result.append(instant)
+    return result
+
+
+def _touch(first: Window, second: Window) -> bool:
+    """Whether the second window follows right below, or right beside, the first."""
+    below = first.bottom == second.top and (first.left, first.right) == (second.left, second.right)
+    beside = first.right == second.left and (first.top, first.bottom) == (second.top, second.bottom)
+    return below or beside
+
+
+def _union(first: Window, second: Window) -> Window:
+    return Window(first.top, second.bottom, first.left, second.right)

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One entry point: scene + rig + timed sensors + motion -> signals, each exposure at its own time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rangesim.motion.moving_signals import FrameStack
+from rangesim.motion.passes import plan
+from rangesim.motion.timing import Timing
+from rangesim.motion.track import Motion
+from rangesim.rig import Rig
+from rangesim.sensors import Sensor
+from rangesim.signals import Signals
+
+if TYPE_CHECKING:
+    from rangesim.scene import Scene
+
+
+def transport_moving(
+    scene: Scene,
+    rig: Rig,
+    timings: Mapping[Sensor, Timing],
+    motion: Motion,
+    *,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+    **options: Any,
+) -> dict[Sensor, Signals]:
+    """Signals of sensors in a world that moves: every exposure, and every band of a scan, at its own time.
+
+    All that is taken with everything in one and the same place shares a transport pass, whatever the sensor: without
+    motion there is one pass, and the frames have the bytes of `transport`. A stack of k patterns of something that
+    moves costs k passes. Passes of the whole image share their random numbers, so that what stands still is the same
+    in all frames.
+
+    Parameters
+    ----------
+    scene : Scene of `load_scene`; it stays as it is.
+    rig : Rig, where it stands without motion.
+    timings : sensor -> Timing, when it takes its frames.
+    motion : Motion, what moves.
+    seed : int; the same seed gives the same bytes.
+    progress : called with the share done, 0..1.
+    options : spp, max_depth and what else `transport` takes, for each pass.
+
+    Returns
+    -------
+    dict
+        sensor -> Signals for `expose`. `truth`, `energy` and `rig` (hence the pose that takes a point cloud to the
+        world) are those at the middle of the sensor's acquisition, `Timing.reference_s`. `motion_m` says how far
+        what a pixel sees moves: the largest distance, in the camera's frame, between a surface point at an exposure of
+        the pixel and the same point at that middle; of the point the pixel sees at the middle, and of those it sees
+        when it is exposed (something passing by). None for a sensor whose one exposure holds everything.
+
+    Raises
+    ------
+    ValueError
+        No such shape, one that cannot be moved, or what `transport` refuses.
+    """
+    from rangesim.light_transport.one_pass import transport
+    from rangesim.scene.moving import MovingScene
+
+    _check(scene, rig, timings, motion)
+    passes = plan(rig, timings, motion)
+    stage = MovingScene(scene, tuple(motion.objects))
+    at_once: dict[Sensor, Signals] = {}
+    stacks: dict[Sensor, FrameStack] = {}
+    for number, one in enumerate(passes):
+        signals = transport(
+            stage.at(one.placement.objects),
+            one.rig(rig),
+            one.sensors,
+            seed=one.seed(seed),
+            progress=progress and partial(_report, progress, number, len(passes)),
+            **options,
+        )
+        for sensor in one.reference_of:
+            if any(sensor in other.sensors for other in passes if other is not one):
+                stacks[sensor] = FrameStack(sensor, timings[sensor], rig, one, signals)
+            else:
+                at_once[sensor] = replace(signals, channels={r: signals.channels[r] for r in sensor.responses()})
+        for sensor in one.sensors:
+            if sensor in stacks:
+                stacks[sensor].add(one, signals)
+    return {s: at_once[s] if s in at_once else stacks[s].signals() for s in timings}
+
+
+def _report(progress: Callable[[float], None], number: int, passes: int, share: float) -> None:
+    progress((number + share) / passes)
+
+
+def _check(scene: Scene, rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> None:
+    from rangesim.scene import Scene
+
+    if not isinstance(scene, Scene):
+        raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
+    if not isinstance(rig, Rig):
+        raise ValueError(f"expected a Rig, as scene.rig() returns, got {type(rig).__name__}.")
+    if not isinstance(motion, Motion):
+        raise ValueError(f"expected a Motion, got {motion!r}.")
+    if not isinstance(timings, Mapping) or not timings:
+        raise ValueError(f"expected sensors with their timings, for example {{AmcwToF(): Timing()}}, got {timings!r}.")
+    for sensor, timing in timings.items():
+        if not isinstance(sensor, Sensor) or not isinstance(timing, Timing):
+            raise ValueError(f"expected a Timing for each sensor, got {timing!r} for {sensor!r}.")
+    motion.check(i.name for i in scene.instances)
