@@ -15,6 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from rangesim.response import Math
 
+ROOT_HALF = 0.5**0.5
 SHARPEST = 1e-5
 """Smallest sigma, in periods or pixels: keeps an edge that is read at its place from 0 / 0."""
 SWITCH = 0.2
@@ -32,7 +33,7 @@ def blurred_stripes(x: Any, period: float, sigma: Any, m: Math) -> Any:
     turns = turns - m.floor(turns)
     into = 0.25 - m.abs(turns - 0.5)  # periods from the nearest edge, > 0 inside the bright stripe
     spread = sigma * (1 / period)
-    scale = np.sqrt(0.5) / m.select(spread > SHARPEST, spread, SHARPEST)
+    scale = ROOT_HALF / m.select(spread > SHARPEST, spread, SHARPEST)
     edges = m.erf(into * scale) - m.erf((into - 0.5) * scale) - m.erf((into + 0.5) * scale)
     harmonic = m.exp(-2 * np.pi**2 * spread * spread) * m.cos(2 * np.pi * turns)
     return m.select(spread < SWITCH, 0.5 + 0.5 * edges, 0.5 - 2 / np.pi * harmonic)
@@ -97,7 +98,7 @@ class BlurredImage:
 def _taps(x: Any, size: int, sigma: Any, m: Math) -> list[tuple[Any, Any]]:
     """Indices and weights of the three pixels about `x`: the shares of a Gaussian on each, 0 outside the image."""
     pixel = m.floor(x)
-    scale = np.sqrt(0.5) / m.select(sigma > SHARPEST, sigma, SHARPEST)
+    scale = ROOT_HALF / m.select(sigma > SHARPEST, sigma, SHARPEST)
     before, after = (0.5 + 0.5 * m.erf((pixel + edge - x) * scale) for edge in (0.0, 1.0))
     taps = []
     for place, weight in ((pixel - 1, before), (pixel, after - before), (pixel + 1, 1 - after)):
