@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
+    "Ambient": "rangesim.ambient",
     "AmcwToF": "rangesim.sensors",
     "Capture": "rangesim.capture",
     "Detector": "rangesim.detector",

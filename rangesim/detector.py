@@ -11,12 +11,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from rangesim.rig import Rig
 from rangesim.sensors import DirectToF, Sensor
+
+if TYPE_CHECKING:
+    from rangesim.ambient import Ambient
 
 PLANCK_TIMES_C = 6.626_070_15e-34 * 299_792_458.0
 """h c in joule metres, exact."""
@@ -30,6 +33,7 @@ class PhotoDetector(ABC):
     quantum_efficiency: float
     bits: int
     ambient_transmission: float
+    band_width_m: float
     min_exposure_s: float
     max_exposure_s: float
 
@@ -46,9 +50,13 @@ class PhotoDetector(ABC):
     def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr."""
 
-    def ambient_share(self, sensor: Sensor) -> float:
-        """Share of ambient light that counts: what passes the filter."""
-        return self.ambient_transmission
+    def ambient_share(self, sensor: Sensor, ambient: Ambient | None = None) -> float:
+        """Factor on the scene's ambient light for the part that counts: what passes the filter.
+
+        ambient : what kind of light it is, and how strong: the filter's band decides. None: unknown, so
+            `ambient_transmission` does.
+        """
+        return self.ambient_transmission if ambient is None else ambient.in_band(self.wavelength_m, self.band_width_m)
 
     @property
     def max_dn(self) -> int:
@@ -74,6 +82,10 @@ class PhotoDetector(ABC):
             raise ValueError(f"expected a quantum_efficiency in (0, 1], got {self.quantum_efficiency}.")
         if not 0 <= self.ambient_transmission <= 1:
             raise ValueError(f"expected an ambient_transmission in 0..1, got {self.ambient_transmission}.")
+        if not 0 <= self.band_width_m < 2 * self.wavelength_m:
+            raise ValueError(
+                f"expected a band_width_m of at least 0 m and a filter that ends above 0 m, got {self.band_width_m}."
+            )
         if not 1 <= self.bits <= 16:
             raise ValueError(f"expected 1 to 16 bits, got {self.bits}.")
         if self.min_exposure_s > self.max_exposure_s:
@@ -102,7 +114,11 @@ class Detector(PhotoDetector):
     dark_current_e_s : float, electrons per second [mu_I].
     bits : int in 1..16, ADC resolution.
     offset_dn : float, digital numbers, black level [mu_y.dark without dark current].
-    ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through.
+    ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through, where the kind
+        of light is not stated (`expose` without `ambient`); the default is that of sunlight in the default band.
+    band_width_m : float, metres, full width of the band-pass filter around wavelength_m, where the kind of light is
+        stated. In the band it passes ambient light as it does the projector's, whose losses are part of the
+        quantum efficiency; outside it passes nothing. 0: no ambient light at all.
     pixel_pitch_m : float, metres; pixels are square [sqrt A]. Informative: it cancels, see the module.
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
     """
@@ -115,6 +131,7 @@ class Detector(PhotoDetector):
     bits: int = 12
     offset_dn: float = 16.0
     ambient_transmission: float = 0.05
+    band_width_m: float = 50e-9
     pixel_pitch_m: float = 5e-6
     min_exposure_s: float = 10e-6
     max_exposure_s: float = 0.1
@@ -135,13 +152,13 @@ class Detector(PhotoDetector):
     def time_of_flight(cls) -> Detector:
         """A lock-in pixel as in indirect time-of-flight cameras: large, deep, noisier, behind a narrow filter."""
         return cls(full_well_e=100_000.0, read_noise_e=20.0, dark_current_e_s=1000.0, pixel_pitch_m=10e-6,
-                   ambient_transmission=0.03, max_exposure_s=0.02)  # fmt: skip
+                   ambient_transmission=0.03, band_width_m=30e-9, max_exposure_s=0.02)  # fmt: skip
 
     @classmethod
     def ideal(cls) -> Detector:
         """Shot noise and 16-bit quantisation alone: every photon counts, nothing is dark, the well is deep."""
         return cls(quantum_efficiency=1.0, full_well_e=1e6, read_noise_e=0.0, dark_current_e_s=0.0, bits=16,
-                   offset_dn=0.0, ambient_transmission=0.0)  # fmt: skip
+                   offset_dn=0.0, ambient_transmission=0.0, band_width_m=0.0)  # fmt: skip
 
     @property
     def gain_dn_e(self) -> float:

@@ -13,6 +13,7 @@ from rangesim.rig import Rig
 from rangesim.sensors import IdealToF, Sensor
 
 if TYPE_CHECKING:
+    from rangesim.ambient import Ambient
     from rangesim.signals import Signals
 
 TARGET_SHARE = 0.7
@@ -25,6 +26,7 @@ def expose(
     detector: PhotoDetector | None = None,
     exposure_s: float | None = None,
     seed: int = 0,
+    ambient: Ambient | None = None,
 ) -> Capture:
     """Capture of `sensor`: its frames with the noise and limits of `detector`.
 
@@ -37,6 +39,9 @@ def expose(
         frames are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
     seed : int, of the noise. Every frame has its own stream; the same seed gives the same bytes.
+    ambient : Ambient, what kind of light the scene's own emitters give, and how strong: the detector's
+        band (`band_width_m`) then decides what counts of it. None: unknown, and the detector's
+        `ambient_transmission` does. Other light needs no new pass.
 
     Raises
     ------
@@ -49,8 +54,9 @@ def expose(
     if exposure_s is not None and not 0 < exposure_s < np.inf:
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
     if detector is None or isinstance(sensor, IdealToF):
-        return Capture(_through_lens(signals.frames(sensor), signals.rig), sensor, signals.rig)
-    radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor)), signals.rig)
+        unfiltered = 1.0 if ambient is None else ambient.scale
+        return Capture(_through_lens(signals.frames(sensor, unfiltered), signals.rig), sensor, signals.rig)
+    radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor, ambient)), signals.rig)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor, signals.rig, exposure_s, seed)

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from rangesim.detector import PhotoDetector, streams
 from rangesim.rig import Rig
 from rangesim.sensors import DirectToF, Sensor
+
+if TYPE_CHECKING:
+    from rangesim.ambient import Ambient
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class SpadDetector(PhotoDetector):
     bits : int in 1..16, depth of the counter of a bin.
     pile_up : bool; True: only the first photon after each pulse is counted (Coates 1968), False: every
         photon.
-    ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through.
+    ambient_transmission, band_width_m : the band-pass filter against ambient light, as of `Detector`.
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
     """
 
@@ -39,6 +42,7 @@ class SpadDetector(PhotoDetector):
     bits: int = 12
     pile_up: bool = False
     ambient_transmission: float = 0.02
+    band_width_m: float = 30e-9
     min_exposure_s: float = 10e-6
     max_exposure_s: float = 0.1
 
@@ -58,10 +62,10 @@ class SpadDetector(PhotoDetector):
         period_s, _ = _gate_s(sensor)
         return max(1, round(exposure_s / period_s))
 
-    def ambient_share(self, sensor: Sensor) -> float:
-        """Share of ambient light that counts: what passes the filter while the histogram is open."""
+    def ambient_share(self, sensor: Sensor, ambient: Ambient | None = None) -> float:
+        """Factor on the scene's ambient light: what passes the filter while the histogram is open."""
         period_s, open_s = _gate_s(sensor)
-        return self.ambient_transmission * open_s / period_s
+        return super().ambient_share(sensor, ambient) * open_s / period_s
 
     def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
         pulses, (period_s, open_s) = self.pulses(sensor, exposure_s), _gate_s(sensor)

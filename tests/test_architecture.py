@@ -62,6 +62,7 @@ def test_open3d_is_imported_only_where_it_is_used(path: Path) -> None:
 
 def test_the_public_surface_is_this() -> None:
     assert rangesim.__all__ == [
+        "Ambient",
         "AmcwToF",
         "Capture",
         "Detector",
