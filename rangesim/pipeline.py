@@ -13,9 +13,10 @@ import numpy as np
 
 import rangesim
 from rangesim.capture import Capture
+from rangesim.causes import explain
 from rangesim.experiment import Experiment, Instrument
 from rangesim.provenance import provenance
-from rangesim.result_files import FORMAT, SETTINGS, load_result, save_range_image
+from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, save_range_image
 from rangesim.staging import new_directory, write_json
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
 
 
 def measure(one: Instrument, signals: Signals, folder: Path, seed: int) -> None:
-    """Expose, decode, compare and segment for one instrument; write all of it to the new directory `folder`."""
+    """Expose, decode, compare, explain and segment for one instrument; write all to the new directory `folder`."""
     folder.mkdir()
     times: dict[str, float] = {}
     with timed(times, "exposure"):
@@ -85,7 +86,11 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int) -> None:
         image = rangesim.decode(capture)
     save_range_image(image, folder / "range.npz")
     comparison = rangesim.compare(image, signals.truth)
-    write_json(folder / "comparison.json", {"outlier_m": comparison.outlier_m, "rows": comparison.rows()})
+    with timed(times, "causes"):
+        causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
+    save_causes(causes, folder / "causes.npz")
+    rows = [row | failures for row, failures in zip(comparison.rows(), causes.shares(signals.truth), strict=True)]
+    write_json(folder / "comparison.json", {"outlier_m": comparison.outlier_m, "rows": rows})
     with timed(times, "points"):
         cloud = image.to_point_cloud()
     if cloud.valid.sum() >= FEWEST_POINTS:

@@ -7,6 +7,7 @@ DIR/experiment.json      resolved settings, versions, and which instruments shar
     report.html
     NAME/capture/        of each instrument: frames and sidecar
          range.npz       range image
+         causes.npz      cause of every failed pixel
          cloud.ply       points, metres, camera frame
          comparison.json, measurement.json, segmentation.npz
 """
@@ -22,6 +23,7 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.capture_files import load_capture
+from rangesim.causes import CauseMap
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.range_image import RangeImage
@@ -52,7 +54,9 @@ class Measurement:
     """What one instrument measured.
 
     capture : Capture. image : RangeImage. truth : GroundTruth of its pass.
-    rows : statistics per material class, "all" last; see `rangesim.comparison.ErrorStatistics`.
+    causes : CauseMap, why pixels failed.
+    rows : statistics per material class, "all" last; see `rangesim.comparison.ErrorStatistics` and
+        `rangesim.causes.CauseMap.shares`.
     segmentation : Segmentation, or None if there were no points to group.
     facts : frames, exposure and time per stage; see `rangesim.pipeline`.
     light_pass : int from 1, the transport pass the instrument took part in.
@@ -62,6 +66,7 @@ class Measurement:
     capture: Capture
     image: RangeImage
     truth: GroundTruth
+    causes: CauseMap
     rows: list[dict[str, Any]]
     segmentation: Segmentation | None
     facts: dict[str, Any]
@@ -82,6 +87,11 @@ def save_range_image(image: RangeImage, path: Path) -> None:
     """Write the arrays of a range image to a compressed .npz file; its camera is in the capture's sidecar."""
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
     np.savez_compressed(path, **arrays)
+
+
+def save_causes(causes: CauseMap, path: Path) -> None:
+    """Write a cause map to a compressed .npz file: `cause`, values of `rangesim.causes.Cause`, and `tolerance_m`."""
+    np.savez_compressed(path, cause=causes.cause, tolerance_m=causes.tolerance_m)
 
 
 def load_result(directory: str | Path) -> Result:
@@ -132,9 +142,11 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int) -> Meas
     rig = capture.rig
     arrays["T_world_camera"] = rig.T_world_camera if rig else None
     image = RangeImage(**arrays, camera=rig.camera if rig else None)
+    with np.load(folder / "causes.npz") as data:
+        causes = CauseMap(data["cause"], float(data["tolerance_m"]))
     segmentation = None
     if (folder / "segmentation.npz").is_file():
         with np.load(folder / "segmentation.npz") as data:
             segmentation = Segmentation(**{f.name: data[f.name] for f in fields(Segmentation)})
     facts = json.loads((folder / "measurement.json").read_text(encoding="utf-8"))
-    return Measurement(folder.name, capture, image, truth, read_rows(folder), segmentation, facts, light_pass)
+    return Measurement(folder.name, capture, image, truth, causes, read_rows(folder), segmentation, facts, light_pass)

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from small_result import SENSORS, small_result
 
+from rangesim.causes import Cause
 from rangesim.doctor import find_browser
 from rangesim.report import cloud, palette, tables
 from rangesim.report.verdict import verdict
@@ -43,6 +44,7 @@ def test_every_part_is_there(html: str) -> None:
     for title in ("Structured light", "Time of flight (AMCW)", "Time of flight (direct)", "Ideal time of flight"):
         assert f"<h3>{title}" in html
     assert [int(n) for n in re.findall(r"<b>Figure (\d+)", html)] == list(range(1, 7))
+    assert [int(n) for n in re.findall(r"<b>Table (\d+)", html)] == list(range(1, 5))
     assert html.count('class="cloud"') == html.count('class="labels"') == len(SENSORS)
 
 
@@ -84,27 +86,46 @@ def test_the_error_scale_is_odd_and_rises_to_its_limits() -> None:
     assert (np.diff(palette.error_share(np.linspace(-0.1, 0.1, 99))) > 0).all()
 
 
-def test_dark_pixels_in_the_emitters_shadow_are_told_apart() -> None:
+def test_every_outcome_has_a_name_and_a_colour() -> None:
+    assert len(palette.OUTCOME_NAMES) == len(palette.OUTCOME_COLORS) == len(Cause) + 1
+    assert len(palette.STATUS_NAMES) == len(palette.STATUS_COLORS) == len(Status)
     for m in load_result(small_result()).measurements:
-        found = palette.causes(m)
-        changed = found != m.image.status
-        assert (found[changed] >= palette.SHADOW).all()
-        assert (m.image.status[changed] == Status.LOW_SIGNAL).all()
-        assert not m.truth.projector_visible[found == palette.SHADOW].any()
-        assert np.isfinite(m.truth.z[found == palette.SHADOW]).all()
-        assert np.isnan(m.truth.z[found == palette.NOTHING]).all()
+        found = palette.outcomes(m)
+        assert ((found == palette.NOTHING) == np.isnan(m.truth.z)).all()
+        assert (found[m.causes.failed] == m.causes.cause[m.causes.failed]).all()
 
 
-def test_dark_pixels_without_a_surface_are_told_apart() -> None:
-    status = np.array([[Status.LOW_SIGNAL, Status.LOW_SIGNAL, Status.LOW_SIGNAL, Status.CODE_ERROR]], dtype=np.uint8)
-    truth = SimpleNamespace(
-        z=np.array([[1.0, 1.0, np.nan, np.nan]]), projector_visible=np.array([[True, False, False, False]])
-    )
-    measurement: Any = SimpleNamespace(image=SimpleNamespace(status=status), truth=truth)
-    assert palette.causes(measurement).tolist() == [
-        [Status.LOW_SIGNAL, palette.SHADOW, palette.NOTHING, Status.CODE_ERROR]
-    ]
-    assert len(palette.STATUS_NAMES) == len(palette.STATUS_COLORS)
+# Machado, Oliveira, Fernandes: "A physiologically-based model for simulation of color vision deficiency" (2009)
+SIGHT = {
+    "normal": np.eye(3),
+    "no red cones": np.array(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "no green cones": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+}
+
+
+@pytest.mark.parametrize("sight", SIGHT)
+def test_causes_are_told_apart_without_red_or_green_cones(sight: str) -> None:
+    """CIE 1976 colour differences of all pairs of outcomes; 2.3 is just noticeable."""
+    share = palette.OUTCOME_COLORS / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ SIGHT[sight].T, 0, 1)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = seen @ to_xyz.T / [0.9505, 1.0, 1.089]
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    lab = np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=-1)
+    distance = np.linalg.norm(lab[:, None] - lab, axis=-1)[np.triu_indices(len(lab), 1)]
+    assert distance.min() > 10
+
+
+def test_the_failures_of_a_surface_add_up() -> None:
+    for m in load_result(small_result()).measurements:
+        for row in m.rows:
+            assert sum(row["causes"].values()) == pytest.approx(row["failed"])
+        assert m.rows[-1]["failed"] == pytest.approx(m.causes.failed[np.isfinite(m.truth.z)].mean())
 
 
 def test_a_node_has_the_colour_of_its_largest_child() -> None:
@@ -126,6 +147,8 @@ def test_the_verdict_says_what_the_rows_say() -> None:
     assert "glossy (60\xa0% missing, 70\xa0% of the rest wrong by over 10\xa0mm)" in second.text
     assert "Smallest median error: Structured light, 1.00\xa0mm" in both.text
     assert "Shortest exposure of all frames: Time of flight (AMCW)" in both.text
+    assert "It fails on 5.0\xa0% of the pixels: 80\xa0% multipath, 20\xa0% low signal." in first.text
+    assert "Causes of these failures: glossy: 80\xa0% multipath, 20\xa0% low signal." in second.text
     assert "Smallest median error" not in verdict([good, poor])[-1].text  # on the few pixels that are left
 
 
@@ -150,6 +173,7 @@ def _measured(sensor: str, complete: float, median: float, outliers: float, acqu
         "outlier_rate": outliers,
     }
     row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
+    row |= {"failed": 0.05, "causes": {"multipath": 0.04, "low_signal": 0.01}}
     rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
     facts = {"acquisition_s": acquisition_s, "frames": 10}
     return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, facts=facts)

@@ -14,40 +14,44 @@ from rangesim.signals import GroundTruth
 
 
 class Cause(IntEnum):
-    """Why a pixel failed: it has no reading, or one that is off by more than the tolerance.
+    """Why a pixel failed: it has no reading, or one off by more than the tolerance. See `DEFINITIONS`.
 
-    The order is that of the families: geometry, material, light, electronics and sensor.
+    The order is that of the families: geometry, surface, other light, noise, decoder.
     """
 
     NONE = 0
-    """Not failed: the reading is right, or there is no surface behind the pixel."""
     SHADOWED = 1
-    """The projector does not see the surface: something stands between, or the point lies beside its image."""
     DEPTH_EDGE = 2
-    """The pixel covers surfaces at different depths and reads a mixture, or codes that contradict each other."""
     MOTION = 3
-    """The surface moved while the frames were taken."""
     SPECULAR_AWAY = 4
-    """A mirror or a glossy surface sent the light elsewhere."""
     MIRRORED_GHOST = 5
-    """The light of another surface, seen in a mirror or in a glossy one, was read."""
     SEEN_THROUGH = 6
-    """The light went through a transparent surface; what was read, if anything, lies behind it or within."""
     MULTIPATH = 7
-    """Light that came by way of further matte surfaces disturbed the reading."""
     CAUSTIC = 8
-    """Light that reached the surface off a mirror or through glass, with the code of another direction, was read."""
     GLINT = 9
-    """The detector saturated, or most of the light came straight from the lens of the projector."""
     LOW_SIGNAL = 10
-    """Too little projector light for the detector's own noise."""
     AMBIENT = 11
-    """Enough projector light, but the noise of the ambient light swamps it."""
     WRAPPED = 12
-    """The distance lies beyond the unambiguous range, or the wrong period was picked (time of flight)."""
     RESOLUTION = 13
-    """Neither light nor noise: code, bins or baseline are too coarse to tell this depth to the tolerance."""
 
+
+DEFINITIONS = {
+    Cause.NONE: "Not failed: the reading is right, or there is no surface behind the pixel.",
+    Cause.SHADOWED: "The projector does not see the point: something is in between, or it lies beside its image.",
+    Cause.DEPTH_EDGE: "The pixel covers surfaces at different depths; it mixes them, or their codes contradict.",
+    Cause.MOTION: "The surface moved while the frames were taken.",
+    Cause.SPECULAR_AWAY: "A mirror or a glossy surface sent the light elsewhere.",
+    Cause.MIRRORED_GHOST: "The light of another surface, seen in a mirror or in a glossy one, was read.",
+    Cause.SEEN_THROUGH: "The light went through the surface; what was read, if anything, lies behind or within.",
+    Cause.MULTIPATH: "Light that came by way of further surfaces disturbed the reading.",
+    Cause.CAUSTIC: "Light that lit the surface off a mirror or through glass disturbed the reading.",
+    Cause.GLINT: "The detector saturated, or most of the light came straight from the lens of the projector.",
+    Cause.LOW_SIGNAL: "Too little projector light for the detector's own noise.",
+    Cause.AMBIENT: "Enough projector light, but the noise of the ambient light swamps it.",
+    Cause.WRAPPED: "The distance lies beyond the unambiguous range, or the wrong period was picked (time of flight).",
+    Cause.RESOLUTION: "Neither stray light nor noise: code, bins or baseline are too coarse for this depth.",
+}
+"""What each cause means, in a sentence."""
 
 TITLES = {
     Cause.NONE: "right",

@@ -13,7 +13,7 @@ def compare_command(
     results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
     markdown: Annotated[bool, typer.Option("--markdown", help="Markdown instead of a drawn table.")] = False,
 ) -> None:
-    """Print errors per surface material and sensor; lengths in mm, shares in %.
+    """Print errors per surface material and sensor, and why pixels failed; lengths in mm, shares in %.
 
     Example:
 
@@ -30,7 +30,8 @@ def compare_command(
     if markdown:
         typer.echo(in_markdown(tables), nl=False)
     else:
-        _print(in_markdown(tables))
+        for table in in_markdown(tables).split("\n\n"):
+            _print(table)
 
 
 def report_command(
@@ -58,7 +59,8 @@ def _print(markdown: str) -> None:
     head, _, *lines = ([cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines())
     table = Table(box=box.SIMPLE_HEAD)
     for i, name in enumerate(head):
-        table.add_column(name, justify="right" if i > 1 else "left", overflow="fold")
+        words = i < 2 or name.startswith("because")
+        table.add_column(name, justify="left" if words else "right", overflow="fold")
     for before, line in zip([head, *lines], lines, strict=False):
         table.add_row("" if line[0] == before[0] else line[0], *line[1:])
     console = Console()

@@ -47,6 +47,9 @@ def context(result: Result) -> dict[str, Any]:
         "material_legend": legend,
         "columns": tables.COLUMNS,
         "comparison": tables.comparison_table(measurements),
+        "failures": tables.failure_table(measurements),
+        "tolerance_mm": f"{1e3 * measurements[0].causes.tolerance_m:g}",
+        "definitions": tables.definitions(measurements),
         "maps": [_maps(m, limits, depth, error) for m in measurements],
         "depth_bar": {"uri": figures.color_bar(depth), "ticks": palette.depth_ticks(*limits)},
         "error_bar": {"uri": figures.color_bar(error), "ticks": palette.error_ticks()},
@@ -61,12 +64,12 @@ def context(result: Result) -> dict[str, Any]:
 
 
 def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -> dict[str, Any]:
-    status, legend = figures.status_map(m)
+    causes, legend = figures.cause_map(m)
     return {
         "name": m.name,
         "depth": figures.depth_map(m, limits, depth),
         "error": figures.error_map(m, error),
-        "status": status,
+        "causes": causes,
         "legend": legend,
     }
 
@@ -122,6 +125,8 @@ def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str,
         "errorLimitM": palette.ERROR_LIMIT_M,
         "errorStepM": cloud.ERROR_STEP_M,
         "status": list(palette.STATUS_NAMES.values()),
+        "causes": palette.OUTCOME_NAMES,
+        "causeColors": palette.OUTCOME_COLORS.ravel().tolist(),
         "materials": list(truth.material_names),
         "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
         "material": cloud.pack(truth.material.astype("int8")),

@@ -28,7 +28,7 @@ def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, An
     """What the viewer needs of one instrument.
 
     z : uint16, 0 for none, else near_m + (value - 1) step_m. error : int16, in 10 µm, clipped.
-    intensity, status : uint8. supervoxel : uint16 or uint32, 0 for none, else index + 1.
+    intensity, status, cause : uint8. supervoxel : uint16 or uint32, 0 for none, else index + 1.
     """
     camera = m.image.camera
     assert camera is not None  # every measurement of an experiment has its rig
@@ -49,7 +49,8 @@ def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, An
         "z": pack(z),
         "error": pack(_error(m)),
         "intensity": pack(_intensity(m)),
-        "status": pack(palette.causes(m)),
+        "status": pack(m.image.status.astype(np.uint8)),
+        "cause": pack(palette.outcomes(m)),
         "segmentation": _packed_tree(m.segmentation) if m.segmentation else None,
     }
 

@@ -29,11 +29,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class Share:
-    """A legend entry: a class with its colour and its share of the pixels, in percent."""
+    """A class with its colour and its share of some pixels, in percent: an entry of a legend."""
 
     name: str
     color: str
     percent: float
+
+    @property
+    def text(self) -> str:
+        """Percent with one digit; what is there is never 0."""
+        return f"{self.percent:.1f}" if self.percent >= 0.05 else "< 0.1"
 
 
 def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
@@ -97,12 +102,10 @@ def error_map(measurement: Measurement, table: np.ndarray) -> str:
     return color_map(palette.error_share(measurement.image.z - measurement.truth.z), table)
 
 
-def status_map(measurement: Measurement) -> tuple[str, list[Share]]:
-    """PNG of why pixels have no measurement, and its legend."""
-    classes = palette.causes(measurement)
-    return png(classes, palette.STATUS_COLORS), _legend(
-        classes, list(palette.STATUS_NAMES.values()), palette.STATUS_COLORS
-    )
+def cause_map(measurement: Measurement) -> tuple[str, list[Share]]:
+    """PNG of why pixels failed, and its legend."""
+    classes = palette.outcomes(measurement)
+    return png(classes, palette.OUTCOME_COLORS), _legend(classes, palette.OUTCOME_NAMES, palette.OUTCOME_COLORS)
 
 
 def captured_frames(capture: Capture) -> list[Picture]:
@@ -165,7 +168,7 @@ def _bright(image: np.ndarray) -> float:
 def _legend(classes: np.ndarray, names: list[str], table: np.ndarray) -> list[Share]:
     counts = np.bincount(classes.ravel(), minlength=len(names))
     return [
-        Share(name, "#{:02x}{:02x}{:02x}".format(*table[i]), 100 * float(counts[i]) / classes.size)
+        Share(name, palette.hexadecimal(table[i]), 100 * float(counts[i]) / classes.size)
         for i, name in enumerate(names)
         if counts[i]
     ]

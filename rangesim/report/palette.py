@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rangesim.causes.cause import TITLES, Cause
 from rangesim.result_files import Measurement
 from rangesim.status import Status
 
-SHADOW = len(Status)
-"""Class beyond `Status`: no light arrives because the emitter does not see the point."""
-NOTHING = SHADOW + 1
-"""Class beyond `Status`: no light arrives because the scene has no surface there."""
+NOTHING = len(Cause)
+"""Class beyond `Cause`: the scene has no surface there."""
 NO_DATA = (203, 206, 210)
 ERROR_KNEE_M = 1e-4
 """Metres; the error scale is linear below and logarithmic beyond."""
@@ -26,22 +25,32 @@ STATUS_NAMES = {
     Status.CODE_ERROR: "code error",
     Status.WRAPPED: "phases disagree",
     Status.OUT_OF_RANGE: "out of range",
-    SHADOW: "in the emitter's shadow",
-    NOTHING: "nothing there",
 }
 STATUS_COLORS = np.array(
+    [(231, 234, 237), (52, 104, 176), (240, 171, 0), (196, 56, 45), (125, 79, 163), (40, 44, 52)], dtype=np.uint8
+)
+OUTCOME_NAMES = [*(TITLES[c] for c in Cause), "nothing there"]
+OUTCOME_COLORS = np.array(
     [
-        (231, 234, 237),
-        (52, 104, 176),
-        (240, 171, 0),
-        (196, 56, 45),
-        (125, 79, 163),
-        (40, 44, 52),
-        (150, 180, 214),
-        (176, 158, 130),
+        (236, 238, 240),  # right
+        (8, 24, 100),  # geometry: blues
+        (24, 84, 214),
+        (135, 190, 252),
+        (129, 78, 6),  # surfaces: browns, orange, sand
+        (233, 124, 1),
+        (255, 215, 120),
+        (150, 50, 75),  # other light: reds; glint yellow
+        (212, 65, 151),
+        (250, 240, 20),
+        (3, 45, 3),  # noise: greens
+        (126, 185, 126),
+        (138, 103, 242),  # decoder: violets
+        (43, 31, 76),
+        (203, 206, 210),  # nothing there
     ],
     dtype=np.uint8,
 )
+"""Colours of `outcomes`: a hue per family, told apart by lightness as well, so that few cones suffice."""
 MATERIAL_COLORS = {
     "matte": (196, 178, 150),
     "glossy": (221, 119, 60),
@@ -100,11 +109,11 @@ def error_ticks() -> list[Tick]:
     return [Tick(float(p), s) for p, s in zip(places, signs, strict=True)]
 
 
-def causes(measurement: Measurement) -> np.ndarray:
-    """(h, w) uint8, `Status` per pixel; dark ones `SHADOW` where the emitter does not see, `NOTHING` off surfaces."""
-    status = measurement.image.status.copy()
-    dark = status == Status.LOW_SIGNAL
-    surface = np.isfinite(measurement.truth.z)
-    status[dark & surface & ~measurement.truth.projector_visible] = SHADOW
-    status[dark & ~surface] = NOTHING
-    return status
+def outcomes(measurement: Measurement) -> np.ndarray:
+    """(h, w) uint8, `Cause` per pixel, or `NOTHING` where there is no surface; index of names and colours above."""
+    return np.where(np.isfinite(measurement.truth.z), measurement.causes.cause, NOTHING).astype(np.uint8)
+
+
+def hexadecimal(color: np.ndarray) -> str:
+    """#rrggbb of three numbers 0..255."""
+    return "#{:02x}{:02x}{:02x}".format(*color)

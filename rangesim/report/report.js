@@ -14,10 +14,11 @@ async function unpack(text, Type) {
 
 async function unpackInstrument(one) {
   const s = one.segmentation;
-  const [z, error, intensity, status] = await Promise.all([
+  const [z, error, intensity, status, cause] = await Promise.all([
     unpack(one.z, Uint16Array), unpack(one.error, Int16Array), unpack(one.intensity, Uint8Array), unpack(one.status, Uint8Array),
+    unpack(one.cause, Uint8Array),
   ]);
-  Object.assign(one, { z, error, intensity, status });
+  Object.assign(one, { z, error, intensity, status, cause });
   if (s) [s.supervoxel, s.parents, s.altitudes, s.colors] = await Promise.all([
     unpack(s.supervoxel, s.wide ? Uint32Array : Uint16Array), unpack(s.parents, Int32Array),
     unpack(s.altitudes, Float32Array), unpack(s.colors, Uint8Array)]);
@@ -71,6 +72,7 @@ const PAINT = {
     if (one.error[i] === -32768) put(rgb, i, NOTHING, 0, 1);
     else put(rgb, i, DATA.errorColors, 3 * errorIndex(one.error[i] * DATA.errorStepM), 1);
   },
+  cause: (one, i, rgb) => put(rgb, i, DATA.causeColors, 3 * one.cause[i], 1),
   material: (one, i, rgb) => put(rgb, i, DATA.materialColors[DATA.material[i]] || NOTHING, 0, 0.35 + 0.65 * one.intensity[i] / 255),
   segments: (one, i, rgb) => {
     const s = one.segmentation, node = s && s.supervoxel[i] ? one.owner[s.supervoxel[i] - 1] : -1;
@@ -190,11 +192,12 @@ class Page {
 }
 
 function reading(one, i) {
-  if (!one.z[i]) return DATA.status[one.status[i]];
+  const why = one.cause[i] ? ` (${DATA.causes[one.cause[i]]})` : "";
+  if (!one.z[i]) return DATA.status[one.status[i]] + why;
   const z = `${(one.nearM + (one.z[i] - 1) * one.stepM).toFixed(4)} m`, mm = one.error[i] * DATA.errorStepM * 1e3;
   if (one.error[i] === -32768) return z;
   const sign = mm < 0 ? "−" : "+", size = Math.abs(mm);
-  return `${z}, error ${sign}${size > 327 ? "over 327" : size.toFixed(2)} mm`;
+  return `${z}, error ${sign}${size > 327 ? "over 327" : size.toFixed(2)} mm${why}`;
 }
 
 async function start() {

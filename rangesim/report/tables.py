@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.experiment import Experiment
+from rangesim.report import palette
+from rangesim.report.figures import Share
 from rangesim.result_files import Measurement
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 
@@ -39,6 +42,14 @@ COLUMNS = (
     Column("outlier_rate", "outliers", "%", "share of the measurements off by more than 10 mm"),
     Column("flying_rate", "flying", "%", "share of the measurements at depth edges that lie on neither side"),
 )
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A cause and what it means, in a sentence."""
+
+    name: str
+    meaning: str
 
 
 @dataclass(frozen=True)
@@ -97,10 +108,8 @@ def is_unreliable(row: dict[str, Any]) -> bool:
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
     """Per material class, "all" first: name and cells of each instrument."""
-    names = list(dict.fromkeys(row["material"] for m in measurements for row in m.rows))
-    names.sort(key=lambda n: n != "all")
     table = []
-    for material in names:
+    for material in materials(measurements):
         rows = {m.name: row for m in measurements for row in m.rows if row["material"] == material}
         real = [rows[m.name] for m in measurements if m.name in rows and not is_reference(m)]
         rivals = [row for row in real if not is_unreliable(row)]  # the few pixels left of the others prove nothing
@@ -110,17 +119,60 @@ def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, lis
     return table
 
 
+def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, str, list[Share]]]]]:
+    """Per material class, "all" first: name, failed pixels in percent, and their causes, of each instrument."""
+    table = []
+    for material in materials(measurements):
+        rows = [(m.name, row) for m in measurements for row in m.rows if row["material"] == material]
+        lines = [(name, _percent(row["failed"]), parts(row)) for name, row in rows if row["failed"] is not None]
+        table.append((material, lines))
+    return table
+
+
+def definitions(measurements: Sequence[Measurement]) -> list[Definition]:
+    """What the causes that occur mean, in the order of their families."""
+    found = {name for m in measurements for row in m.rows for name in row["causes"]}
+    return [Definition(TITLES[c], DEFINITIONS[c]) for c in Cause if c.name.lower() in found]
+
+
+def parts(row: dict[str, Any]) -> list[Share]:
+    """Causes of the failed pixels of a row, largest first."""
+    causes = [(Cause[name.upper()], share) for name, share in row["causes"].items()]
+    return [Share(TITLES[c], palette.hexadecimal(palette.OUTCOME_COLORS[c]), 100 * share) for c, share in causes]
+
+
+def materials(measurements: Sequence[Measurement]) -> list[str]:
+    """Material classes of all rows, "all" first."""
+    names = dict.fromkeys(row["material"] for m in measurements for row in m.rows)
+    return sorted(names, key=lambda n: n != "all")
+
+
 def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
-    """The same comparison in Markdown, one row per instrument and material."""
-    heads = ["material", "sensor", *(f"{c.title} ({c.unit})" for c in COLUMNS)]
-    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
-    materials = dict.fromkeys(row["material"] for _, rows in tables for row in rows)
-    for material in materials:
+    """The same comparison in Markdown, one row per instrument and material: a table of errors, then one of failures."""
+    heads = [f"{c.title} ({c.unit})" for c in COLUMNS]
+    errors = _markdown(tables, heads, lambda row: [number(c, row[c.key]) for c in COLUMNS])
+    return errors + "\n" + _markdown(tables, ["failed (%)", "because (% of the pixels)"], _failures)
+
+
+def _markdown(
+    tables: Sequence[tuple[str, Rows]], heads: list[str], cells: Callable[[dict[str, Any]], list[str]]
+) -> str:
+    lines = ["| " + " | ".join(["material", "sensor", *heads]) + " |", "|" + " --- |" * (2 + len(heads))]
+    for material in dict.fromkeys(row["material"] for _, rows in tables for row in rows):
         for name, rows in tables:
-            for row in rows:
-                if row["material"] == material:
-                    lines.append("| " + " | ".join([material, name, *(number(c, row[c.key]) for c in COLUMNS)]) + " |")
+            lines += [
+                "| " + " | ".join([material, name, *cells(row)]) + " |" for row in rows if row["material"] == material
+            ]
     return "\n".join(lines) + "\n"
+
+
+def _failures(row: dict[str, Any]) -> list[str]:
+    """Failed pixels in percent, and their causes."""
+    return [_percent(row["failed"]), ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"]
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.1f}"
 
 
 def number(column: Column, value: float | None) -> str:

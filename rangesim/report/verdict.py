@@ -7,8 +7,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rangesim.report.tables import Rows, is_reference, is_unreliable, millimetres, missing_share, seconds, titles
+from rangesim.report.tables import (
+    Rows,
+    is_reference,
+    is_unreliable,
+    millimetres,
+    missing_share,
+    parts,
+    seconds,
+    titles,
+)
 from rangesim.result_files import Measurement
+
+MAIN_CAUSE = 0.1
+"""Share of the failures from which a cause is named."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +35,7 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
     """Accuracy and failures of each real sensor, then who is best at what."""
     names = titles(measurements)
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
-    findings = [Finding(names[m.name], f"{_accuracy(m.rows)}{_failures(m.rows)}") for m in real]
+    findings = [Finding(names[m.name], f"{_accuracy(m.rows)}{_failures(m.rows)}{_reasons(m.rows)}") for m in real]
     if len(real) > 1:
         parts = [_best_error(real, names), _most_complete(real, names), _shortest_exposure(real, names)]
         findings.append(Finding("Side by side", " ".join(filter(None, parts))))
@@ -53,6 +65,23 @@ def _failures(rows: Rows) -> str:
             parts.append(f"{row['material']} ({found})")
     listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
     return f" Unreliable on these surfaces: {listed}." if parts else ""
+
+
+def _reasons(rows: Rows) -> str:
+    """Why readings are wrong or missing: on the materials where most are, and on the whole where there is none."""
+    poor = [row for row in rows if row["material"] != "all" and is_unreliable(row)]
+    named = [f"{row['material']}: {_main_causes(row)}" for row in poor if row["causes"]]
+    if named:
+        return f" Causes of these failures: {'; '.join(named)}."
+    total = _total(rows)
+    return f" It fails on {_percent(total['failed'])} of the pixels: {_main_causes(total)}." if total["causes"] else ""
+
+
+def _main_causes(row: dict[str, Any]) -> str:
+    """The most frequent causes, with their shares of the failures."""
+    shares = [(p.percent / 100 / row["failed"], p.name) for p in parts(row)]
+    main = [f"{_percent(share, 0)} {name}" for share, name in shares if share >= MAIN_CAUSE]
+    return ", ".join(main)
 
 
 def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
