@@ -5,12 +5,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
+
+if TYPE_CHECKING:
+    from rangesim.ambient import Ambient
 
 DTYPES = ("uint8", "uint16", "uint32", "float32")
 
@@ -37,6 +41,7 @@ class Capture:
     rig : Rig, or None for an uncalibrated capture.
     detector : PhotoDetector, or None if unknown (a real capture) or noise-free.
     exposure_s : float, seconds per frame; NaN if unknown.
+    ambient : Ambient, the ambient light it was taken in, or None if not stated.
     """
 
     frames: np.ndarray
@@ -44,6 +49,7 @@ class Capture:
     rig: Rig | None = None
     detector: PhotoDetector | None = None
     exposure_s: float = float("nan")
+    ambient: Ambient | None = None
 
     def __post_init__(self) -> None:
         if self.frames.ndim != 3 or len(self.frames) != self.sensor.n_frames or self.frames.size == 0:

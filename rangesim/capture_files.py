@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rangesim import __version__
+from rangesim.ambient import Ambient
 from rangesim.capture import DTYPES, Capture
 from rangesim.config import check_keys, from_dict, to_dict
 from rangesim.detector import Detector, PhotoDetector
@@ -26,7 +27,18 @@ FORMAT = "rangesim-capture"
 FORMAT_VERSION = 1
 DETECTORS = (Detector, SpadDetector)
 """What the key `detector` of a sidecar may hold."""
-_KEYS = ("format", "format_version", "rangesim", "dtype", "frames", "sensor", "rig", "detector", "exposure_s")
+_KEYS = (
+    "format",
+    "format_version",
+    "rangesim",
+    "dtype",
+    "frames",
+    "sensor",
+    "rig",
+    "detector",
+    "exposure_s",
+    "ambient",
+)
 
 
 def save_capture(capture: Capture, directory: str | Path) -> None:
@@ -72,9 +84,11 @@ def load_capture(directory: str | Path) -> Capture:
         rig = from_dict(Rig, settings["rig"], "rig") if settings.get("rig") is not None else None
         given = settings.get("detector")
         detector = from_dict(PhotoDetector, given, "detector") if given is not None else None  # type: ignore[type-abstract]
+        light = settings.get("ambient")
+        ambient = from_dict(Ambient, light, "ambient") if light is not None else None
         exposure = settings.get("exposure_s")
         frames = _read_frames(sidecar, settings, sensor)
-        return Capture(frames, sensor, rig, detector, math.nan if exposure is None else float(exposure))
+        return Capture(frames, sensor, rig, detector, math.nan if exposure is None else float(exposure), ambient)
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{sidecar}: {str(error).removeprefix(f'{sidecar}: ')}") from error
 
@@ -127,6 +141,7 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
         "rig": to_dict(capture.rig),
         "detector": to_dict(capture.detector),
         "exposure_s": None if math.isnan(capture.exposure_s) else capture.exposure_s,
+        **({} if capture.ambient is None else {"ambient": to_dict(capture.ambient)}),
         "frames": names,
     }
 

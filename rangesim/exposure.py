@@ -55,12 +55,14 @@ def expose(
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
     if detector is None or isinstance(sensor, IdealToF):
         unfiltered = 1.0 if ambient is None else ambient.scale
-        return Capture(_through_lens(signals.frames(sensor, unfiltered), signals.rig), sensor, signals.rig)
+        return Capture(
+            _through_lens(signals.frames(sensor, unfiltered), signals.rig), sensor, signals.rig, ambient=ambient
+        )
     radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor, ambient)), signals.rig)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor, signals.rig, exposure_s, seed)
-    return Capture(frames, sensor, signals.rig, detector, exposure_s)
+    return Capture(frames, sensor, signals.rig, detector, exposure_s, ambient)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:

@@ -197,9 +197,11 @@ def test_settings_round_trip(tmp_path: Path) -> None:
         assert from_dict(Ambient, to_dict(ambient)) == ambient
     detector = Detector(band_width_m=12e-9)
     assert from_dict(PhotoDetector, to_dict(detector)) == detector  # type: ignore[type-abstract]
-    capture = expose(plane_signals(stereo_rig(), SENSOR), SENSOR, detector)
-    capture.save(tmp_path / "capture")
-    assert load(tmp_path / "capture").detector == detector
+    for i, ambient in enumerate((None, Ambient("led", illuminance_lux=500.0))):
+        capture = expose(plane_signals(stereo_rig(), SENSOR), SENSOR, detector, ambient=ambient)
+        capture.save(tmp_path / f"capture{i}")
+        loaded = load(tmp_path / f"capture{i}")
+        assert (loaded.detector, loaded.ambient) == (detector, ambient)
 
 
 @pytest.mark.parametrize(
