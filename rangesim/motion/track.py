@@ -6,13 +6,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-from rangesim.config import nearest
+from rangesim.config import nearest, to_dict
 from rangesim.rig import Array, Rig, pose
 
 
@@ -21,6 +21,9 @@ class Track(ABC):
 
     The identity means at rest. A world point x of the thing is at T(t) x at time t. Subclasses are frozen dataclasses.
     """
+
+    type_name: ClassVar[str]
+    """Name in configuration files."""
 
     @abstractmethod
     def at(self, time_s: float) -> Array:
@@ -49,6 +52,8 @@ class PoseTrack(Track):
     times_s: np.ndarray
     poses: np.ndarray
 
+    type_name: ClassVar[str] = "poses"
+
     def __post_init__(self) -> None:
         times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
         if times.ndim != 1 or len(times) == 0 or poses.shape != (len(times), 4, 4):
@@ -61,6 +66,12 @@ class PoseTrack(Track):
         for name, value in (("times_s", times), ("poses", poses)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, PoseTrack) and to_dict(self) == to_dict(other)
+
+    def __hash__(self) -> int:
+        return hash((self.times_s.tobytes(), self.poses.tobytes()))
 
     def at(self, time_s: float) -> Array:
         time = float(np.clip(time_s, self.times_s[0], self.times_s[-1]))
@@ -85,6 +96,8 @@ class SteadyTrack(Track):
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    type_name: ClassVar[str] = "steady"
 
     def __post_init__(self) -> None:
         for name in ("velocity_m_s", "rotation_rad_s", "centre_m"):
