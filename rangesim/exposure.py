@@ -46,13 +46,15 @@ def expose(
     Raises
     ------
     ValueError
-        The pass lacks the sensor's signals, the exposure is not positive, or detector and sensor do not go
-        together.
+        The pass lacks the sensor's signals, the exposure is not positive, detector and sensor do not go
+        together, or ambient light is stated for a scene that has none.
     """
     if detector is not None and not isinstance(detector, PhotoDetector):
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     if exposure_s is not None and not 0 < exposure_s < np.inf:
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
+    if ambient is not None and ambient.scale > 0 and not signals.energy.ambient.any():
+        raise ValueError("expected a scene with emitters for the ambient light to scale, got one without such light.")
     if detector is None or isinstance(sensor, IdealToF):
         unfiltered = 1.0 if ambient is None else ambient.scale
         return Capture(

@@ -198,10 +198,16 @@ def test_settings_round_trip(tmp_path: Path) -> None:
     detector = Detector(band_width_m=12e-9)
     assert from_dict(PhotoDetector, to_dict(detector)) == detector  # type: ignore[type-abstract]
     for i, ambient in enumerate((None, Ambient("led", illuminance_lux=500.0))):
-        capture = expose(plane_signals(stereo_rig(), SENSOR), SENSOR, detector, ambient=ambient)
+        capture = expose(plane_signals(stereo_rig(), SENSOR, ambient=0.1), SENSOR, detector, ambient=ambient)
         capture.save(tmp_path / f"capture{i}")
         loaded = load(tmp_path / f"capture{i}")
         assert (loaded.detector, loaded.ambient) == (detector, ambient)
+
+
+def test_a_scene_without_light_cannot_be_in_the_sun() -> None:
+    signals = plane_signals(stereo_rig(), SENSOR)
+    with pytest.raises(ValueError, match="a scene with emitters"):
+        expose(signals, SENSOR, Detector(), ambient=Ambient("sun", illuminance_lux=1e4))
 
 
 @pytest.mark.parametrize(
