@@ -4,15 +4,21 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from synthetic import plane_signals, stereo_rig
 
+from rangesim.capture_files import load_capture
 from rangesim.config import from_dict, to_dict
 from rangesim.defocus import SWITCH, blurred_stripes
+from rangesim.exposure import expose
 from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
 from rangesim.rig import Intrinsics, Rig
+from rangesim.sensors import IdealToF
 
 MATH = NumpyMath()
 STRONG = (-0.3, 0.12, 2e-3, -1e-3, 0.01)
@@ -115,6 +121,20 @@ def test_a_rig_s_optics_read_back_and_may_be_missing() -> None:
     for key in ("camera_focus_m", "projector_focus_m", "camera_vignetting", "projector_vignetting"):
         del data[key]
     assert from_dict(Rig, data) == Rig(lens, lens)
+
+
+def test_captures_keep_the_optics_and_older_ones_load_without(tmp_path: Path) -> None:
+    sensor, plain = IdealToF(), stereo_rig(8, 6)
+    rig = dataclasses.replace(plain, camera_focus_m=0.8, projector_vignetting=2.0)
+    expose(plane_signals(rig, sensor), sensor).save(tmp_path / "new")
+    assert load_capture(tmp_path / "new").rig == rig
+    expose(plane_signals(plain, sensor), sensor).save(tmp_path / "old")
+    sidecar = tmp_path / "old" / "capture.json"
+    data = json.loads(sidecar.read_text())
+    for key in ("camera_focus_m", "projector_focus_m", "camera_vignetting", "projector_vignetting"):
+        del data["rig"][key]
+    sidecar.write_text(json.dumps(data))
+    assert load_capture(tmp_path / "old").rig == plain
 
 
 @pytest.mark.parametrize("wrong", [{"camera_focus_m": 0.0}, {"projector_focus_m": np.inf}, {"camera_vignetting": -1.0}])

@@ -218,4 +218,5 @@ def connect(scene: Any, projector: Device, si: Any, active: Any) -> Connection:
     inside &= active
     shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
     lit = inside & ~scene.ray_test(shadow_ray, coherent=False, active=inside)
-    return Connection(uv, to_projector, distance, geometry, lit, projector.blur_px(z))
+    blur = projector.blur_px(z)
+    return Connection(uv, to_projector, distance, geometry, lit, None if blur is None else dr.select(lit, blur, 0))
