@@ -6,13 +6,15 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rangesim.config import check_keys, from_dict, nearest, to_dict
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
+from rangesim.motion import Motion, Timing
+from rangesim.motion.settings import motion_from_dict
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 from rangesim.spad import SpadDetector
 
@@ -39,6 +41,7 @@ class Instrument:
         0.03 m for time of flight.
     power_w : watts, mean radiant power of the emitter when it is fully on.
     exposure_s : seconds per frame; None: automatic.
+    timing : when its frames are taken, in an experiment in which something moves.
     """
 
     name: str
@@ -48,6 +51,7 @@ class Instrument:
     baseline_m: float | None = None
     power_w: float = 1.0
     exposure_s: float | None = None
+    timing: Timing = field(default_factory=Timing)
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -114,7 +118,8 @@ class Experiment:
     spp : light paths per pixel.
     max_depth : longest path in segments up to the light; 2 is direct light alone.
     seed : of transport and noise; the same seed gives the same bytes.
-    instruments : those whose emitters stand in the same place share one light-transport pass.
+    instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
+    motion : what moves; None: nothing.
     """
 
     scene: str
@@ -126,6 +131,7 @@ class Experiment:
     max_depth: int = 5
     seed: int = 0
     instruments: tuple[Instrument, ...] = tuple(instrument(name) for name in DEFAULT_SENSORS)
+    motion: Motion | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "spp", "max_depth"):
@@ -167,8 +173,10 @@ def load_experiment(path: str | Path) -> Experiment:
 def experiment_from_dict(data: Mapping[str, Any]) -> Experiment:
     """The experiment of plain data; each table under `instrument` is one instrument. ValueError as `from_dict`."""
     check_keys(data, ["instrument" if f.name == "instruments" else f.name for f in fields(Experiment)], "experiment")
-    rest = {key: value for key, value in data.items() if key != "instrument"}
+    rest = {key: value for key, value in data.items() if key not in ("instrument", "motion")}
     experiment = from_dict(Experiment, rest)
+    if data.get("motion") is not None:
+        experiment = replace(experiment, motion=motion_from_dict(data["motion"]))
     tables = data.get("instrument")
     if tables is None:
         return experiment

@@ -15,6 +15,7 @@ import rangesim
 from rangesim.capture import Capture
 from rangesim.causes import explain
 from rangesim.experiment import Experiment, Instrument
+from rangesim.motion import transport_moving
 from rangesim.provenance import provenance
 from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, save_range_image
 from rangesim.staging import new_directory, write_json
@@ -117,7 +118,12 @@ def segment(cloud: PointCloud, path: Path) -> None:
 
 
 def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
-    """Instruments that share camera, emitter and power, and so one transport pass; in order of first appearance."""
+    """Instruments that share camera, emitter and power, and so one transport pass; in order of first appearance.
+
+    Where something moves, each is on its own: it has its own time, and so its own truth.
+    """
+    if experiment.motion is not None:
+        return [(one.rig(scene, experiment.width, experiment.height), [one]) for one in experiment.instruments]
     groups: dict[Rig, list[Instrument]] = {}
     for one in experiment.instruments:
         rig = one.rig(scene, experiment.width, experiment.height)
@@ -166,16 +172,17 @@ def _trace(
 ) -> Signals:
     stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
     say(stage, _share(number, passes, 0.0))
+    settings: dict[str, Any] = {
+        "spp": experiment.spp,
+        "max_depth": experiment.max_depth,
+        "seed": experiment.seed,
+        "progress": lambda share: say(stage, _share(number, passes, share)),
+    }
     with timed(times, f"transport_{number}"):
-        return rangesim.transport(
-            scene,
-            rig,
-            [i.sensor for i in instruments],
-            spp=experiment.spp,
-            max_depth=experiment.max_depth,
-            seed=experiment.seed,
-            progress=lambda share: say(stage, _share(number, passes, share)),
-        )
+        if experiment.motion is None:
+            return rangesim.transport(scene, rig, [i.sensor for i in instruments], **settings)
+        (one,) = instruments
+        return transport_moving(scene, rig, {one.sensor: one.timing}, experiment.motion, **settings)[one.sensor]
 
 
 def _share(number: int, passes: int, of_pass: float) -> float:

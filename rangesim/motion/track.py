@@ -10,7 +10,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation, Slerp
 
 from rangesim.config import nearest, to_dict
 from rangesim.rig import Array, Rig, pose
@@ -74,6 +73,8 @@ class PoseTrack(Track):
         return hash((self.times_s.tobytes(), self.poses.tobytes()))
 
     def at(self, time_s: float) -> Array:
+        from scipy.spatial.transform import Rotation, Slerp
+
         time = float(np.clip(time_s, self.times_s[0], self.times_s[-1]))
         result = np.eye(4)
         result[:3, 3] = [np.interp(time, self.times_s, self.poses[:, i, 3]) for i in range(3)]
@@ -107,6 +108,8 @@ class SteadyTrack(Track):
             object.__setattr__(self, name, tuple(map(float, value)))
 
     def at(self, time_s: float) -> Array:
+        from scipy.spatial.transform import Rotation
+
         result = np.eye(4)
         result[:3, :3] = Rotation.from_rotvec(np.multiply(self.rotation_rad_s, time_s)).as_matrix()
         centre = np.asarray(self.centre_m)
