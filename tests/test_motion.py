@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +15,15 @@ import pytest
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, Scene, Sensor, Signals, StructuredLight, transport
+from rangesim.causes import Cause
 from rangesim.decoding.amcw import tap_phase
 from rangesim.decoding.phase_shift import phase_of
+from rangesim.experiment import experiment_from_dict, experiment_to_dict
 from rangesim.motion import Motion, MovingSignals, PoseTrack, SteadyTrack, Timing, transport_moving
 from rangesim.motion.passes import plan
+from rangesim.pipeline import run
 from rangesim.response import SPEED_OF_LIGHT
+from rangesim.result_files import load_result
 from rangesim.rig import translation
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -401,3 +407,69 @@ def test_a_scene_that_cannot_be_loaded_again_is_refused(matte: Scene) -> None:
             {IdealToF(): Timing(start_s=1.0)},
             Motion({"can": SteadyTrack((1, 0, 0))}),
         )
+
+
+# ---- Experiments ------------------------------------------------------------------------------------
+
+EXPERIMENT = """
+scene = "matte.xml"
+width = 96
+height = 72
+spp = 8
+max_depth = 2
+
+[[instrument]]
+sensor = "gray-phase"
+noise = false
+timing.frame_period_s = 0.01
+
+[[instrument]]
+sensor = "ideal-tof"
+timing.line_period_s = 0.002
+
+[motion.objects.large_ball]
+type = "steady"
+velocity_m_s = [0.5, 0, 0]
+
+[motion.rig]
+type = "poses"
+times_s = [0.0]
+poses = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]
+"""
+
+
+def test_an_experiment_reads_back_equal_with_its_motion() -> None:
+    experiment = experiment_from_dict(tomllib.loads(EXPERIMENT))
+    assert experiment.motion is not None
+    assert experiment.motion.objects["large_ball"] == SteadyTrack((0.5, 0.0, 0.0))
+    assert [i.timing for i in experiment.instruments] == [Timing(0.01), Timing(line_period_s=0.002)]
+    assert experiment_from_dict(json.loads(json.dumps(experiment_to_dict(experiment)))) == experiment
+
+
+@pytest.mark.parametrize(
+    ("motion", "message"),
+    [
+        ({"object": {}}, "did you mean 'objects'"),
+        ({"objects": {"can": {"velocity_m_s": [1, 0, 0]}}}, r"motion\.objects\.can: expected 'type' to be one of"),
+        ({"rig": {"type": "steady", "velocity": [1, 0, 0]}}, r"motion\.rig: unknown key 'velocity'"),
+        ({"rig": {"type": "poses", "times_s": [0], "poses": [[[2, 0], [0, 1]]]}}, "as many poses"),
+        ([1.0, 0.0], "expected a table"),
+    ],
+)
+def test_a_motion_that_is_none_is_refused(motion: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        experiment_from_dict({"scene": "a.xml", "motion": motion})
+
+
+def test_in_an_experiment_each_instrument_has_its_own_truth_and_motion_is_a_cause(tmp_path: Path) -> None:
+    experiment = experiment_from_dict(tomllib.loads(EXPERIMENT))
+    run(replace(experiment, scene=str(SCENES / "matte.xml")), tmp_path / "out")
+    result = load_result(tmp_path / "out")
+    light, tof = result.measurements
+    ball = light.truth.instance_names.index("large_ball")
+    middles = [np.nonzero(m.truth.instance == ball)[1].mean() for m in (light, tof)]
+    times = [i.timing.reference_s(i.sensor, light.capture.rig.camera) for i in experiment.instruments]
+    f_per_depth = light.capture.rig.camera.fx / np.median(light.truth.z[light.truth.instance == ball])
+    assert middles[0] - middles[1] == pytest.approx(0.5 * (times[0] - times[1]) * f_per_depth, rel=0.1)
+    shares = [(m.causes.cause == Cause.MOTION).mean() for m in result.measurements]
+    assert shares[0] > 0.01
