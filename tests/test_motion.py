@@ -334,6 +334,23 @@ def test_a_scan_shears_what_moves_sideways_and_a_flash_does_not(card: Scene) -> 
     assert np.ptp(edge(card, Timing(start_s=line_period * 24))) == 0
 
 
+def test_a_stack_of_patterns_smears_and_a_burst_of_taps_smears_less(matte: Scene) -> None:
+    rig = matte.rig(width=96, height=72)
+    motion = Motion({"large_ball": SteadyTrack((0.5, 0.0, 0.0))})
+
+    def failed(sensor: Sensor, timing: Timing) -> float:
+        """Share of the ball's pixels that are lost or off by more than 1 cm."""
+        (signals,) = transport_moving(matte, rig, {sensor: timing}, motion, spp=8, max_depth=2).values()
+        error = np.abs(rangesim.decode(rangesim.expose(signals, sensor)).z - signals.truth.z)
+        return float(np.mean(~(error[signals.truth.instance == 2] < 0.01)))
+
+    stack, one_by_one = failed(StructuredLight(), Timing(0.005)), failed(AmcwToF(), Timing(0.005, single_tap=True))
+    burst, still = failed(AmcwToF(), Timing(0.005)), failed(AmcwToF(), Timing(0))
+    assert stack > 2 * one_by_one
+    assert one_by_one > 2 * burst
+    assert burst < 2 * still
+
+
 def test_an_exposure_in_two_halves_is_their_mean(card: Scene) -> None:
     rig, sensor = card.rig(width=32, height=24), AmcwToF((20e6,))
     motion = Motion({"card": SteadyTrack((2.0, 0.0, 0.0))})
