@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projector light through glass and off mirrors against references that share no code with the pass.
+
+    make     computes the references (about 8 minutes on two cores) and writes benchmarks/references/*.npz
+    compare  renders the same cases with `transport` and compares (the default)
+
+Two references. `ptracer` is Mitsuba's particle tracer with its `projector` plugin: it reaches all that the camera sees
+directly. `path` is a plain path tracer whose projector is a disc of finite size (`finite_aperture.py`): it reaches paths
+that are specular on both sides as well; its means are extrapolated to a point, from two radii, a and 2 a. Where both
+apply they are compared with each other. The last line of `compare` is JSON:
+
+    max_region_error        largest relative error of the mean radiance of white over the marked regions and references
+    min_stripe_correlation  smallest correlation of a stripe image with its reference within a marked region
+
+Usage: python benchmarks/caustic_references.py [make | compare] [--spp 256] [--photons N] [--scale 1]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from plain_mitsuba import plain_scene, render, show
+from reference_scenes import PROJECTOR_PIXELS, STRIPES, Case, cases
+
+from rangesim import StructuredLight, transport
+
+HERE = Path(__file__).resolve().parent / "references"
+MAX_DEPTH = 12
+PTRACER_SPP = 16_000
+PATH_SAMPLES = 600_000_000
+"""Camera paths per case of the path tracer with the aperture of the case; a quarter of that with twice the radius."""
+IMAGES = ("white", *STRIPES)
+
+
+class Reference(NamedTuple):
+    """Images (3, h, w) of `IMAGES`, NaN outside the regions; relative standard error of each region's mean of white;
+    and what the aperture does to that mean (1: nothing)."""
+
+    images: np.ndarray
+    error: dict[str, float]
+    aperture: dict[str, float]
+
+
+def stripes() -> tuple[StructuredLight, list[int]]:
+    """The sensor whose frames are rendered, and which frames."""
+    light = StructuredLight(*PROJECTOR_PIXELS, code="gray", axes=("columns", "rows"))
+    return light, [light.frame_names().index(name) for name in IMAGES]
+
+
+def seen(name: str, case: Case) -> dict[str, np.ndarray]:
+    """Masks of the regions that a reference reaches."""
+    return {k: m for k, m in case.masks().items() if name == "path" or not case.regions[k].through}
+
+
+def ptracer(case: Case, scale: float) -> Reference:
+    """Mitsuba's particle tracer, in two independent halves."""
+    import mitsuba as mi
+
+    plain = plain_scene(case.scene, case.rig, {"type": "hdrfilm", "pixel_format": "luminance"})
+    integrator = mi.load_dict({"type": "ptracer", "max_depth": MAX_DEPTH, "rr_depth": MAX_DEPTH})
+    light, frames = stripes()
+    halves = np.empty((2, len(frames), case.rig.camera.height, case.rig.camera.width))
+    for i, frame in enumerate(frames):
+        show(plain, light.patterns()[frame])
+        for half in range(2):
+            halves[half, i] = render(plain, integrator, max(1, int(PTRACER_SPP * scale) // 2), 2 * i + half)
+    masks = seen("ptracer", case)
+    return _reference(halves, masks, dict.fromkeys(masks, 1.0))
+
+
+def path(case: Case, scale: float) -> Reference:
+    """The path tracer with a finite projector, in two independent halves; the pixels of the regions alone."""
+    from finite_aperture import Lamp, finite_aperture
+
+    masks = seen("path", case)
+    row, column = np.nonzero(np.any(list(masks.values()), axis=0))
+    pixels = np.stack([column, row], axis=-1)
+    light, frames = stripes()
+    patterns = light.patterns()[frames[1:]]
+    spp = max(1, int(PATH_SAMPLES * scale) // (2 * len(pixels)))
+    h, w = case.rig.camera.height, case.rig.camera.width
+    runs = []
+    for seed, factor in enumerate((1, 1, 2)):
+        lamp = Lamp(case.rig, factor * case.aperture_radius_m, case.focus_m, patterns)
+        white, _, *shown = finite_aperture(
+            case.scene.mitsuba, lamp, case.guide, pixels, spp // factor, seed << 32 | sum(map(ord, str(pixels.shape)))
+        )
+        images = np.full((len(frames), h, w), np.nan)
+        images[:, row, column] = [white, *shown]
+        runs.append(images)
+    halves = np.stack(runs[:2])
+    wider = {k: runs[2][0][m].mean() / halves[:, 0, m].mean() for k, m in masks.items()}
+    return _reference(halves, masks, {k: 1 + (x - 1) / 3 for k, x in wider.items()})  # the effect grows as a^2
+
+
+def _reference(halves: np.ndarray, masks: dict[str, np.ndarray], aperture: dict[str, float]) -> Reference:
+    mean = halves.mean(0)
+    error = {}
+    for name, mask in masks.items():
+        difference = 0.5 * (halves[0, 0] - halves[1, 0])[mask]
+        error[name] = float(np.sqrt((difference**2).mean() / mask.sum()) / mean[0][mask].mean())
+    return Reference(np.where(np.any(list(masks.values()), axis=0), mean, np.nan), error, aperture)
+
+
+METHODS = {"ptracer": ptracer, "path": path}
+
+
+def make(scale: float) -> None:
+    """Compute and write all references."""
+    HERE.mkdir(exist_ok=True)
+    for case_name, case in cases().items():
+        for name, method in METHODS.items():
+            start = time.perf_counter()
+            reference = method(case, scale)
+            arrays = {"images": reference.images.astype(np.float32)}
+            for key in ("error", "aperture"):
+                arrays[key] = np.array(json.dumps(getattr(reference, key)))
+            np.savez_compressed(_file(case_name, name), **arrays)  # type: ignore[arg-type]
+            worst = max(reference.error.values())
+            aperture = max(abs(x - 1) for x in reference.aperture.values())
+            print(f"{case_name:<22} {name:<8} {time.perf_counter() - start:4.0f} s, standard error of regions at most "
+                  f"{worst:.2%}, aperture at most {aperture:.2%}", flush=True)  # fmt: skip
+
+
+def load(case_name: str, name: str) -> Reference:
+    """A reference that `make` wrote."""
+    with np.load(_file(case_name, name)) as file:
+        return Reference(file["images"], json.loads(str(file["error"])), json.loads(str(file["aperture"])))
+
+
+def _file(case_name: str, name: str) -> Path:
+    return HERE / f"{case_name.replace(', ', '_').replace(' ', '_')}-{name}.npz"
+
+
+def compare(spp: int, photons: int | None) -> dict[str, float]:
+    """Print the table and return the figures of the last line."""
+    light, frames = stripes()
+    errors, correlations = [], []
+    print(f"{'case':<22} {'region':<30} {'reference':<9} {'error':>7} {'+-':>6}  correlation: white, columns, rows")
+    for case_name, case in cases().items():
+        more = {} if photons is None else {"photons": photons}
+        signals = transport(case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, **more)
+        ours = signals.frames(light)[frames]
+        references = {name: load(case_name, name) for name in METHODS}
+        for name, reference in references.items():
+            for region, mask in seen(name, case).items():
+                expected = reference.images[0][mask].mean() / reference.aperture[region]
+                errors.append(float(ours[0][mask].mean() / expected - 1))
+                both = zip(ours[:, mask], reference.images[:, mask], strict=True)
+                r = [float(np.corrcoef(a, b)[0, 1]) for a, b in both]
+                correlations += r[1:]
+                print(f"{case_name:<22} {region:<30} {name:<9} {errors[-1]:>+7.2%} {reference.error[region]:>6.2%}  "
+                      + ", ".join(f"{x:.4f}" for x in r))  # fmt: skip
+        _references_agree(case_name, case, references)
+    return {"max_region_error": round(max(map(abs, errors)), 5), "min_stripe_correlation": round(min(correlations), 5)}
+
+
+def _references_agree(case_name: str, case: Case, references: dict[str, Reference]) -> None:
+    a, b = references["ptracer"], references["path"]
+    for region, mask in seen("ptracer", case).items():
+        ratio = b.images[0][mask].mean() / b.aperture[region] / a.images[0][mask].mean()
+        r = [float(np.corrcoef(x, y)[0, 1]) for x, y in zip(a.images[:, mask], b.images[:, mask], strict=True)]
+        error = np.hypot(a.error[region], b.error[region])
+        print(f"{case_name:<22} {region:<30} path : ptracer {ratio - 1:>+.2%} {error:>6.2%}  "
+              + ", ".join(f"{x:.4f}" for x in r))  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", choices=("make", "compare"), default="compare")
+    parser.add_argument("--spp", type=int, default=256)
+    parser.add_argument("--photons", type=int, help="default: that of transport")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
+    args = parser.parse_args()
+    if args.what == "make":
+        make(args.scale)
+    else:
+        print(json.dumps(compare(args.spp, args.photons)))
+
+
+if __name__ == "__main__":
+    main()
