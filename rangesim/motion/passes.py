@@ -58,12 +58,12 @@ class Pass:
         return replace(rig, camera=camera, T_world_camera=self.placement.place(rig))
 
     def seed(self, seed: int) -> int:
-        """The seed itself for the whole image, so that what stands still has the same noise at all times; another
-        one for each window, as otherwise every band of a scan would repeat the noise of the first."""
+        """Seed of the pass: the same at all times, so that what stands still has the same noise in all frames, but
+        another one for each place of the window, or every band of a scan would repeat the noise of the first."""
         corner = (self.window.top, self.window.left)
-        return (
-            seed if not any(corner) else int(np.random.SeedSequence([seed & 0xFFFFFFFF, *corner]).generate_state(1)[0])
-        )
+        if not any(corner):
+            return seed
+        return int(np.random.SeedSequence([seed & 0xFFFFFFFF, *corner]).generate_state(1)[0])
 
 
 def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pass]:
@@ -87,19 +87,20 @@ def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pas
 
 
 def _joined(instants: Sequence[Instant], motion: Motion) -> list[Instant]:
-    """Fewer instants: bands that see everything at one place become one window, equal windows one share."""
-    keys = [motion.at(instant.time_s).key for instant in instants]
+    """Fewer instants that mean the same: where nothing has moved from one to the next, equal windows become one
+    share, and then neighbouring bands one window."""
     shares: dict[tuple[bytes, Window], Instant] = {}
-    for key, instant in zip(keys, instants, strict=True):
-        before = shares.get((key, instant.window))
-        shares[key, instant.window] = instant._replace(share=instant.share + (before.share if before else 0.0))
+    for instant in instants:
+        place = (motion.at(instant.time_s).key, instant.window)
+        before = shares[place].share if place in shares else 0.0
+        shares[place] = instant._replace(share=before + instant.share)
     joined: dict[bytes, Instant] = {}
     result: list[Instant] = []
     for (key, window), instant in shares.items():
         last = joined.get(key)
         if last is not None and np.isclose(last.share, instant.share) and _touch(last.window, window):
             result.remove(last)
-            instant = last._replace(window=_union(last.window, window))
+            instant = last._replace(window=Window(last.window.top, window.bottom, last.window.left, window.right))
         joined[key] = instant
         result.append(instant)
     return result
@@ -110,7 +111,3 @@ def _touch(first: Window, second: Window) -> bool:
     below = first.bottom == second.top and (first.left, first.right) == (second.left, second.right)
     beside = first.right == second.left and (first.top, first.bottom) == (second.top, second.bottom)
     return below or beside
-
-
-def _union(first: Window, second: Window) -> Window:
-    return Window(first.top, second.bottom, first.left, second.right)
