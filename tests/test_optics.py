@@ -12,9 +12,9 @@ import pytest
 from scipy.ndimage import binary_erosion, map_coordinates
 
 import rangesim
-from rangesim import Detector, IdealToF, Intrinsics, Rig, StructuredLight, decode, expose, transport
+from rangesim import Detector, IdealToF, Intrinsics, Rig, StructuredLight, decode, expose, look_at, transport
 from rangesim.light_transport.backend import select_variant
-from rangesim.response import FirstReturn, Fringes, GrayBits
+from rangesim.response import FirstReturn, Fringes, GrayBits, Images, LightPath, NumpyMath
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 BARREL = (-0.25, 0.08, 1e-3, -2e-3, 0.01)
@@ -338,6 +338,46 @@ def test_fringes_lose_the_contrast_that_the_formula_says(plane: rangesim.Scene, 
     sigma = 0.5 * 4e-3 * rig.projector.fx * abs(1 - 1 / focus)
     expected = np.exp(-2 * np.pi**2 * sigma**2 / 16**2) * np.sinc(1 / 16)
     np.testing.assert_allclose(blurred / modulation, expected, rtol=1e-4)
+
+
+def test_the_modulation_that_a_camera_measures_falls_with_depth(plane: rangesim.Scene) -> None:
+    """A camera close to the projector and turned away sees the plane at many depths z of the projector."""
+    sensor = StructuredLight(320, 200, steps=4)
+    turn = look_at((0.05, 0, 0), (0.9, 0, 1.0), (0, -1, 0))  # 42 degrees: the plane recedes along the projector's x
+    rig = before_plane(plane, 96, 72, projector=Intrinsics.from_fov(320, 200, 60), T_camera_projector=turn)
+    rig = dataclasses.replace(rig, projector_aperture_radius_m=0.05, projector_focus_m=0.7)
+    sharp = dataclasses.replace(rig, projector_focus_m=None)
+    modulation, truth = [], None
+    for one in (rig, sharp):
+        signals = transport(plane, one, [sensor], spp=256)
+        steps = expose(signals, sensor).frames[-6:-2].astype(float)
+        lit = binary_erosion(signals.energy.direct > 0)  # whole pixels
+        modulation.append(np.hypot(steps[0] - steps[2], steps[1] - steps[3])[lit] / signals.energy.direct[lit])
+        truth = signals.truth
+    z = projector_frame(rig, world_points(rig, truth.z.astype(float)))[..., 2][lit]
+    sigma = 0.5 * 0.05 * rig.projector.fx * np.abs(1 / z - 1 / 0.7)
+    expected = np.exp(-2 * np.pi**2 * sigma**2 / 16**2) * np.sinc(1 / 16)
+    assert len(z) > 1000
+    assert np.ptp(expected) > 0.2
+    np.testing.assert_allclose(modulation[0] / modulation[1], expected, atol=3e-3)
+
+
+def test_images_out_of_focus_in_the_renderer_are_those_of_numpy(plane: rangesim.Scene) -> None:
+    pattern = (np.random.default_rng(0).random((200, 320)) > 0.8).astype(np.float32)
+    images = Images(pattern[None])
+    offsets = (np.arange(12) + 0.5) / 12 - 0.5
+    for focus in (0.9, 0.35):
+        rig = before_plane(plane, projector=Intrinsics.from_fov(320, 200, 70), projector_aperture_radius_m=6e-3)
+        rig = dataclasses.replace(rig, projector_focus_m=focus)
+        signals = transport(plane, rig, [images], spp=1024)
+        pixels = rig.camera.pixel_centres()[..., None, None, :] + np.stack(np.meshgrid(offsets, offsets), axis=-1)
+        uv = rig.projector.project(rig.camera.directions(pixels))
+        blur = 0.5 * 6e-3 * rig.projector.fx * abs(1 - 1 / focus)
+        path = LightPath(uv[..., 0], uv[..., 1], 0.0, True, blur_px=np.full(uv.shape[:-1], blur))
+        expected = images.weights(path, NumpyMath())[0].mean(axis=(2, 3))
+        seen = signals.channels[images][0] / signals.energy.direct
+        assert expected.std() > 0.03
+        assert np.abs(seen - expected).mean() < 0.05 * expected.std()  # both are sums over the pixel's area
 
 
 def test_prefiltered_patterns_are_the_mean_over_the_projector_s_lens(matte: rangesim.Scene) -> None:
