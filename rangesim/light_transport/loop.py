@@ -6,9 +6,9 @@ next sample in the same turn of the loop. So no lane idles while its neighbours 
 register instead of a film, and each sum is made by one thread in one order: same seed, same bytes,
 whatever the number of threads or the size of a tile.
 
-The strategies that bring projector light to the camera partition all light paths:
-next-event estimation (here), caustic photons gathered at every non-delta vertex, and glint (both to come; their
-places in the loop are marked).
+The strategies that bring projector light to the camera partition all light paths: next-event estimation (here),
+caustic photons gathered at every non-delta vertex (here, from maps made before), and glint, paths without any
+non-delta vertex (`rangesim.light_transport.glint`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ import drjit as dr
 import mitsuba as mi
 
 from rangesim.light_transport.device import Device, connect
+from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
-from rangesim.response import DIRECT, MULTIPATH, VIA_DELTA, LightPath
+from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
 
 class Settings(NamedTuple):
@@ -44,7 +45,19 @@ class Radiance(NamedTuple):
     direct: Any
     multipath: Any
     via_delta: Any
+    caustic: Any
     ambient: Any
+
+
+class Vertex(NamedTuple):
+    """A vertex of a camera path: surface, throughput, optical length from the camera, and whether light that reaches it
+    is the first to do so."""
+
+    si: Any
+    bsdf: Any
+    throughput: Any
+    length: Any
+    is_first: Any
 
 
 @dr.syntax
@@ -56,6 +69,7 @@ def trace(
     accumulators: Accumulators,
     pixel: Any,
     settings: Settings,
+    maps: PhotonMaps | None = None,
 ) -> tuple[list[list[Any]], Radiance]:
     """Sums over all samples: dense channels, and radiance by kind of path; bins go to the accumulators' buffers.
 
@@ -65,12 +79,15 @@ def trace(
     # ---- State of the lane: its random numbers, its sums --------------------------------------------
     lanes = dr.width(pixel)
     lane = dr.arange(mi.UInt32, lanes)
-    rng = mi.PCG32(1, *(mi.UInt64(x) for x in mi.sample_tea_32(settings.seed, pixel)))  # 1: no lane number mixed in
+    states = [mi.UInt64(x) for x in mi.sample_tea_32(settings.seed, pixel)]
+    rng = mi.PCG32(1, *states)  # 1: no lane number mixed in
+    choice = mi.PCG32(1, *reversed(states))  # of photons; apart, so that they change no other light
+    turns = mi.PCG32(1, *(mi.UInt64(x) for x in mi.sample_tea_32(pixel >> 4, settings.seed)))  # shared by neighbours
     width = mi.UInt32(camera.size.x)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     shift = mi.Point2f(rng.next_float32(), rng.next_float32())
     channels = accumulators.zeros()
-    direct, multipath, via_delta, ambient = (dr.zeros(mi.Float, lanes) for _ in range(4))
+    direct, multipath, via_delta, caustic, ambient = (dr.zeros(mi.Float, lanes) for _ in range(5))
 
     # ---- State of the path ---------------------------------------------------------------------------
     sample = dr.zeros(mi.UInt32, lanes)  # samples of this pixel finished so far
@@ -128,8 +145,13 @@ def trace(
         via_delta += dr.select(kind == VIA_DELTA, radiance, 0)
         multipath += dr.select(kind == MULTIPATH, radiance, 0)
 
-        # ---- Caustic photons: gather around si.p here ------------------------------------------------
-        # ---- Glint: does a segment off a delta surface meet the projector's lens? here ---------------
+        # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
+        if dr.hint(maps is not None, mode="scalar"):
+            vertex = Vertex(si, bsdf, throughput / mi.Float(settings.spp), length, first & ~link.lit)
+            xi = [choice.next_float32() for _ in range(3)]
+            photon, brought = gather(maps, vertex, sample, xi, turns.next_float32(), may_connect)
+            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, lane)
+            caustic += radiance
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
@@ -170,7 +192,53 @@ def trace(
         previous_delta |= ends
         active = sample < settings.spp
 
-    return channels, Radiance(direct, multipath, via_delta, ambient)
+    return channels, Radiance(direct, multipath, via_delta, caustic, ambient)
+
+
+@dr.syntax
+def gather(maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance: Any, active: Any) -> tuple[Any, Any]:
+    """The photon that stands for all around a vertex, and their irradiance.
+
+    `chance` decides which levels are gathered. Neighbouring lanes share it, so that they skip a level together.
+    """
+    photon, irradiance = dr.zeros(mi.UInt32, dr.width(sample)), dr.zeros(mi.Float, dr.width(sample))
+    pick = mi.Float(xi[2])
+    for level, kind in enumerate(LEVELS):
+        p, n = vertex.si.p, vertex.si.n
+        if maps.near(level, p, sample, active & (chance < kind.chance)):
+            found = maps.gather(level, p, n, sample, xi[0], xi[1], active)
+            irradiance += found.irradiance / kind.chance
+            share = dr.select(irradiance > 0, found.irradiance / kind.chance / irradiance, 0)
+            taken = pick < share
+            photon = dr.select(taken, found.photon, photon)
+            pick = dr.select(taken, pick / share, (pick - share) / (1 - share))
+    return photon, irradiance
+
+
+@dr.syntax
+def caustics(
+    maps: PhotonMaps,
+    accumulators: Accumulators,
+    channels: list[list[Any]],
+    vertex: Vertex,
+    photon: Any,
+    irradiance: Any,
+    lane: Any,
+) -> tuple[list[list[Any]], Any]:
+    """Channels with the light of the photons at a vertex added, and the radiance they bring to the camera."""
+    radiance = dr.zeros(mi.Float, dr.width(lane))
+    found = irradiance > 0
+    if found:
+        flight = maps.flight(photon, found)
+        wo = vertex.si.to_local(-flight.direction)
+        value = vertex.bsdf.eval(mi.BSDFContext(), vertex.si, wo, found)
+        # Photons count flux per area of the surface: its cosine is in them already
+        radiance = vertex.throughput * irradiance * mono(value) / dr.abs(wo.z)
+        radiance = dr.select(found & (wo.z != 0), radiance, 0)
+        length = vertex.length + flight.length
+        path = LightPath(flight.u, flight.v, length, vertex.is_first, mi.UInt32(CAUSTIC))
+        channels = accumulators.add(channels, path, radiance, lane, found)
+    return channels, radiance
 
 
 def stratified(shift: Any, sample: Any) -> Any:

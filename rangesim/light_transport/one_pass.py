@@ -13,6 +13,8 @@ import numpy as np
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.ground_truth import ground_truth
 from rangesim.light_transport.loop import Radiance, Settings, trace
+from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
+from rangesim.light_transport.photons import has_delta, trace_photons
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import Response
 from rangesim.rig import Rig
@@ -23,6 +25,10 @@ from rangesim.signals import EnergySplit, Signals
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 PROGRESS_STEPS = 16
+PHOTONS = 500_000
+RADIUS_IN_PROJECTOR_PIXELS = 4.0
+RADIUS_IN_CAMERA_PIXELS = 3.0
+"""Largest photon radius, at the working distance: finer than the stripes and about as fine as the image."""
 
 
 def transport(
@@ -34,6 +40,9 @@ def transport(
     max_depth: int = 5,
     rr_depth: int = 5,
     seed: int = 0,
+    photons: int = PHOTONS,
+    caustic_radius_m: float | None = None,
+    glint: bool = True,
     memory_bytes: int = 2 << 30,
     progress: Callable[[float], None] | None = None,
 ) -> Signals:
@@ -45,8 +54,14 @@ def transport(
     rig : Rig
     sensors : sensors, or bare responses; none for energy split and ground truth alone.
     spp : int >= 1, samples (camera paths) per pixel.
-    max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba.
+    max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba. A photon's way from
+        the projector counts as one segment, however many delta surfaces it met.
     rr_depth : int >= 1, surfaces after which Russian roulette may end a path.
+    photons : int >= 0, caustic photons: the projector's light through glass and off mirrors, see
+        `rangesim.light_transport.photons`; 0: none, and such light is missing. No cost without such surfaces.
+    caustic_radius_m : metres, largest radius over which photons are gathered; None: four pixels of the projector or
+        three of the camera at the working distance, whichever is smaller. Caustics are blurred by about half of it.
+    glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     seed : int; the same seed gives the same bytes, whatever the number of threads and the memory budget.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size.
     progress : called with the share done, 0..1, after each tile.
@@ -71,10 +86,13 @@ def transport(
         lamps=scene.has_lamps,
     )
     irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
+    maps = None
+    if photons and has_delta(scene.mitsuba):
+        maps = _photon_maps(scene, rig, projector, photons, caustic_radius_m, min(spp, MOST_MAPS), seed, memory_bytes)
     for begin, end in _tiles(h * w, responses, memory_bytes, PROGRESS_STEPS if progress else 1):
         accumulators = Accumulators(responses, end - begin)
         pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
-        dense, radiance = trace(scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings)
+        dense, radiance = trace(scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings, maps)
         bins = accumulators.bins
         dr.eval(dense, list(radiance), list(bins.values()))  # all at once: one by one, the loop would run once for each
         for r, values in zip(responses, dense, strict=True):
@@ -86,13 +104,32 @@ def transport(
     return _signals(scene, rig, Radiance(*_join(radiances, h, w)), images, spp)
 
 
+def _photon_maps(
+    scene: Scene,
+    rig: Rig,
+    projector: Device,
+    photons: int,
+    radius_m: float | None,
+    maps: int,
+    seed: int,
+    memory_bytes: int,
+) -> PhotonMaps | None:
+    """Maps of the projector's light beyond delta surfaces; None if no photon landed."""
+    landed = trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes)
+    if radius_m is None:
+        cells = (RADIUS_IN_PROJECTOR_PIXELS / rig.projector.fx, RADIUS_IN_CAMERA_PIXELS / rig.camera.fx)
+        radius_m = scene.working_distance_m * min(cells)
+    irradiance = rig.projector_irradiance / scene.working_distance_m**2
+    return PhotonMaps(landed, maps, radius_m, irradiance) if len(landed.flux) else None
+
+
 def _signals(scene: Scene, rig: Rig, radiance: Radiance, channels: dict[Response, np.ndarray], spp: int) -> Signals:
     nothing = np.zeros_like(radiance.direct)
     split = EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,
         via_delta=radiance.via_delta,
-        caustic=nothing,
+        caustic=radiance.caustic,
         glint=nothing,
         ambient=radiance.ambient / np.float32(spp),
     )
