@@ -438,27 +438,6 @@ def test_the_projector_darkens_towards_its_corners_as_cos_n(plane: rangesim.Scen
     np.testing.assert_allclose(dark / even, cos**3, rtol=1e-3)
 
 
-def test_rays_from_the_projector_carry_the_light_that_the_connection_has() -> None:
-    """For photons: cos^n of their direction, and nothing from pixels without a ray."""
-    select_variant()
-    import mitsuba as mi
-
-    from rangesim.light_transport.device import Device
-
-    lens = distorted(Intrinsics.from_fov(320, 200, 100), FOLDED)
-    pixels = lens.pixel_centres().reshape(-1, 2)
-    ideal = Device(distorted(lens, ()), np.eye(4))
-    assert ideal.flux_share(ideal.centre_ray(mi.Point2f(pixels.T))) == 1.0
-    device = Device(lens, np.eye(4), vignetting=3.0)
-    share = device.flux_share(device.centre_ray(mi.Point2f(pixels.T))).numpy()
-    expected = np.linalg.norm(lens.directions(pixels), axis=-1) ** -3
-    lost = np.isnan(expected)
-    assert 0.1 < lost.mean() < 0.9
-    assert not share[lost].any()
-    safe = np.linalg.norm(lens.normalise(pixels), axis=-1) < 0.95 * np.sqrt(lens.fold_radius2)
-    np.testing.assert_allclose(share[safe], expected[safe], rtol=1e-4)
-
-
 def test_the_camera_darkens_at_exposure_and_signals_stay_radiance(plane: rangesim.Scene) -> None:
     even = before_plane(plane, projector_power_w=5.0)
     rig = dataclasses.replace(even, camera_vignetting=4.0)

@@ -157,13 +157,6 @@ class Device:
             return 1.0
         return dr.power(dr.maximum(dr.dot(direction, self.z), 0), self.vignetting)
 
-    def flux_share(self, ray: PrimaryRay) -> Any:
-        """Share of its pixel's power that a primary ray of a projector carries: relative illumination, 0 if it does not
-        exist. The Python number 1 for an ideal lens.
-        """
-        share = self.relative_illumination(ray.direction)
-        return share if ray.exists is None else dr.select(ray.exists, share, 0)
-
     def pixel_density(self, direction: Any) -> Any:
         """Pixels per area of the plane z = 1 along a unit world direction, relative to an undistorted lens.
 
