@@ -35,7 +35,7 @@ class Evidence:
     """Masks and measures per pixel, each (h, w).
 
     image, clean : RangeImage of the capture, and of the same signals without noise and without ambient light.
-    motion_m : (h, w) float, metres, or None: nothing moved.
+    motion_m : (h, w) float, metres that what the pixel sees moves, or None: nothing does.
     """
 
     image: RangeImage
@@ -91,6 +91,11 @@ class Evidence:
     def unlit(self) -> np.ndarray:
         """In shadow, and without a lit part that brings most of the light and enough of it."""
         return self.in_shadow & ~(self.enough & self.mostly(DIRECT))
+
+    @cached_property
+    def beside_shadow(self) -> np.ndarray:
+        """A neighbouring pixel is in shadow, so that this one may be lit in part."""
+        return np.any(neighbours(self.in_shadow & np.isfinite(self.truth.z), 1), axis=0)
 
     @cached_property
     def at_edge(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from rangesim.causes.light_budget import light_budget
 from rangesim.comparison import OUTLIER_M
 from rangesim.decoding import decode
 from rangesim.range_image import RangeImage
-from rangesim.response import CAUSTIC, GLINT, MULTIPATH, VIA_DELTA
+from rangesim.response import CAUSTIC, DIRECT, GLINT, MULTIPATH, VIA_DELTA
 
 if TYPE_CHECKING:
     from rangesim.signals import Signals
@@ -29,7 +29,6 @@ def explain(
     image: RangeImage,
     capture: Capture,
     signals: Signals,
-    motion_m: np.ndarray | None = None,
     tolerance_m: float = OUTLIER_M,
 ) -> CauseMap:
     """The cause of every failed pixel, from the energy split and the ground truth of its pass.
@@ -44,24 +43,25 @@ def explain(
     image : RangeImage, decoded from `capture`.
     capture : Capture, as `rangesim.expose` made it from `signals`.
     signals : Signals of the pass; the sensor of the capture must have been part of it.
-    motion_m : (h, w) float, metres that the first surface moves during the acquisition; None: nothing moves.
     tolerance_m : float, metres.
 
     Raises
     ------
     ValueError
-        Image, capture, signals and motion differ in size, the pass lacks the sensor's signals, or `tolerance_m` is
-        not positive.
+        Image, capture and signals differ in size, the pass lacks the sensor's signals, or `tolerance_m` is not
+        positive.
     """
     shape = signals.truth.z.shape
-    sizes = [image.z.shape, capture.frames.shape[1:], *([] if motion_m is None else [np.shape(motion_m)])]
-    if any(size != shape for size in sizes):
-        raise ValueError(f"expected image, capture and motion of shape {shape} as the signals, got {sizes}.")
+    if image.z.shape != shape or capture.frames.shape[1:] != shape:
+        raise ValueError(
+            f"expected image and capture of shape {shape} as the signals, got {image.z.shape} and "
+            f"{capture.frames.shape[1:]}."
+        )
     if not tolerance_m > 0:
         raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
     clean = decode(Capture(signals.frames(capture.sensor, ambient_transmission=0.0), capture.sensor, signals.rig))
     budget = light_budget(signals, capture)
-    evidence = Evidence(image, clean, capture, signals.truth, signals.energy, budget, motion_m, tolerance_m)
+    evidence = Evidence(image, clean, capture, signals.truth, signals.energy, budget, signals.motion_m, tolerance_m)
     masks, causes = zip(*rules(evidence), strict=True)
     cause = np.select(masks, causes)
     return CauseMap(np.where(evidence.failed, cause, Cause.NONE).astype(np.uint8), tolerance_m)
@@ -79,7 +79,8 @@ def rules(e: Evidence) -> list[Rule]:
     return [
         # ---- The detector, blinded
         (e.saturated | e.mostly(GLINT), Cause.GLINT),
-        # ---- Surfaces that pass the light on: whether they are lit does not matter
+        # ---- Surfaces that pass the light on: whether they are lit does not matter. Direct light is their neighbour's
+        (e.is_a("transparent", "mirror") & e.at_edge & e.enough & e.mostly(DIRECT), Cause.DEPTH_EDGE),
         (e.is_a("transparent") | (e.is_a("translucent") & too_dark), Cause.SEEN_THROUGH),
         (e.is_a("mirror") & (~e.missing | e.enough), Cause.MIRRORED_GHOST),
         (e.is_a("mirror"), Cause.SPECULAR_AWAY),
@@ -99,6 +100,8 @@ def rules(e: Evidence) -> list[Rule]:
         (e.moving, Cause.MOTION),
         (e.at_edge & ~(disturbed & e.fails_off_edge), Cause.DEPTH_EDGE),
         (e.in_shadow, Cause.SHADOWED),
+        (e.optical & ~disturbed & np.any(e.moving), Cause.MOTION),  # of a shadow, over a surface at rest
+        (e.optical & ~disturbed & e.beside_shadow, Cause.SHADOWED),
         (disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC),
         (disturbed & e.mostly(VIA_DELTA, OTHER), Cause.MIRRORED_GHOST),
         (disturbed & e.mostly(MULTIPATH, OTHER), Cause.MULTIPATH),
