@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.device import Device
+from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth
 from rangesim.light_transport.loop import Radiance, Settings, trace
 from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
@@ -54,8 +55,8 @@ def transport(
     rig : Rig
     sensors : sensors, or bare responses; none for energy split and ground truth alone.
     spp : int >= 1, samples (camera paths) per pixel.
-    max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba. A photon's way from
-        the projector counts as one segment, however many delta surfaces it met.
+    max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba. A photon's way
+        from the projector counts as one segment, however many delta surfaces it met.
     rr_depth : int >= 1, surfaces after which Russian roulette may end a path.
     photons : int >= 0, caustic photons: the projector's light through glass and off mirrors, see
         `rangesim.light_transport.photons`; 0: none, and such light is missing. No cost without such surfaces.
@@ -101,7 +102,13 @@ def transport(
         if progress:
             progress(end / (h * w))
     images = {r: _join(tiles, h, w) for r, tiles in channels.items()}
-    return _signals(scene, rig, Radiance(*_join(radiances, h, w)), images, spp)
+    highlights = np.zeros((1, h, w), np.float32)
+    if glint:
+        found = trace_glint(scene.mitsuba, rig, responses, seed)
+        found.add_to(highlights, found.radiance)
+        for r, values in zip(responses, found.channels, strict=True):
+            found.add_to(images[r], values)
+    return _signals(scene, rig, Radiance(*_join(radiances, h, w)), highlights[0], images, spp)
 
 
 def _photon_maps(
@@ -123,14 +130,15 @@ def _photon_maps(
     return PhotonMaps(landed, maps, radius_m, irradiance) if len(landed.flux) else None
 
 
-def _signals(scene: Scene, rig: Rig, radiance: Radiance, channels: dict[Response, np.ndarray], spp: int) -> Signals:
-    nothing = np.zeros_like(radiance.direct)
+def _signals(
+    scene: Scene, rig: Rig, radiance: Radiance, glint: np.ndarray, channels: dict[Response, np.ndarray], spp: int
+) -> Signals:
     split = EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,
         via_delta=radiance.via_delta,
         caustic=radiance.caustic,
-        glint=nothing,
+        glint=glint,
         ambient=radiance.ambient / np.float32(spp),
     )
     return Signals(rig, channels, split, ground_truth(scene, rig))
