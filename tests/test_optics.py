@@ -15,6 +15,7 @@ import rangesim
 from rangesim import Detector, IdealToF, Intrinsics, Rig, StructuredLight, decode, expose, look_at, transport
 from rangesim.light_transport.backend import select_variant
 from rangesim.response import FirstReturn, Fringes, GrayBits, Images, LightPath, NumpyMath
+from rangesim.rig import translation
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 BARREL = (-0.25, 0.08, 1e-3, -2e-3, 0.01)
@@ -454,6 +455,49 @@ def test_the_camera_darkens_at_exposure_and_signals_stay_radiance(plane: rangesi
     ratio = digital[:4].sum(axis=0) / level[:4].sum(axis=0)
     np.testing.assert_allclose(ratio, cos4[:4].mean(axis=0), atol=0.03)
     np.testing.assert_allclose(decode(expose(signals, IdealToF())).z, 1, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "vignetting", "focus"), [((-0.4,), 0.0, None), ((), 6.0, None), (BARREL, 4.0, 0.8)]
+)
+def test_photons_through_a_pane_that_does_nothing_bring_the_light_that_connections_bring(
+    plane: rangesim.Scene, distortion: tuple[float, ...], vignetting: float, focus: float | None
+) -> None:
+    """Photons are even over the projector's pixels, connections carry the density of pixels: two ways to one image."""
+    import mitsuba as mi
+
+    select_variant()
+    T = mi.ScalarTransform4f
+
+    def standing(y: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "type": "rectangle",
+            "to_world": T().translate([0, y, 0.5]).rotate([1, 0, 0], 90).scale(2),
+            "bsdf": bsdf,
+        }
+
+    film = {"type": "hdrfilm", "width": 64, "height": 48}
+    view = T().look_at([0, 0, 0.5], [0, 1, 0.5], [0, 0, 1])
+    parts = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 60.0, "to_world": view, "film": film},
+        "wall": standing(1.0, {"type": "diffuse", "reflectance": 0.5}),
+    }
+    pane = standing(0.6, {"type": "thindielectric", "int_ior": 1.00001, "ext_ior": 1.0})
+    clear, behind = rangesim.load_scene(parts), rangesim.load_scene({**parts, "pane": pane})
+    projector = distorted(Intrinsics.from_fov(320, 200, 60), distortion)
+    rig = Rig(clear.camera, projector, clear.T_world_camera, translation(0.4, 0, 0), projector_vignetting=vignetting)
+    rig = dataclasses.replace(rig, projector_focus_m=focus)
+    fringes = Fringes(0, 32.0)
+    by_connection, by_photons = (transport(s, rig, [fringes], spp=64) for s in (clear, behind))
+    inner = binary_erosion(by_connection.energy.direct > 0, iterations=2)
+    expected, caustic = by_connection.energy.direct[inner], by_photons.energy.caustic[inner]
+    assert not by_photons.energy.direct.any()
+    assert caustic.mean() == pytest.approx(expected.mean(), rel=0.01)
+    assert abs(np.polyfit(expected / expected.mean(), caustic / expected - 1, 1)[0]) < 0.05  # as even or uneven
+    a, b = (s.channels[fringes][0][inner] for s in (by_connection, by_photons))
+    assert np.corrcoef(a, b)[0, 1] > 0.98
+    assert (a @ b) / (a @ a) == pytest.approx(1, abs=0.02)
 
 
 # ---- Off is off ----------------------------------------------------------------------------------------
