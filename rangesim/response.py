@@ -243,6 +243,33 @@ class LengthBins(SparseResponse):
     channels: int  # type: ignore[misc]
 
     def bin(self, path: LightPath, m: Math) -> Any:
-        position = (path.path_length_m - self.start_m) * (1 / self.width_m)
-        inside = (position >= 0) & (position < self.channels)
-        return m.unsigned(m.select(inside, position, float(self.channels)))
+        index, inside = _length_bin(path, m, self.start_m, self.width_m, self.channels)
+        return m.unsigned(m.select(inside, index, float(self.channels)))
+
+
+@dataclass(frozen=True)
+class LengthSplit(SparseResponse):
+    """The energy split per path length: `bins` bins from `start_m`, `width_m` each, for every one of `KINDS`.
+
+    Channels are kind-major: channel kind * bins + bin. Their sum over the kinds is that of `LengthBins`, their sum over
+    the bins the `rangesim.signals.EnergySplit` of what lies within them.
+    """
+
+    start_m: float
+    width_m: float
+    bins: int
+
+    @property
+    def channels(self) -> int:  # type: ignore[override]
+        return len(KINDS) * self.bins
+
+    def bin(self, path: LightPath, m: Math) -> Any:
+        index, inside = _length_bin(path, m, self.start_m, self.width_m, self.bins)
+        place = path.kind * self.bins + m.unsigned(m.select(inside, index, 0.0))
+        return m.select(inside, place, self.channels)
+
+
+def _length_bin(path: LightPath, m: Math, start_m: float, width_m: float, bins: int) -> tuple[Any, Any]:
+    """Place of a path length in bins, and whether it is in any of them."""
+    position = (path.path_length_m - start_m) * (1 / width_m)
+    return position, (position >= 0) & (position < bins)
