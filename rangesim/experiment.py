@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rangesim.ambient import Ambient
 from rangesim.config import check_keys, from_dict, nearest, to_dict
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
@@ -118,6 +119,7 @@ class Experiment:
     spp : light paths per pixel.
     max_depth : longest path in segments up to the light; 2 is direct light alone.
     seed : of transport and noise; the same seed gives the same bytes.
+    ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
     instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
     motion : what moves; None: nothing.
     """
@@ -130,6 +132,7 @@ class Experiment:
     spp: int = 64
     max_depth: int = 5
     seed: int = 0
+    ambient: Ambient | None = None
     instruments: tuple[Instrument, ...] = tuple(instrument(name) for name in DEFAULT_SENSORS)
     motion: Motion | None = None
 

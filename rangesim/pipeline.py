@@ -21,6 +21,7 @@ from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, sa
 from rangesim.staging import new_directory, write_json
 
 if TYPE_CHECKING:
+    from rangesim.ambient import Ambient
     from rangesim.point_cloud import PointCloud
     from rangesim.rig import Rig
     from rangesim.scene import Scene
@@ -68,7 +69,7 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
             signals.save(str(folder / f"pass_{number}.npz"))
             for one in instruments:
                 say(f"Measuring with {one.name}", _share(number, len(passes), 1.0))
-                measure(one, signals, folder / one.name, noise_seed(experiment, one))
+                measure(one, signals, folder / one.name, noise_seed(experiment, one), experiment.ambient)
         write_json(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
         say("Writing the report", 0.97)
         result = load_result(folder)
@@ -76,12 +77,12 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
         write_report(result, folder / "report.html")
 
 
-def measure(one: Instrument, signals: Signals, folder: Path, seed: int) -> None:
+def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient: Ambient | None = None) -> None:
     """Expose, decode, compare, explain and segment for one instrument; write all to the new directory `folder`."""
     folder.mkdir()
     times: dict[str, float] = {}
     with timed(times, "exposure"):
-        capture = rangesim.expose(signals, one.sensor, one.detector, one.exposure_s, seed)
+        capture = rangesim.expose(signals, one.sensor, one.detector, one.exposure_s, seed, ambient)
     capture.save(folder / "capture")
     with timed(times, "decode"):
         image = rangesim.decode(capture)

@@ -175,3 +175,10 @@ def test_a_scene_from_a_dictionary_runs_too(tmp_path: Path) -> None:
     (measurement,) = load_result(tmp_path / "box").measurements
     assert measurement.facts["points"] > 0.9 * 64 * 64
     assert measurement.rows[-1]["median_abs_m"] < 0.01
+
+
+def test_an_experiment_states_its_ambient_light() -> None:
+    experiment = experiment_from_dict({"scene": "a.xml", "ambient": {"illuminant": "sun", "illuminance_lux": 5e4}})
+    assert experiment.ambient is not None
+    assert experiment.ambient.illuminance_lux == 5e4
+    assert experiment_from_dict(experiment_to_dict(experiment)) == experiment

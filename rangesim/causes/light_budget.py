@@ -44,6 +44,8 @@ def light_budget(signals: Signals, capture: Capture) -> LightBudget:
     """Signal, least signal and share of ambient noise of every pixel of a capture made from these signals."""
     signal = signals.energy.projector.astype(np.float64)
     ambient = signals.energy.ambient.astype(np.float64)
+    if capture.detector is None and capture.ambient is not None:
+        ambient *= capture.ambient.scale
     if isinstance(capture.sensor, IdealToF):
         first = signals.frames(capture.sensor)[0].astype(np.float64)
         nothing = np.full(first.shape, np.finfo(np.float32).tiny)
@@ -73,7 +75,7 @@ def _noisy(capture: Capture, detector: PhotoDetector, signal: np.ndarray, ambien
     assert rig is not None  # signals always have one
     dark_e = float(detector.mean_electrons(np.zeros(1), sensor, rig, exposure_s)[0])
     gain = float(detector.mean_electrons(np.ones(1), sensor, rig, exposure_s)[0]) - dark_e  # electrons per W/m2/sr
-    ambient_e = detector.ambient_share(sensor) * ambient * gain
+    ambient_e = detector.ambient_share(sensor, capture.ambient) * ambient * gain
     needed_e = _least_electrons(capture, detector, dark_e, ambient_e)
     in_the_dark_e = _least_electrons(capture, detector, dark_e, np.zeros_like(ambient_e))
     dark_in_frame_e = dark_e * (_window_bins(sensor) if isinstance(sensor, DirectToF) else 1)

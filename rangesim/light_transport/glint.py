@@ -2,10 +2,9 @@
 """Glint: the camera sees the projector's lens itself, in a mirror, through glass or directly.
 
 The lens is a disc as large as its aperture. A camera path of delta interactions alone that meets it brings its full
-radiance: where the whole of a pixel sees the lens, 10^4 times that of a lit wall, so a highlight much finer than a pixel
-counts. Random paths of the pass would mostly miss it. So three steps close in on it: pixels behind whose centre there is
-a delta surface; of those, pixels of which a few probing paths come near the lens; and these get thousands of paths of
-their own.
+radiance. Where all of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much finer
+than a pixel counts. Random paths of the pass would mostly miss it, hence three steps: pixels behind whose centre there
+is a delta surface; of those, pixels of which a few probing paths come near the lens; and these get thousands of paths.
 """
 
 from __future__ import annotations
