@@ -97,12 +97,16 @@ def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int
     index, width = dr.arange(mi.UInt32, h * w), dr.opaque(mi.UInt32, w)
     ray = camera.centre_ray(mi.Point2f(mi.Float(index % width) + 0.5, mi.Float(index // width) + 0.5))
     si = scene.ray_intersect(mi.Ray3f(ray.origin, ray.direction))
-    mask = (si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)).numpy().reshape(h, w)
+    delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
+    mask = delta.numpy().reshape(h, w)
     uv, z = camera.project(mi.Point3f(projector.centre))
     u, v = float(uv.x[0]), float(uv.y[0])
     if float(z[0]) > 0 and 0 <= u < w and 0 <= v < h:
         mask[int(v), int(u)] = True
-    return np.flatnonzero(binary_dilation(mask, np.ones((3, 3))))
+    mask = binary_dilation(mask, np.ones((3, 3)))
+    if ray.exists is not None:  # a distorted lens may send no ray through some pixels
+        mask &= ray.exists.numpy().reshape(h, w)
+    return np.flatnonzero(mask)
 
 
 def _near_the_lens(scene: Any, rig: Rig, camera: Device, projector: Device, pixel: np.ndarray, seed: int) -> np.ndarray:
