@@ -19,6 +19,17 @@ from rangesim.causes import Cause, CauseMap, explain
 from rangesim.causes.cause import DEFINITIONS, TITLES
 from rangesim.causes.light_budget import light_budget
 from rangesim.causes.single_path import single_path_depth
+from rangesim.response import (
+    CAUSTIC,
+    DIRECT,
+    KINDS,
+    MULTIPATH,
+    VIA_DELTA,
+    LengthBins,
+    LengthSplit,
+    LightPath,
+    NumpyMath,
+)
 from rangesim.status import Status
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -82,7 +93,7 @@ def test_causes_do_not_depend_on_the_seed_of_the_noise_where_optics_fails() -> N
 # ---- The laws ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ambient", [0.0, 5.0], ids=["dark", "sunlit"])
+@pytest.mark.parametrize("ambient", [0.0, 1.0], ids=["dark", "sunlit"])
 @pytest.mark.parametrize("name", ["lines", "gray", "amcw", "histogram"])
 def test_the_least_signal_is_where_decoders_begin_to_refuse(name: str, ambient: float) -> None:
     """At the signal that the budget calls needed, noise decides; at half and twice of it, it hardly does."""
@@ -182,3 +193,25 @@ def test_the_docs_define_every_cause() -> None:
         if cause:
             assert f"| {TITLES[cause]} | {DEFINITIONS[cause]} |" in text
     assert set(TITLES) == set(DEFINITIONS) == set(Cause)
+
+
+# ---- The energy split over path length --------------------------------------------------------------
+
+
+def test_the_split_over_path_length_adds_up_to_bins_and_to_the_energy_split() -> None:
+    scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
+    bins, split = LengthBins(0.0, 0.5, 80), LengthSplit(0.0, 0.5, 80)
+    signals = rangesim.transport(scene, scene.rig(0.03, width=64, height=48), [bins, split], spp=4)
+    parts = signals.channels[split].reshape(len(KINDS), 80, 48, 64)
+    np.testing.assert_allclose(parts.sum(axis=0), signals.channels[bins], rtol=1e-5, atol=1e-6)
+    for kind, part in zip(KINDS, parts, strict=True):
+        np.testing.assert_allclose(part.sum(axis=0), getattr(signals.energy, kind), rtol=1e-4, atol=1e-6)
+    assert all(parts[k].any() for k in (DIRECT, MULTIPATH, VIA_DELTA, CAUSTIC))
+
+
+def test_paths_out_of_the_bins_count_nowhere() -> None:
+    split = LengthSplit(1.0, 0.5, 4)
+    length = np.array([0.9, 1.0, 2.99, 3.0, 2.2])
+    kind = np.array([0, 0, 1, 1, 4], dtype=np.uint32)
+    found = split.bin(LightPath(0 * length, 0 * length, length, length > 0, kind), NumpyMath())
+    assert found.tolist() == [split.channels, 0, 4 + 3, split.channels, 16 + 2]
