@@ -148,6 +148,23 @@ def test_glint_is_named_where_it_is_most_of_the_light() -> None:
     assert (found.cause[signals.truth.projector_visible] == Cause.GLINT).all()
 
 
+def test_the_lens_in_a_mirror_is_glint_where_the_law_of_reflection_puts_it() -> None:
+    """A mirror square to the camera shows the lens, 5 cm wide for once, as far behind it as it is before."""
+    scene = cause_scenes.room(mirror=cause_scenes.board(0, 0, 1.0, 0.5, cause_scenes.SILVER))
+    rig = replace(scene.rig(0.2, **cause_scenes.SIZE), projector_aperture_radius_m=0.05)
+    sensor, detector = AmcwToF(), Detector.time_of_flight()
+    signals = rangesim.transport(scene, rig, [sensor], spp=16)
+    capture = expose(signals, sensor, detector, 1e-3)
+    found = explain(decode(capture), capture, signals)
+    x, _, z = rig.T_camera_projector[:3, 3]
+    image_of_lens = rig.camera.project(np.array([x, 0.0, 2.0 - z]))
+    away = np.linalg.norm(rig.camera.pixel_centres() - image_of_lens, axis=-1)
+    radius = 0.05 * rig.camera.fx / (2.0 - z)
+    assert (found.cause[away < radius - 1] == Cause.GLINT).all()
+    assert (found.cause[away > radius + 1] == Cause.SPECULAR_AWAY).all()
+    assert (away < radius - 1).sum() >= 5
+
+
 def test_right_readings_and_empty_pixels_have_no_cause() -> None:
     sensor = StructuredLight()
     signals = plane_signals(stereo_rig(), sensor)
