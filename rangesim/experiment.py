@@ -3,107 +3,18 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rangesim.ambient import Ambient
-from rangesim.config import check_keys, from_dict, nearest, to_dict
-from rangesim.detector import Detector, PhotoDetector
+from rangesim.config import check_keys, from_dict, to_dict
 from rangesim.errors import FileFormatError
-from rangesim.motion import Motion, Timing
+from rangesim.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
+from rangesim.motion import Motion
 from rangesim.motion.settings import motion_from_dict
-from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
-from rangesim.spad import SpadDetector
-
-if TYPE_CHECKING:
-    from rangesim.rig import Rig
-    from rangesim.scene import Scene
-
-TOF_BASELINE_M = 0.03
-"""Metres from the camera's lens to the lamp beside it, of a time-of-flight camera."""
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-
-
-@dataclass(frozen=True)
-class Instrument:
-    """A sensor with its electronics and its place in the scene.
-
-    Parameters
-    ----------
-    name : names its directory in the results: letters, digits, hyphens and underscores.
-    sensor : Sensor, the measuring principle.
-    detector : PhotoDetector; None: the usual one of the sensor, see `default_detector`.
-    noise : bool; False: noise-free float frames, no detector at all.
-    baseline_m : metres between camera and emitter; None: a fifth of the working distance for structured light,
-        0.03 m for time of flight.
-    power_w : watts, mean radiant power of the emitter when it is fully on.
-    exposure_s : seconds per frame; None: automatic.
-    timing : when its frames are taken, in an experiment in which something moves.
-    """
-
-    name: str
-    sensor: Sensor
-    detector: PhotoDetector | None = None
-    noise: bool = True
-    baseline_m: float | None = None
-    power_w: float = 1.0
-    exposure_s: float | None = None
-    timing: Timing = field(default_factory=Timing)
-
-    def __post_init__(self) -> None:
-        if not _NAME.fullmatch(self.name):
-            raise ValueError(f"expected a name of letters, digits, - and _, got {self.name!r}.")
-        for name in ("baseline_m", "power_w", "exposure_s"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise ValueError(f"expected a positive {name}, got {value}.")
-        usual = self.detector or default_detector(self.sensor)
-        object.__setattr__(self, "detector", usual if self.noise else None)
-
-    def rig(self, scene: Scene, width: int | None = None, height: int | None = None) -> Rig:
-        """The scene's camera, `width` x `height` pixels, and this instrument's emitter, which covers its view."""
-        if isinstance(self.sensor, StructuredLight):
-            size = (self.sensor.projector_width, self.sensor.projector_height)
-            return scene.rig(self.baseline_m, size, self.power_w, width, height)
-        baseline = TOF_BASELINE_M if self.baseline_m is None else self.baseline_m
-        return scene.rig(baseline, power_w=self.power_w, width=width, height=height)
-
-
-def default_detector(sensor: Sensor) -> PhotoDetector | None:
-    """An industrial camera for structured light, a lock-in pixel for AMCW, a SPAD for direct time of flight."""
-    if isinstance(sensor, StructuredLight):
-        return Detector()
-    if isinstance(sensor, AmcwToF):
-        return Detector.time_of_flight()
-    return SpadDetector() if isinstance(sensor, DirectToF) else None
-
-
-SENSORS: dict[str, Sensor] = {
-    "gray": StructuredLight(code="gray"),
-    "gray-phase": StructuredLight(code="gray-phase"),
-    "amcw": AmcwToF(),
-    "direct-tof": DirectToF(),
-    "ideal-tof": IdealToF(),
-}
-"""Short names of sensors with their usual settings, as on the command line."""
-
-DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
-"""Structured light against time of flight, and the reference that says what no time-of-flight camera can better."""
-
-
-def instrument(name: str, **settings: Any) -> Instrument:
-    """The instrument of a short name in `SENSORS`; ValueError with the nearest valid name if there is none."""
-    if name not in SENSORS:
-        raise ValueError(_unknown(name))
-    return Instrument(name, SENSORS[name], **settings)
-
-
-def _unknown(name: str) -> str:
-    return f"expected a sensor out of {', '.join(SENSORS)}, got {name!r}{nearest(name, SENSORS)}."
 
 
 @dataclass(frozen=True)
@@ -118,6 +29,8 @@ class Experiment:
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
     spp : light paths per pixel.
     max_depth : longest path in segments up to the light; 2 is direct light alone.
+    photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
+    glint : whether the camera sees the projector's lens in mirrors.
     seed : of transport and noise; the same seed gives the same bytes.
     ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
     instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
@@ -131,6 +44,8 @@ class Experiment:
     height: int | None = None
     spp: int = 64
     max_depth: int = 5
+    photons: int | None = None
+    glint: bool = True
     seed: int = 0
     ambient: Ambient | None = None
     instruments: tuple[Instrument, ...] = tuple(instrument(name) for name in DEFAULT_SENSORS)
@@ -141,6 +56,8 @@ class Experiment:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"expected {name} to be a whole number of at least 1, got {value}.")
+        if self.photons is not None and self.photons < 0:
+            raise ValueError(f"expected no negative number of photons, got {self.photons}.")
         if self.seed < 0:
             raise ValueError(f"expected a seed of at least 0, got {self.seed}.")
         names = [i.name for i in self.instruments]
@@ -185,7 +102,9 @@ def experiment_from_dict(data: Mapping[str, Any]) -> Experiment:
         return experiment
     if not isinstance(tables, list):
         raise ValueError("expected instruments as tables headed [[instrument]], with two brackets.")
-    return replace(experiment, instruments=tuple(_instrument(t, f"instrument[{i}]") for i, t in enumerate(tables)))
+    return replace(
+        experiment, instruments=tuple(instrument_from_dict(t, f"instrument[{i}]") for i, t in enumerate(tables))
+    )
 
 
 def experiment_to_dict(experiment: Experiment) -> dict[str, Any]:
@@ -193,21 +112,3 @@ def experiment_to_dict(experiment: Experiment) -> dict[str, Any]:
     data = to_dict(experiment)
     data["instrument"] = data.pop("instruments")
     return dict(data)
-
-
-def _instrument(table: Any, place: str) -> Instrument:
-    """An instrument; its sensor is a table with a `type`, or a short name out of `SENSORS`."""
-    if not isinstance(table, Mapping):
-        raise ValueError(f"{place}: expected a table of settings, got {table!r}.")
-    values = dict(table)
-    check_keys(values, [f.name for f in fields(Instrument)], place)
-    sensor = values.get("sensor")
-    if isinstance(sensor, str):
-        if sensor not in SENSORS:
-            raise ValueError(f"{place}: {_unknown(sensor)}")
-        values = {"name": sensor, **values, "sensor": SENSORS[sensor]}
-    elif sensor is not None:
-        values["sensor"] = from_dict(Sensor, sensor, f"{place}.sensor")  # type: ignore[type-abstract]
-    if values.get("detector") is not None:
-        values["detector"] = from_dict(PhotoDetector, values["detector"], f"{place}.detector")  # type: ignore[type-abstract]
-    return from_dict(Instrument, values, place)

@@ -14,7 +14,8 @@ import numpy as np
 import rangesim
 from rangesim.capture import Capture
 from rangesim.causes import explain
-from rangesim.experiment import Experiment, Instrument
+from rangesim.experiment import Experiment
+from rangesim.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.provenance import provenance
 from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, save_range_image
@@ -176,9 +177,12 @@ def _trace(
     settings: dict[str, Any] = {
         "spp": experiment.spp,
         "max_depth": experiment.max_depth,
+        "glint": experiment.glint,
         "seed": experiment.seed,
         "progress": lambda share: say(stage, _share(number, passes, share)),
     }
+    if experiment.photons is not None:
+        settings["photons"] = experiment.photons
     with timed(times, f"transport_{number}"):
         if experiment.motion is None:
             return rangesim.transport(scene, rig, [i.sensor for i in instruments], **settings)

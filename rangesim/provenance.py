@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rangesim.config import to_dict
-from rangesim.experiment import Experiment, Instrument, experiment_to_dict
+from rangesim.experiment import Experiment, experiment_to_dict
+from rangesim.instrument import Instrument
 from rangesim.result_files import FORMAT
 
 if TYPE_CHECKING:

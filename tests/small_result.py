@@ -9,7 +9,8 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from rangesim.experiment import Experiment, Instrument
+from rangesim.experiment import Experiment
+from rangesim.instrument import Instrument
 from rangesim.pipeline import run
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 

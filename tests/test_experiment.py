@@ -15,15 +15,8 @@ from small_result import ROOT, SENSORS, small_experiment, small_result
 import rangesim
 from rangesim.detector import Detector
 from rangesim.errors import FileFormatError
-from rangesim.experiment import (
-    DEFAULT_SENSORS,
-    Experiment,
-    Instrument,
-    experiment_from_dict,
-    experiment_to_dict,
-    instrument,
-    load_experiment,
-)
+from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment
+from rangesim.instrument import DEFAULT_SENSORS, Instrument, Optics, instrument
 from rangesim.pipeline import group_by_rig, noise_seed, run
 from rangesim.result_files import load_result
 from rangesim.sensors import DirectToF, IdealToF
@@ -123,7 +116,7 @@ def test_the_result_holds_every_stage() -> None:
         assert (np.isfinite(m.image.z) == (m.image.status == Status.OK)).all()
         assert m.segmentation is not None
         assert (m.segmentation.supervoxels >= 0).sum() == m.facts["points"] == m.image.valid.sum()
-        assert {"exposure", "decode", "points", "segmentation"} == set(m.facts["times_s"])
+        assert {"exposure", "decode", "causes", "points", "segmentation"} == set(m.facts["times_s"])
         assert m.rows[-1]["material"] == "all"
     acquired = {m.name: m.facts["acquisition_s"] for m in result.measurements}
     assert acquired["ideal"] is None
@@ -182,3 +175,20 @@ def test_an_experiment_states_its_ambient_light() -> None:
     assert experiment.ambient is not None
     assert experiment.ambient.illuminance_lux == 5e4
     assert experiment_from_dict(experiment_to_dict(experiment)) == experiment
+
+
+def test_optics_photons_and_glint_reach_the_pass() -> None:
+    settings = {
+        "scene": "x.xml",
+        "photons": 0,
+        "glint": False,
+        "instrument": [{"sensor": "gray", "optics": {"projector_focus_m": 0.8, "camera_vignetting": 4.0}}],
+    }
+    experiment = experiment_from_dict(settings)
+    assert experiment.instruments[0].optics == Optics(projector_focus_m=0.8, camera_vignetting=4.0)
+    assert experiment_from_dict(experiment_to_dict(experiment)) == experiment
+    scene = rangesim.load_scene(ROOT / "scenes" / "plane.xml")
+    rig = experiment.instruments[0].rig(scene)
+    assert (rig.projector_focus_m, rig.camera_focus_m, rig.camera_vignetting) == (0.8, None, 4.0)
+    with pytest.raises(ValueError, match="expected no negative number of photons, got -1"):
+        Experiment("x.xml", photons=-1)

@@ -48,6 +48,10 @@ def run_command(
     max_depth: Annotated[
         int | None, typer.Option(help="Segments of a light path; 2 is direct light alone. (default: 5)")
     ] = None,
+    photons: Annotated[
+        int | None,
+        typer.Option(help="Photons for light through glass and off mirrors; 0 for none. (default: 500000)"),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same bytes. (default: 0)")] = None,
     baseline: Annotated[
         float | None,
@@ -77,7 +81,7 @@ def run_command(
       rangesim run --config examples/tabletop.toml --spp 16 --width 320 --height 240 --out out/quick
     """
     given: dict[str, Any] = {"width": width, "height": height, "spp": spp, "max_depth": max_depth, "seed": seed}
-    given |= {"material": material, "unit_m": unit_m}
+    given |= {"material": material, "unit_m": unit_m, "photons": photons}
     experiment = _experiment(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
     if baseline is not None:
         experiment = replace(
@@ -112,7 +116,8 @@ def _experiment(
     scene: Path | None, config: Path | None, settings: dict[str, Any], sensors: list[str] | None
 ) -> Experiment:
     """The experiment of a file or of a scene, with what the command line sets itself."""
-    from rangesim.experiment import Experiment, instrument, load_experiment
+    from rangesim.experiment import Experiment, load_experiment
+    from rangesim.instrument import instrument
 
     if config is None and scene is None:
         raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")

@@ -73,6 +73,7 @@ def transport(
         A number out of its range, patterns that do not fit the projector, or too little memory.
     """
     _check(scene, rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    _check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
@@ -178,3 +179,10 @@ def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], seed: i
     for name, value in counts.items():
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"expected {name} to be a whole number of at least 1, got {value!r}.")
+
+
+def _check_photons(photons: int, radius_m: float | None) -> None:
+    if not isinstance(photons, (int, np.integer)) or photons < 0:
+        raise ValueError(f"expected photons to be a whole number of at least 0, got {photons!r}.")
+    if radius_m is not None and not 0 < radius_m < np.inf:
+        raise ValueError(f"expected a positive caustic_radius_m in metres, got {radius_m!r}.")
