@@ -124,7 +124,7 @@ def test_decode_of_bare_images(command: Command, tmp_path: Path) -> None:
     assert answer.status == 0, answer.err
     assert (tmp_path / "out" / "cloud.ply").is_file()
     with np.load(tmp_path / "out" / "range.npz") as new, np.load(small_result() / "lines" / "range.npz") as old:
-        assert np.isfinite(new["z"]).sum() > 0.8 * np.isfinite(old["z"]).sum()
+        assert np.isfinite(new["z"]).sum() > 0.75 * np.isfinite(old["z"]).sum()
         assert np.nanmedian(np.abs(new["z"] - old["z"])) < 1e-3
 
 
