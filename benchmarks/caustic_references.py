@@ -12,7 +12,7 @@ apply they are compared with each other. The last line of `compare` is JSON:
     max_region_error        largest relative error of the mean radiance of white over the marked regions and references
     min_stripe_correlation  smallest correlation of a stripe image with its reference within a marked region
 
-Usage: python benchmarks/caustic_references.py [make | compare] [--spp 256] [--photons N] [--scale 1]
+Usage: python benchmarks/caustic_references.py [make | compare] [--spp 256] [--photons N] [--radius-m R] [--scale 1]
 """
 
 from __future__ import annotations
@@ -137,14 +137,16 @@ def _file(case_name: str, name: str) -> Path:
     return HERE / f"{case_name.replace(', ', '_').replace(' ', '_')}-{name}.npz"
 
 
-def compare(spp: int, photons: int | None) -> dict[str, float]:
+def compare(spp: int, photons: int | None, radius_m: float | None) -> dict[str, float]:
     """Print the table and return the figures of the last line."""
     light, frames = stripes()
     errors, correlations = [], []
     print(f"{'case':<22} {'region':<30} {'reference':<9} {'error':>7} {'+-':>6}  correlation: white, columns, rows")
     for case_name, case in cases().items():
         more = {} if photons is None else {"photons": photons}
-        signals = transport(case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, **more)
+        signals = transport(
+            case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, caustic_radius_m=radius_m, **more
+        )
         ours = signals.frames(light)[frames]
         references = {name: load(case_name, name) for name in METHODS}
         for name, reference in references.items():
@@ -175,12 +177,13 @@ def main() -> None:
     parser.add_argument("what", nargs="?", choices=("make", "compare"), default="compare")
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--photons", type=int, help="default: that of transport")
+    parser.add_argument("--radius-m", type=float, help="of the gathering of photons; default: that of transport")
     parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
     args = parser.parse_args()
     if args.what == "make":
         make(args.scale)
     else:
-        print(json.dumps(compare(args.spp, args.photons)))
+        print(json.dumps(compare(args.spp, args.photons, args.radius_m)))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from rangesim import Rig
 GUIDED_SHARE, STRAIGHT_SHARE = 0.45, 0.1
 STRAIGHT_HALF_ANGLE_RAD = 0.04
 LANES = 1 << 18
-MOST_SURFACES = 24
+MOST_SURFACES = 16
 
 
 class Lamp:
@@ -156,10 +156,8 @@ def _trace(scene: Any, lamp: Lamp, guided: Cone, straight: Cone, corner: Any, sp
         delta = hit & ~smooth & (delta | scattered)
         ray = si.spawn_ray(si.to_world(wo))
         depth += 1
-        survives = (depth < 6) | (rng.next_float32() < 0.8)
-        throughput = dr.select(depth < 6, throughput, throughput / 0.8)
 
-        ends = ~(hit & survives & (throughput > 0) & (depth < most))
+        ends = ~(hit & (throughput > 0) & (depth < most))  # no roulette: its weights would be seen as single bright dots
         sample = dr.select(ends, sample + 1, sample)
         depth = dr.select(ends, 0, depth)
         throughput = dr.select(ends, 1, throughput)
