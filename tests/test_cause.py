@@ -18,7 +18,7 @@ from rangesim import AmcwToF, Detector, DirectToF, IdealToF, Sensor, SpadDetecto
 from rangesim.causes import Cause, CauseMap, explain
 from rangesim.causes.cause import DEFINITIONS, TITLES
 from rangesim.causes.light_budget import light_budget
-from rangesim.causes.single_path import single_path_depth
+from rangesim.causes.reading import single_path_depth
 from rangesim.response import (
     CAUSTIC,
     DIRECT,
@@ -123,8 +123,8 @@ def _power_at_threshold(rig: Any, sensor: Sensor, detector: Any, exposure_s: flo
 def test_a_single_path_is_read_right(name: str) -> None:
     sensor, _ = SENSORS[name]
     signals = plane_signals(stereo_rig(), sensor)
-    z = single_path_depth(sensor, signals.rig, signals.truth)
-    error = np.abs(z - signals.truth.z)[signals.truth.projector_visible]
+    lit = signals.truth.projector_visible
+    error = np.abs(single_path_depth(sensor, signals.rig, signals.truth, lit) - signals.truth.z[lit])
     assert np.nanmax(error) < (0.02 if name == "histogram" else 0.005)  # bins of 30 mm in range
     assert np.isfinite(error).mean() > 0.99
 

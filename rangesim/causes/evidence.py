@@ -3,27 +3,29 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.causes.light_budget import LightBudget
-from rangesim.causes.single_path import in_projector, single_path_depth
-from rangesim.comparison import EDGE_SHARE, neighbours
+from rangesim.causes.edges import depth_edges, error_off_edge
+from rangesim.causes.light_budget import LightBudget, light_budget
+from rangesim.causes.reading import clean_depth, points_in_projector, single_path_depth
+from rangesim.comparison import neighbours
 from rangesim.decoding.amcw import MAX_RANGE_M
 from rangesim.range_image import RangeImage
 from rangesim.response import DIRECT, KINDS, MULTIPATH, SPEED_OF_LIGHT
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF
-from rangesim.signals import EnergySplit, GroundTruth
+from rangesim.signals import GroundTruth
 from rangesim.status import Status
+
+if TYPE_CHECKING:
+    from rangesim.signals import Signals
 
 FAINT = 0.1
 """Less than this share of what white paper would return here is little light."""
-NEAR = 2
-"""Pixels around an edge pixel, in both directions, that show how its surface fares off the edge."""
 DISTURBING = 0.005
 """Share of the projector's light, other than direct, from which it can shift a reading by the tolerance."""
 MOTION_SHARE = 0.1
@@ -32,20 +34,16 @@ MOTION_SHARE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Masks and measures per pixel, each (h, w).
-
-    image, clean : RangeImage of the capture, and of the same signals without noise and without ambient light.
-    motion_m : (h, w) float, metres that what the pixel sees moves, or None: nothing does.
-    """
+    """Masks and measures per pixel, each (h, w); they hold for failed pixels, and say nothing of others."""
 
     image: RangeImage
-    clean: RangeImage
     capture: Capture
-    truth: GroundTruth
-    energy: EnergySplit
-    budget: LightBudget
-    motion_m: np.ndarray | None
+    signals: Signals
     tolerance_m: float
+
+    @property
+    def truth(self) -> GroundTruth:
+        return self.signals.truth
 
     # ---- The reading ---------------------------------------------------------------------------------
 
@@ -67,8 +65,7 @@ class Evidence:
     @cached_property
     def optical(self) -> np.ndarray:
         """Without noise, ambient light and saturation the pixel fails as well, or is off by half as much or more."""
-        clean = np.where(self.clean.valid, self.clean.z.astype(np.float64) - self.truth.z, np.nan)
-        return np.asarray(~(np.abs(clean) <= self._half_of_error))
+        return self._wrong(clean_depth(self.signals, self.capture.sensor, self.failed))
 
     @cached_property
     def saturated(self) -> np.ndarray:
@@ -100,45 +97,31 @@ class Evidence:
     @cached_property
     def at_edge(self) -> np.ndarray:
         """Of the depths of the pixel and its eight neighbours, some lie across a depth edge."""
-        own = np.where(np.isfinite(self.truth.z), self.truth.z, np.inf)
-        near, far = self._window
-        with np.errstate(invalid="ignore"):
-            return np.asarray((own > self._beyond(near)) | (far > self._beyond(own)))
+        return depth_edges(self.truth.z, self.tolerance_m)
 
     @cached_property
     def fails_off_edge(self) -> np.ndarray:
         """Around the pixel, off the edge, the same surface is off by half as much or more: it is not the edge."""
+        result, where = np.zeros(self.failed.shape, dtype=bool), self.failed & self.at_edge
         error = np.where(self.missing, np.inf, np.abs(self.error))
-        off_edge = np.isfinite(self.truth.z) & ~self.at_edge
-        around = [neighbours(a, NEAR) for a in (np.where(off_edge, error, np.nan), self.truth.instance, self.truth.z)]
-        with np.errstate(invalid="ignore"):
-            alike = [
-                np.where((instance == self.truth.instance) & ~(z > self._beyond(self.truth.z)), e, np.nan)
-                for e, instance, z in zip(*around, strict=True)
-            ]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # windows without any such pixel: NaN, not off
-            return np.asarray(np.nanmedian(alike, axis=0) >= self._half_of_error)
-
-    def _beyond(self, depth: np.ndarray) -> np.ndarray:
-        return np.maximum(depth * (1 + EDGE_SHARE), depth + self.tolerance_m)
-
-    @cached_property
-    def _window(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest and farthest true depth of the 3 x 3 pixels around; nothing counts as infinitely far."""
-        from scipy.ndimage import maximum_filter, minimum_filter
-
-        depth = np.where(np.isfinite(self.truth.z), self.truth.z, np.inf)
-        return minimum_filter(depth, 3, mode="nearest"), maximum_filter(depth, 3, mode="nearest")
+        around = error_off_edge(where, error, self.at_edge, self.truth.z, self.truth.instance, self.tolerance_m)
+        result[where] = around >= self._half_of_error[where]
+        return result
 
     @cached_property
     def moving(self) -> np.ndarray:
         """The surface moves by more than `MOTION_SHARE` of the tolerance during the acquisition."""
-        if self.motion_m is None:
+        motion_m = self.signals.motion_m
+        if motion_m is None:
             return np.zeros(self.truth.z.shape, dtype=bool)
-        return np.nan_to_num(np.abs(self.motion_m)) > MOTION_SHARE * self.tolerance_m
+        return np.nan_to_num(motion_m) > MOTION_SHARE * self.tolerance_m
 
     # ---- The light -----------------------------------------------------------------------------------
+
+    @cached_property
+    def budget(self) -> LightBudget:
+        """What light there is, and what is needed."""
+        return light_budget(self.signals, self.capture)
 
     @cached_property
     def enough(self) -> np.ndarray:
@@ -154,15 +137,12 @@ class Evidence:
     @cached_property
     def faint(self) -> np.ndarray:
         """Less direct light than `FAINT` of what a white Lambertian surface would return in this place."""
-        rig, truth = self.capture.rig, self.truth
-        assert rig is not None
-        normal = truth.normal @ rig.T_world_projector[:3, :3]
-        point = self._in_projector
+        rig, normal, point = self.signals.rig, self.truth.normal[self.failed], self._in_projector
         distance = np.linalg.norm(point, axis=-1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            cosine = np.abs((normal * point).sum(axis=-1)) / distance
-            white = rig.projector_irradiance / np.pi * cosine * distance / point[..., 2] ** 3
-            return np.asarray(self.energy.direct < FAINT * white)
+        cosine = np.abs(((normal @ rig.T_world_projector[:3, :3]) * point).sum(axis=-1)) / distance
+        with np.errstate(divide="ignore"):
+            white = rig.projector_irradiance / np.pi * cosine * distance / point[:, 2] ** 3
+        return self._of_failed(self.signals.energy.direct[self.failed] < FAINT * white)
 
     @cached_property
     def disturbed(self) -> np.ndarray:
@@ -178,7 +158,7 @@ class Evidence:
     @cached_property
     def _kinds(self) -> list[np.ndarray]:
         """Radiance of each of `KINDS`; none of those that come after the first return for a sensor that stops there."""
-        light = [getattr(self.energy, kind) for kind in KINDS]
+        light = [getattr(self.signals.energy, kind) for kind in KINDS]
         if isinstance(self.capture.sensor, IdealToF):
             light[MULTIPATH] = np.zeros_like(light[MULTIPATH])
         return light
@@ -188,22 +168,19 @@ class Evidence:
     @cached_property
     def coarse(self) -> np.ndarray:
         """The straight path to the surface, alone, is not read to the tolerance, or makes half of the error or more."""
-        sensor, rig = self.capture.sensor, self.capture.rig
-        assert rig is not None  # signals always have one
-        alone = np.abs(single_path_depth(sensor, rig, self.truth).astype(np.float64) - self.truth.z)
-        return np.asarray(~(alone <= self._half_of_error))
+        return self._wrong(single_path_depth(self.capture.sensor, self.signals.rig, self.truth, self.failed))
 
     @cached_property
     def beyond_range(self) -> np.ndarray:
         """Path length that a time-of-flight sensor takes for another, or has no bin for."""
         sensor = self.capture.sensor
-        length = self.truth.range_m + np.linalg.norm(self._in_projector, axis=-1)
+        length = self.truth.range_m[self.failed] + np.linalg.norm(self._in_projector, axis=-1)
         if isinstance(sensor, AmcwToF):
-            return np.asarray(length > 2 * min(sensor.unambiguous_range_m, MAX_RANGE_M))
+            return self._of_failed(length > 2 * min(sensor.unambiguous_range_m, MAX_RANGE_M))
         if isinstance(sensor, DirectToF):
             start, bins = sensor.start_s * SPEED_OF_LIGHT, sensor.bins * sensor.bin_s * SPEED_OF_LIGHT
-            return np.asarray((length < start) | (length > start + bins))
-        return np.zeros(length.shape, dtype=bool)
+            return self._of_failed((length < start) | (length > start + bins))
+        return np.zeros(self.failed.shape, dtype=bool)
 
     @cached_property
     def wrong_period(self) -> np.ndarray:
@@ -215,14 +192,25 @@ class Evidence:
         off = np.abs(self.image.range_m - self.truth.range_m) > half_period_m
         return np.asarray(np.isin(self.image.status, [Status.WRAPPED, Status.OUT_OF_RANGE]) | off)
 
+    # ---- Helpers -------------------------------------------------------------------------------------
+
     @cached_property
     def _half_of_error(self) -> np.ndarray:
         """Half of the error, of which what exceeds it made most; the tolerance where there is no reading."""
         return np.asarray(np.where(self.missing, self.tolerance_m, np.abs(self.error) / 2))
 
+    def _wrong(self, z: np.ndarray) -> np.ndarray:
+        """Where depths z (n,) of the failed pixels are off by half of their error or more."""
+        error = np.abs(z - self.truth.z[self.failed])
+        return self._of_failed(~(error <= self._half_of_error[self.failed]))
+
+    def _of_failed(self, values: np.ndarray) -> np.ndarray:
+        """(h, w) bool of (n,) values of the failed pixels."""
+        result = np.zeros(self.failed.shape, dtype=bool)
+        result[self.failed] = values
+        return result
+
     @cached_property
     def _in_projector(self) -> np.ndarray:
-        """(h, w, 3) true surface points in the frame of the projector, metres."""
-        rig = self.capture.rig
-        assert rig is not None
-        return in_projector(rig, self.truth.z)
+        """(n, 3) true surface points of the failed pixels in the frame of the projector, metres."""
+        return points_in_projector(self.signals.rig, self.truth.z, self.failed)

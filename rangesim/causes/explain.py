@@ -10,9 +10,7 @@ import numpy as np
 from rangesim.capture import Capture
 from rangesim.causes.cause import Cause, CauseMap
 from rangesim.causes.evidence import Evidence
-from rangesim.causes.light_budget import light_budget
 from rangesim.comparison import OUTLIER_M
-from rangesim.decoding import decode
 from rangesim.range_image import RangeImage
 from rangesim.response import CAUSTIC, DIRECT, GLINT, MULTIPATH, VIA_DELTA
 
@@ -59,9 +57,7 @@ def explain(
         )
     if not tolerance_m > 0:
         raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
-    clean = decode(Capture(signals.frames(capture.sensor, ambient_transmission=0.0), capture.sensor, signals.rig))
-    budget = light_budget(signals, capture)
-    evidence = Evidence(image, clean, capture, signals.truth, signals.energy, budget, signals.motion_m, tolerance_m)
+    evidence = Evidence(image, capture, signals, tolerance_m)
     masks, causes = zip(*rules(evidence), strict=True)
     cause = np.select(masks, causes)
     return CauseMap(np.where(evidence.failed, cause, Cause.NONE).astype(np.uint8), tolerance_m)
