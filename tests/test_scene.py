@@ -134,9 +134,9 @@ BROKEN: dict[str, tuple[str, str]] = {
         "put in copies",
     ),
     "fog.xml": (
-        f'<scene version="3.0.0">{SENSOR}<shape type="cube"><bsdf type="null"/>'
+        f'<scene version="3.0.0">{SENSOR}<shape type="cube"><bsdf type="dielectric"/>'
         '<medium type="homogeneous" name="interior"/></shape></scene>',
-        "participating medium",
+        "boundaries of matched index",
     ),
     "points.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
     "notes.txt": ("hello", "expected a scene"),

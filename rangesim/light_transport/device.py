@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.distortion import distort, undistort
+from rangesim.light_transport.medium import Media, Medium
 from rangesim.rig import Intrinsics, Rig
 
 NO_RAY_PX = 1e-2
@@ -199,8 +200,10 @@ class Connection(NamedTuple):
     blur_px: Any = None
 
 
-def connect(scene: Any, projector: Device, si: Any, active: Any) -> Connection:
-    """Straight connection of the surface point `si` to the projector.
+def connect(
+    scene: Any, projector: Device, si: Any, active: Any, media: Media | None = None, inside: Medium | None = None
+) -> Connection:
+    """Straight connection of the point `si` to the projector; with `media` through them, from the one that is `inside`.
 
     The pattern is uniform per projector pixel, so the radiant intensity is E / cos^3 and falls as
     cos^2 / z^2, which leaves E / (z^2 cos), with E of the lens: its pixels' density and relative illumination.
@@ -209,14 +212,18 @@ def connect(scene: Any, projector: Device, si: Any, active: Any) -> Connection:
     to_projector = projector.centre - mi.Vector3f(si.p)
     distance = dr.norm(to_projector)
     to_projector /= distance
-    inside = (uv.x >= 0) & (uv.x < projector.size.x) & (uv.y >= 0) & (uv.y < projector.size.y) & (z > 0)
+    in_image = (uv.x >= 0) & (uv.x < projector.size.x) & (uv.y >= 0) & (uv.y < projector.size.y) & (z > 0)
     geometry = dr.rcp(dr.square(z) * -dr.dot(projector.z, to_projector))
     if projector.distortion is not None:
         geometry *= projector.pixel_density(-to_projector)
     if projector.vignetting is not None:
         geometry *= projector.relative_illumination(-to_projector)
-    inside &= active
-    shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
-    lit = inside & ~scene.ray_test(shadow_ray, coherent=False, active=inside)
+    in_image &= active
+    if media is None or inside is None:
+        shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
+        lit = in_image & ~scene.ray_test(shadow_ray, coherent=False, active=in_image)
+    else:
+        share, _ = media.transmittance(scene, si, mi.Point3f(projector.centre), inside, in_image)
+        lit, geometry = in_image & (share > 0), geometry * share
     blur = projector.blur_px(z)
     return Connection(uv, to_projector, distance, geometry, lit, None if blur is None else dr.select(lit, blur, 0))

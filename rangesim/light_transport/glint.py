@@ -5,6 +5,7 @@ The lens is a disc as large as its aperture. A camera path of delta interactions
 radiance. Where all of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much finer
 than a pixel counts. Random paths of the pass would mostly miss it, hence three steps: pixels behind whose centre there
 is a delta surface; of those, pixels of which a few probing paths come near the lens; and these get thousands of paths.
+The lens is not seen through a participating medium: its boundary ends a path.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.loop import mono, stratified
+from rangesim.light_transport.medium import Media, bounded
 from rangesim.light_transport.photons import MAX_CHAIN
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import GLINT, LightPath, Response
@@ -53,18 +55,19 @@ class Glint:
         image.reshape(len(image), -1)[:, self.pixel] += values
 
 
-def trace_glint(scene: Any, rig: Rig, responses: Sequence[Response], seed: int) -> Glint:
+def trace_glint(scene: Any, rig: Rig, responses: Sequence[Response], seed: int, media: Media | None = None) -> Glint:
     """What the camera of the rig sees of the projector's lens."""
     camera, projector = Device.camera(rig), Device.projector(rig)
     h, w = rig.camera.height, rig.camera.width
-    pixel = _near_the_lens(scene, rig, camera, projector, _worth_probing(scene, camera, projector, h, w), seed)
+    worth_probing = _worth_probing(scene, camera, projector, h, w, media)
+    pixel = _near_the_lens(scene, rig, camera, projector, worth_probing, seed, media)
     accumulators = Accumulators(responses, max(1, len(pixel)))
     if len(pixel) == 0:
         return Glint(pixel, np.zeros(0, np.float32), [np.zeros((r.channels, 0), np.float32) for r in responses])
     paths = int(np.clip(MOST_PATHS // len(pixel), *PATHS_PER_PIXEL))
     radiance_of_lens = rig.projector_irradiance / (np.pi * rig.projector_aperture_radius_m**2) / paths
     lens = Lens(rig, projector, dr.opaque(mi.Float, radiance_of_lens))
-    dense, total = _paths_to_the_lens(scene, camera, lens, accumulators, *_lanes(pixel, seed, paths))
+    dense, total = _paths_to_the_lens(scene, camera, lens, accumulators, *_lanes(pixel, seed, paths), media)
     bins = accumulators.bins
     dr.eval(dense, [total], list(bins.values()))
     channels = [
@@ -92,12 +95,12 @@ class Lens:
         return across, t, (slope > 0) & (t > 0) & (t < si.t)
 
 
-def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int) -> np.ndarray:
+def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int, media: Media | None) -> np.ndarray:
     """Flat indices of the pixels around whose centre there is a delta surface, or the lens in plain view."""
     index, width = dr.arange(mi.UInt32, h * w), dr.opaque(mi.UInt32, w)
     ray = camera.centre_ray(mi.Point2f(mi.Float(index % width) + 0.5, mi.Float(index // width) + 0.5))
     si = scene.ray_intersect(mi.Ray3f(ray.origin, ray.direction))
-    delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
+    delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
     mask = delta.numpy().reshape(h, w)
     uv, z = camera.project(mi.Point3f(projector.centre))
     u, v = float(uv.x[0]), float(uv.y[0])
@@ -109,12 +112,14 @@ def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int
     return np.flatnonzero(mask)
 
 
-def _near_the_lens(scene: Any, rig: Rig, camera: Device, projector: Device, pixel: np.ndarray, seed: int) -> np.ndarray:
+def _near_the_lens(
+    scene: Any, rig: Rig, camera: Device, projector: Device, pixel: np.ndarray, seed: int, media: Media | None
+) -> np.ndarray:
     """Those of the pixels whose probes come near the lens, as measured by how far they spread."""
     if len(pixel) == 0:
         return pixel
     lens = Lens(rig, projector, mi.Float(1))
-    nearest, spread = _probe(scene, camera, lens, *_lanes(pixel, seed, PROBES))
+    nearest, spread = _probe(scene, camera, lens, *_lanes(pixel, seed, PROBES), media)
     dr.eval([nearest, spread])
     near = nearest.numpy() < rig.projector_aperture_radius_m + NEAR * spread.numpy()
     return pixel[near]
@@ -128,7 +133,9 @@ def _lanes(pixel: np.ndarray, seed: int, paths: int) -> tuple[Any, Any, Any]:
 
 
 @dr.syntax
-def _probe(scene: Any, camera: Device, lens: Lens, pixel: Any, rng: Any, paths: Any) -> tuple[Any, Any]:
+def _probe(
+    scene: Any, camera: Device, lens: Lens, pixel: Any, rng: Any, paths: Any, media: Media | None = None
+) -> tuple[Any, Any]:
     """Least distance at which each pixel's delta paths pass the lens's centre, and how far apart they cross its plane.
 
     Where light splits into reflection and refraction, probes take both alike, however faint one is.
@@ -151,7 +158,7 @@ def _probe(scene: Any, camera: Device, lens: Lens, pixel: Any, rng: Any, paths: 
         # The least step, because probes that went another way are far off and say nothing
         spread = dr.select(crosses, dr.minimum(spread, dr.norm(across - before)), spread)
         before = dr.select(crosses, across, before)
-        hit = si.is_valid()
+        hit = si.is_valid() & ~bounded(media, si)
         way = dr.select(rng.next_float32() < 0.5, mi.Float(0), mi.Float(0.9999))
         bs, weight = si.bsdf(ray).sample(context, si, way, mi.Point2f(0.5), hit)
         ray = si.spawn_ray(si.to_world(bs.wo))
@@ -164,7 +171,14 @@ def _probe(scene: Any, camera: Device, lens: Lens, pixel: Any, rng: Any, paths: 
 
 @dr.syntax
 def _paths_to_the_lens(
-    scene: Any, camera: Device, lens: Lens, accumulators: Accumulators, pixel: Any, rng: Any, paths: Any
+    scene: Any,
+    camera: Device,
+    lens: Lens,
+    accumulators: Accumulators,
+    pixel: Any,
+    rng: Any,
+    paths: Any,
+    media: Media | None = None,
 ) -> tuple[list[list[Any]], Any]:
     """Dense channels and radiance of the delta paths from each pixel to the lens; bins go to the accumulators."""
     lanes = dr.width(pixel)
@@ -207,7 +221,7 @@ def _paths_to_the_lens(
         total += radiance
 
         # ---- On through delta interactions, or the next path -----------------------------------------
-        hit = si.is_valid() & ~meets
+        hit = si.is_valid() & ~meets & ~bounded(media, si)
         length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
         bs, weight = si.bsdf(ray).sample(
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), hit

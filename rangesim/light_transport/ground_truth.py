@@ -63,6 +63,7 @@ def _first_surface(scene: Scene, ray: Any) -> Any:
         bsdf = si.bsdf()
         is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
         passes = si.is_valid() & ~is_glass & (mono(bsdf.eval_null_transmission(si)) > 0.5)
+        passes &= ~si.shape.is_medium_transition()  # a translucent object begins at its boundary
         behind = scene.mitsuba.ray_intersect(si.spawn_ray(ray.d), mi.RayFlags.All, coherent=True, active=passes)
         si = dr.select(passes, behind, si)
     return si

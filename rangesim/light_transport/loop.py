@@ -6,6 +6,9 @@ next sample in the same turn of the loop. So no lane idles while its neighbours 
 register instead of a film, and each sum is made by one thread in one order: same seed, same bytes,
 whatever the number of threads or the size of a tile.
 
+Inside a translucent object a turn of the loop is a scattering event instead of a surface; a stay inside counts as one
+surface towards the depth, however often it scatters (`rangesim.light_transport.medium`).
+
 The strategies that bring projector light to the camera partition all light paths: next-event estimation (here),
 caustic photons gathered at every non-delta vertex (here, from maps made before), and glint, paths without any
 non-delta vertex (`rangesim.light_transport.glint`).
@@ -19,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rangesim.light_transport.device import Device, connect
+from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
@@ -70,11 +74,12 @@ def trace(
     pixel: Any,
     settings: Settings,
     maps: PhotonMaps | None = None,
+    media: Any = None,
 ) -> tuple[list[list[Any]], Radiance]:
     """Sums over all samples: dense channels, and radiance by kind of path; bins go to the accumulators' buffers.
 
     `pixel` (lanes,) UInt32 is the flat index of each lane's pixel in the whole image: random numbers depend on it and
-    the seed alone.
+    the seed alone. `media` is a `Media`, or None where there are none.
     """
     # ---- State of the lane: its random numbers, its sums --------------------------------------------
     lanes = dr.width(pixel)
@@ -101,11 +106,15 @@ def trace(
     previous = dr.zeros(mi.Interaction3f, lanes)
     previous_pdf = dr.zeros(mi.Float, lanes)  # of the BSDF sample that made the ray; for MIS with ambient light
     previous_delta = dr.full(mi.Bool, True, lanes)
+    inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
+    scatters, crosses = mi.Bool(False), mi.Bool(False)  # this turn: an event inside a medium, or its boundary
+    events = dr.zeros(mi.UInt32, lanes)  # of both kinds so far
+    stays = dr.full(mi.Bool, False, lanes)  # scattered since it entered the medium
     active = sample < settings.spp
 
     while active:
         # ---- A new sample starts at the camera -------------------------------------------------------
-        starts = depth == 0
+        starts = (depth == 0) & (events == 0)
         jitter = stratified(shift, sample)
         lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(camera.has_lens, mode="scalar") else None
         primary = camera.sample_ray(corner + jitter, lens)
@@ -119,23 +128,37 @@ def trace(
         # ---- Next surface ----------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
-        depth += 1
+        if dr.hint(media is not None, mode="scalar"):
+            flight = inside.free_flight(rng.next_float32())
+            scatters = hit & (flight < dr.norm(si.p - previous.p))
+            crosses = hit & ~scatters & media.bounded_by(si, hit)
+            si.p = dr.select(scatters, dr.fma(ray.d, flight, previous.p), si.p)
+            si.n = dr.select(scatters, 0, si.n)  # so that rays start at the event itself
+        at_surface = hit & ~scatters
+        depth += dr.select(crosses | (scatters & stays), mi.UInt32(0), mi.UInt32(1))
         # Not si.t: spawned rays start a little off the surface
         length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous.p), length), length)
         bsdf = si.bsdf(ray)
-        may_connect = hit & (depth < settings.max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        may_connect = hit & (depth < settings.max_depth) & (scatters | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
-        link = connect(scene, projector, si, may_connect)
+        link = connect(scene, projector, si, may_connect, media, inside)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
             si.to_local(link.direction),
             rng.next_float32(),
             mi.Point2f(rng.next_float32(), rng.next_float32()),
-            hit,
+            at_surface,
         )
-        radiance = dr.select(link.lit, throughput * mono(value) * link.geometry * irradiance, 0)
+        value, bs_weight = mono(value), mono(bs_weight)
+        wo = si.to_world(bs.wo)
+        if dr.hint(media is not None, mode="scalar"):
+            value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(ray.d, link.direction)), value)
+            bs_weight = dr.select(scatters, inside.albedo, bs_weight)
+            xi = mi.Point2f(rng.next_float32(), rng.next_float32())
+            wo = dr.select(scatters, inside.scattered(ray.d, xi), wo)
+        radiance = dr.select(link.lit, throughput * value * link.geometry * irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
         u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, length + link.distance))
         kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
@@ -149,39 +172,50 @@ def trace(
         if dr.hint(maps is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, throughput / mi.Float(settings.spp), length, first & ~link.lit)
             xi = [choice.next_float32() for _ in range(3)]
-            photon, brought = gather(maps, vertex, sample, xi, turns.next_float32(), may_connect)
+            photon, brought = gather(maps, vertex, sample, xi, turns.next_float32(), may_connect & ~scatters)
             channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, lane)
             caustic += radiance
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
             alone = previous_delta | (not settings.lamps)  # no other strategy finds this light
-            ambient += throughput * emission(scene, si, previous, previous_pdf, alone, active)
+            ambient += throughput * emission(scene, si, previous, previous_pdf, alone, active & ~scatters)
             if dr.hint(settings.lamps, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
-                ambient += throughput * sampled_emission(scene, bsdf, si, xi, may_connect)
+                if dr.hint(media is None, mode="scalar"):
+                    ambient += throughput * sampled_emission(scene, bsdf, si, xi, may_connect)
+                else:
+                    lamp = emission_through(media, scene, bsdf, si, ray.d, inside, scatters, xi, may_connect)
+                    ambient += throughput * lamp
 
         # ---- Next direction --------------------------------------------------------------------------
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         is_transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
-        throughput *= mono(bs_weight)
+        throughput *= bs_weight
         ior = dr.select(is_transmitted, ior * bs.eta, ior)
         survival = dr.select(depth > settings.rr_depth, dr.minimum(throughput * dr.square(ior), 0.95), 1)
+        if dr.hint(media is not None, mode="scalar"):
+            survival = dr.select(scatters, dr.minimum(throughput / FAINT, 1), dr.select(crosses, 1, survival))
         survives = rng.next_float32() < survival
         throughput /= survival
         is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
         passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) & ~is_glass  # through a hole, as if nothing were there
-        first &= passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        first &= ~scatters & (passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         via |= is_delta & ~passes
         previous = mi.Interaction3f(si)
         previous_pdf = mi.Float(bs.pdf)
-        previous_delta = mi.Bool(is_delta)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        previous_delta = is_delta | scatters
+        ray = si.spawn_ray(wo)
+        if dr.hint(media is not None, mode="scalar"):
+            inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
+            events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
+            stays = scatters | (stays & ~crosses)
 
         # ---- Or next sample --------------------------------------------------------------------------
         # The last surface can only be seen to emit, so it is needed for ambient light alone
         last = settings.max_depth if settings.ambient else settings.max_depth - 1
-        ends = ~(hit & survives & (throughput > 0) & (depth < last))
+        goes_on = (depth < last) | ((scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS))
+        ends = ~(hit & survives & (throughput > 0) & goes_on)
         sample = dr.select(ends, sample + 1, sample)
         depth = dr.select(ends, 0, depth)
         throughput = dr.select(ends, 1, throughput)
@@ -190,6 +224,10 @@ def trace(
         first |= ends
         via &= ~ends
         previous_delta |= ends
+        if dr.hint(media is not None, mode="scalar"):
+            inside = inside.replaced(ends, media.none(lanes))
+            events = dr.select(ends, 0, events)
+            stays &= ~ends
         active = sample < settings.spp
 
     return channels, Radiance(direct, multipath, via_delta, caustic, ambient)
@@ -264,6 +302,31 @@ def sampled_emission(scene: Any, bsdf: Any, si: Any, xi: Any, active: Any) -> An
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
     return dr.select(active, weight * mono(value) * mono(radiance), 0)
+
+
+def emission_through(
+    media: Media,
+    scene: Any,
+    bsdf: Any,
+    si: Any,
+    direction: Any,
+    inside: Medium,
+    scatters: Any,
+    xi: Any,
+    active: Any,
+) -> Any:
+    """Like `sampled_emission`, through media as well, and also at scattering events.
+
+    Lamps of finite size are left to random walks there and beyond boundaries, so that none is counted twice.
+    """
+    ds, radiance = scene.sample_emitter_direction(si, xi, False, active)
+    active &= ds.pdf != 0
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)
+    value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
+    share, crossed = media.transmittance(scene, si, ds.p, inside, active)
+    weight = dr.select(scatters | crossed, 0, power_heuristic(ds.pdf, pdf))
+    weight = dr.select(ds.delta, 1, weight)
+    return dr.select(active, weight * share * value * mono(radiance), 0)
 
 
 def power_heuristic(a: Any, b: Any) -> Any:

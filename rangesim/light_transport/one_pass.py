@@ -14,6 +14,7 @@ from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth
 from rangesim.light_transport.loop import Radiance, Settings, trace
+from rangesim.light_transport.medium import Media, media_of
 from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
 from rangesim.light_transport.photons import has_delta, trace_photons
 from rangesim.light_transport.responses import Accumulators
@@ -88,13 +89,18 @@ def transport(
         lamps=scene.has_lamps,
     )
     irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
+    media = media_of(scene.mitsuba)
     maps = None
     if photons and has_delta(scene.mitsuba):
-        maps = _photon_maps(scene, rig, projector, photons, caustic_radius_m, min(spp, MOST_MAPS), seed, memory_bytes)
+        maps = _photon_maps(
+            scene, rig, projector, photons, caustic_radius_m, min(spp, MOST_MAPS), seed, memory_bytes, media
+        )
     for begin, end in _tiles(h * w, responses, memory_bytes, PROGRESS_STEPS if progress else 1):
         accumulators = Accumulators(responses, end - begin)
         pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
-        dense, radiance = trace(scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings, maps)
+        dense, radiance = trace(
+            scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings, maps, media
+        )
         bins = accumulators.bins
         dr.eval(dense, list(radiance), list(bins.values()))  # all at once: one by one, the loop would run once for each
         for r, values in zip(responses, dense, strict=True):
@@ -105,7 +111,7 @@ def transport(
     images = {r: _join(tiles, h, w) for r, tiles in channels.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
-        found = trace_glint(scene.mitsuba, rig, responses, seed)
+        found = trace_glint(scene.mitsuba, rig, responses, seed, media)
         found.add_to(highlights, found.radiance)
         for r, values in zip(responses, found.channels, strict=True):
             found.add_to(images[r], values)
@@ -121,9 +127,10 @@ def _photon_maps(
     maps: int,
     seed: int,
     memory_bytes: int,
+    media: Media | None,
 ) -> PhotonMaps | None:
     """Maps of the projector's light beyond delta surfaces; None if no photon landed."""
-    landed = trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes)
+    landed = trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media)
     if radius_m is None:
         cells = (RADIUS_IN_PROJECTOR_PIXELS / rig.projector.fx, RADIUS_IN_CAMERA_PIXELS / rig.camera.fx)
         radius_m = scene.working_distance_m * min(cells)

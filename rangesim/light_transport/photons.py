@@ -3,7 +3,8 @@
 
 A photon leaves the projector through a pixel, follows delta interactions alone (dielectric, conductor, thin
 dielectric, hole), and lands on the first non-delta surface. Light that lands without any delta interaction is
-next-event estimation's (`rangesim.light_transport.loop`) and ends at once.
+next-event estimation's (`rangesim.light_transport.loop`) and ends at once. A translucent object's medium weakens
+photons by what it scatters out of their way; that scattered light is not followed further.
 
 Only pixels whose light meets a delta surface first are worth photons. A pre-pass with one ray per pixel finds them and
 their neighbours; a small share of the photons goes to all other pixels, so that the estimate stays unbiased where
@@ -21,6 +22,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
+from rangesim.light_transport.medium import Media, bounded, is_boundary
 
 DEFENSIVE_SHARE = 0.05
 """Of the photons, for the pixels where the pre-pass found no delta surface."""
@@ -28,6 +30,8 @@ LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
 MAX_CHAIN = 16
 """Delta surfaces in a row that a photon is followed through."""
+GRAZING = 0.05
+"""Cosine below which a ray would have to start too far ahead to be clear of the surface."""
 LANES_PER_GIB = 1 << 23
 
 
@@ -37,7 +41,7 @@ class PhotonBalance:
 
     emitted : of the pixels that photons were sent through. direct : landed without a delta surface, left to next-event
     estimation. stored : landed beyond delta surfaces. absorbed : by delta surfaces and by the parts of mixed ones that
-    scatter. escaped : met no surface. truncated : still under way after `MAX_CHAIN` surfaces.
+    scatter, and by media. escaped : met no surface. truncated : still under way after `MAX_CHAIN` surfaces.
     """
 
     emitted: float
@@ -72,14 +76,24 @@ class Photons:
 
 def has_delta(scene: Any) -> bool:
     """Whether some surface of a mitsuba.Scene has a delta interaction: without one there is nothing to trace."""
-    return any(bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) for shape in scene.shapes())
+    return any(
+        bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
+        for shape in scene.shapes()
+    )
 
 
 def trace_photons(
-    scene: Any, projector: Device, power_w: float, photons: int, maps: int, seed: int, memory_bytes: int
+    scene: Any,
+    projector: Device,
+    power_w: float,
+    photons: int,
+    maps: int,
+    seed: int,
+    memory_bytes: int,
+    media: Media | None = None,
 ) -> Photons:
     """`photons` photons of a projector of that power, dealt out evenly to `maps` independent maps."""
-    pixels, share = _worthwhile_pixels(scene, projector)
+    pixels, share = _worthwhile_pixels(scene, projector, media)
     per_map = -(-photons // maps)
     cumulative = np.cumsum(share)
     total = per_map * maps
@@ -90,7 +104,7 @@ def trace_photons(
         number = np.arange(begin, min(begin + chunk, total))
         chosen = np.searchsorted(cumulative, _stratified(number, per_map) * cumulative[-1], side="right")
         flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
-        end, fate = _fly(scene, projector, pixels[chosen], flux, number, seed)
+        end, fate = _fly(scene, projector, pixels[chosen], flux, number, seed, media)
         kept = np.flatnonzero(end.flux)
         landed.append([_columns(x)[kept] for x in end] + [number[kept] // per_map])
         balance += fate
@@ -98,13 +112,13 @@ def trace_photons(
     return Photons(position, direction, flux, u, v, length, of_map, PhotonBalance(*(balance / maps)))
 
 
-def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:
+def _worthwhile_pixels(scene: Any, projector: Device, media: Media | None) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices of all projector pixels along a Morton curve, and the relative chance of a photon for each."""
     w, h = int(projector.size.x[0]), int(projector.size.y[0])
     index, width = dr.arange(mi.UInt32, w * h), mi.UInt32(projector.size.x)
     ray = projector.centre_ray(mi.Point2f(mi.Float(index % width) + 0.5, mi.Float(index // width) + 0.5))
     si = scene.ray_intersect(mi.Ray3f(ray.origin, ray.direction))
-    meets_delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
+    meets_delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
     mask = binary_dilation(meets_delta.numpy().reshape(h, w), np.ones((3, 3))).ravel()
     rest = ~mask
     chance = np.where(mask, 1.0, DEFENSIVE_SHARE / (1 - DEFENSIVE_SHARE) * max(mask.sum(), 1) / max(rest.sum(), 1))
@@ -142,7 +156,13 @@ class _Landing(NamedTuple):
 
 
 def _fly(
-    scene: Any, projector: Device, pixel: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
+    scene: Any,
+    projector: Device,
+    pixel: np.ndarray,
+    flux: np.ndarray,
+    number: np.ndarray,
+    seed: int,
+    media: Media | None = None,
 ) -> tuple[_Landing, np.ndarray]:
     """Landings of photons sent through projector pixels, and the sums of `PhotonBalance`."""
     pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(projector.size.x)
@@ -151,7 +171,7 @@ def _fly(
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
     landing, fate = _chain(
-        scene, projector, uv, mi.Float(flux.astype(np.float32)), rng, dr.opaque(mi.UInt32, MAX_CHAIN)
+        scene, projector, uv, mi.Float(flux.astype(np.float32)), rng, dr.opaque(mi.UInt32, MAX_CHAIN), media
     )
     dr.eval(list(landing), list(fate))
     return landing, np.array([x.numpy().sum(dtype=np.float64) for x in fate])
@@ -159,7 +179,7 @@ def _fly(
 
 @dr.syntax
 def _chain(
-    scene: Any, projector: Device, uv: Any, power: Any, rng: Any, max_chain: Any
+    scene: Any, projector: Device, uv: Any, power: Any, rng: Any, max_chain: Any, media: Any = None
 ) -> tuple[_Landing, tuple[Any, ...]]:
     """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
     lanes = dr.width(power)
@@ -173,6 +193,8 @@ def _chain(
     length = primary.lead + dr.zeros(mi.Float, lanes)  # optical, from the projector to `previous`
     ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
     chain = dr.zeros(mi.UInt32, lanes)  # delta interactions so far
+    inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
+    crosses, crossed = mi.Bool(False), dr.zeros(mi.UInt32, lanes)  # boundaries of media: this one, those so far
     previous = mi.Point3f(primary.origin)
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
     direct, stored, absorbed, escaped, truncated = (dr.zeros(mi.Float, lanes) for _ in range(5))
@@ -185,6 +207,12 @@ def _chain(
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         escaped += dr.select(active & ~hit, flux, 0)
+        if dr.hint(media is not None, mode="scalar"):
+            crosses = hit & media.bounded_by(si, hit)
+            lost = dr.select(hit, flux * (1 - dr.exp(-inside.sigma_t * dr.norm(si.p - previous))), 0)
+            flux -= lost
+            direct += dr.select(chain == 0, lost, 0)
+            absorbed += dr.select(chain == 0, 0, lost)
         length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
         bsdf = si.bsdf(ray)
         scatters = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -210,14 +238,29 @@ def _chain(
         absorbed += dr.select(hit & ~(~mirrors & (chain == 0)), flux - remains - dr.select(lands, landing_flux, 0), 0)
         flux = dr.select(active, remains, flux)
         ior = dr.select(goes_on & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
-        chain += dr.select(goes_on, mi.UInt32(1), mi.UInt32(0))
+        chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))
         previous = dr.select(goes_on, si.p, previous)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        truncated += dr.select(goes_on & (chain >= max_chain), flux, 0)
-        active = goes_on & (chain < max_chain)
+        ray = straight_on(si, si.to_world(bs.wo))
+        if dr.hint(media is not None, mode="scalar"):
+            inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
+            crossed += dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
+        truncated += dr.select(goes_on & (chain + crossed >= max_chain), flux, 0)
+        active = goes_on & (chain + crossed < max_chain)
 
     landing = _Landing(position, direction, stored, uv.x, uv.y, length)
     return landing, (emitted, direct, stored, absorbed, escaped, truncated)
+
+
+def straight_on(si: Any, direction: Any) -> Any:
+    """The ray that leaves a surface point; it starts off the surface, but on its own line.
+
+    Mitsuba's `spawn_ray` moves the start along the normal, about 0.1 mm at 1 m, and so shifts oblique rays sideways: by
+    a twentieth of a projector pixel or more.
+    """
+    ray = si.spawn_ray(direction)
+    clearance = dr.norm(ray.o - si.p)
+    cosine = dr.abs(dr.dot(direction, si.n))
+    return mi.Ray3f(dr.select(cosine > GRAZING, si.p + direction * (clearance / cosine), ray.o), direction)
 
 
 def _columns(array: Any) -> np.ndarray:

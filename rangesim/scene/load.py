@@ -17,6 +17,7 @@ import numpy as np
 
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
+from rangesim.light_transport.medium import is_boundary, why_not_traced
 from rangesim.rig import Intrinsics
 from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of
@@ -59,7 +60,7 @@ def load_scene(
     ------
     FileFormatError
         Missing, broken or empty file, a scene without a perspective sensor, or with shapes that cannot be traced
-        (instances, participating media).
+        (instances; participating media other than homogeneous ones inside closed shapes with a `null` BSDF).
     ValueError
         Unknown material class, or one for a scene that names its own; no such sensor.
     """
@@ -84,7 +85,7 @@ def load_scene(
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
         mitsuba=loaded,
-        instances=tuple(Instance(s.id(), classes.get(s.id()) or material_class(s.bsdf())) for s in loaded.shapes()),
+        instances=tuple(Instance(s.id(), classes.get(s.id()) or _class_of(s)) for s in loaded.shapes()),
         camera=camera,
         T_world_camera=T_world_camera,
         working_distance_m=_median_depth(loaded, camera, T_world_camera),
@@ -152,10 +153,13 @@ def _check(scene: Any, ids: set[str], sensor: int, label: str) -> None:
             raise FileFormatError(
                 f"expected shapes of {label} as dictionaries, got a loaded object; give its dictionary."
             )
-        if shape.is_medium_transition():
-            raise FileFormatError(
-                f"{label}: shape {shape.id()!r} bounds a participating medium, which is not traced yet."
-            )
+        problem = why_not_traced(shape)
+        if problem is not None:
+            raise FileFormatError(f"{label}: shape {shape.id()!r} {problem}.")
+
+
+def _class_of(shape: Any) -> str:
+    return "translucent" if is_boundary(shape) else material_class(shape.bsdf())
 
 
 def _is_mesh(source: Source) -> bool:
