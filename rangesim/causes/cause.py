@@ -41,7 +41,7 @@ DEFINITIONS = {
     Cause.DEPTH_EDGE: "The pixel covers surfaces at different depths; it mixes them, or their codes contradict.",
     Cause.MOTION: "The surface moved while the frames were taken.",
     Cause.SPECULAR_AWAY: "A mirror or a glossy surface sent the light elsewhere.",
-    Cause.MIRRORED_GHOST: "The light of another surface, seen in a mirror or in a glossy one, was read.",
+    Cause.MIRRORED_GHOST: "The light of another surface, seen in a mirror or in a gloss, took the place of its own.",
     Cause.SEEN_THROUGH: "The light went through the surface; what was read, if anything, lies behind or within.",
     Cause.MULTIPATH: "Light that came by way of further surfaces disturbed the reading.",
     Cause.CAUSTIC: "Light that lit the surface off a mirror or through glass disturbed the reading.",

@@ -129,6 +129,11 @@ class Evidence:
         return np.asarray(self.budget.signal >= self.budget.needed)
 
     @cached_property
+    def enough_direct(self) -> np.ndarray:
+        """Direct light alone above the thresholds of the decoder."""
+        return np.asarray(self.signals.energy.direct >= self.budget.needed)
+
+    @cached_property
     def swamped(self) -> np.ndarray:
         """Without ambient light the projector's would do, and ambient light makes most of the noise."""
         b = self.budget

@@ -71,7 +71,7 @@ def rules(e: Evidence) -> list[Rule]:
     it, and a right reading without noise, it was the noise.
     """
     too_dark, disturbed = ~e.enough, e.optical & e.disturbed
-    glossy = e.is_a("glossy") & e.faint  # as far as the projector's light goes, a mirror
+    dim = e.is_a("glossy") & e.faint & ~e.enough_direct  # without the light that it reflects, it would be dark
     return [
         # ---- The detector, blinded
         (e.saturated | e.mostly(GLINT), Cause.GLINT),
@@ -84,9 +84,10 @@ def rules(e: Evidence) -> list[Rule]:
         (e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC),
         (e.unlit & e.enough & e.mostly(VIA_DELTA), Cause.MIRRORED_GHOST),
         (e.unlit, Cause.SHADOWED),
-        # ---- Too little of it comes back, or less than of other light
-        (glossy & (too_dark | e.missing | ~e.optical), Cause.SPECULAR_AWAY),
-        (glossy & disturbed, Cause.MIRRORED_GHOST),
+        # ---- Too little of it comes back
+        (e.is_a("glossy") & e.faint & ~e.optical, Cause.SPECULAR_AWAY),
+        (dim & (too_dark | e.missing), Cause.SPECULAR_AWAY),
+        (dim, Cause.MIRRORED_GHOST),
         (too_dark & e.swamped, Cause.AMBIENT),
         (too_dark, Cause.LOW_SIGNAL),
         # ---- The distance itself
