@@ -87,7 +87,8 @@ def trace(
     states = [mi.UInt64(x) for x in mi.sample_tea_32(settings.seed, pixel)]
     rng = mi.PCG32(1, *states)  # 1: no lane number mixed in
     choice = mi.PCG32(1, *reversed(states))  # of photons; apart, so that they change no other light
-    turns = mi.PCG32(1, *(mi.UInt64(x) for x in mi.sample_tea_32(pixel >> 4, settings.seed)))  # shared by neighbours
+    shared = mi.PCG32(1, *(mi.UInt64(x) for x in mi.sample_tea_32(pixel >> 4, settings.seed)))  # by neighbours
+    turns = shared.next_uint32()  # evenly spread numbers from here on
     width = mi.UInt32(camera.size.x)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     shift = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -172,7 +173,8 @@ def trace(
         if dr.hint(maps is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, throughput / mi.Float(settings.spp), length, first & ~link.lit)
             xi = [choice.next_float32() for _ in range(3)]
-            photon, brought = gather(maps, vertex, sample, xi, turns.next_float32(), may_connect & ~scatters)
+            turns += 2654435769  # 2^32 over the golden ratio
+            photon, brought = gather(maps, vertex, sample, xi, mi.Float(turns >> 8) * 2**-24, may_connect & ~scatters)
             channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, lane)
             caustic += radiance
 
