@@ -185,7 +185,7 @@ def levels_of(photons: Photons, maps: int, cell_m: float, irradiance: float) -> 
     key = _hash(*np.floor(photons.position / cell_m).astype(np.int64).T) & (OCCUPANCY_CELLS - 1)
     power = np.bincount(key, photons.flux, OCCUPANCY_CELLS)[key] / maps
     share = power / (irradiance * cell_m**2)
-    return np.asarray(sum((share < one.brightest).astype(np.int64) for one in LEVELS[1:]))
+    return np.count_nonzero([share < one.brightest for one in LEVELS], axis=0) - 1
 
 
 def _hash(x: Any, y: Any, z: Any) -> Any:
