@@ -28,6 +28,7 @@ _HOME = {
     "StructuredLight": "rangesim.sensors",
     "compare": "rangesim.comparison",
     "decode": "rangesim.decoding",
+    "explain": "rangesim.causes",
     "expose": "rangesim.exposure",
     "import_capture": "rangesim.capture_files",
     "load_calibration": "rangesim.calibration_files",

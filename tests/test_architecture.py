@@ -80,6 +80,7 @@ def test_the_public_surface_is_this() -> None:
         "StructuredLight",
         "compare",
         "decode",
+        "explain",
         "expose",
         "import_capture",
         "load_calibration",

@@ -17,7 +17,7 @@ import rangesim
 from rangesim import AmcwToF, Detector, DirectToF, IdealToF, Sensor, SpadDetector, StructuredLight, decode, expose
 from rangesim.causes import Cause, CauseMap, explain
 from rangesim.causes.cause import DEFINITIONS, TITLES
-from rangesim.causes.light_budget import light_budget
+from rangesim.causes.light_budget import light_budget, white_radiance
 from rangesim.causes.reading import single_path_depth
 from rangesim.response import (
     CAUSTIC,
@@ -139,6 +139,14 @@ def _power_at_threshold(rig: Any, sensor: Sensor, detector: Any, exposure_s: flo
     signals = plane_signals(replace(rig, projector_power_w=1.0), sensor, ambient=ambient)
     budget = light_budget(signals, expose(signals, sensor, detector, exposure_s))
     return float(np.median((budget.needed / budget.signal)[signals.truth.projector_visible]))
+
+
+def test_a_white_surface_returns_what_lambert_s_law_says() -> None:
+    """The plane of albedo 1/2 is half as bright, wherever it faces the projector squarely."""
+    rig = stereo_rig(baseline_m=0.0)
+    points = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]])
+    white = white_radiance(rig, points, np.array([[0.0, 0.0, -1.0]] * 2))
+    np.testing.assert_allclose(white, rig.projector_irradiance / np.pi / 4)
 
 
 @pytest.mark.parametrize("name", SENSORS)

@@ -2,6 +2,6 @@
 """Why a pixel has no reading, or a wrong one. Definitions and test scenes: docs/causes.md."""
 
 from rangesim.causes.cause import Cause, CauseMap
-from rangesim.causes.explain import explain
+from rangesim.causes.rules import explain
 
 __all__ = ["Cause", "CauseMap", "explain"]

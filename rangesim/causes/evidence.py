@@ -11,15 +11,14 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.causes.edges import depth_edges, error_off_edge
-from rangesim.causes.light_budget import LightBudget, light_budget
+from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
+from rangesim.causes.range_limits import is_beyond_range, is_wrong_period
 from rangesim.causes.reading import clean_depth, points_in_projector, single_path_depth
 from rangesim.comparison import neighbours
-from rangesim.decoding.amcw import MAX_RANGE_M
 from rangesim.range_image import RangeImage
-from rangesim.response import DIRECT, KINDS, MULTIPATH, SPEED_OF_LIGHT
-from rangesim.sensors import AmcwToF, DirectToF, IdealToF
+from rangesim.response import DIRECT, KINDS, MULTIPATH
+from rangesim.sensors import IdealToF
 from rangesim.signals import GroundTruth
-from rangesim.status import Status
 
 if TYPE_CHECKING:
     from rangesim.signals import Signals
@@ -142,11 +141,8 @@ class Evidence:
     @cached_property
     def faint(self) -> np.ndarray:
         """Less direct light than `FAINT` of what a white Lambertian surface would return in this place."""
-        rig, normal, point = self.signals.rig, self.truth.normal[self.failed], self._in_projector
-        distance = np.linalg.norm(point, axis=-1)
-        cosine = np.abs(((normal @ rig.T_world_projector[:3, :3]) * point).sum(axis=-1)) / distance
-        with np.errstate(divide="ignore"):
-            white = rig.projector_irradiance / np.pi * cosine * distance / point[:, 2] ** 3
+        rig, normal = self.signals.rig, self.truth.normal[self.failed] @ self.signals.rig.T_world_projector[:3, :3]
+        white = white_radiance(rig, self._in_projector, normal)
         return self._of_failed(self.signals.energy.direct[self.failed] < FAINT * white)
 
     @cached_property
@@ -178,24 +174,13 @@ class Evidence:
     @cached_property
     def beyond_range(self) -> np.ndarray:
         """Path length that a time-of-flight sensor takes for another, or has no bin for."""
-        sensor = self.capture.sensor
         length = self.truth.range_m[self.failed] + np.linalg.norm(self._in_projector, axis=-1)
-        if isinstance(sensor, AmcwToF):
-            return self._of_failed(length > 2 * min(sensor.unambiguous_range_m, MAX_RANGE_M))
-        if isinstance(sensor, DirectToF):
-            start, bins = sensor.start_s * SPEED_OF_LIGHT, sensor.bins * sensor.bin_s * SPEED_OF_LIGHT
-            return self._of_failed((length < start) | (length > start + bins))
-        return np.zeros(self.failed.shape, dtype=bool)
+        return self._of_failed(is_beyond_range(self.capture.sensor, length))
 
     @cached_property
     def wrong_period(self) -> np.ndarray:
         """Phases of several frequencies that agree on no distance, or on one that is off by half a period."""
-        sensor = self.capture.sensor
-        if not isinstance(sensor, AmcwToF):
-            return np.zeros(self.error.shape, dtype=bool)
-        half_period_m = SPEED_OF_LIGHT / (4 * max(sensor.modulation_hz))
-        off = np.abs(self.image.range_m - self.truth.range_m) > half_period_m
-        return np.asarray(np.isin(self.image.status, [Status.WRAPPED, Status.OUT_OF_RANGE]) | off)
+        return is_wrong_period(self.capture.sensor, self.image, self.truth)
 
     # ---- Helpers -------------------------------------------------------------------------------------
 

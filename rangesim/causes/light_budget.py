@@ -18,6 +18,7 @@ from rangesim.decoding.gray import CONTRAST_SIGMAS, RELATIVE_CONTRAST
 from rangesim.decoding.histogram import MIN_COUNTS, PEAK_SIGMAS, RELATIVE_PEAK
 from rangesim.decoding.phase_shift import MAX_PHASE_SIGMA, RELATIVE_MODULATION
 from rangesim.detector import Detector, PhotoDetector
+from rangesim.rig import Rig
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 
 if TYPE_CHECKING:
@@ -53,6 +54,17 @@ def light_budget(signals: Signals, capture: Capture) -> LightBudget:
     if capture.detector is None:
         return _noise_free(capture, signal, ambient)
     return _noisy(capture, capture.detector, signal, ambient)
+
+
+def white_radiance(rig: Rig, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(n,) float, W/m2/sr: what white Lambertian surfaces return of the projector's light.
+
+    points, normals : (n, 3) float, metres and unit, frame of the projector.
+    """
+    distance = np.linalg.norm(points, axis=-1)
+    cosine = np.abs((normals * points).sum(axis=-1)) / distance
+    with np.errstate(divide="ignore"):
+        return np.asarray(rig.projector_irradiance / np.pi * cosine * distance / points[:, 2] ** 3)
 
 
 def _noise_free(capture: Capture, signal: np.ndarray, ambient: np.ndarray) -> LightBudget:
