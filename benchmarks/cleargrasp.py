@@ -10,6 +10,7 @@ distance, with and without photons beyond glass. Figures on the objects, and on 
     median     signed error in z, millimetres; positive is too far
     quartiles  25 % and 75 % of the signed error, millimetres
 
+"Against what is behind" takes, on the simulated objects, the depth of the same table and wall without objects for the truth.
 The last line is JSON. Usage: python benchmarks/cleargrasp.py [--data DIR] [--width 320] [--spp 64]
 """
 
@@ -17,11 +18,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 
-from rangesim import AmcwToF, DirectToF, StructuredLight, decode, expose, load_scene, transport
+from rangesim import AmcwToF, DirectToF, Rig, StructuredLight, decode, expose, load_scene, transport
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "glassware.xml"
 DATA = Path("../shared/data/cleargrasp_d435")
@@ -33,6 +36,7 @@ SENSORS = {
     "direct ToF, 100 ps bins": DirectToF(bins=128, pulse_fwhm_s=200e-12),
 }
 BASELINE_M = 0.05
+TRANSPARENT = ("pet", "glass")
 Figures = dict[str, float]
 
 
@@ -61,6 +65,19 @@ def real(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return depth("transparent"), depth("opaque"), np.array(mi.Bitmap(str(folder / f"{name}-mask.png"))) > 0
 
 
+def depth_behind(rig: Rig) -> np.ndarray:
+    """(h, w) true z of the scene without its transparent objects."""
+    tree = ET.parse(SCENE)
+    root = tree.getroot()
+    for shape in root.findall("shape"):
+        if any(ref.get("id") in TRANSPARENT for ref in shape.findall("ref")):
+            root.remove(shape)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "empty.xml"
+        tree.write(path)
+        return transport(load_scene(path), rig, [], spp=1, photons=0).truth.z
+
+
 def show(label: str, on_glass: Figures, background: Figures) -> None:
     """One line of the table."""
     cells = [f"{f['lost']:>6.1%} {f['off']:>8.1%} {f['median_mm']:>+8.1f} {f['low_mm']:>+8.1f}..{f['high_mm']:<+8.1f}"
@@ -87,6 +104,7 @@ def main() -> None:
         print(f"no real data: there is no directory {args.data}; name it with --data")
 
     rig = scene.rig(BASELINE_M, width=args.width)
+    behind = depth_behind(rig)
     for light, settings in (("all light", {}), ("no light beyond glass", {"photons": 0, "glint": False})):
         signals = transport(scene, rig, list(SENSORS.values()), spp=args.spp, max_depth=12, **settings)
         truth = signals.truth
@@ -97,6 +115,9 @@ def main() -> None:
             key = f"{label}, {light}"
             result[key] = figures(z, truth.z, mask), figures(z, truth.z, ~mask)
             show(key, *result[key])
+            if light == "all light":
+                result[f"{key}, against what is behind"] = figures(z, behind, mask), result[key][1]
+                show("    against what is behind", *result[f"{key}, against what is behind"])
     print(json.dumps({k: {"glass": a, "background": b} for k, (a, b) in result.items()}))
 
 

@@ -157,7 +157,9 @@ def _trace(scene: Any, lamp: Lamp, guided: Cone, straight: Cone, corner: Any, sp
         ray = si.spawn_ray(si.to_world(wo))
         depth += 1
 
-        ends = ~(hit & (throughput > 0) & (depth < most))  # no roulette: its weights would be seen as single bright dots
+        ends = ~(
+            hit & (throughput > 0) & (depth < most)
+        )  # no roulette: its weights would be seen as single bright dots
         sample = dr.select(ends, sample + 1, sample)
         depth = dr.select(ends, 0, depth)
         throughput = dr.select(ends, 1, throughput)

@@ -149,7 +149,7 @@ def _ball(camera: tuple[float, float, float], target: tuple[float, float, float]
         rig=_rig(camera, target, fov_deg, (0.27, 0.0, 0.9), (0.0, 0.0, 0.1), 28.0),
         regions=straight if camera[0] < 0 else through,
         guide=Guide((0.0, 0.0, 0.15), 0.33),
-        aperture_radius_m=0.01,
+        aperture_radius_m=0.016,
         focus_m=0.66,  # conjugate to the floor by way of the ball
     )
 
