@@ -24,6 +24,7 @@ import mitsuba as mi
 from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
+from rangesim.light_transport.photons import straight_on
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
@@ -208,6 +209,7 @@ def trace(
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
+        ray.o = dr.select(is_delta, straight_on(si, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))

@@ -33,6 +33,7 @@ MOST_LOOKED_AT = 16
 OCCUPANCY_CELLS = 1 << 18
 PRIMES = (73856093, 19349663, 83492791)
 """Spatial hash (Teschner et al. 2003)."""
+ROW_FACTORS = (0x9E3779B3, 0x85EBCA75)
 
 
 class Level(NamedTuple):
@@ -92,7 +93,7 @@ class PhotonMaps:
         cell = np.floor((photons.position - origin) * (0.5 / radii[of_map])[:, None].astype(np.float32)).astype(
             np.int64
         )
-        key = of_map * (rows + columns) + (_hash(0, cell[:, 1], cell[:, 2]) & (rows - 1)) + cell[:, 0]
+        key = of_map * (rows + columns) + _row(cell[:, 1], cell[:, 2], rows - 1) + cell[:, 0]
         order = np.argsort(key, kind="stable")
         starts = np.cumsum(np.bincount(key + 1, minlength=len(radii) * (rows + columns) + 1))
         points = np.column_stack([photons.position, photons.flux])
@@ -166,7 +167,7 @@ class PhotonMaps:
         left, right = mi.UInt32(dr.maximum(x, 0)), mi.UInt32(dr.minimum(x + 1, last))
         starts, counts = [], []
         for dy, dz in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            row = of_map * self.stride + (_hash(0, y + dy, z + dz) & self.row_mask)
+            row = of_map * self.stride + _row(y + dy, z + dz, self.row_mask)
             begin = dr.gather(mi.UInt32, self.starts, row + left, active)
             end = dr.gather(mi.UInt32, self.starts, row + right + 1, active)
             starts.append(begin)
@@ -191,6 +192,15 @@ def levels_of(photons: Photons, maps: int, cell_m: float, irradiance: float) -> 
 def _hash(x: Any, y: Any, z: Any) -> Any:
     """Hash of integer cell coordinates; NumPy integers and Dr.Jit UInt32 alike give the same low 32 bits."""
     return (x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])
+
+
+def _row(y: Any, z: Any, mask: Any) -> Any:
+    """Where the cells of a row along x begin, in 0..mask; mask + 1 is a power of two of at least 16.
+
+    A point looks at two cells in each of four neighbouring rows and must count no photon twice, so these begin two
+    cells or more apart: their differences are 3, 5, 8 or 2 modulo 16.
+    """
+    return (y * ROW_FACTORS[0] + z * ROW_FACTORS[1]) & mask
 
 
 def _occupancy(position: np.ndarray, of_map: np.ndarray, radius_m: float) -> np.ndarray:

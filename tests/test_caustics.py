@@ -1,0 +1,443 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Caustic photons against closed forms: optical length, image sources, projector coordinates, density estimation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from delta_scenes import (
+    GLASS,
+    MIRROR,
+    ProjectorCoordinates,
+    SlabPath,
+    fresnel_conductor,
+    fresnel_dielectric,
+    matte,
+    rig_of,
+    scene_of,
+    slab,
+    transform,
+    wall,
+)
+
+import rangesim
+from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight, transport
+from rangesim.light_transport import photon_maps
+from rangesim.light_transport.backend import select_variant
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.photon_maps import ALPHA, Level, radii_of_maps
+from rangesim.light_transport.photons import PhotonBalance, Photons, trace_photons
+from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Images, LengthBins, LightPath
+
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
+CAMERA = Intrinsics.from_fov(64, 48, 20)
+PROJECTOR = Intrinsics.from_fov(160, 120, 26)
+NEAR, FAR, PLANE = 0.4, 0.45, 1.0
+"""Depths of the slab's faces and of the plane behind it, metres."""
+
+
+# ---- Optical length through a slab ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ShortPaths(DenseResponse):
+    """Radiance, and radiance times length, of paths below a length: light that did not bounce inside the slab."""
+
+    limit_m: float
+    channels: int = 2  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Any) -> list[Any]:
+        short = m.select(path.path_length_m < self.limit_m, 1.0, 0.0)
+        return [short, short * path.path_length_m]
+
+
+def across_of_pixels(camera: Intrinsics, reach: float) -> np.ndarray:
+    """(h, w, 8, 8) metres from the axis at which parts of the pixels see the depth `reach`, straight."""
+    offsets = (np.arange(8) + 0.5) / 8 - 0.5
+    pixels = camera.pixel_centres()[..., None, None, :] + np.stack(np.meshgrid(offsets, offsets), axis=-1)
+    return np.linalg.norm(camera.normalise(pixels), axis=-1) * reach
+
+
+def check_lengths(signals: rangesim.Signals, limit_m: float, expected: np.ndarray) -> None:
+    """The issue's law: exact to 1e-5 m; a pixel alone has the noise of where its light lands within it."""
+    radiance, moment = signals.channels[ShortPaths(limit_m)]
+    lengths = moment / radiance
+    assert abs((lengths - expected).mean()) < 1e-5
+    assert np.abs((lengths - expected).mean(axis=0)).max() < 1e-4
+    assert np.abs(lengths - expected).max() < 1e-3
+
+
+def test_the_length_of_light_through_a_slab_is_that_of_snell_s_law() -> None:
+    """The projector shines through the slab, the camera behind it sees the plane straight: photons alone."""
+    camera_at, limit_m = 0.6, 1.5
+    scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
+    rig = rig_of(CAMERA, Intrinsics.from_fov(160, 120, 12), camera_at=(0.0, 0.0, camera_at))
+    signals = transport(scene, rig, [ShortPaths(limit_m)], spp=64, max_depth=2, caustic_radius_m=4e-3)
+    across = across_of_pixels(CAMERA, PLANE - camera_at)
+    path = SlabPath(PLANE, FAR - NEAR)
+    light, optical = path.irradiance(across), path.length(path.tangent(across)) + np.hypot(across, PLANE - camera_at)
+    check_lengths(signals, limit_m, (light * optical).sum(axis=(2, 3)) / light.sum(axis=(2, 3)))
+    np.testing.assert_array_equal(signals.energy.caustic, signals.energy.projector)
+
+
+def test_the_length_of_sight_through_a_slab_is_that_of_snell_s_law() -> None:
+    """The camera looks through the slab, the projector behind it lights the plane evenly: no photons."""
+    lamp_at, limit_m = 0.6, 1.53
+    scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
+    rig = rig_of(CAMERA, Intrinsics.from_fov(160, 120, 60), (0.0, 0.0, lamp_at))
+    signals = transport(scene, rig, [ShortPaths(limit_m)], spp=64, max_depth=4)
+    t, path = across_of_pixels(CAMERA, 1.0), SlabPath(PLANE, FAR - NEAR)
+    across, light = path.across(t), path.transmittance(t)
+    optical = path.length(t) + np.hypot(across, PLANE - lamp_at)
+    check_lengths(signals, limit_m, (light * optical).sum(axis=(2, 3)) / light.sum(axis=(2, 3)))
+    assert signals.energy.via_delta.min() > 0
+    assert not signals.energy.direct.any()
+
+
+def test_light_and_sight_through_a_slab_and_what_time_of_flight_makes_of_it() -> None:
+    """A slab before the plane lets it appear (n - 1) d too far: camera and projector both look through it.
+
+    The depth leaves the camera its straight way through; photons may bounce in the slab, R^2 of them twice.
+    """
+    limit_m, frequency_hz, d = 2.15, 100e6, FAR - NEAR
+    ideal, amcw, bins = IdealToF(), AmcwToF((frequency_hz,), waveform="sine"), LengthBins(2.0, 0.025, 40)
+    scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
+    signals = transport(
+        scene,
+        rig_of(CAMERA, PROJECTOR),
+        [ideal, amcw, bins, ShortPaths(limit_m)],
+        spp=64,
+        max_depth=4,
+        photons=2_000_000,
+        glint=False,  # the projector's reflection in the slab, in the middle of the image
+        caustic_radius_m=4e-3,
+    )
+    way, t = SlabPath(PLANE, d), across_of_pixels(CAMERA, 1.0)
+    across = way.across(t)
+    paths = [SlabPath(PLANE, d, turns=k) for k in range(4)]
+    light = np.stack([p.irradiance(across) * way.transmittance(t) for p in paths])
+    length = np.stack([p.length(p.tangent(across)) + way.length(t) for p in paths])
+    check_lengths(signals, limit_m, (light * length)[0].sum(axis=(2, 3)) / light[0].sum(axis=(2, 3)))
+
+    # Each sensor's range is the closed form of its own mean over the bounces
+    expected = (light * length).sum(axis=(0, 3, 4)) / light.sum(axis=(0, 3, 4)) / 2
+    by_length = rangesim.decode(rangesim.expose(signals, ideal)).range_m
+    assert abs((by_length - expected).mean()) < 2e-5
+    phasor = (light * np.exp(2j * np.pi * frequency_hz * length / SPEED_OF_LIGHT)).sum(axis=(0, 3, 4))
+    from_phase = np.angle(phasor) % (2 * np.pi) * SPEED_OF_LIGHT / (4 * np.pi * frequency_hz)
+    by_phase = rangesim.decode(rangesim.expose(signals, amcw)).range_m
+    assert abs((by_phase - from_phase).mean()) < 2e-5
+    axis = (slice(22, 26), slice(30, 34))
+    assert (by_phase[axis] - PLANE).mean() == pytest.approx(0.5 * d, abs=4e-4)
+
+    # A histogram tells the bounces apart: 2 n d later
+    histogram = signals.channels[bins][:, 16:32, 24:40].mean(axis=(1, 2))
+    first = int((2 * (PLANE + 0.5 * d) - 2.0) / 0.025)
+    assert histogram.argmax() == first
+    second = histogram[first + 6] / histogram[first]
+    assert second == pytest.approx(fresnel_dielectric(0.0) ** 2, rel=0.25)
+    np.testing.assert_allclose(signals.channels[bins].sum(axis=0), signals.energy.projector, rtol=1e-5)
+
+
+# ---- Image sources ----------------------------------------------------------------------------------
+
+MIRROR_X = 0.3
+NARROW = Intrinsics.from_fov(160, 120, 20)
+PLASTIC = {"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0, "diffuse_reflectance": {"type": "spectrum", "value": 0.6}}
+
+
+def beside_a_mirror(bsdf: dict[str, Any], **parts: dict[str, Any]) -> tuple[Scene, Rig]:
+    """The projector shines on a mirror to its right alone, which sends the light to the plane z = 1."""
+    place = transform().translate([MIRROR_X, 0, 0.5]).rotate([0, 1, 0], -90).scale(0.45)
+    scene = scene_of(mirror={"type": "rectangle", "to_world": place, "bsdf": bsdf}, wall=wall(PLANE, matte()), **parts)
+    rig = rig_of(
+        Intrinsics.from_fov(64, 48, 12), NARROW, (0.0, 0.0, 0.0), (0.3, 0.0, 0.5), (-0.3, 0.0, 0.2), (-0.02, 0.0, 1.0)
+    )
+    return scene, rig
+
+
+def points_on_the_plane(rig: Rig) -> np.ndarray:
+    """(h, w, 3) where the rays through pixel centres meet z = PLANE, world."""
+    rays = rig.camera.directions(rig.camera.pixel_centres()) @ rig.T_world_camera[:3, :3].T
+    origin = rig.T_world_camera[:3, 3]
+    return np.asarray(origin + rays * ((PLANE - origin[2]) / rays[..., 2])[..., None])
+
+
+def image_source(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Irradiance of the plane by the projector's mirror image (a perfect mirror's), the (u, v) there, and the
+    direction (world) in which the light left the projector."""
+    mirrored = points_on_the_plane(rig) * [-1, 1, 1] + [2 * MIRROR_X, 0, 0]
+    local = mirrored @ rig.T_world_projector[:3, :3]  # the projector stands in the origin
+    irradiance = rig.projector_irradiance * mirrored[..., 2] / local[..., 2] ** 3
+    return irradiance, rig.projector.project(local), mirrored / np.linalg.norm(mirrored, axis=-1, keepdims=True)
+
+
+def check_image_source(scene: Scene, rig: Rig, factor: Any) -> None:
+    """The caustic is `factor` (of the direction in which light left) times that of the image source."""
+    coordinates = ProjectorCoordinates()
+    signals = transport(scene, rig, [coordinates], spp=64, max_depth=2, caustic_radius_m=4e-3)
+    irradiance, uv, direction = image_source(rig)
+    ratio = signals.energy.caustic * np.pi / 0.5 / (irradiance * factor(direction))
+    assert ratio.mean() == pytest.approx(1, abs=0.004)
+    blocks = ratio.reshape(6, 8, 8, 8).mean(axis=(1, 3))
+    assert np.abs(blocks - 1).max() < 0.03
+    white, u, v = signals.channels[coordinates]
+    np.testing.assert_allclose(white, signals.energy.caustic, rtol=1e-5)
+    off = np.stack([u / white, v / white], axis=-1) - uv
+    assert np.abs(off.mean(axis=(0, 1))).max() < 0.02
+    assert np.abs(off).max() < 0.5
+
+
+def test_light_off_a_flat_mirror_is_that_of_the_image_source() -> None:
+    check_image_source(*beside_a_mirror(MIRROR), lambda d: fresnel_conductor(d[..., 0]))
+
+
+def test_light_off_polished_plastic_is_fresnel_s_share_of_the_image_source() -> None:
+    check_image_source(*beside_a_mirror(PLASTIC), lambda d: fresnel_dielectric(np.sqrt(1 - d[..., 0] ** 2)))
+
+
+def test_light_through_a_pane_and_off_plastic_lands_and_goes_on() -> None:
+    """On the plastic a photon that came through glass both lands and goes on; shares of either must add up."""
+    pane = wall(0.1, {**GLASS, "type": "thindielectric"}, 0.19)
+    scene, rig = beside_a_mirror(PLASTIC, pane=pane)
+    check_image_source(
+        scene,
+        rig,
+        lambda d: fresnel_dielectric(np.sqrt(1 - d[..., 0] ** 2)) * pane_transmittance(np.sqrt(1 - d[..., 2] ** 2)),
+    )
+
+
+def pane_transmittance(sine: np.ndarray) -> np.ndarray:
+    r = fresnel_dielectric(sine)
+    return np.asarray((1 - r) / (1 + r))
+
+
+# ---- Panes and holes --------------------------------------------------------------------------------
+
+
+def before_the_projector(**parts: dict[str, Any]) -> rangesim.Signals:
+    """A plane lit through what is put before the projector; the camera sees it straight."""
+    rig = rig_of(CAMERA, PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+    scene = scene_of(wall=wall(PLANE, matte()), **parts)
+    return transport(scene, rig, [ProjectorCoordinates()], spp=64, max_depth=2, caustic_radius_m=4e-3)
+
+
+def test_a_thin_pane_dims_the_light_and_does_not_shift_it() -> None:
+    free = before_the_projector()
+    pane = before_the_projector(pane=wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3))
+    points = points_on_the_plane(free.rig) - [0.3, 0.0, 0.0]
+    sine = np.linalg.norm(points[..., :2], axis=-1) / np.linalg.norm(points, axis=-1)
+    ratio = pane.energy.caustic / free.energy.direct / pane_transmittance(sine)
+    assert ratio.mean() == pytest.approx(1, abs=0.003)
+    assert not pane.energy.direct.any()
+    (a, *uv_a), (b, *uv_b) = (s.channels[ProjectorCoordinates()] for s in (free, pane))
+    for x, y in zip(uv_a, uv_b, strict=True):
+        assert abs((x / a - y / b).mean()) < 0.01
+
+
+def test_light_through_a_cut_out_hole_arrives_undimmed_and_counts_as_caustic() -> None:
+    free = before_the_projector()
+    hole = {"type": "mask", "opacity": 0.0, "bsdf": matte()}
+    through = before_the_projector(hole=wall(0.2, hole, 0.15, x=0.3))
+    assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(1, abs=0.003)
+    np.testing.assert_array_equal(through.energy.caustic, through.energy.projector)
+
+
+def test_half_a_hole_passes_half_the_light() -> None:
+    free = before_the_projector()
+    veil = {"type": "mask", "opacity": 0.5, "bsdf": matte()}
+    through = before_the_projector(hole=wall(0.2, veil, 0.15, x=0.3))
+    assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(0.5, abs=0.01)
+
+
+# ---- Density estimation -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("photons", "maps", "radius_m"), [(60, 4, 0.3), (300, 4, 0.2), (3000, 16, 0.1)])
+@pytest.mark.parametrize("most_looked_at", [16, 10_000])
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.36, 0.48, 0.8)])
+def test_a_gather_is_the_sum_over_all_photons_of_its_map(
+    monkeypatch: pytest.MonkeyPatch,
+    photons: int,
+    maps: int,
+    radius_m: float,
+    most_looked_at: int,
+    normal: tuple[float, float, float],
+) -> None:
+    """Epanechnikov's kernel over photons on a plane, by brute force; where a gather looks at some of them, its mean."""
+    import drjit as dr
+    import mitsuba as mi
+
+    select_variant()
+    monkeypatch.setattr(photon_maps, "MOST_LOOKED_AT", most_looked_at)
+    rng = np.random.default_rng(1)
+
+    def on_the_plane(n: int) -> np.ndarray:
+        p = rng.uniform(-1, 1, (n, 3))
+        return np.asarray((p - np.outer(p @ normal, normal)).astype(np.float32))
+
+    position, of_map, nothing = on_the_plane(photons), np.arange(photons) % maps, np.zeros(photons, np.float32)
+    flux = rng.uniform(0.5, 1.5, photons).astype(np.float32)
+    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, of_map, PhotonBalance(0, 0, 0, 0, 0, 0))
+    built = photon_maps.PhotonMaps(landed, maps, radius_m, irradiance=1e-9)  # all brighter than the first level
+    points, repeats = on_the_plane(1000), 64
+    sample = np.arange(1000) % maps
+    many = mi.UInt32(np.tile(sample, repeats).astype(np.uint32))
+    uniform = [mi.Float(rng.random(1000 * repeats).astype(np.float32)) for _ in range(2)]
+    active = dr.full(mi.Bool, True, 1000 * repeats)
+    found = built.gather(0, mi.Point3f(np.tile(points, (repeats, 1)).T), mi.Normal3f(*normal), many, *uniform, active)
+    gathered = found.irradiance.numpy().reshape(repeats, 1000)
+
+    radii = radii_of_maps(radius_m, maps)[sample][:, None]
+    square = ((points[:, None].astype(float) - position[None]) ** 2).sum(axis=-1)
+    kernel = np.maximum(1 - square / radii**2, 0) * 2 / (np.pi * radii**2) * (of_map[None] == sample[:, None])
+    expected = kernel @ flux
+    if most_looked_at > photons:
+        np.testing.assert_allclose(gathered, np.broadcast_to(expected, gathered.shape), atol=1e-4 * expected.max())
+    error = gathered.mean(axis=1).std(ddof=1) / np.sqrt(repeats)
+    assert abs(gathered.mean() - expected.mean()) < 5 * error + 1e-4 * expected.mean()
+
+
+def ball_over_a_plane() -> tuple[Scene, Rig]:
+    """A camera under a glass ball sees all of the plane that it lights, most of it faintly, and nothing else."""
+    ball = {"type": "sphere", "center": [0.0, 0.0, 0.5], "radius": 0.06, "bsdf": GLASS}
+    scene = scene_of(ball=ball, wall=wall(0.62, matte(), 3.0))
+    rig = rig_of(Intrinsics.from_fov(64, 64, 110), Intrinsics.from_fov(160, 160, 20), camera_at=(0.0, 0.0, 0.57))
+    return scene, rig
+
+
+def received_w(energy: rangesim.EnergySplit, rig: Rig) -> float:
+    """Flux of the caustic on the plane that the camera of `ball_over_a_plane` sees."""
+    return float(energy.caustic.sum(dtype=float)) * np.pi / 0.5 * (0.05 / rig.camera.fx) ** 2
+
+
+def test_radii_follow_the_law_of_progressive_photon_mapping() -> None:
+    radii = radii_of_maps(0.01, 64)
+    assert radii[0] == 0.01
+    i = np.arange(1, 64)
+    np.testing.assert_allclose(radii[1:] ** 2, radii[:-1] ** 2 * (i + ALPHA) / (i + 1))
+
+
+@pytest.mark.parametrize(("photons", "radius_m"), [(50_000, 1e-3), (400_000, 1e-3), (400_000, 3e-3)])
+def test_flux_depends_on_neither_radius_nor_number_of_photons(photons: int, radius_m: float) -> None:
+    scene, rig = ball_over_a_plane()
+    landed = trace_photons(scene.mitsuba, Device.projector(rig), 1.0, 400_000, 16, 3, 2 << 30)
+    seen = np.abs(landed.position[:, :2]).max(axis=1) < 0.05 * np.tan(np.radians(55)) - 0.01
+    rays = rig.camera.normalise(rig.camera.pixel_centres()) * 0.05
+    expected = landed.flux[seen].sum(dtype=float) / 16
+    energy = transport(scene, rig, [], spp=64, max_depth=2, photons=photons, caustic_radius_m=radius_m).energy
+    inside = np.abs(rays).max(axis=-1) < 0.05 * np.tan(np.radians(55)) - 0.01
+    received = float(energy.caustic[inside].sum(dtype=float)) * np.pi / 0.5 * (0.05 / rig.camera.fx) ** 2
+    assert received == pytest.approx(expected, rel=0.01)
+
+
+def test_levels_change_the_noise_and_not_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rangesim.light_transport import loop
+
+    scene, rig = ball_over_a_plane()
+
+    def render(seed: int) -> np.ndarray:
+        energy = transport(scene, rig, [], spp=32, max_depth=2, photons=200_000, seed=seed).energy
+        return energy.caustic.reshape(4, 16, 4, 16).mean(axis=(1, 3))
+
+    with_levels = np.stack([render(s) for s in range(6)])
+    for module in (photon_maps, loop):
+        monkeypatch.setattr(module, "LEVELS", (Level(np.inf, 1.0, 1.0),))
+    without = np.stack([render(s) for s in range(6)])
+    error = np.sqrt((with_levels.var(axis=0, ddof=1) + without.var(axis=0, ddof=1)) / 6)
+    difference = with_levels.mean(axis=0) - without.mean(axis=0)
+    assert (np.abs(difference) < 5 * error + 0.01 * without.mean(axis=0)).all()
+    assert with_levels.mean() == pytest.approx(without.mean(), rel=0.005)
+
+
+def test_more_photons_make_less_noise() -> None:
+    scene, rig = beside_a_mirror(MIRROR)
+    noise = []
+    for photons in (20_000, 320_000):
+        images = [
+            transport(
+                scene, rig, [], spp=16, max_depth=2, photons=photons, caustic_radius_m=2e-3, seed=s
+            ).energy.caustic
+            for s in range(3)
+        ]
+        noise.append(np.std(images, axis=0, ddof=1).mean() / np.mean(images))
+    assert noise[0] / noise[1] > 2.5  # 4 by Poisson; strata and the pixels' own sampling change it a little
+
+
+# ---- Same bytes -------------------------------------------------------------------------------------
+
+
+def all_sensors() -> list[rangesim.Sensor]:
+    return [StructuredLight(axes=("columns",)), AmcwToF((20e6,)), rangesim.DirectToF(bins=32, bin_s=800e-12)]
+
+
+def test_caustics_leave_all_other_light_as_it_was() -> None:
+    scene = rangesim.load_scene(SCENES / "tabletop.xml")
+    rig = scene.rig(width=64, height=48)
+    on, off = (transport(scene, rig, all_sensors(), spp=8, photons=n, glint=False) for n in (50_000, 0))
+    for name in ("direct", "multipath", "via_delta", "ambient", "glint"):
+        np.testing.assert_array_equal(getattr(on.energy, name), getattr(off.energy, name))
+    assert on.energy.caustic.any()
+    assert not off.energy.caustic.any()
+
+
+def test_without_glass_and_mirrors_photons_and_glint_change_nothing() -> None:
+    scene = rangesim.load_scene(SCENES / "matte.xml")
+    rig = scene.rig(width=64, height=48)
+    on = transport(scene, rig, all_sensors(), spp=4)
+    off = transport(scene, rig, all_sensors(), spp=4, photons=0, glint=False)
+    assert not on.energy.caustic.any()
+    for response, values in on.channels.items():
+        np.testing.assert_array_equal(values, off.channels[response])
+
+
+def test_chunks_of_photons_and_tiles_change_no_byte() -> None:
+    scene = rangesim.load_scene(SCENES / "tabletop.xml")
+    rig = scene.rig(width=64, height=48)
+    large, small = (
+        trace_photons(scene.mitsuba, Device.projector(rig), 1.0, 100_001, 7, 5, memory) for memory in (2 << 30, 999_937)
+    )
+    for name in ("position", "direction", "flux", "u", "v", "length_m", "map"):
+        np.testing.assert_array_equal(getattr(large, name), getattr(small, name))
+    images = [
+        transport(scene, rig, all_sensors(), spp=4, photons=50_000, memory_bytes=memory)
+        for memory in (2 << 30, 999_937)
+    ]
+    for response, values in images[0].channels.items():
+        np.testing.assert_array_equal(values, images[1].channels[response])
+
+
+def test_threads_change_no_byte() -> None:
+    import drjit as dr
+
+    scene = rangesim.load_scene(SCENES / "tabletop.xml")
+    rig = scene.rig(width=64, height=48)
+    before = dr.thread_count()
+    images = []
+    for threads in (1, 2):
+        dr.set_thread_count(threads)
+        images.append(transport(scene, rig, all_sensors(), spp=4, photons=50_000))
+    dr.set_thread_count(before)
+    for response, values in images[0].channels.items():
+        np.testing.assert_array_equal(values, images[1].channels[response])
+
+
+# ---- Responses --------------------------------------------------------------------------------------
+
+
+def test_every_response_sees_the_caustics() -> None:
+    scene = rangesim.load_scene(SCENES / "tabletop.xml")
+    rig = scene.rig(width=64, height=48)
+    light = StructuredLight(axes=("columns",), code="gray")
+    images, bins = Images(np.ones((1, 800, 1280), np.float32)), LengthBins(0.0, 0.5, 60)
+    signals = transport(scene, rig, [light, images, bins], spp=8)
+    white = signals.energy.projector
+    assert (signals.energy.caustic > 0.5 * white).any()
+    frames = signals.frames(light, ambient_transmission=0.0)
+    np.testing.assert_allclose(frames[0:-2:2] + frames[1:-2:2], np.broadcast_to(white, (11, 48, 64)), rtol=1e-4)
+    np.testing.assert_allclose(signals.channels[images][0], white, rtol=1e-4)
+    np.testing.assert_allclose(signals.channels[bins].sum(axis=0), white, rtol=1e-4)

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Light through glass and off mirrors is neither lost nor made: balances, white furnaces, closed boxes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from delta_scenes import (
+    GLASS,
+    MIRROR,
+    SlabPath,
+    fresnel_conductor,
+    fresnel_dielectric,
+    matte,
+    rig_of,
+    scene_of,
+    slab,
+    transform,
+    wall,
+)
+
+from rangesim import Intrinsics, Rig, Scene, look_at, transport
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.photons import Photons, trace_photons
+
+POWER_W = 2.0
+PROJECTOR = Intrinsics.from_fov(160, 120, 40)
+CAMERA = Intrinsics.from_fov(64, 48, 40)
+
+
+def photons_of(scene: Scene, rig: Rig, photons: int = 200_000, maps: int = 4, seed: int = 1) -> Photons:
+    projector = Device.projector(rig)
+    return trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, 2 << 30)
+
+
+def mean_over_the_field(function: Any) -> float:
+    """Mean over the projector's pixels, all equally bright, of a function of the tangent to the axis."""
+    rays = PROJECTOR.normalise(PROJECTOR.pixel_centres())
+    return float(function(np.linalg.norm(rays, axis=-1)).mean())
+
+
+def check_identity(photons: Photons, maps: int = 4) -> None:
+    b = photons.balance
+    assert b.direct + b.stored + b.absorbed + b.escaped + b.truncated == pytest.approx(b.emitted, rel=1e-6)
+    assert b.emitted == pytest.approx(POWER_W, rel=2e-3)
+    assert photons.flux.sum(dtype=float) / maps == pytest.approx(b.stored, rel=1e-5)
+
+
+# ---- Balance of the photons -------------------------------------------------------------------------
+
+
+def test_a_mirror_absorbs_one_minus_its_reflectance() -> None:
+    """It covers the half x > 0 of the field; what it reflects escapes, what passes it lands directly."""
+    scene = scene_of(mirror=wall(1.0, MIRROR, 5.0, x=5.0), wall=wall(2.0, matte()))
+    rig = rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W)
+    photons = photons_of(scene, rig)
+    check_identity(photons)
+    reflected = mean_over_the_field(lambda t: fresnel_conductor(1 / np.hypot(1, t)))
+    assert photons.balance.absorbed == pytest.approx(POWER_W / 2 * (1 - reflected), rel=0.01)
+    assert photons.balance.direct == pytest.approx(POWER_W / 2, rel=0.01)
+    # The wall is 10 m wide, so none of the reflected light comes back
+    assert photons.balance.escaped == pytest.approx(POWER_W / 2 * reflected, rel=0.01)
+    assert photons.balance.stored == 0
+
+
+@pytest.mark.parametrize("kind", ["dielectric", "thindielectric"])
+def test_a_slab_passes_one_minus_r_over_one_plus_r(kind: str) -> None:
+    pane = slab(0.3, 0.35) if kind == "dielectric" else wall(0.3, {**GLASS, "type": "thindielectric"})
+    scene = scene_of(pane=pane, wall=wall(1.0, matte()))
+    photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
+    check_identity(photons)
+
+    def passed(t: Any) -> Any:
+        r = fresnel_dielectric(t / np.hypot(1, t))
+        return (1 - r) / (1 + r)
+
+    expected = mean_over_the_field(passed)
+    assert photons.balance.stored == pytest.approx(POWER_W * expected, rel=2e-3)
+    assert photons.balance.escaped == pytest.approx(POWER_W * (1 - expected), rel=0.02)
+    assert photons.balance.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
+    assert photons.balance.direct == 0
+
+
+def test_polished_plastic_scatters_what_it_does_not_mirror() -> None:
+    """Its coat sends F away; the rest is next-event estimation's, which the balance counts as absorbed."""
+    plastic = {
+        "type": "plastic",
+        "int_ior": 1.5,
+        "ext_ior": 1.0,
+        "diffuse_reflectance": {"type": "spectrum", "value": 0.6},
+    }
+    scene = scene_of(wall=wall(1.0, plastic))
+    photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
+    check_identity(photons)
+    mirrored = mean_over_the_field(lambda t: fresnel_dielectric(t / np.hypot(1, t)))
+    assert photons.balance.escaped == pytest.approx(POWER_W * mirrored, rel=0.01)
+    assert photons.balance.stored == photons.balance.direct == 0
+
+
+def test_in_a_closed_box_all_light_lands_or_is_absorbed() -> None:
+    box = {"type": "cube", "to_world": transform().scale(2.0), "bsdf": matte()}
+    ball = {"type": "sphere", "center": [0.0, 0.0, 1.0], "radius": 0.2, "bsdf": GLASS}
+    scene = scene_of(box=box, ball=ball)
+    photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
+    check_identity(photons)
+    assert photons.balance.escaped == 0
+    assert photons.balance.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
+    rays = PROJECTOR.directions(PROJECTOR.pixel_centres())
+    meets = (
+        np.linalg.norm(rays[..., :2], axis=-1) / np.linalg.norm(rays, axis=-1) < 0.2
+    )  # sine of the ball's half angle
+    assert photons.balance.stored + photons.balance.truncated == pytest.approx(POWER_W * meets.mean(), rel=0.005)
+    assert photons.balance.truncated < 1e-4 * POWER_W
+
+
+# ---- Closed boxes and white furnaces ----------------------------------------------------------------
+
+
+def test_what_a_plane_receives_behind_a_slab_is_what_the_slab_passes() -> None:
+    """The camera stands behind the slab and sees all of the lit part of the plane."""
+    scene = scene_of(slab=slab(0.2, 0.25), wall=wall(1.0, matte(0.5)))
+    camera = Intrinsics.from_fov(96, 72, 80)
+    rig = rig_of(camera, PROJECTOR, camera_at=(0.0, 0.0, 0.5), projector_power_w=POWER_W)
+    energy = transport(scene, rig, [], spp=32, max_depth=2, caustic_radius_m=0.01).energy
+    area_of_pixel = (0.5 / camera.fx) ** 2
+    received = (energy.caustic * np.pi / 0.5).sum(dtype=float) * area_of_pixel
+
+    def passed(t: Any) -> Any:
+        r = fresnel_dielectric(t / np.hypot(1, t))
+        return (1 - r) / (1 + r)
+
+    assert received == pytest.approx(POWER_W * mean_over_the_field(passed), rel=0.003)
+    assert not energy.direct.any()
+    # ...and where it lands is given by Snell's law
+    points = rig.camera.normalise(rig.camera.pixel_centres()) * 0.5
+    across = np.linalg.norm(points, axis=-1)
+    expected = sum(SlabPath(1.0, 0.05, turns=k).irradiance(across) for k in range(3)) * rig.projector_irradiance
+    well_inside = (np.abs(points) < [0.30, 0.22]).all(axis=-1)
+    mean = (energy.caustic * np.pi / 0.5)[well_inside] / expected[well_inside]
+    assert mean.mean() == pytest.approx(1.0, abs=0.005)
+
+
+def integrating_sphere(*parts: dict[str, Any], albedo: float) -> float:
+    """Flux that the wall of a closed diffuse sphere receives, as six cameras in its middle see it."""
+    radius = 2.0
+    sphere = {"type": "sphere", "radius": radius, "bsdf": matte(albedo)}
+    scene = scene_of(sphere=sphere, **{f"part_{i}": part for i, part in enumerate(parts)})
+    camera = Intrinsics.from_fov(24, 24, 90)
+    rays = camera.directions(camera.pixel_centres())
+    solid_angle = np.linalg.norm(rays, axis=-1) ** -3 / (camera.fx * camera.fy)
+    received, seen = 0.0, 0.0
+    T_world_projector = look_at((0.6, -0.9, -0.8), (0.6, 0.2, 0.4), DOWN_Z)
+    for ahead, up in ((x, u) for x, u in FACES):
+        T_world_camera = look_at((0, 0, 0), ahead, up)
+        rig = Rig(camera, Intrinsics.from_fov(64, 64, 30), T_world_camera,
+                  np.linalg.inv(T_world_camera) @ T_world_projector, projector_power_w=POWER_W)  # fmt: skip
+        signals = transport(scene, rig, [], spp=96, max_depth=40, rr_depth=40, glint=False, caustic_radius_m=0.05)
+        wall_seen = signals.truth.instance == 0
+        radiance = signals.energy.projector
+        received += float((radiance * solid_angle)[wall_seen].sum()) * np.pi / albedo * radius**2
+        seen += float(solid_angle[wall_seen].sum())
+    indirect = POWER_W * albedo / (1 - albedo) / (4 * np.pi)  # per solid angle, uniform
+    return received + indirect * (4 * np.pi - seen)
+
+
+FACES = [((1, 0, 0), (0, 0, 1)), ((-1, 0, 0), (0, 0, 1)), ((0, 1, 0), (0, 0, 1)), ((0, -1, 0), (0, 0, 1)),
+         ((0, 0, 1), (0, 1, 0)), ((0, 0, -1), (0, 1, 0))]  # fmt: skip
+DOWN_Z = (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("inside", ["nothing", "glass ball", "cut-out"])
+def test_an_integrating_sphere_keeps_its_flux_with_lossless_glass_inside(inside: str) -> None:
+    """The wall receives Phi (1 + rho + rho^2 + ...), whatever lossless delta surfaces the light meets on its way."""
+    at = [0.6, 0.1, 0.3]
+    parts = {
+        "nothing": [],
+        "glass ball": [{"type": "sphere", "center": at, "radius": 0.25, "bsdf": GLASS}],
+        "cut-out": [
+            {"type": "sphere", "center": at, "radius": 0.25, "bsdf": {"type": "mask", "opacity": 0.0, "b": matte()}}
+        ],
+    }[inside]
+    received = integrating_sphere(*parts, albedo=0.5)
+    assert received == pytest.approx(POWER_W / (1 - 0.5), rel=0.01)
+
+
+def test_a_white_furnace_hides_lossless_glass() -> None:
+    """Under light of the same radiance from everywhere, glass and thin panes look as bright as what surrounds them."""
+    scene = scene_of(
+        sky={"type": "constant", "radiance": {"type": "spectrum", "value": 1.0}},
+        ball={"type": "sphere", "center": [0.0, 0.0, 1.0], "radius": 0.2, "bsdf": GLASS},
+        slab=slab(1.5, 1.6, 0.3),
+        pane=wall(0.5, {**GLASS, "type": "thindielectric"}, 0.1),
+    )
+    rig = rig_of(CAMERA, PROJECTOR)
+    ambient = transport(scene, rig, [], spp=64, max_depth=60, rr_depth=60).energy.ambient
+    np.testing.assert_allclose(ambient, 1.0, atol=2e-3)
