@@ -4,16 +4,16 @@
     make     computes the references (about 8 minutes on two cores) and writes benchmarks/references/*.npz
     compare  renders the same cases with `transport` and compares (the default)
 
-Two references. `ptracer` is Mitsuba's particle tracer with its `projector` plugin: it is the reference for all that the
-camera sees directly. `path` is a plain path tracer whose projector is a disc of finite size (`finite_aperture.py`): it is
-the reference for what the camera sees through glass or off a mirror; its means are extrapolated to a point, from
+Two references. `ptracer` is Mitsuba's particle tracer with its `projector` plugin: it is the reference for all that
+the camera sees directly. `path` is a plain path tracer whose projector is a disc of finite size (`finite_aperture.py`): it
+is the reference for what the camera sees through glass or off a mirror; its means are extrapolated to a point, from
 two radii, a and 2 a. Where both apply, for caustics that the camera sees directly, the two are compared with each
 other. The last line of `compare` is JSON:
 
     max_region_error        largest relative error of the mean radiance of white over the marked regions and references
     min_stripe_correlation  smallest correlation of a stripe image with its reference within a marked region
 
-Usage: python benchmarks/caustic_references.py [make | compare] [--spp 2048] [--photons N] [--radius-m R] [--scale 1]
+Usage: python benchmarks/caustic_references.py [make | compare] [--spp 2048] [--photons N] [--radius-scale 1] [--scale 1]
 """
 
 from __future__ import annotations
@@ -140,16 +140,17 @@ def _file(case_name: str, name: str) -> Path:
     return HERE / f"{case_name.replace(', ', '_').replace(' ', '_')}-{name}.npz"
 
 
-def compare(spp: int, photons: int | None, radius_m: float | None) -> dict[str, float]:
+def compare(spp: int, photons: int, radius_scale: float) -> dict[str, float]:
     """Print the table and return the figures of the last line."""
     light, frames = stripes()
     errors, correlations = [], []
     print(f"{'case':<22} {'region':<30} {'reference':<9} {'error':>7} {'+-':>6}  correlation: white, columns, rows")
     for case_name, case in cases().items():
-        more = {} if photons is None else {"photons": photons}
+        radius_m = case.gather_m * radius_scale
         signals = transport(
-            case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, caustic_radius_m=radius_m, **more
-        )
+            case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, photons=photons,
+            caustic_radius_m=radius_m,
+        )  # fmt: skip
         ours = signals.frames(light)[frames]
         references = {name: load(case_name, name) for name in METHODS}
         for name, reference in references.items():
@@ -183,14 +184,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", choices=("make", "compare"), default="compare")
     parser.add_argument("--spp", type=int, default=2048)
-    parser.add_argument("--photons", type=int, help="default: that of transport")
-    parser.add_argument("--radius-m", type=float, help="of the gathering of photons; default: that of transport")
+    parser.add_argument("--photons", type=int, default=8_000_000)
+    parser.add_argument("--radius-scale", type=float, default=1.0, help="times the radius of each case")
     parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
     args = parser.parse_args()
     if args.what == "make":
         make(args.scale)
     else:
-        print(json.dumps(compare(args.spp, args.photons, args.radius_m)))
+        print(json.dumps(compare(args.spp, args.photons, args.radius_scale)))
 
 
 if __name__ == "__main__":

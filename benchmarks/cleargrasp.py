@@ -10,7 +10,7 @@ distance, with and without photons beyond glass. Figures on the objects, and on 
     median     signed error in z, millimetres; positive is too far
     quartiles  25 % and 75 % of the signed error, millimetres
 
-"Against what is behind" takes, on the simulated objects, the depth of the same table and wall without objects for the truth.
+"Against what is behind" takes, on the simulated objects, the depth of table and wall without the objects for the truth.
 The last line is JSON. Usage: python benchmarks/cleargrasp.py [--data DIR] [--width 320] [--spp 64]
 """
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plain path tracer that knows the projector as a disc of finite size: slow, simple, and independent of `rangesim`.
 
-Camera paths scatter until a segment happens to cross the disc from its front. The disc blocks nothing and has the flux of
-the pinhole it replaces: where the irradiance of white at z = 1 m is E, light that leaves it at the angle theta to the axis
-has the radiance E / (pi a^2 cos^4 theta). It is focused at a distance where blur matters least. Nothing connects
-to the projector and no photon is stored, so the disc is found through glass and off mirrors like anywhere
-else, and the only bias is the blur of the aperture, of order a^2.
+Camera paths scatter until a segment happens to cross the disc from its front. The disc blocks nothing and has the
+flux of the pinhole it replaces: where the irradiance of white at z = 1 m is E, light that leaves it at the angle
+theta to the axis has the radiance E / (pi a^2 cos^4 theta). It is focused at a distance where blur matters least.
+Nothing connects to the projector and no photon is stored, so the disc is found through glass and off mirrors like
+anywhere else, and the only bias is the blur of the aperture, of order a^2.
 
 Directions at matte surfaces come from a mixture of the BSDF, the case's cone (`Guide`) and a narrow cone around the
 projector; all densities are known, so the cones change the noise and not the mean.

@@ -14,6 +14,8 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from rangesim import Intrinsics, Rig, Scene, load_scene, look_at
+from rangesim.light_transport.backend import select_variant
+from rangesim.scene.camera import MITSUBA_FROM_OPENCV
 
 CAMERA_PIXELS = (96, 72)
 PROJECTOR_PIXELS = (64, 40)
@@ -47,7 +49,8 @@ class Guide:
 @dataclass(frozen=True, eq=False)
 class Case:
     """A scene dictionary, a rig, what is measured, and the projector's aperture in the reference: its radius, and the
-    distance from it where its stripes are focused, so that they are sharpest in the regions."""
+    distance from it where its stripes are focused, so that they are sharpest in the regions. `gather_m`: radius within
+    which the pass gathers photons, metres, well below the stripes."""
 
     shapes: dict[str, Any]
     rig: Rig
@@ -55,10 +58,16 @@ class Case:
     guide: Guide
     aperture_radius_m: float
     focus_m: float
+    gather_m: float
     scene: Scene = field(init=False)
 
     def __post_init__(self) -> None:
-        sensor = {"type": "perspective", "fov": 45.0}
+        import mitsuba as mi
+
+        to_world = mi.ScalarTransform4f(self.rig.T_world_camera @ MITSUBA_FROM_OPENCV)
+        film = {"type": "hdrfilm", "width": CAMERA_PIXELS[0], "height": CAMERA_PIXELS[1]}
+        fov = float(np.degrees(2 * np.arctan(0.5 * CAMERA_PIXELS[0] / self.rig.camera.fx)))
+        sensor = {"type": "perspective", "fov": fov, "to_world": to_world, "film": film}
         object.__setattr__(self, "scene", load_scene({"type": "scene", "sensor": sensor, **self.shapes}))
 
     def masks(self) -> dict[str, np.ndarray]:
@@ -123,13 +132,6 @@ def _rig(
     )
 
 
-def _set_variant() -> None:
-    """Mitsuba's transforms below need a variant."""
-    from rangesim.light_transport.backend import select_variant
-
-    select_variant()
-
-
 def _floor(half_size_m: float) -> dict[str, Any]:
     import mitsuba as mi
 
@@ -138,7 +140,7 @@ def _floor(half_size_m: float) -> dict[str, Any]:
 
 def _ball(camera: tuple[float, float, float], target: tuple[float, float, float], fov_deg: float) -> Case:
     """A glass ball above a floor; beyond its focus the stripes come out bent and reversed."""
-    _set_variant()
+    select_variant()  # before Mitsuba's transforms
     ball = {"type": "sphere", "center": [0.0, 0.0, 0.15], "radius": 0.05, "bsdf": GLASS}
     lit = Region((-0.054, 0.0, 0.0), 0.04)
     straight = {"caustic": lit, "floor": Region((-0.16, 0.0, 0.0), 0.03)}
@@ -151,12 +153,13 @@ def _ball(camera: tuple[float, float, float], target: tuple[float, float, float]
         guide=Guide((0.0, 0.0, 0.15), 0.33),
         aperture_radius_m=0.016,
         focus_m=0.66,  # conjugate to the floor by way of the ball
+        gather_m=0.0015,
     )
 
 
 def _pane() -> Case:
     """A glass pane, 10 mm thick, halfway to a wall that is partly seen and partly lit through it."""
-    _set_variant()
+    select_variant()  # before Mitsuba's transforms
     import mitsuba as mi
 
     up = mi.ScalarTransform4f()
@@ -173,12 +176,13 @@ def _pane() -> Case:
         guide=Guide((0.25, 0.0, 1.0), 0.03),
         aperture_radius_m=0.01,
         focus_m=1.0,
+        gather_m=0.004,
     )
 
 
 def _mirror() -> Case:
     """An upright silver cylinder beside a floor; a screen keeps the straight light off the part that it lights."""
-    _set_variant()
+    select_variant()  # before Mitsuba's transforms
     import mitsuba as mi
 
     cylinder = {"type": "cylinder", "p0": [0.0, 0.0, 0.0], "p1": [0.0, 0.0, 0.4], "radius": 0.15, "bsdf": SILVER}
@@ -193,4 +197,5 @@ def _mirror() -> Case:
         guide=Guide((0.0, 0.0, 0.2), 0.45),
         aperture_radius_m=0.01,
         focus_m=0.65,
+        gather_m=0.003,
     )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the thin-walled vessels of scenes/glassware.xml: closed meshes of revolution about z, standing on z = 0, metres.
+"""Writes the thin-walled vessels of scenes/glassware.xml: closed meshes of revolution about z, on z = 0, metres.
 
 Usage: python scenes/glassware/vessels.py
 """
@@ -42,7 +42,7 @@ def _mitre(normals: np.ndarray) -> np.ndarray:
 
 
 def revolve(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and triangles (m, 3), normals outwards of the material; the ends of the profile lie on the axis."""
+    """Vertices (n, 3) and triangles (m, 3), normals out of the material; both ends of the profile lie on the axis."""
     angle = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     body = profile[1:-1]
