@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projector light through glass and off mirrors against references that share no code with the pass.
 
-    make     computes the references (about 8 minutes on two cores) and writes benchmarks/references/*.npz
+    make     computes the references (about 9 minutes on two busy cores) and writes benchmarks/references/*.npz
     compare  renders the same cases with `transport` and compares (the default)
 
 Two references. `ptracer` is Mitsuba's particle tracer with its `projector` plugin: it is the reference for all that
-the camera sees directly. `path` is a plain path tracer whose projector is a disc of finite size (`finite_aperture.py`): it
-is the reference for what the camera sees through glass or off a mirror; its means are extrapolated to a point, from
-two radii, a and 2 a. Where both apply, for caustics that the camera sees directly, the two are compared with each
-other. The last line of `compare` is JSON:
+the camera sees directly. `path` is a plain path tracer whose projector is a disc of finite size
+(`finite_aperture.py`): it is the reference for what the camera sees through glass or off a mirror; its means are
+extrapolated to a point, from two radii, a and 2 a. Where both apply, for caustics that the camera sees directly, the
+two are compared with each other. The last line of `compare` is JSON:
 
     max_region_error        largest relative error of the mean radiance of white over the marked regions and references
     min_stripe_correlation  smallest correlation of a stripe image with its reference within a marked region
 
-Usage: python benchmarks/caustic_references.py [make | compare] [--spp 2048] [--photons N] [--radius-scale 1] [--scale 1]
+Usage: python benchmarks/caustic_references.py [make | compare] [--spp 2048] [--photons N] [--radius-scale 1]
 """
 
 from __future__ import annotations

@@ -28,8 +28,7 @@ MATTE = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type":
 
 @dataclass(frozen=True)
 class Region:
-    """Pixels that see the disc of the matte surface around `centre` (world, metres), straight or through/off a delta
-    surface."""
+    """Pixels that see the disc around `centre` (world, metres) of the matte floor, straight or by a delta surface."""
 
     centre: tuple[float, float, float]
     radius_m: float
