@@ -33,6 +33,10 @@ NEAR = 1.5
 """Times the spread of a pixel's probes, within which the lens counts as near."""
 UNKNOWN_SPREAD = 8.0
 """Radii of the lens; stands for the spread where but one probe crossed its plane."""
+FINEST = 0.2
+"""Times the spread, the radius of the smallest disc that a pixel's paths hit well: about a tenth of the pixel."""
+MOST_ENLARGED = 16.0
+"""Times the radius of the lens, of the disc that stands for it."""
 MOST_PATHS = 1 << 22
 """Of all pixels together."""
 PATHS_PER_PIXEL = (64, 4096)
@@ -60,13 +64,12 @@ def trace_glint(scene: Any, rig: Rig, responses: Sequence[Response], seed: int, 
     camera, projector = Device.camera(rig), Device.projector(rig)
     h, w = rig.camera.height, rig.camera.width
     worth_probing = _worth_probing(scene, camera, projector, h, w, media)
-    pixel = _near_the_lens(scene, rig, camera, projector, worth_probing, seed, media)
+    pixel, radius_m = _near_the_lens(scene, rig, camera, projector, worth_probing, seed, media)
     accumulators = Accumulators(responses, max(1, len(pixel)))
     if len(pixel) == 0:
         return Glint(pixel, np.zeros(0, np.float32), [np.zeros((r.channels, 0), np.float32) for r in responses])
     paths = int(np.clip(MOST_PATHS // len(pixel), *PATHS_PER_PIXEL))
-    radiance_of_lens = rig.projector_irradiance / (np.pi * rig.projector_aperture_radius_m**2) / paths
-    lens = Lens(rig, projector, dr.opaque(mi.Float, radiance_of_lens))
+    lens = Lens(rig, projector, radius_m, rig.projector_irradiance / (np.pi * radius_m**2) / paths)
     dense, total = _paths_to_the_lens(scene, camera, lens, accumulators, *_lanes(pixel, seed, paths), media)
     bins = accumulators.bins
     dr.eval(dense, [total], list(bins.values()))
@@ -78,12 +81,16 @@ def trace_glint(scene: Any, rig: Rig, responses: Sequence[Response], seed: int, 
 
 
 class Lens:
-    """The projector's lens as the camera may see it: a disc that faces along the projector's axis."""
+    """The projector's lens as the camera may see it: a disc that faces along the projector's axis.
 
-    def __init__(self, rig: Rig, projector: Device, radiance: Any) -> None:
+    Where a curved mirror makes its image too small for a pixel's paths to hit, a larger and dimmer disc stands for it:
+    `radius_m` and `radiance`, for each pixel. What the pixel receives is the same.
+    """
+
+    def __init__(self, rig: Rig, projector: Device, radius_m: np.ndarray, radiance: np.ndarray) -> None:
         self.projector = projector
-        self.radius = dr.opaque(mi.Float, rig.projector_aperture_radius_m)
-        self.radiance = radiance
+        self.radius = mi.Float(np.float32(radius_m))
+        self.radiance = mi.Float(np.float32(radiance))
 
     def offset(self, ray: Any, si: Any) -> tuple[Any, Any, Any]:
         """Where the ray crosses the plane of the lens, metres from its centre; the way there; and whether it does."""
@@ -114,15 +121,17 @@ def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int
 
 def _near_the_lens(
     scene: Any, rig: Rig, camera: Device, projector: Device, pixel: np.ndarray, seed: int, media: Media | None
-) -> np.ndarray:
-    """Those of the pixels whose probes come near the lens, as measured by how far they spread."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the pixels whose probes come near the lens, as measured by how far they spread; and for each of them
+    the radius in metres of the disc to hit."""
+    aperture = np.full(len(pixel), rig.projector_aperture_radius_m)
     if len(pixel) == 0:
-        return pixel
-    lens = Lens(rig, projector, mi.Float(1))
+        return pixel, aperture
+    lens = Lens(rig, projector, aperture, aperture)
     nearest, spread = _probe(scene, camera, lens, *_lanes(pixel, seed, PROBES), media)
     dr.eval([nearest, spread])
-    near = nearest.numpy() < rig.projector_aperture_radius_m + NEAR * spread.numpy()
-    return pixel[near]
+    near = nearest.numpy() < aperture + NEAR * spread.numpy()
+    return pixel[near], np.clip(FINEST * spread.numpy(), aperture, MOST_ENLARGED * aperture)[near]
 
 
 def _lanes(pixel: np.ndarray, seed: int, paths: int) -> tuple[Any, Any, Any]:
@@ -141,7 +150,7 @@ def _probe(
     Where light splits into reflection and refraction, probes take both alike, however faint one is.
     """
     lanes = dr.width(pixel)
-    nearest, spread = dr.full(mi.Float, dr.inf, lanes), UNKNOWN_SPREAD * lens.radius + dr.zeros(mi.Float, lanes)
+    nearest, spread = dr.full(mi.Float, dr.inf, lanes), dr.full(mi.Float, dr.inf, lanes)
     before = dr.full(mi.Point2f, dr.inf, lanes)  # where the last one crossed
     shift, width = mi.Point2f(rng.next_float32(), rng.next_float32()), mi.UInt32(camera.size.x)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
@@ -166,7 +175,7 @@ def _probe(
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (mono(weight) <= 0) | (chain >= MAX_CHAIN)
         chain = dr.select(ends, 0, chain)
         k = dr.select(ends, k + 1, k)
-    return nearest, spread
+    return nearest, dr.select(dr.isfinite(spread), spread, UNKNOWN_SPREAD * lens.radius)
 
 
 @dr.syntax
