@@ -28,9 +28,11 @@ BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 PROGRESS_STEPS = 16
 PHOTONS = 500_000
+PHOTONS_PER_DISC = 150
+"""Photons of all maps within the largest radius, where light is neither spread nor focused."""
 RADIUS_IN_PROJECTOR_PIXELS = 4.0
-RADIUS_IN_CAMERA_PIXELS = 3.0
-"""Largest photon radius, at the working distance: finer than the stripes and about as fine as the image."""
+RADIUS_IN_CAMERA_PIXELS = (0.3, 3.0)
+"""Bounds of the largest photon radius, at the working distance: finer than the stripes, about as fine as the image."""
 
 
 def transport(
@@ -61,8 +63,9 @@ def transport(
     rr_depth : int >= 1, surfaces after which Russian roulette may end a path.
     photons : int >= 0, caustic photons: the projector's light through glass and off mirrors, see
         `rangesim.light_transport.photons`; 0: none, and such light is missing. No cost without such surfaces.
-    caustic_radius_m : metres, largest radius over which photons are gathered; None: four pixels of the projector or
-        three of the camera at the working distance, whichever is smaller. Caustics are blurred by about half of it.
+    caustic_radius_m : metres, largest radius over which photons are gathered; None: as wide as the number of photons
+        asks for, at most four pixels of the projector or three of the camera at the working distance. Caustics are
+        blurred by about half of it.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     seed : int; the same seed gives the same bytes, whatever the number of threads and the memory budget.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size.
@@ -131,11 +134,16 @@ def _photon_maps(
 ) -> PhotonMaps | None:
     """Maps of the projector's light beyond delta surfaces; None if no photon landed."""
     landed = trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media)
-    if radius_m is None:
-        cells = (RADIUS_IN_PROJECTOR_PIXELS / rig.projector.fx, RADIUS_IN_CAMERA_PIXELS / rig.camera.fx)
-        radius_m = scene.working_distance_m * min(cells)
+    radius_m = radius_m or scene.working_distance_m * _gathering_angle(rig, landed.per_pixel)
     irradiance = rig.projector_irradiance / scene.working_distance_m**2
     return PhotonMaps(landed, maps, radius_m, irradiance) if len(landed.flux) else None
+
+
+def _gathering_angle(rig: Rig, photons_per_pixel: float) -> float:
+    """Largest photon radius at z = 1 m: wide enough for `PHOTONS_PER_DISC`, within bounds."""
+    of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), RADIUS_IN_PROJECTOR_PIXELS)
+    low, high = (pixels / rig.camera.fx for pixels in RADIUS_IN_CAMERA_PIXELS)
+    return float(np.clip(of_projector / rig.projector.fx, low, high))
 
 
 def _signals(

@@ -33,6 +33,8 @@ MOST_LOOKED_AT = 16
 OCCUPANCY_CELLS = 1 << 18
 PRIMES = (73856093, 19349663, 83492791)
 """Spatial hash (Teschner et al. 2003)."""
+FOLD = 1024
+"""Cells along x after which a row turns back on itself, so that the table stays small in a large scene."""
 ROW_FACTORS = (0x9E3779B3, 0x85EBCA75)
 
 
@@ -87,15 +89,14 @@ class PhotonMaps:
         radii = np.concatenate([radii_of_maps(radius_m * one.radius, maps) for one in LEVELS])
         of_map = level * maps + photons.map
         origin = photons.position.min(axis=0) - radii.max()
-        extent = photons.position[:, 0].max() + radii.max() - origin[0]
-        columns = int(extent / (2 * radii.min())) + 2
         rows = 1 << int(np.ceil(np.log2(max(16, len(photons.flux) / maps))))
         cell = np.floor((photons.position - origin) * (0.5 / radii[of_map])[:, None].astype(np.float32)).astype(
             np.int64
         )
-        key = of_map * (rows + columns) + _row(cell[:, 1], cell[:, 2], rows - 1) + cell[:, 0]
+        stride = rows + FOLD + 1
+        key = of_map * stride + _row(cell[:, 1], cell[:, 2], rows - 1) + _column(cell[:, 0])
         order = np.argsort(key, kind="stable")
-        starts = np.cumsum(np.bincount(key + 1, minlength=len(radii) * (rows + columns) + 1))
+        starts = np.cumsum(np.bincount(key + 1, minlength=len(radii) * stride + 1))
         points = np.column_stack([photons.position, photons.flux])
         padding = np.zeros((len(order), 2))
         flights = np.column_stack([photons.direction, photons.u, photons.v, photons.length_m, padding])
@@ -106,8 +107,7 @@ class PhotonMaps:
         self.flights = mi.Float(flights[order].astype(np.float32).ravel())
         self.radii = mi.Float(radii.astype(np.float32))
         self.origin = mi.Vector3f(*(opaque(x) for x in origin))
-        self.columns, self.row_mask = dr.opaque(mi.UInt32, columns), dr.opaque(mi.UInt32, rows - 1)
-        self.stride = dr.opaque(mi.UInt32, rows + columns)
+        self.row_mask, self.stride = dr.opaque(mi.UInt32, rows - 1), dr.opaque(mi.UInt32, stride)
         self.coarse = [opaque(0.5 / (radius_m * one.radius)) for one in LEVELS]
         self.occupied = [
             mi.UInt32(_occupancy(photons.position[level == i] - origin, photons.map[level == i], radius_m * one.radius))
@@ -162,14 +162,12 @@ class PhotonMaps:
         """Start and length of the four ranges of photons that lie in the 2 x 2 x 2 cells around a point."""
         base = dr.floor((mi.Vector3f(point) - self.origin) * (0.5 * dr.rcp(radius)) - 0.5)
         x, y, z = mi.Int32(base.x), mi.UInt32(mi.Int32(base.y)), mi.UInt32(mi.Int32(base.z))
-        last = mi.Int32(self.columns) - 1
-        active = active & (x >= -1) & (x <= last)
-        left, right = mi.UInt32(dr.maximum(x, 0)), mi.UInt32(dr.minimum(x + 1, last))
+        first = mi.UInt32(dr.minimum(_column(x), _column(x + 1)))  # the other one follows
         starts, counts = [], []
         for dy, dz in ((0, 0), (1, 0), (0, 1), (1, 1)):
             row = of_map * self.stride + _row(y + dy, z + dz, self.row_mask)
-            begin = dr.gather(mi.UInt32, self.starts, row + left, active)
-            end = dr.gather(mi.UInt32, self.starts, row + right + 1, active)
+            begin = dr.gather(mi.UInt32, self.starts, row + first, active)
+            end = dr.gather(mi.UInt32, self.starts, row + first + 2, active)
             starts.append(begin)
             counts.append(end - begin)
         return starts, counts
@@ -192,6 +190,11 @@ def levels_of(photons: Photons, maps: int, cell_m: float, irradiance: float) -> 
 def _hash(x: Any, y: Any, z: Any) -> Any:
     """Hash of integer cell coordinates; NumPy integers and Dr.Jit UInt32 alike give the same low 32 bits."""
     return (x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])
+
+
+def _column(x: Any) -> Any:
+    """Place of a cell within its row, in 0..FOLD; neighbours stay neighbours. NumPy integers and Dr.Jit Int32."""
+    return FOLD - abs(FOLD - (x & (2 * FOLD - 1)))
 
 
 def _row(y: Any, z: Any, mask: Any) -> Any:

@@ -32,7 +32,8 @@ MAX_CHAIN = 16
 """Delta surfaces in a row that a photon is followed through."""
 GRAZING = 0.05
 """Cosine below which a ray would have to start too far ahead to be clear of the surface."""
-LANES_PER_GIB = 1 << 23
+BYTES_PER_PHOTON = 128
+"""While it flies, an upper bound."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,7 @@ class Photons:
     length_m : (n,) float32, metres, optical length from the projector.
     map : (n,) int, which of the independent maps a photon belongs to; each map alone carries all the power.
     balance : PhotonBalance, the mean over the maps.
+    per_pixel : float, photons of all maps sent through each projector pixel that is worth it.
     """
 
     position: np.ndarray
@@ -72,6 +74,7 @@ class Photons:
     length_m: np.ndarray
     map: np.ndarray
     balance: PhotonBalance
+    per_pixel: float
 
 
 def has_delta(scene: Any) -> bool:
@@ -97,7 +100,7 @@ def trace_photons(
     per_map = -(-photons // maps)
     cumulative = np.cumsum(share)
     total = per_map * maps
-    chunk = max(1, min(total, memory_bytes * LANES_PER_GIB >> 30))
+    chunk = max(1, min(total, memory_bytes // BYTES_PER_PHOTON))
     landed: list[list[np.ndarray]] = []
     balance = np.zeros(len(PhotonBalance.__dataclass_fields__))
     for begin in range(0, total, chunk):
@@ -109,7 +112,8 @@ def trace_photons(
         landed.append([_columns(x)[kept] for x in end] + [number[kept] // per_map])
         balance += fate
     position, direction, flux, u, v, length, of_map = (np.concatenate(parts) for parts in zip(*landed, strict=True))
-    return Photons(position, direction, flux, u, v, length, of_map, PhotonBalance(*(balance / maps)))
+    total_balance = PhotonBalance(*(balance / maps))
+    return Photons(position, direction, flux, u, v, length, of_map, total_balance, total / cumulative[-1])
 
 
 def _worthwhile_pixels(scene: Any, projector: Device, media: Media | None) -> tuple[np.ndarray, np.ndarray]:
