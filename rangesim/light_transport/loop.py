@@ -209,7 +209,7 @@ def trace(
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
-        ray.o = dr.select(is_delta, straight_on(si, wo).o, ray.o)
+        ray.o = dr.select(is_delta & ~crosses, straight_on(si, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
