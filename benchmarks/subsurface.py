@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What translucent objects do to range sensors, and what tracing them costs; prints the tables of docs/subsurface.md.
 
-Run from the repository root: python -m benchmarks.subsurface
+Usage: python benchmarks/subsurface.py
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from plain_mitsuba import plain_scene, render, timed
 
 import rangesim
-from benchmarks.plain_mitsuba import plain_scene, render, timed
 from rangesim import AmcwToF, Detector, decode, expose, load_scene, transport
 from rangesim.light_transport.backend import select_variant
 from rangesim.response import Fringes
