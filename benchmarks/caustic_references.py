@@ -146,7 +146,7 @@ def compare(spp: int, photons: int, radius_scale: float) -> dict[str, float]:
     errors, correlations = [], []
     print(f"{'case':<22} {'region':<30} {'reference':<9} {'error':>7} {'+-':>6}  correlation: white, columns, rows")
     for case_name, case in cases().items():
-        radius_m = case.gather_m * radius_scale
+        radius_m = case.gather_m * radius_scale or None
         signals = transport(
             case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, photons=photons,
             caustic_radius_m=radius_m,
@@ -185,7 +185,7 @@ def main() -> None:
     parser.add_argument("what", nargs="?", choices=("make", "compare"), default="compare")
     parser.add_argument("--spp", type=int, default=2048)
     parser.add_argument("--photons", type=int, default=8_000_000)
-    parser.add_argument("--radius-scale", type=float, default=1.0, help="times the radius of each case")
+    parser.add_argument("--radius-scale", type=float, default=1.0, help="of each case; 0: the default of transport")
     parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
     args = parser.parse_args()
     if args.what == "make":

@@ -195,6 +195,4 @@ def test_a_white_furnace_hides_lossless_glass() -> None:
     )
     rig = rig_of(CAMERA, PROJECTOR)
     ambient = transport(scene, rig, [], spp=64, max_depth=60, rr_depth=60).energy.ambient
-    assert ambient.mean() == pytest.approx(1, abs=5e-4)
-    # Rays within a millimetre of the slab's edges may miss a face
-    assert np.abs(ambient - 1).max() < 0.04
+    np.testing.assert_allclose(ambient, 1.0, atol=2e-3)

@@ -22,9 +22,9 @@ import drjit as dr
 import mitsuba as mi
 
 from rangesim.light_transport.device import Device, connect
+from rangesim.light_transport.exact_point import on_its_line
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
-from rangesim.light_transport.photons import straight_on
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
@@ -108,6 +108,7 @@ def trace(
     previous = dr.zeros(mi.Interaction3f, lanes)
     previous_pdf = dr.zeros(mi.Float, lanes)  # of the BSDF sample that made the ray; for MIS with ambient light
     previous_delta = dr.full(mi.Bool, True, lanes)
+    was_bent = dr.full(mi.Bool, False, lanes)  # the ray left a delta surface
     inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
     scatters, crosses = mi.Bool(False), mi.Bool(False)  # this turn: an event inside a medium, or its boundary
     events = dr.zeros(mi.UInt32, lanes)  # of both kinds so far
@@ -130,6 +131,8 @@ def trace(
         # ---- Next surface ----------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
+        met = mi.Point3f(si.p)
+        si.p = dr.select(was_bent, on_its_line(si, previous.p, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
             flight = inside.free_flight(rng.next_float32())
             scatters = hit & (flight < dr.norm(si.p - previous.p))
@@ -209,7 +212,8 @@ def trace(
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
-        ray.o = dr.select(is_delta & ~crosses, straight_on(si, wo).o, ray.o)
+        was_bent = is_delta & ~crosses
+        ray.o = dr.select(was_bent, ray.o + (met - si.p), ray.o)  # on the safe side of edges
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
@@ -228,6 +232,7 @@ def trace(
         first |= ends
         via &= ~ends
         previous_delta |= ends
+        was_bent &= ~ends
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(ends, media.none(lanes))
             events = dr.select(ends, 0, events)

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
+from rangesim.light_transport.exact_point import on_its_line
 from rangesim.light_transport.medium import Media, bounded, is_boundary
 
 DEFENSIVE_SHARE = 0.05
@@ -30,8 +31,6 @@ LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
 MAX_CHAIN = 16
 """Delta surfaces in a row that a photon is followed through."""
-GRAZING = 0.05
-"""Cosine below which a ray would have to start too far ahead to be clear of the surface."""
 BYTES_PER_PHOTON = 128
 """While it flies, an upper bound."""
 
@@ -210,14 +209,15 @@ def _chain(
         # ---- Next surface ----------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
+        point = dr.select(chain > 0, on_its_line(si, previous, ray.d), si.p)
         escaped += dr.select(active & ~hit, flux, 0)
         if dr.hint(media is not None, mode="scalar"):
             crosses = hit & media.bounded_by(si, hit)
-            lost = dr.select(hit, flux * (1 - dr.exp(-inside.sigma_t * dr.norm(si.p - previous))), 0)
+            lost = dr.select(hit, flux * (1 - dr.exp(-inside.sigma_t * dr.norm(point - previous))), 0)
             flux -= lost
             direct += dr.select(chain == 0, lost, 0)
             absorbed += dr.select(chain == 0, 0, lost)
-        length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
+        length = dr.select(hit, dr.fma(ior, dr.norm(point - previous), length), length)
         bsdf = si.bsdf(ray)
         scatters = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
@@ -228,7 +228,7 @@ def _chain(
         lands = scatters & (chain > 0) & (~mixed | (rng.next_float32() < LANDING_SHARE))
         landing_flux = dr.select(mixed, flux / LANDING_SHARE, flux)
         stored = dr.select(lands, landing_flux, stored)
-        position = dr.select(lands, si.p, position)
+        position = dr.select(lands, point, position)
         direction = dr.select(lands, ray.d, direction)
 
         # ---- Or goes on as a delta interaction -------------------------------------------------------
@@ -243,8 +243,8 @@ def _chain(
         flux = dr.select(active, remains, flux)
         ior = dr.select(goes_on & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
         chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))
-        previous = dr.select(goes_on, si.p, previous)
-        ray = straight_on(si, si.to_world(bs.wo))
+        previous = dr.select(goes_on, point, previous)
+        ray = si.spawn_ray(si.to_world(bs.wo))
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             crossed += dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
@@ -253,18 +253,6 @@ def _chain(
 
     landing = _Landing(position, direction, stored, uv.x, uv.y, length)
     return landing, (emitted, direct, stored, absorbed, escaped, truncated)
-
-
-def straight_on(si: Any, direction: Any) -> Any:
-    """The ray that leaves a surface point; it starts off the surface, but on its own line.
-
-    Mitsuba's `spawn_ray` moves the start along the normal, about 0.1 mm at 1 m, and so shifts oblique rays sideways: by
-    a twentieth of a projector pixel or more.
-    """
-    ray = si.spawn_ray(direction)
-    clearance = 0.1 * dr.norm(ray.o - si.p)  # close, so that few rays miss another face beside an edge
-    cosine = dr.abs(dr.dot(direction, si.n))
-    return mi.Ray3f(dr.select(cosine > GRAZING, si.p + direction * (clearance / cosine), ray.o), direction)
 
 
 def _columns(array: Any) -> np.ndarray:
