@@ -141,12 +141,28 @@ def _power_at_threshold(rig: Any, sensor: Sensor, detector: Any, exposure_s: flo
     return float(np.median((budget.needed / budget.signal)[signals.truth.projector_visible]))
 
 
+@pytest.mark.parametrize("noise", [True, False], ids=["noisy", "noise-free"])
+def test_a_lens_that_darkens_the_corners_asks_for_more_light_there(noise: bool) -> None:
+    """The detector needs what it needs, so before the lens 1 / cos^n as much; ambient light is darkened alike."""
+    sensor, detector = SENSORS["gray"]
+    rig = replace(stereo_rig(), camera_vignetting=4.0)
+    even, darkened = (
+        light_budget(signals, expose(signals, sensor, detector if noise else None, 2e-3))
+        for signals in (plane_signals(replace(rig, camera_vignetting=n), sensor, ambient=0.0) for n in (0.0, 4.0))
+    )
+    np.testing.assert_array_equal(darkened.signal, even.signal)
+    needed = darkened.needed * rig.camera_illumination
+    np.testing.assert_allclose(needed, even.needed if noise else needed[0, 0], rtol=1e-6)
+
+
 def test_a_white_surface_returns_what_lambert_s_law_says() -> None:
     """The plane of albedo 1/2 is half as bright, wherever it faces the projector squarely."""
     rig = stereo_rig(baseline_m=0.0)
     points = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]])
     white = white_radiance(rig, points, np.array([[0.0, 0.0, -1.0]] * 2))
     np.testing.assert_allclose(white, rig.projector_irradiance / np.pi / 4)
+    darkened = white_radiance(replace(rig, projector_vignetting=4.0), points, np.array([[0.0, 0.0, -1.0]] * 2))
+    np.testing.assert_allclose(darkened / white, [1.0, (2 / np.sqrt(5)) ** 4])
 
 
 @pytest.mark.parametrize("name", SENSORS)

@@ -8,7 +8,7 @@ with one positive root.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 class LightBudget:
     """Projector light of each pixel against what its sensor needs; radiances, W/m2/sr.
 
-    signal : (h, w) float, projector light at full power.
+    signal : (h, w) float, projector light at full power, before the camera's lens, as all radiances here.
     needed : (h, w) float, least signal that the decoder takes, in the ambient light there is.
     needed_in_the_dark : (h, w) float, the same without ambient light.
     ambient_share : (h, w) float in 0..1, share of ambient light in the variance of the noise.
@@ -51,9 +51,13 @@ def light_budget(signals: Signals, capture: Capture) -> LightBudget:
         first = signals.frames(capture.sensor)[0].astype(np.float64)
         nothing = np.full(first.shape, np.finfo(np.float32).tiny)
         return LightBudget(first, nothing, nothing, np.zeros(first.shape))
+    lens = np.maximum(signals.rig.camera_illumination, np.finfo(np.float32).tiny)  # what vignetting leaves
     if capture.detector is None:
-        return _noise_free(capture, signal, ambient)
-    return _noisy(capture, capture.detector, signal, ambient)
+        behind = _noise_free(capture, signal * lens, ambient * lens)
+    else:
+        behind = _noisy(capture, capture.detector, signal * lens, ambient * lens)
+    needed, in_the_dark = behind.needed / lens, behind.needed_in_the_dark / lens
+    return replace(behind, signal=signal, needed=needed, needed_in_the_dark=in_the_dark)
 
 
 def white_radiance(rig: Rig, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -63,8 +67,9 @@ def white_radiance(rig: Rig, points: np.ndarray, normals: np.ndarray) -> np.ndar
     """
     distance = np.linalg.norm(points, axis=-1)
     cosine = np.abs((normals * points).sum(axis=-1)) / distance
+    irradiance = rig.projector_irradiance * (np.abs(points[:, 2]) / distance) ** rig.projector_vignetting
     with np.errstate(divide="ignore"):
-        return np.asarray(rig.projector_irradiance / np.pi * cosine * distance / points[:, 2] ** 3)
+        return np.asarray(irradiance / np.pi * cosine * distance / points[:, 2] ** 3)
 
 
 def _noise_free(capture: Capture, signal: np.ndarray, ambient: np.ndarray) -> LightBudget:
