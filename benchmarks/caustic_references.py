@@ -13,7 +13,7 @@ two are compared with each other. The last line of `compare` is JSON:
     max_region_error        largest relative error of the mean radiance of white over the marked regions and references
     min_stripe_correlation  smallest correlation of a stripe image with its reference within a marked region
 
-Usage: python benchmarks/caustic_references.py [make | compare] [--spp 2048] [--photons N] [--radius-scale 1]
+Usage: python benchmarks/caustic_references.py [make | compare] [--spp 2048] [--photons N]
 """
 
 from __future__ import annotations
@@ -140,16 +140,14 @@ def _file(case_name: str, name: str) -> Path:
     return HERE / f"{case_name.replace(', ', '_').replace(' ', '_')}-{name}.npz"
 
 
-def compare(spp: int, photons: int, radius_scale: float) -> dict[str, float]:
+def compare(spp: int, photons: int) -> dict[str, float]:
     """Print the table and return the figures of the last line."""
     light, frames = stripes()
     errors, correlations = [], []
     print(f"{'case':<22} {'region':<30} {'reference':<9} {'error':>7} {'+-':>6}  correlation: white, columns, rows")
     for case_name, case in cases().items():
-        radius_m = case.gather_m * radius_scale or None
         signals = transport(
             case.scene, case.rig, [light], spp=spp, max_depth=MAX_DEPTH, glint=False, photons=photons,
-            caustic_radius_m=radius_m,
         )  # fmt: skip
         ours = signals.frames(light)[frames]
         references = {name: load(case_name, name) for name in METHODS}
@@ -185,13 +183,12 @@ def main() -> None:
     parser.add_argument("what", nargs="?", choices=("make", "compare"), default="compare")
     parser.add_argument("--spp", type=int, default=2048)
     parser.add_argument("--photons", type=int, default=8_000_000)
-    parser.add_argument("--radius-scale", type=float, default=1.0, help="of each case; 0: the default of transport")
     parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
     args = parser.parse_args()
     if args.what == "make":
         make(args.scale)
     else:
-        print(json.dumps(compare(args.spp, args.photons, args.radius_scale)))
+        print(json.dumps(compare(args.spp, args.photons)))
 
 
 if __name__ == "__main__":

@@ -48,8 +48,7 @@ class Guide:
 @dataclass(frozen=True, eq=False)
 class Case:
     """A scene dictionary, a rig, what is measured, and the projector's aperture in the reference: its radius, and the
-    distance from it where its stripes are focused, so that they are sharpest in the regions. `gather_m`: radius within
-    which the pass gathers photons, metres, well below the stripes."""
+    distance from it where its stripes are focused, so that they are sharpest in the regions."""
 
     shapes: dict[str, Any]
     rig: Rig
@@ -57,7 +56,6 @@ class Case:
     guide: Guide
     aperture_radius_m: float
     focus_m: float
-    gather_m: float
     scene: Scene = field(init=False)
 
     def __post_init__(self) -> None:
@@ -152,7 +150,6 @@ def _ball(camera: tuple[float, float, float], target: tuple[float, float, float]
         guide=Guide((0.0, 0.0, 0.15), 0.33),
         aperture_radius_m=0.016,
         focus_m=0.66,  # conjugate to the floor by way of the ball
-        gather_m=0.0015,
     )
 
 
@@ -175,7 +172,6 @@ def _pane() -> Case:
         guide=Guide((0.25, 0.0, 1.0), 0.03),
         aperture_radius_m=0.01,
         focus_m=1.0,
-        gather_m=0.004,
     )
 
 
@@ -196,5 +192,4 @@ def _mirror() -> Case:
         guide=Guide((0.0, 0.0, 0.2), 0.45),
         aperture_radius_m=0.01,
         focus_m=0.65,
-        gather_m=0.003,
     )  # fmt: skip

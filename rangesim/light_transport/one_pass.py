@@ -28,7 +28,7 @@ BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 PROGRESS_STEPS = 16
 PHOTONS = 500_000
-PHOTONS_PER_DISC = 150
+PHOTONS_PER_DISC = 400
 """Photons of all maps within the largest radius, where light is neither spread nor focused."""
 RADIUS_IN_PROJECTOR_PIXELS = 4.0
 RADIUS_IN_CAMERA_PIXELS = (0.3, 3.0)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Responses to how far light went: modulation, first return, time bins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from rangesim.response.base import KINDS, DenseResponse, LightPath, Math, SparseResponse
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""Metres per second in vacuum, exact."""
+
+
+@dataclass(frozen=True)
+class Phasor(DenseResponse):
+    """Correlation of the returned modulation with a reference in phase and in quadrature, over 2 pi f l / c.
+
+    A sine source gives cos and sin; a square source and a square reference give triangle waves of the same
+    period, which hold odd harmonics (the "wiggling" error of AMCW cameras).
+    """
+
+    modulation_hz: float
+    square: bool = False
+    channels: ClassVar[int] = 2  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        turns = path.path_length_m * (self.modulation_hz / SPEED_OF_LIGHT)
+        if self.square:
+            return [_triangle(turns, m), _triangle(turns - 0.25, m)]
+        return [m.cos(2 * np.pi * turns), m.sin(2 * np.pi * turns)]
+
+
+def _triangle(turns: Any, m: Math) -> Any:
+    """Triangle wave of period 1 with value 1 at 0 and -1 at 1/2."""
+    return 4 * m.abs(turns - m.floor(turns) - 0.5) - 1
+
+
+@dataclass(frozen=True)
+class FirstReturn(DenseResponse):
+    """Radiance, and radiance times path length, of the paths that are lit where the camera looks."""
+
+    channels: ClassVar[int] = 2  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        first = m.select(path.is_first, 1.0, 0.0)
+        return [first, first * path.path_length_m]
+
+
+@dataclass(frozen=True)
+class LengthBins(SparseResponse):
+    """Histogram over the path length (round trip), `channels` bins from `start_m`, `width_m` each."""
+
+    start_m: float
+    width_m: float
+    channels: int  # type: ignore[misc]
+
+    def bin(self, path: LightPath, m: Math) -> Any:
+        index, inside = _length_bin(path, m, self.start_m, self.width_m, self.channels)
+        return m.unsigned(m.select(inside, index, float(self.channels)))
+
+
+@dataclass(frozen=True)
+class LengthSplit(SparseResponse):
+    """The energy split per path length: `bins` bins from `start_m`, `width_m` each, for every one of `KINDS`.
+
+    Channels are kind-major: channel kind * bins + bin. Their sum over the kinds is that of `LengthBins`, their sum over
+    the bins the `rangesim.signals.EnergySplit` of what lies within them.
+    """
+
+    start_m: float
+    width_m: float
+    bins: int
+
+    @property
+    def channels(self) -> int:  # type: ignore[override]
+        return len(KINDS) * self.bins
+
+    def bin(self, path: LightPath, m: Math) -> Any:
+        index, inside = _length_bin(path, m, self.start_m, self.width_m, self.bins)
+        place = path.kind * self.bins + m.unsigned(m.select(inside, index, 0.0))
+        return m.select(inside, place, self.channels)
+
+
+def _length_bin(path: LightPath, m: Math, start_m: float, width_m: float, bins: int) -> tuple[Any, Any]:
+    """Place of a path length in bins, and whether it is in any of them."""
+    position = (path.path_length_m - start_m) * (1 / width_m)
+    return position, (position >= 0) & (position < bins)
