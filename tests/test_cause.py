@@ -194,6 +194,18 @@ def test_glint_is_named_where_it_is_most_of_the_light() -> None:
     assert (found.cause[signals.truth.projector_visible] == Cause.GLINT).all()
 
 
+def test_a_detector_that_the_sun_fills_is_swamped_and_one_that_the_projector_fills_saturated() -> None:
+    sensor, detector = SENSORS["lines"]
+    for ambient, power_w, cause in ((50.0, 1.0, Cause.AMBIENT), (0.0, 1000.0, Cause.GLINT)):
+        signals = plane_signals(replace(stereo_rig(), projector_power_w=power_w), sensor, ambient=ambient)
+        capture = expose(signals, sensor, replace(detector, ambient_transmission=1.0), 0.1)
+        assert capture.saturated(capture.frames).mean() > 0.9
+        found = explain(decode(capture), capture, signals)
+        seen = signals.truth.projector_visible & found.failed
+        assert seen.sum() > 100
+        assert (found.cause[seen] == cause).all()
+
+
 def test_the_lens_in_a_mirror_is_glint_where_the_law_of_reflection_puts_it() -> None:
     """A mirror square to the camera shows the lens, 5 cm wide for once, as far behind it as it is before."""
     scene = cause_scenes.room(mirror=cause_scenes.board(0, 0, 1.0, 0.5, cause_scenes.SILVER))

@@ -47,7 +47,7 @@ DEFINITIONS = {
     Cause.CAUSTIC: "Light that lit the surface off a mirror or through glass disturbed the reading.",
     Cause.GLINT: "The detector saturated, or most of the light came straight from the lens of the projector.",
     Cause.LOW_SIGNAL: "Too little projector light for the detector's own noise.",
-    Cause.AMBIENT: "Enough projector light, but the noise of the ambient light swamps it.",
+    Cause.AMBIENT: "Enough projector light, but ambient light fills the detector or swamps it with noise.",
     Cause.WRAPPED: "The distance lies beyond the unambiguous range, or the wrong period was picked (time of flight).",
     Cause.RESOLUTION: "Neither stray light nor noise: code, bins or baseline are too coarse for this depth.",
 }

@@ -135,8 +135,12 @@ class Evidence:
     @cached_property
     def swamped(self) -> np.ndarray:
         """Without ambient light the projector's would do, and ambient light makes most of the noise."""
-        b = self.budget
-        return np.asarray((b.signal >= b.needed_in_the_dark) & (b.ambient_share > 0.5))
+        return np.asarray((self.budget.signal >= self.budget.needed_in_the_dark) & self.mostly_ambient)
+
+    @cached_property
+    def mostly_ambient(self) -> np.ndarray:
+        """Ambient light makes most of the noise, hence most of what the detector collects."""
+        return np.asarray(self.budget.ambient_share > 0.5)
 
     @cached_property
     def faint(self) -> np.ndarray:

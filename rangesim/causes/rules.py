@@ -74,6 +74,7 @@ def rules(e: Evidence) -> list[Rule]:
     dim = e.is_a("glossy") & e.faint & ~e.enough_direct  # without the light that it reflects, it would be dark
     return [
         # ---- The detector, blinded
+        (e.saturated & e.mostly_ambient & ~e.mostly(GLINT), Cause.AMBIENT),
         (e.saturated | e.mostly(GLINT), Cause.GLINT),
         # ---- Surfaces that pass the light on: whether they are lit does not matter. Direct light is their neighbour's
         (e.is_a("transparent", "mirror") & e.at_edge & e.enough & e.mostly(DIRECT), Cause.DEPTH_EDGE),
