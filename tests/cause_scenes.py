@@ -151,8 +151,11 @@ def motion() -> Case:
     shift = 0.5 * 0.3 * (sensor.n_frames - 1) / 60
     passes = np.any([crossed(signals, 0.05, 0.02, 1.0 + dz, 0.2) for dz in np.linspace(-shift, shift, 50)], axis=0)
     none = at_rest.energy.direct == 0
-    # what neither moves nor is in shadow, and fails, has been crossed by the shadow
-    known = [(none, Cause.SHADOWED), (healed | passes | (signals.motion_m == 0), Cause.MOTION)]
+    ends = (transport(room(wall=board(0, 0, 1.5, 2), board=board(0.05, 0.02, 1.0 + dz, 0.2)), rig, [], **options)
+            for dz in (-shift, shift))  # fmt: skip
+    near, far = (s.energy.direct for s in ends)
+    swept = np.abs(near - far) > 0.05 * far.max()  # the shadow's edge has passed, or the board's
+    known = [(none, Cause.SHADOWED), (healed | passes | swept, Cause.MOTION)]
     return case(signals, sensor, Detector(), lambda c, i: known)
 
 

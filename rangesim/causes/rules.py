@@ -98,7 +98,6 @@ def rules(e: Evidence) -> list[Rule]:
         (e.moving, Cause.MOTION),
         (e.at_edge & ~(disturbed & e.fails_off_edge), Cause.DEPTH_EDGE),
         (e.in_shadow, Cause.SHADOWED),
-        (e.optical & ~disturbed & np.any(e.moving), Cause.MOTION),  # of a shadow, over a surface at rest
         (e.optical & ~disturbed & e.beside_shadow, Cause.SHADOWED),
         (disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC),
         (disturbed & e.mostly(VIA_DELTA, OTHER), Cause.MIRRORED_GHOST),

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from rangesim.motion.displacement import displacement
 from rangesim.motion.passes import Pass
@@ -74,6 +75,11 @@ class FrameStack:
         comes = displacement(signals.truth, cropped, one.placement, self.middle.placement)
         moved = one.window.of(self.motion_m)
         np.maximum(moved, np.maximum(one.window.of(leaves), comes), out=moved)
+        # A shadow moves with what casts it, also over what stands still
+        lit_at_middle = one.window.of(self.at_middle.truth.projector_visible)
+        passed_by_shadow = binary_dilation(lit_at_middle != signals.truth.projector_visible, np.ones((3, 3)))
+        caster = max(np.nanmax(leaves, initial=0), np.nanmax(comes, initial=0))
+        moved[passed_by_shadow] = np.maximum(moved[passed_by_shadow], caster)
 
     def signals(self) -> MovingSignals:
         """The signals, when all passes are in."""

@@ -54,7 +54,8 @@ def transport_moving(
         world) are those at the middle of the sensor's acquisition, `Timing.reference_s`. `motion_m` says how far
         what a pixel sees moves: the largest distance, in the camera's frame, between a surface point at an exposure of
         the pixel and the same point at that middle; of the point the pixel sees at the middle, and of those it sees
-        when it is exposed (something passing by). None for a sensor whose one exposure holds everything.
+        when it is exposed (something passing by). Where a shadow
+        passes, the distance is that of the fastest thing. None for a sensor whose one exposure holds everything.
 
     Raises
     ------
