@@ -29,6 +29,7 @@ _HOME = {
     "compare": "rangesim.comparison",
     "decode": "rangesim.decoding",
     "explain": "rangesim.causes",
+    "default_detector": "rangesim.instrument",
     "expose": "rangesim.exposure",
     "import_capture": "rangesim.capture_files",
     "load_calibration": "rangesim.calibration_files",

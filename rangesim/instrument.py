@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from rangesim.config import check_keys, from_dict, nearest
+from rangesim.config import check_keys, from_dict, nearest, to_dict
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.motion import Timing
+from rangesim.rig import check_optics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 from rangesim.spad import SpadDetector
 
@@ -33,6 +34,9 @@ class Optics:
     projector_focus_m: float | None = None
     camera_vignetting: float = 0.0
     projector_vignetting: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_optics(self)
 
 
 @dataclass(frozen=True)
@@ -131,5 +135,13 @@ def instrument_from_dict(table: Any, place: str) -> Instrument:
     elif sensor is not None:
         values["sensor"] = from_dict(Sensor, sensor, f"{place}.sensor")  # type: ignore[type-abstract]
     if values.get("detector") is not None:
-        values["detector"] = from_dict(PhotoDetector, values["detector"], f"{place}.detector")  # type: ignore[type-abstract]
+        values["detector"] = _detector(values["detector"], values.get("sensor"), f"{place}.detector")
     return from_dict(Instrument, values, place)
+
+
+def _detector(table: Any, sensor: Any, place: str) -> PhotoDetector:
+    """The detector of a table: the usual one of the sensor, but for what the table says."""
+    usual = default_detector(sensor) if isinstance(sensor, Sensor) else None
+    if isinstance(table, Mapping) and usual is not None and table.get("type", usual.type_name) == usual.type_name:
+        table = {**to_dict(usual), **table}
+    return from_dict(PhotoDetector, table, place)  # type: ignore[type-abstract]

@@ -42,8 +42,8 @@ class Intrinsics:
             raise ValueError(f"expected a positive image size, got {self.width} x {self.height}.")
         if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
             raise ValueError(f"expected positive finite focal lengths in pixels, got fx {self.fx}, fy {self.fy}.")
-        if len(self.distortion) > 5:
-            raise ValueError(f"expected at most 5 distortion coefficients, got {len(self.distortion)}.")
+        if len(self.distortion) > 5 or not np.isfinite(self.distortion).all():
+            raise ValueError(f"expected at most 5 finite distortion coefficients, got {self.distortion}.")
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov_x_deg: float) -> Intrinsics:
@@ -143,6 +143,22 @@ def translation(x: float, y: float, z: float) -> Array:
     return result
 
 
+def check_optics(lenses: Any) -> None:
+    """Raise ValueError if apertures, focus or vignetting of a `Rig` (or of what sets them) are not possible."""
+    for device in ("camera", "projector"):
+        rules = (
+            (f"{device}_aperture_radius_m", "to be positive", lambda x: 0 < x < np.inf),
+            (f"{device}_focus_m", "to be positive and finite, or None for a sharp lens", lambda x: 0 < x < np.inf),
+            (f"{device}_vignetting", "to be an exponent of at least 0", lambda x: 0 <= x < np.inf),
+        )
+        for name, expected, holds in rules:
+            value = getattr(lenses, name)
+            if value is None and name.endswith("focus_m"):
+                continue
+            if not (isinstance(value, (int, float, np.number)) and holds(value)):
+                raise ValueError(f"expected {name} {expected}, got {value!r}.")
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """A camera and the emitter (projector or modulated lamp) fixed to it.
@@ -176,16 +192,9 @@ class Rig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
         object.__setattr__(self, "T_camera_projector", pose(self.T_camera_projector, "T_camera_projector"))
-        for name in ("camera_aperture_radius_m", "projector_aperture_radius_m", "projector_power_w"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"expected {name} to be positive, got {getattr(self, name)}.")
-        for name in ("camera_focus_m", "projector_focus_m"):
-            focus = getattr(self, name)
-            if focus is not None and not 0 < focus < np.inf:
-                raise ValueError(f"expected {name} to be positive and finite, or None for a sharp lens, got {focus}.")
-        for name in ("camera_vignetting", "projector_vignetting"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"expected {name} to be an exponent of at least 0, got {getattr(self, name)}.")
+        if not (isinstance(self.projector_power_w, (int, float)) and 0 < self.projector_power_w < np.inf):
+            raise ValueError(f"expected projector_power_w to be positive, got {self.projector_power_w!r}.")
+        check_optics(self)
 
     def __eq__(self, other: Any) -> bool:
         return isinstance(other, Rig) and to_dict(self) == to_dict(other)

@@ -80,6 +80,7 @@ def test_the_public_surface_is_this() -> None:
         "StructuredLight",
         "compare",
         "decode",
+        "default_detector",
         "explain",
         "expose",
         "import_capture",

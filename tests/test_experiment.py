@@ -192,3 +192,14 @@ def test_optics_photons_and_glint_reach_the_pass() -> None:
     assert (rig.projector_focus_m, rig.camera_focus_m, rig.camera_vignetting) == (0.8, None, 4.0)
     with pytest.raises(ValueError, match="expected no negative number of photons, got -1"):
         Experiment("x.xml", photons=-1)
+
+
+def test_a_detector_table_changes_the_usual_detector_of_the_sensor() -> None:
+    table = {"sensor": "amcw", "detector": {"band_width_m": 10e-9}}
+    one = experiment_from_dict({"scene": "x.xml", "instrument": [table]}).instruments[0]
+    assert one.detector == replace(Detector.time_of_flight(), band_width_m=10e-9)
+    table["detector"] = {"type": "emva1288", "full_well_e": 5e4}
+    one = experiment_from_dict({"scene": "x.xml", "instrument": [table]}).instruments[0]
+    assert one.detector == replace(Detector.time_of_flight(), full_well_e=5e4)
+    with pytest.raises(ValueError, match=r"instrument\[0\].*expected camera_focus_m to be positive"):
+        experiment_from_dict({"scene": "x.xml", "instrument": [{"sensor": "gray", "optics": {"camera_focus_m": 0}}]})
