@@ -44,8 +44,8 @@ def timed(task: Callable[[], Any]) -> tuple[Any, np.ndarray]:
 
 def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.ndarray]:
     """Photons that landed, and (repeats, 2) seconds to trace them and to build their maps."""
+    from rangesim.light_transport.caustics import PHOTONS, gathering_angle
     from rangesim.light_transport.device import Device
-    from rangesim.light_transport.one_pass import PHOTONS, _gathering_angle
     from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
     from rangesim.light_transport.photons import trace_photons
 
@@ -55,7 +55,7 @@ def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.
     seconds = []
     for seed in range(repeats + 1):
         landed, tracing = timed(partial(trace, seed=seed, memory_bytes=2 << 30))
-        radius_m = z * _gathering_angle(rig, landed.per_pixel)
+        radius_m = z * gathering_angle(rig, landed.per_pixel)
         _, building = timed(partial(PhotonMaps, landed, maps, radius_m, irradiance))
         seconds.append([tracing[0], building[0]])
     return len(landed.flux), np.array(seconds[1:])

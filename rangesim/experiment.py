@@ -60,6 +60,13 @@ class Experiment:
             raise ValueError(f"expected no negative number of photons, got {self.photons}.")
         if self.seed < 0:
             raise ValueError(f"expected a seed of at least 0, got {self.seed}.")
+        for one in self.instruments if self.motion else ():
+            period_s = one.timing.frame_period_s
+            if one.exposure_s is not None and 0 < period_s < one.exposure_s:
+                raise ValueError(
+                    f"expected exposure_s of {one.name} within its frame_period_s of {period_s:g} s, "
+                    f"got {one.exposure_s:g} s."
+                )
         names = [i.name for i in self.instruments]
         if not names:
             raise ValueError("expected at least one instrument, got none.")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +18,15 @@ from rangesim.causes import explain
 from rangesim.experiment import Experiment
 from rangesim.instrument import Instrument
 from rangesim.motion import transport_moving
+from rangesim.motion.moving_signals import MovingSignals
 from rangesim.provenance import provenance
 from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, save_range_image
 from rangesim.staging import new_directory, write_json
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
+    from rangesim.detector import PhotoDetector
+    from rangesim.motion import Timing
     from rangesim.point_cloud import PointCloud
     from rangesim.rig import Rig
     from rangesim.scene import Scene
@@ -82,8 +86,10 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     """Expose, decode, compare, explain and segment for one instrument; write all to the new directory `folder`."""
     folder.mkdir()
     times: dict[str, float] = {}
+    moves = isinstance(signals, MovingSignals)
     with timed(times, "exposure"):
-        capture = rangesim.expose(signals, one.sensor, one.detector, one.exposure_s, seed, ambient)
+        detector = _in_time(one) if moves else one.detector
+        capture = rangesim.expose(signals, one.sensor, detector, one.exposure_s, seed, ambient)
     capture.save(folder / "capture")
     with timed(times, "decode"):
         image = rangesim.decode(capture)
@@ -100,9 +106,17 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
         cloud.save(folder / "cloud.ply")
         with timed(times, "segmentation"):
             segment(cloud, folder / "segmentation.npz")
-    write_json(
-        folder / "measurement.json", {**acquisition(capture), "points": int(cloud.valid.sum()), "times_s": times}
-    )
+    facts = acquisition(capture, one.timing, moves)
+    write_json(folder / "measurement.json", {**facts, "points": int(cloud.valid.sum()), "times_s": times})
+
+
+def _in_time(one: Instrument) -> PhotoDetector | None:
+    """The instrument's detector, whose automatic exposure ends before the next one begins."""
+    period_s = one.timing.frame_period_s
+    if one.detector is None or not period_s:
+        return one.detector
+    longest_s = max(one.detector.min_exposure_s, min(one.detector.max_exposure_s, period_s))
+    return replace(one.detector, max_exposure_s=longest_s)  # type: ignore[type-var]
 
 
 def segment(cloud: PointCloud, path: Path) -> None:
@@ -139,17 +153,24 @@ def noise_seed(experiment: Experiment, one: Instrument) -> int:
     return int(np.random.SeedSequence([experiment.seed, position]).generate_state(1)[0])
 
 
-def acquisition(capture: Capture) -> dict[str, Any]:
-    """Frames and time of a capture; exposure None for a noise-free one, which takes no time."""
+def acquisition(capture: Capture, timing: Timing, moves: bool) -> dict[str, Any]:
+    """Frames and time of a capture; exposure None for a noise-free one, which takes no time.
+
+    Exposures follow each other at once, or, where something moves, as the timing says.
+    """
     exposure = capture.exposure_s if np.isfinite(capture.exposure_s) else None
-    frames = len(capture.frames)
-    # all bins of a photon histogram fill during one exposure
-    shots = 1 if capture.sensor.type_name == "direct-tof" else frames
+    camera = capture.frames.shape[1:]
+    shots = len(timing.exposure_times_s(capture.sensor))
+    taken = None
+    if exposure is not None:
+        pause = max(exposure, timing.frame_period_s) if moves else exposure
+        lines = camera[0] if timing.lines == "rows" else camera[1]
+        taken = (shots - 1) * pause + exposure + (lines - 1) * (timing.line_period_s if moves else 0.0)
     return {
         "sensor": capture.sensor.type_name,
-        "frames": frames,
+        "frames": len(capture.frames),
         "exposure_s": exposure,
-        "acquisition_s": None if exposure is None else shots * exposure,
+        "acquisition_s": taken,
         "pixels": int(capture.frames[0].size),
     }
 

@@ -22,7 +22,7 @@ from scipy.ndimage import binary_dilation
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.loop import mono, stratified
 from rangesim.light_transport.medium import Media, bounded
-from rangesim.light_transport.photons import MAX_CHAIN
+from rangesim.light_transport.photon_flight import MAX_CHAIN
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
@@ -71,13 +71,8 @@ def trace_glint(scene: Any, rig: Rig, responses: Sequence[Response], seed: int, 
     paths = int(np.clip(MOST_PATHS // len(pixel), *PATHS_PER_PIXEL))
     lens = Lens(rig, projector, radius_m, rig.projector_irradiance / (np.pi * radius_m**2) / paths)
     dense, total = _paths_to_the_lens(scene, camera, lens, accumulators, *_lanes(pixel, seed, paths), media)
-    bins = accumulators.bins
-    dr.eval(dense, [total], list(bins.values()))
-    channels = [
-        bins[r].numpy().reshape(-1, len(pixel)) if r in bins else np.stack([v.numpy() for v in values])
-        for r, values in zip(responses, dense, strict=True)
-    ]
-    return Glint(pixel, total.numpy(), channels)
+    channels, sums = accumulators.images(dense, [total])
+    return Glint(pixel, sums[0], channels)
 
 
 class Lens:

@@ -4,19 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth
 from rangesim.light_transport.loop import Radiance, Settings, trace
-from rangesim.light_transport.medium import Media, media_of
-from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
-from rangesim.light_transport.photons import has_delta, trace_photons
+from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.responses import Accumulators
 from rangesim.response import Response
 from rangesim.rig import Rig
@@ -27,12 +25,6 @@ from rangesim.signals import EnergySplit, Signals
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 PROGRESS_STEPS = 16
-PHOTONS = 500_000
-PHOTONS_PER_DISC = 400
-"""Photons of all maps within the largest radius, where light is neither spread nor focused."""
-RADIUS_IN_PROJECTOR_PIXELS = 4.0
-RADIUS_IN_CAMERA_PIXELS = (0.3, 3.0)
-"""Bounds of the largest photon radius, at the working distance: finer than the stripes, about as fine as the image."""
 
 
 def transport(
@@ -68,7 +60,8 @@ def transport(
         blurred by about half of it.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     seed : int; the same seed gives the same bytes, whatever the number of threads and the memory budget.
-    memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size.
+    memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed
+        come on top, some 200 bytes each.
     progress : called with the share done, 0..1, after each tile.
 
     Raises
@@ -77,7 +70,7 @@ def transport(
         A number out of its range, patterns that do not fit the projector, or too little memory.
     """
     _check(scene, rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
-    _check_photons(photons, caustic_radius_m)
+    check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
@@ -93,57 +86,27 @@ def transport(
     )
     irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
     media = media_of(scene.mitsuba)
-    maps = None
-    if photons and has_delta(scene.mitsuba):
-        maps = _photon_maps(
-            scene, rig, projector, photons, caustic_radius_m, min(spp, MOST_MAPS), seed, memory_bytes, media
-        )
+    maps = caustic_maps(scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media)
     for begin, end in _tiles(h * w, responses, memory_bytes, PROGRESS_STEPS if progress else 1):
         accumulators = Accumulators(responses, end - begin)
         pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
         dense, radiance = trace(
             scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings, maps, media
         )
-        bins = accumulators.bins
-        dr.eval(dense, list(radiance), list(bins.values()))  # all at once: one by one, the loop would run once for each
-        for r, values in zip(responses, dense, strict=True):
-            channels[r].append(bins[r].numpy().reshape(-1, end - begin) if r in bins else _stack(values))
-        radiances.append(_stack(radiance))
+        tile, sums = accumulators.images(dense, radiance)
+        for response, values in zip(responses, tile, strict=True):
+            channels[response].append(values)
+        radiances.append(sums)
         if progress:
             progress(end / (h * w))
     images = {r: _join(tiles, h, w) for r, tiles in channels.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
         found = trace_glint(scene.mitsuba, rig, responses, seed, media)
-        found.add_to(highlights, found.radiance)
-        for r, values in zip(responses, found.channels, strict=True):
-            found.add_to(images[r], values)
+        found.add_to(highlights, found.radiance[None])
+        for response, values in zip(responses, found.channels, strict=True):
+            found.add_to(images[response], values)
     return _signals(scene, rig, Radiance(*_join(radiances, h, w)), highlights[0], images, spp)
-
-
-def _photon_maps(
-    scene: Scene,
-    rig: Rig,
-    projector: Device,
-    photons: int,
-    radius_m: float | None,
-    maps: int,
-    seed: int,
-    memory_bytes: int,
-    media: Media | None,
-) -> PhotonMaps | None:
-    """Maps of the projector's light beyond delta surfaces; None if no photon landed."""
-    landed = trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media)
-    radius_m = radius_m or scene.working_distance_m * _gathering_angle(rig, landed.per_pixel)
-    irradiance = rig.projector_irradiance / scene.working_distance_m**2
-    return PhotonMaps(landed, maps, radius_m, irradiance) if len(landed.flux) else None
-
-
-def _gathering_angle(rig: Rig, photons_per_pixel: float) -> float:
-    """Largest photon radius at z = 1 m: wide enough for `PHOTONS_PER_DISC`, within bounds."""
-    of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), RADIUS_IN_PROJECTOR_PIXELS)
-    low, high = (pixels / rig.camera.fx for pixels in RADIUS_IN_CAMERA_PIXELS)
-    return float(np.clip(of_projector / rig.projector.fx, low, high))
 
 
 def _signals(
@@ -163,10 +126,6 @@ def _signals(
 def _join(tiles: list[np.ndarray], h: int, w: int) -> np.ndarray:
     """(c, h, w) of tiles (c, pixels), without a copy where there is but one."""
     return (tiles[0] if len(tiles) == 1 else np.concatenate(tiles, axis=1)).reshape(-1, h, w)
-
-
-def _stack(values: Sequence[Any]) -> np.ndarray:
-    return np.stack([v.numpy() for v in values])
 
 
 def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, at_least: int) -> Iterator[tuple[int, int]]:
@@ -194,10 +153,3 @@ def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], seed: i
     for name, value in counts.items():
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"expected {name} to be a whole number of at least 1, got {value!r}.")
-
-
-def _check_photons(photons: int, radius_m: float | None) -> None:
-    if not isinstance(photons, (int, np.integer)) or photons < 0:
-        raise ValueError(f"expected photons to be a whole number of at least 0, got {photons!r}.")
-    if radius_m is not None and not 0 < radius_m < np.inf:
-        raise ValueError(f"expected a positive caustic_radius_m in metres, got {radius_m!r}.")

@@ -98,7 +98,7 @@ class PhotonMaps:
         order = np.argsort(key, kind="stable")
         starts = np.cumsum(np.bincount(key + 1, minlength=len(radii) * stride + 1))
         points = np.column_stack([photons.position, photons.flux])
-        padding = np.zeros((len(order), 2))
+        padding = np.zeros((len(order), 2), np.float32)
         flights = np.column_stack([photons.direction, photons.u, photons.v, photons.length_m, padding])
 
         opaque = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731

@@ -14,7 +14,7 @@ something is finer than a pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,15 +22,11 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.exact_point import on_its_line
 from rangesim.light_transport.medium import Media, bounded, is_boundary
+from rangesim.light_transport.photon_flight import fly
 
 DEFENSIVE_SHARE = 0.05
 """Of the photons, for the pixels where the pre-pass found no delta surface."""
-LANDING_SHARE = 0.75
-"""Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
-MAX_CHAIN = 16
-"""Delta surfaces in a row that a photon is followed through."""
 BYTES_PER_PHOTON = 128
 """While it flies, an upper bound."""
 
@@ -106,7 +102,7 @@ def trace_photons(
         number = np.arange(begin, min(begin + chunk, total))
         chosen = np.searchsorted(cumulative, _stratified(number, per_map) * cumulative[-1], side="right")
         flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
-        end, fate = _fly(scene, projector, pixels[chosen], flux, number, seed, media)
+        end, fate = fly(scene, projector, pixels[chosen], flux, number, seed, media)
         kept = np.flatnonzero(end.flux)
         landed.append([_columns(x)[kept] for x in end] + [number[kept] // per_map])
         balance += fate
@@ -145,114 +141,6 @@ def _stratified(number: np.ndarray, per_map: int) -> np.ndarray:
     """Places in 0..1, evenly spaced within each map, each map shifted against the others (golden ratio)."""
     shift = (number // per_map * 0.6180339887498949 + 0.5) % 1.0
     return np.asarray((number % per_map + shift) / per_map)
-
-
-class _Landing(NamedTuple):
-    """Where a photon landed; flux 0 where it did not."""
-
-    position: Any
-    direction: Any
-    flux: Any
-    u: Any
-    v: Any
-    length: Any
-
-
-def _fly(
-    scene: Any,
-    projector: Device,
-    pixel: np.ndarray,
-    flux: np.ndarray,
-    number: np.ndarray,
-    seed: int,
-    media: Media | None = None,
-) -> tuple[_Landing, np.ndarray]:
-    """Landings of photons sent through projector pixels, and the sums of `PhotonBalance`."""
-    pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(projector.size.x)
-    states = mi.sample_tea_32(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), mi.UInt32(number.astype(np.uint32)) ^ 0x9E3779B9)
-    rng = mi.PCG32(1, *(mi.UInt64(x) for x in states))
-    jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-    uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
-    landing, fate = _chain(
-        scene, projector, uv, mi.Float(flux.astype(np.float32)), rng, dr.opaque(mi.UInt32, MAX_CHAIN), media
-    )
-    dr.eval(list(landing), list(fate))
-    return landing, np.array([x.numpy().sum(dtype=np.float64) for x in fate])
-
-
-@dr.syntax
-def _chain(
-    scene: Any, projector: Device, uv: Any, power: Any, rng: Any, max_chain: Any, media: Any = None
-) -> tuple[_Landing, tuple[Any, ...]]:
-    """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
-    lanes = dr.width(power)
-    lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(projector.has_lens, mode="scalar") else None
-    primary = projector.sample_ray(uv, lens)
-    ray = mi.Ray3f(primary.origin, primary.direction)
-    flux = power * projector.relative_illumination(primary.direction)
-    if dr.hint(primary.exists is not None, mode="scalar"):
-        flux = dr.select(primary.exists, flux, 0)
-    emitted = mi.Float(flux)
-    length = primary.lead + dr.zeros(mi.Float, lanes)  # optical, from the projector to `previous`
-    ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
-    chain = dr.zeros(mi.UInt32, lanes)  # delta interactions so far
-    inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
-    crosses, crossed = mi.Bool(False), dr.zeros(mi.UInt32, lanes)  # boundaries of media: this one, those so far
-    previous = mi.Point3f(primary.origin)
-    position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
-    direct, stored, absorbed, escaped, truncated = (dr.zeros(mi.Float, lanes) for _ in range(5))
-    context = mi.BSDFContext(mi.TransportMode.Importance)
-    context.type_mask = mi.BSDFFlags.Delta
-    active = emitted > 0
-
-    while active:
-        # ---- Next surface ----------------------------------------------------------------------------
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
-        hit = si.is_valid() & active
-        point = dr.select(chain > 0, on_its_line(si, previous, ray.d), si.p)
-        escaped += dr.select(active & ~hit, flux, 0)
-        if dr.hint(media is not None, mode="scalar"):
-            crosses = hit & media.bounded_by(si, hit)
-            lost = dr.select(hit, flux * (1 - dr.exp(-inside.sigma_t * dr.norm(point - previous))), 0)
-            flux -= lost
-            direct += dr.select(chain == 0, lost, 0)
-            absorbed += dr.select(chain == 0, 0, lost)
-        length = dr.select(hit, dr.fma(ior, dr.norm(point - previous), length), length)
-        bsdf = si.bsdf(ray)
-        scatters = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-
-        # ---- It lands: beyond a delta surface for the map, else for next-event estimation ------------
-        direct += dr.select(hit & ~mirrors & (chain == 0), flux, 0)
-        mixed = scatters & mirrors & (chain > 0)
-        lands = scatters & (chain > 0) & (~mixed | (rng.next_float32() < LANDING_SHARE))
-        landing_flux = dr.select(mixed, flux / LANDING_SHARE, flux)
-        stored = dr.select(lands, landing_flux, stored)
-        position = dr.select(lands, point, position)
-        direction = dr.select(lands, ray.d, direction)
-
-        # ---- Or goes on as a delta interaction -------------------------------------------------------
-        goes_on = mirrors & ~lands
-        bs, weight = bsdf.sample(
-            context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), goes_on
-        )
-        remains = flux * dr.select(mixed, 1 / (1 - LANDING_SHARE), 1) * mi.unpolarized_spectrum(weight)[0]
-        goes_on &= (remains > 0) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        remains = dr.select(goes_on, remains, 0)
-        absorbed += dr.select(hit & ~(~mirrors & (chain == 0)), flux - remains - dr.select(lands, landing_flux, 0), 0)
-        flux = dr.select(active, remains, flux)
-        ior = dr.select(goes_on & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
-        chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))
-        previous = dr.select(goes_on, point, previous)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        if dr.hint(media is not None, mode="scalar"):
-            inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
-            crossed += dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
-        truncated += dr.select(goes_on & (chain + crossed >= max_chain), flux, 0)
-        active = goes_on & (chain + crossed < max_chain)
-
-    landing = _Landing(position, direction, stored, uv.x, uv.y, length)
-    return landing, (emitted, direct, stored, absorbed, escaped, truncated)
 
 
 def _columns(array: Any) -> np.ndarray:

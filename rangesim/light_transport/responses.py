@@ -68,3 +68,19 @@ class Accumulators:
                 dr.scatter_add(self.bins[response], radiance, target, inside, mode=dr.ReduceMode.NoConflicts)
             result.append(values)
         return result
+
+    def images(self, channels: list[list[Any]], others: Sequence[Any]) -> tuple[list[np.ndarray], np.ndarray]:
+        """(c, lanes) float32 of each response, and the `others`, Floats of the same loop, as (n, lanes) float32.
+
+        All are evaluated at once: one by one, the loop would run once for each.
+        """
+        dr.eval(channels, list(others), list(self.bins.values()))
+        images = [
+            self.bins[r].numpy().reshape(-1, self.lanes) if r in self.bins else _stack(values)
+            for r, values in zip(self.responses, channels, strict=True)
+        ]
+        return images, _stack(others)
+
+
+def _stack(values: Sequence[Any]) -> np.ndarray:
+    return np.stack([v.numpy() for v in values])

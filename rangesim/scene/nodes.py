@@ -39,8 +39,20 @@ def ids_of_shapes(state: Any, label: str) -> set[str]:
                 name += "_"
             node.props.set_id(name)
             taken.add(name)
+        _check_media(state, node, f"{label}: shape {name!r}")
         ids.add(name)
     return ids
+
+
+def _check_media(state: Any, node: Any, place: str) -> None:
+    """A medium counts only as the interior (or exterior) of a shape; under another name Mitsuba would pass it over."""
+    for key, value in node.props.items():
+        is_medium = (
+            isinstance(value, mi.Properties.ResolvedReference)
+            and state.nodes[value.index()].type == mi.ObjectType.Medium
+        )
+        if is_medium and key not in ("interior", "exterior"):
+            raise FileFormatError(f'{place} refers to a medium without saying where: add name="interior".')
 
 
 def take_material_classes(state: Any) -> dict[str, str]:

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The projector's light beyond glass and mirrors, ready to be gathered: how many photons, maps, and what radius."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.medium import Media
+from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
+from rangesim.light_transport.photons import has_delta, trace_photons
+from rangesim.rig import Rig
+from rangesim.scene import Scene
+
+PHOTONS = 500_000
+PHOTONS_PER_DISC = 400
+"""Photons of all maps within the largest radius, where light is neither spread nor focused."""
+RADIUS_IN_PROJECTOR_PIXELS = 4.0
+RADIUS_IN_CAMERA_PIXELS = (0.3, 3.0)
+"""Bounds of the largest photon radius, at the working distance: finer than the stripes, about as fine as the image."""
+
+SMALLEST_RADIUS_M = 1e-6
+
+
+def caustic_maps(
+    scene: Scene,
+    rig: Rig,
+    photons: int,
+    radius_m: float | None,
+    spp: int,
+    seed: int,
+    memory_bytes: int,
+    media: Media | None,
+) -> PhotonMaps | None:
+    """Maps for a pass of `spp` samples; None if there are no photons, nothing to send them through, or none landed."""
+    if not photons or not has_delta(scene.mitsuba):
+        return None
+    maps, projector = min(spp, MOST_MAPS), Device.projector(rig)
+    landed = trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media)
+    radius_m = radius_m or scene.working_distance_m * gathering_angle(rig, landed.per_pixel)
+    irradiance = rig.projector_irradiance / scene.working_distance_m**2
+    return PhotonMaps(landed, maps, radius_m, irradiance) if len(landed.flux) else None
+
+
+def gathering_angle(rig: Rig, photons_per_pixel: float) -> float:
+    """Largest photon radius at z = 1 m: wide enough for `PHOTONS_PER_DISC`, within bounds."""
+    of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), RADIUS_IN_PROJECTOR_PIXELS)
+    low, high = (pixels / rig.camera.fx for pixels in RADIUS_IN_CAMERA_PIXELS)
+    return float(np.clip(of_projector / rig.projector.fx, low, high))
+
+
+def check_photons(photons: int, radius_m: float | None) -> None:
+    """Raise ValueError if there cannot be so many photons, or no such radius."""
+    if not isinstance(photons, (int, np.integer)) or photons < 0:
+        raise ValueError(f"expected photons to be a whole number of at least 0, got {photons!r}.")
+    if radius_m is not None and not SMALLEST_RADIUS_M <= radius_m < np.inf:
+        raise ValueError(f"expected a caustic_radius_m of at least {SMALLEST_RADIUS_M:g} m, got {radius_m!r}.")
