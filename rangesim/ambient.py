@@ -152,6 +152,13 @@ class Ambient:
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"expected {name} to be positive and finite, got {getattr(self, name)}.")
 
+    def check_emitters(self, scene_has_any: bool) -> None:
+        """Raise ValueError if there is light to scale, but none in the scene."""
+        if self.scale > 0 and not scene_has_any:
+            raise ValueError(
+                "expected a scene with emitters for the ambient light to scale, got one without such light."
+            )
+
     @cached_property
     def spectrum(self) -> Illuminant:
         """The illuminant."""

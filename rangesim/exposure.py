@@ -53,8 +53,8 @@ def expose(
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     if exposure_s is not None and not 0 < exposure_s < np.inf:
         raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
-    if ambient is not None and ambient.scale > 0 and not signals.energy.ambient.any():
-        raise ValueError("expected a scene with emitters for the ambient light to scale, got one without such light.")
+    if ambient is not None:
+        ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or isinstance(sensor, IdealToF):
         unfiltered = 1.0 if ambient is None else ambient.scale
         return Capture(

@@ -66,6 +66,8 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
             scene = scene or rangesim.load_scene(
                 experiment.scene, material=experiment.material, unit_m=experiment.unit_m
             )
+        if experiment.ambient is not None:
+            experiment.ambient.check_emitters(scene.has_ambient)
         with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
             compile_kernels()
         passes = group_by_rig(experiment, scene)

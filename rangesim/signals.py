@@ -19,8 +19,8 @@ class EnergySplit:
     direct : projector -> surface -> camera.
     multipath : two or more non-delta surfaces.
     via_delta : the camera sees the lit surface off a mirror or through glass, and nothing else between.
-    caustic : the projector lights the surface off a mirror or through glass (zero until photons are traced).
-    glint : the camera sees the projector's lens off a mirror or through glass (zero until traced).
+    caustic : the projector lights the surface off a mirror or through glass.
+    glint : the camera sees the projector's lens off a mirror, through glass or directly.
     ambient : every light but the projector, before any filter.
     """
 

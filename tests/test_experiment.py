@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from rangesim.detector import Detector
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment
 from rangesim.instrument import DEFAULT_SENSORS, Instrument, Optics, instrument
+from rangesim.motion import Motion, SteadyTrack, Timing
 from rangesim.pipeline import group_by_rig, noise_seed, run
 from rangesim.result_files import load_result
 from rangesim.sensors import DirectToF, IdealToF
@@ -203,3 +206,20 @@ def test_a_detector_table_changes_the_usual_detector_of_the_sensor() -> None:
     assert one.detector == replace(Detector.time_of_flight(), full_well_e=5e4)
     with pytest.raises(ValueError, match=r"instrument\[0\].*expected camera_focus_m to be positive"):
         experiment_from_dict({"scene": "x.xml", "instrument": [{"sensor": "gray", "optics": {"camera_focus_m": 0}}]})
+
+
+def test_the_experiment_of_the_docs_is_one() -> None:
+    text = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    experiment = experiment_from_dict({"scene": "x.xml", **tomllib.loads(snippet)})
+    assert experiment.ambient is not None
+    assert experiment.motion is not None
+    assert experiment.instruments[0].optics.camera_focus_m == 0.8
+
+
+def test_exposures_end_before_the_next_frame_of_what_moves() -> None:
+    moves = Motion({"ball": SteadyTrack((0.1, 0.0, 0.0))})
+    one = instrument("gray", exposure_s=0.02, timing=Timing(frame_period_s=0.01))
+    assert Experiment("x.xml", instruments=(one,)).instruments == (one,)  # at rest they follow each other
+    with pytest.raises(ValueError, match=r"exposure_s of gray within its frame_period_s of 0\.01 s, got 0\.02 s"):
+        Experiment("x.xml", instruments=(one,), motion=moves)

@@ -6,13 +6,13 @@ A deep slab of matched index is a half space: its radiance has Chandrasekhar's c
 
 from __future__ import annotations
 
-import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from plain_mitsuba import plain_scene, render, show, z_score
 
 import rangesim
 from rangesim import AmcwToF, transport
@@ -24,9 +24,6 @@ from rangesim.light_transport.photons import trace_photons
 from rangesim.response import SPEED_OF_LIGHT, Fringes, Images, Phasor
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-from benchmarks.plain_mitsuba import plain_scene, render, show, z_score  # noqa: E402
-
 TOP_M = 0.02
 """Height of the slab's upper face; the camera is 0.5 m above z = 0."""
 UP = [0.1, 1, 0]
@@ -360,3 +357,13 @@ def test_the_media_of_the_catalogue_load_and_are_translucent(tmp_path: Path, pat
         f'<shape type="sphere"><bsdf type="null"/><ref id="{path.stem}" name="interior"/></shape></scene>'
     )
     assert [i.material for i in rangesim.load_scene(file).instances] == ["translucent"]
+
+
+def test_a_medium_that_fills_nothing_is_refused(tmp_path: Path) -> None:
+    scene = tmp_path / "wax.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><include filename="materials/media/wax.xml"/><sensor type="perspective"/>'
+        '<shape type="sphere" id="candle"><bsdf type="null"/><ref id="wax"/></shape></scene>'
+    )
+    with pytest.raises(FileFormatError, match="shape 'candle' refers to a medium without saying where"):
+        rangesim.load_scene(scene)

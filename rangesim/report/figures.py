@@ -134,7 +134,7 @@ def telling_frames(capture: Capture) -> list[int]:
 
 
 def light_pictures(energy: EnergySplit) -> list[Picture]:
-    """Radiance by the kind of light path, all with the same white, and each kind's share of the emitter's light."""
+    """Radiance by the kind of light path, all with the same white, and their shares of the projector's light seen."""
     white = _bright(energy.projector)
     total = float(energy.projector.sum())
     kinds = {
@@ -147,7 +147,7 @@ def light_pictures(energy: EnergySplit) -> list[Picture]:
     pictures = [
         Picture(
             grey(image, white),
-            f"{name}: {meaning}; {100 * float(image.sum()) / total:.1f} % of the emitter’s light",
+            f"{name}: {meaning}; {100 * float(image.sum()) / total:.1f} % of the projector’s light in the image",
             name,
         )
         for name, (meaning, image) in kinds.items()
