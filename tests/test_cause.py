@@ -290,3 +290,16 @@ def test_paths_out_of_the_bins_count_nowhere() -> None:
     kind = np.array([0, 0, 1, 1, 4], dtype=np.uint32)
     found = split.bin(LightPath(0 * length, 0 * length, length, length > 0, kind), NumpyMath())
     assert found.tolist() == [split.channels, 0, 4 + 3, split.channels, 16 + 2]
+
+
+EASY = [StructuredLight(256, 160), AmcwToF(), DirectToF(), IdealToF()]
+
+
+@pytest.mark.parametrize("sensor", EASY, ids=lambda s: s.type_name)
+def test_where_nothing_fails_nothing_is_explained(sensor: Sensor) -> None:
+    scene = rangesim.load_scene(ROOT / "scenes" / "plane.xml")
+    signals = rangesim.transport(scene, scene.rig(0.2, (256, 160), width=16, height=12), [sensor], spp=16)
+    capture = rangesim.expose(signals, sensor)
+    found = explain(rangesim.decode(capture), capture, signals, tolerance_m=0.2)
+    assert not found.failed.any()
+    assert found.shares(signals.truth)[-1] == {"material": "all", "failed": 0.0, "causes": {}}

@@ -58,6 +58,8 @@ def explain(
     if not tolerance_m > 0:
         raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
     evidence = Evidence(image, capture, signals, tolerance_m)
+    if not evidence.failed.any():
+        return CauseMap(np.zeros(shape, dtype=np.uint8), tolerance_m)
     masks, causes = zip(*rules(evidence), strict=True)
     cause = np.select(masks, causes)
     return CauseMap(np.where(evidence.failed, cause, Cause.NONE).astype(np.uint8), tolerance_m)
