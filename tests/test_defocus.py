@@ -14,9 +14,9 @@ from synthetic import plane_signals, stereo_rig
 
 from rangesim.capture_files import load_capture
 from rangesim.config import from_dict, to_dict
-from rangesim.defocus import SWITCH, blurred_stripes
 from rangesim.exposure import expose
 from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
+from rangesim.response.defocus import SWITCH, blurred_stripes
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensors import IdealToF
 

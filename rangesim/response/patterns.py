@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rangesim.defocus import BlurredImage, blurred_stripes, fringe_contrast
 from rangesim.response.base import DenseResponse, LightPath, Math
+from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
 
 
 @dataclass(frozen=True)
