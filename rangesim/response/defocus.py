@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from rangesim.response import Math
+    from rangesim.response.base import Math
 
 ROOT_HALF = 0.5**0.5
 SHARPEST = 1e-5
