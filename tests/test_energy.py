@@ -24,6 +24,7 @@ from delta_scenes import (
 from rangesim import Intrinsics, Rig, Scene, look_at, transport
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import Photons, trace_photons
+from rangesim.response import FirstReturn
 
 POWER_W = 2.0
 PROJECTOR = Intrinsics.from_fov(160, 120, 40)
@@ -196,3 +197,21 @@ def test_a_white_furnace_hides_lossless_glass() -> None:
     rig = rig_of(CAMERA, PROJECTOR)
     ambient = transport(scene, rig, [], spp=64, max_depth=60, rr_depth=60).energy.ambient
     np.testing.assert_allclose(ambient, 1.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("thickness_m", [1e-2, 1e-4, 5e-5])
+def test_thin_glass_keeps_both_faces(thickness_m: float) -> None:
+    """A foil passes as much as a pane, and delays the light by (n - 1) d."""
+    response = FirstReturn()
+    scenes = (scene_of(wall=wall(1.0, matte(0.5))), scene_of(wall=wall(1.0, matte(0.5)), foil=foil(thickness_m)))
+    plain, covered = (transport(s, rig_of(CAMERA, PROJECTOR), [response], spp=32) for s in scenes)
+    share = covered.energy.caustic.sum() / plain.energy.direct.sum()
+    assert share == pytest.approx(0.85, abs=0.01)  # 0.923 for each way
+    lit = (plain.channels[response][0] > 0) & (covered.channels[response][0] > 0)
+    lengths = (c.channels[response][1][lit] / c.channels[response][0][lit] for c in (plain, covered))
+    before, after = lengths
+    assert np.median(after - before) == pytest.approx(2 * 0.5 * thickness_m, rel=0.05, abs=2e-5)
+
+
+def foil(thickness_m: float) -> dict[str, Any]:
+    return slab(0.5, 0.5 + thickness_m, 0.4)

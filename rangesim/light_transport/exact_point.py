@@ -14,6 +14,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+CLEARANCE = 0.1
+"""Of Mitsuba's own: how far off a delta surface rays start, so that thin glass keeps its far face."""
 GRAZING = 0.05
 """Cosine below which the correction would be worse than the error."""
 
@@ -23,3 +25,8 @@ def on_its_line(si: Any, origin: Any, direction: Any) -> Any:
     slope = dr.dot(direction, si.n)
     along = dr.dot(si.p - origin, si.n) / slope
     return dr.select(dr.abs(slope) > GRAZING, mi.Point3f(origin + direction * along), si.p)
+
+
+def close_start(start: Any, point: Any, met: Any) -> Any:
+    """Where a ray from the surface at `met` starts that `spawn_ray` would have start at `start`, seen from `point`."""
+    return met + CLEARANCE * (start - point)

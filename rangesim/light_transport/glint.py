@@ -20,6 +20,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
+from rangesim.light_transport.exact_point import close_start
 from rangesim.light_transport.loop import mono, stratified
 from rangesim.light_transport.medium import Media, bounded
 from rangesim.light_transport.photon_flight import MAX_CHAIN
@@ -166,6 +167,7 @@ def _probe(
         way = dr.select(rng.next_float32() < 0.5, mi.Float(0), mi.Float(0.9999))
         bs, weight = si.bsdf(ray).sample(context, si, way, mi.Point2f(0.5), hit)
         ray = si.spawn_ray(si.to_world(bs.wo))
+        ray.o = close_start(ray.o, si.p, si.p)
         chain += 1
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (mono(weight) <= 0) | (chain >= MAX_CHAIN)
         chain = dr.select(ends, 0, chain)
@@ -234,6 +236,7 @@ def _paths_to_the_lens(
         ior = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
         previous = mi.Point3f(si.p)
         ray = si.spawn_ray(si.to_world(bs.wo))
+        ray.o = close_start(ray.o, si.p, si.p)
         chain += 1
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)

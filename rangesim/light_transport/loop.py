@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rangesim.light_transport.device import Device, connect
-from rangesim.light_transport.exact_point import on_its_line
+from rangesim.light_transport.exact_point import close_start, on_its_line
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
@@ -213,7 +213,9 @@ def trace(
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
         was_bent = is_delta & ~crosses
-        ray.o = dr.select(was_bent, ray.o + (met - si.p), ray.o)  # on the safe side of edges
+        ray.o = dr.select(
+            was_bent, close_start(ray.o, si.p, met), ray.o
+        )  # on the safe side of edges
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.exact_point import on_its_line
+from rangesim.light_transport.exact_point import close_start, on_its_line
 from rangesim.light_transport.medium import Media
 
 LANDING_SHARE = 0.75
@@ -117,6 +117,7 @@ def _chain(
         chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))
         previous = dr.select(goes_on, point, previous)
         ray = si.spawn_ray(si.to_world(bs.wo))
+        ray.o = close_start(ray.o, si.p, si.p)
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             crossed += dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
