@@ -213,9 +213,7 @@ def trace(
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
         was_bent = is_delta & ~crosses
-        ray.o = dr.select(
-            was_bent, close_start(ray.o, si.p, met), ray.o
-        )  # on the safe side of edges
+        ray.o = dr.select(was_bent, close_start(ray.o, si.p, met), ray.o)  # on the safe side of edges
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
