@@ -96,6 +96,12 @@ class Device:
         p, exists = self._undistorted(pixel)
         return PrimaryRay(mi.Point3f(self.centre), self._direction(p), mi.Float(0), exists)
 
+    def centre_rays(self) -> PrimaryRay:
+        """The rays through the centres of all pixels, row by row, and the centre of the lens."""
+        width, height = (int(n[0]) for n in self.size)
+        index, row = dr.arange(mi.UInt32, width * height), mi.UInt32(self.size.x)
+        return self.centre_ray(mi.Point2f(mi.Float(index % row) + 0.5, mi.Float(index // row) + 0.5))
+
     def sample_ray(self, pixel: Any, lens: Any) -> PrimaryRay:
         """The ray through pixel coordinates; `lens` Point2f in the unit square, None where `has_lens` is not set.
 

@@ -27,6 +27,8 @@ def on_its_line(si: Any, origin: Any, direction: Any) -> Any:
     return dr.select(dr.abs(slope) > GRAZING, mi.Point3f(origin + direction * along), si.p)
 
 
-def close_start(start: Any, point: Any, met: Any) -> Any:
-    """Where a ray from the surface at `met` starts that `spawn_ray` would have start at `start`, seen from `point`."""
-    return met + CLEARANCE * (start - point)
+def spawn_close(si: Any, met: Any, direction: Any) -> Any:
+    """The ray that leaves a delta surface close by; `met` is where the ray before met it, on the safe side of edges."""
+    ray = si.spawn_ray(direction)
+    ray.o = met + CLEARANCE * (ray.o - si.p)
+    return ray

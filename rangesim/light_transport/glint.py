@@ -20,11 +20,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.exact_point import close_start
-from rangesim.light_transport.loop import mono, stratified
+from rangesim.light_transport.exact_point import spawn_close
+from rangesim.light_transport.loop import mono
 from rangesim.light_transport.medium import Media, bounded
 from rangesim.light_transport.photon_flight import MAX_CHAIN
+from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.responses import Accumulators
+from rangesim.light_transport.sampling import random_stream, stratified
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
@@ -100,18 +102,15 @@ class Lens:
 
 def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int, media: Media | None) -> np.ndarray:
     """Flat indices of the pixels around whose centre there is a delta surface, or the lens in plain view."""
-    index, width = dr.arange(mi.UInt32, h * w), dr.opaque(mi.UInt32, w)
-    ray = camera.centre_ray(mi.Point2f(mi.Float(index % width) + 0.5, mi.Float(index // width) + 0.5))
-    si = scene.ray_intersect(mi.Ray3f(ray.origin, ray.direction))
-    delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
-    mask = delta.numpy().reshape(h, w)
+    rays = camera.centre_rays()
+    mask = meets_delta(scene, rays, media).reshape(h, w)
     uv, z = camera.project(mi.Point3f(projector.centre))
     u, v = float(uv.x[0]), float(uv.y[0])
     if float(z[0]) > 0 and 0 <= u < w and 0 <= v < h:
         mask[int(v), int(u)] = True
     mask = binary_dilation(mask, np.ones((3, 3)))
-    if ray.exists is not None:  # a distorted lens may send no ray through some pixels
-        mask &= ray.exists.numpy().reshape(h, w)
+    if rays.exists is not None:  # a distorted lens may send no ray through some pixels
+        mask &= rays.exists.numpy().reshape(h, w)
     return np.flatnonzero(mask)
 
 
@@ -133,8 +132,8 @@ def _near_the_lens(
 def _lanes(pixel: np.ndarray, seed: int, paths: int) -> tuple[Any, Any, Any]:
     """Pixels, their random numbers, and the number of paths, on the renderer's side."""
     lanes = mi.UInt32(pixel.astype(np.uint32))
-    states = mi.sample_tea_32(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes ^ 0x85EBCA6B)
-    return lanes, mi.PCG32(1, *(mi.UInt64(x) for x in states)), dr.opaque(mi.UInt32, paths)
+    rng = random_stream(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes ^ 0x85EBCA6B)
+    return lanes, rng, dr.opaque(mi.UInt32, paths)
 
 
 @dr.syntax
@@ -166,8 +165,7 @@ def _probe(
         hit = si.is_valid() & ~bounded(media, si)
         way = dr.select(rng.next_float32() < 0.5, mi.Float(0), mi.Float(0.9999))
         bs, weight = si.bsdf(ray).sample(context, si, way, mi.Point2f(0.5), hit)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        ray.o = close_start(ray.o, si.p, si.p)
+        ray = spawn_close(si, si.p, si.to_world(bs.wo))
         chain += 1
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (mono(weight) <= 0) | (chain >= MAX_CHAIN)
         chain = dr.select(ends, 0, chain)
@@ -235,8 +233,7 @@ def _paths_to_the_lens(
         throughput *= mono(weight)
         ior = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
         previous = mi.Point3f(si.p)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        ray.o = close_start(ray.o, si.p, si.p)
+        ray = spawn_close(si, si.p, si.to_world(bs.wo))
         chain += 1
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)

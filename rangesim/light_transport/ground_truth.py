@@ -24,9 +24,7 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
     h, w = rig.camera.height, rig.camera.width
     camera, projector = Device.camera(rig), Device.projector(rig)
-    pixel, width = dr.arange(mi.UInt32, h * w), dr.opaque(mi.UInt32, w)
-    centre = mi.Point2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5)
-    ray = camera.centre_ray(centre)
+    ray = camera.centre_rays()
     si = _first_surface(scene, mi.Ray3f(ray.origin, ray.direction))
     hit = si.is_valid() if ray.exists is None else si.is_valid() & ray.exists
     to_camera = camera.centre - mi.Vector3f(si.p)

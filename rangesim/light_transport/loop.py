@@ -22,10 +22,11 @@ import drjit as dr
 import mitsuba as mi
 
 from rangesim.light_transport.device import Device, connect
-from rangesim.light_transport.exact_point import close_start, on_its_line
+from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
+from rangesim.light_transport.sampling import random_stream, stratified
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
 
@@ -85,11 +86,9 @@ def trace(
     # ---- State of the lane: its random numbers, its sums --------------------------------------------
     lanes = dr.width(pixel)
     lane = dr.arange(mi.UInt32, lanes)
-    states = [mi.UInt64(x) for x in mi.sample_tea_32(settings.seed, pixel)]
-    rng = mi.PCG32(1, *states)  # 1: no lane number mixed in
-    choice = mi.PCG32(1, *reversed(states))  # of photons; apart, so that they change no other light
-    shared = mi.PCG32(1, *(mi.UInt64(x) for x in mi.sample_tea_32(pixel >> 4, settings.seed)))  # by neighbours
-    turns = shared.next_uint32()  # evenly spread numbers from here on
+    rng = random_stream(settings.seed, pixel)
+    choice = random_stream(settings.seed, pixel, apart=True)  # of photons; they change no other light
+    turns = random_stream(pixel >> 4, settings.seed).next_uint32()  # shared by neighbours; evenly spread from here on
     width = mi.UInt32(camera.size.x)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     shift = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -213,7 +212,7 @@ def trace(
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
         was_bent = is_delta & ~crosses
-        ray.o = dr.select(was_bent, close_start(ray.o, si.p, met), ray.o)  # on the safe side of edges
+        ray.o = dr.select(was_bent, spawn_close(si, met, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
@@ -286,13 +285,6 @@ def caustics(
         path = LightPath(flight.u, flight.v, length, vertex.is_first, mi.UInt32(CAUSTIC))
         channels = accumulators.add(channels, path, radiance, lane, found)
     return channels, radiance
-
-
-def stratified(shift: Any, sample: Any) -> Any:
-    """Place of a sample within its pixel: the R2 sequence (Roberts 2018), shifted per pixel; fills the pixel evenly."""
-    n = mi.Float(sample)
-    p = shift + mi.Point2f(n * 0.7548776662466927, n * 0.5698402909980532)
-    return p - dr.floor(p)
 
 
 def emission(scene: Any, si: Any, previous: Any, pdf: Any, alone: Any, active: Any) -> Any:

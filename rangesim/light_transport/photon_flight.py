@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.exact_point import close_start, on_its_line
+from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.medium import Media
+from rangesim.light_transport.sampling import random_stream
 
 LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
@@ -41,8 +42,8 @@ def fly(
 ) -> tuple[Landing, np.ndarray]:
     """Landings of photons sent through projector pixels, and the sums of `PhotonBalance`."""
     pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(projector.size.x)
-    states = mi.sample_tea_32(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), mi.UInt32(number.astype(np.uint32)) ^ 0x9E3779B9)
-    rng = mi.PCG32(1, *(mi.UInt64(x) for x in states))
+    photon = mi.UInt32(number.astype(np.uint32))
+    rng = random_stream(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), photon ^ 0x9E3779B9)
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
     landing, fate = _chain(
@@ -116,8 +117,7 @@ def _chain(
         ior = dr.select(goes_on & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
         chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))
         previous = dr.select(goes_on, point, previous)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        ray.o = close_start(ray.o, si.p, si.p)
+        ray = spawn_close(si, si.p, si.to_world(bs.wo))
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             crossed += dr.select(crosses, mi.UInt32(1), mi.UInt32(0))

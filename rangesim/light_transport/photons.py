@@ -16,12 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rangesim.light_transport.device import Device
+from rangesim.light_transport.device import Device, PrimaryRay
 from rangesim.light_transport.medium import Media, bounded, is_boundary
 from rangesim.light_transport.photon_flight import fly
 
@@ -80,6 +79,13 @@ def has_delta(scene: Any) -> bool:
     )
 
 
+def meets_delta(scene: Any, rays: PrimaryRay, media: Media | None) -> np.ndarray:
+    """(n,) bool: whether the first surface that each ray meets has a delta interaction."""
+    si = scene.ray_intersect(mi.Ray3f(rays.origin, rays.direction))
+    delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
+    return np.asarray(delta.numpy())
+
+
 def trace_photons(
     scene: Any,
     projector: Device,
@@ -113,12 +119,9 @@ def trace_photons(
 
 def _worthwhile_pixels(scene: Any, projector: Device, media: Media | None) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices of all projector pixels along a Morton curve, and the relative chance of a photon for each."""
-    w, h = int(projector.size.x[0]), int(projector.size.y[0])
-    index, width = dr.arange(mi.UInt32, w * h), mi.UInt32(projector.size.x)
-    ray = projector.centre_ray(mi.Point2f(mi.Float(index % width) + 0.5, mi.Float(index // width) + 0.5))
-    si = scene.ray_intersect(mi.Ray3f(ray.origin, ray.direction))
-    meets_delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
-    mask = binary_dilation(meets_delta.numpy().reshape(h, w), np.ones((3, 3))).ravel()
+    meets = meets_delta(scene, projector.centre_rays(), media)
+    w, h = (int(n[0]) for n in projector.size)
+    mask = binary_dilation(meets.reshape(h, w), np.ones((3, 3))).ravel()
     rest = ~mask
     chance = np.where(mask, 1.0, DEFENSIVE_SHARE / (1 - DEFENSIVE_SHARE) * max(mask.sum(), 1) / max(rest.sum(), 1))
     order = np.argsort(_morton(np.arange(w * h) % w, np.arange(w * h) // w))
