@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pcgraph import metrics
-    from pcgraph.boundary import BoundaryCost
     from pcgraph.cloud import Cloud
     from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
-    from pcgraph.graph import AdjacencyGraph, EdgeFeatures
+    from pcgraph.features.moments import Moments
+    from pcgraph.features.nodes import NodeFeatures
+    from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
+    from pcgraph.graph.boundary import BoundaryCost
     from pcgraph.io import read_cloud, write_segmentation
-    from pcgraph.moments import Moments
-    from pcgraph.nodes import NodeFeatures
     from pcgraph.segmentation import Segmentation, segment
-    from pcgraph.tree import SegmentationTree
+    from pcgraph.tree.tree import SegmentationTree
 
 __all__ = [
     "AdjacencyGraph",
@@ -40,17 +40,17 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AdjacencyGraph": "graph",
-    "BoundaryCost": "boundary",
+    "AdjacencyGraph": "graph.adjacency",
+    "BoundaryCost": "graph.boundary",
     "Cloud": "cloud",
     "CloudReadError": "errors",
     "CloudWriteError": "errors",
-    "EdgeFeatures": "graph",
-    "Moments": "moments",
-    "NodeFeatures": "nodes",
+    "EdgeFeatures": "graph.adjacency",
+    "Moments": "features.moments",
+    "NodeFeatures": "features.nodes",
     "PcgraphError": "errors",
     "Segmentation": "segmentation",
-    "SegmentationTree": "tree",
+    "SegmentationTree": "tree.tree",
     "read_cloud": "io",
     "segment": "segmentation",
     "write_segmentation": "io",

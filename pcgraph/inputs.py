@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.bounds import bounding_box
+from pcgraph.voxels.bounds import bounding_box
 
 _LARGEST = 1e100  # metres; beyond it squares of distances overflow
 

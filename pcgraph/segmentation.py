@@ -8,20 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.boundary import BoundaryCost
-from pcgraph.contacts import contacts
-from pcgraph.graph import AdjacencyGraph
+from pcgraph.features.moments import moments_of_groups
+from pcgraph.features.nodes import node_features
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.graph.contacts import contacts
+from pcgraph.graph.relations import edge_features
 from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, non_negative, positive
-from pcgraph.merging import segmentation_tree
-from pcgraph.moments import moments_of_groups
-from pcgraph.nodes import node_features
-from pcgraph.normals import voxel_normals
-from pcgraph.relations import edge_features
-from pcgraph.spacing import median_spacing
-from pcgraph.tree import SegmentationTree
-from pcgraph.vccs import VccsWeights, vccs
-from pcgraph.voxels import voxel_grid
-from pcgraph.warp import choose_warp
+from pcgraph.supervoxels.vccs import VccsWeights, vccs
+from pcgraph.tree.growth import segmentation_tree
+from pcgraph.tree.tree import SegmentationTree
+from pcgraph.voxels.grid import voxel_grid
+from pcgraph.voxels.normals import voxel_normals
+from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.warp import choose_warp
 
 VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0

@@ -14,8 +14,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 import pcgraph
-from pcgraph.voxels import voxel_grid
-from pcgraph.warp import choose_warp
+from pcgraph.voxels.grid import voxel_grid
+from pcgraph.voxels.warp import choose_warp
 
 
 def assert_covered_and_connected(points, result):

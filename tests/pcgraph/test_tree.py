@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from clouds import refines
 
-from pcgraph.linkage import average_linkage
-from pcgraph.merging import segmentation_tree
-from pcgraph.moments import moments_of_groups
-from pcgraph.nodes import node_features
+from pcgraph.features.moments import moments_of_groups
+from pcgraph.features.nodes import node_features
+from pcgraph.tree.growth import segmentation_tree
+from pcgraph.tree.linkage import average_linkage
 
 ORIGIN = np.zeros(3)
 
@@ -108,7 +108,7 @@ def test_moments_are_exact_at_every_node(boxes):
     colors = rng.random(points.shape)
     leaves = moments_of_groups(points, colors, result.supervoxels, result.graph.n_nodes)
     tree = result.tree
-    from pcgraph.moments import moments_up_tree
+    from pcgraph.features.moments import moments_up_tree
 
     pooled = moments_up_tree(leaves, tree.parents)
     features = node_features(pooled, result.viewpoint)

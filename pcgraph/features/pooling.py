@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pooling of moments from children to parents."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+@njit(cache=True)
+def pool_moments(
+    parents: NDArray[np.int32],
+    counts: NDArray[np.int64],
+    centroids: NDArray[np.float64],
+    scatters: NDArray[np.float64],
+    colors: NDArray[np.float64],
+) -> None:
+    """Nothing; the rows of inner nodes, zero at first, become the moments of all their leaves.
+
+    Parameters
+    ----------
+    parents : (k,) int32
+        Larger than the node's own number, so one pass in ascending order meets children before parents.
+    counts, centroids, scatters, colors : (k,), (k, 3), (k, 3, 3), (k, 3)
+        As in `pcgraph.Moments`; overwritten.
+
+    Notes
+    -----
+    Source: Chan, Golub and LeVeque 1979, pairwise update of sums of squares.
+    """
+    for node in range(len(parents)):
+        up = parents[node]
+        if up == node:
+            continue
+        n_up, n_node = counts[up], counts[node]
+        total = n_up + n_node
+        share = n_node / total
+        spread = n_up * share
+        for i in range(3):
+            for j in range(3):
+                shift = (centroids[node, i] - centroids[up, i]) * (centroids[node, j] - centroids[up, j])
+                scatters[up, i, j] += scatters[node, i, j] + spread * shift
+        for i in range(3):
+            if n_up == 0:  # exact copies: a mean must not move by rounding where there is one child only
+                centroids[up, i] = centroids[node, i]
+                colors[up, i] = colors[node, i]
+            else:
+                centroids[up, i] += share * (centroids[node, i] - centroids[up, i])
+                colors[up, i] += share * (colors[node, i] - colors[up, i])
+        counts[up] = total

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The adjacency graph of supervoxels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.features.nodes import NodeFeatures
+
+if TYPE_CHECKING:
+    import networkx
+
+
+@dataclass(frozen=True)
+class EdgeFeatures:
+    """One row per edge (i, j), i < j.
+
+    Attributes
+    ----------
+    convexity : (m,) float64, radians
+        Angle between the nodes' normals, positive where the two bend away from the viewer (convex), negative
+        where they form a valley (concave): the sign of (n_j - n_i) . (x_j - x_i). Source: LCCP, Stein et al.
+        2014.
+    contact_convexity : (m,) float64, radians
+        The same from the normals and positions of the two rims of voxels that touch.
+    normal_angle : (m,) float64, radians, 0..pi
+        Angle between the nodes' normals.
+    color_contrast : (m,) float64, 0..sqrt(3)
+        Distance of the nodes' mean colours; 0 if the cloud has none.
+    contact_length : (m,) float64, metres
+        Mean over both rims of the number of touching voxels times their edge length.
+    step : (m,) float64, metres
+        Offset between the surfaces at the contact: distance of each rim to the other node's plane, the
+        smaller of the two. Near 0 where surfaces meet in a crease, the height of the step where one lies
+        before the other.
+    """
+
+    convexity: NDArray[np.float64]
+    contact_convexity: NDArray[np.float64]
+    normal_angle: NDArray[np.float64]
+    color_contrast: NDArray[np.float64]
+    contact_length: NDArray[np.float64]
+    step: NDArray[np.float64]
+
+    def columns(self) -> dict[str, NDArray[np.float64]]:
+        """All features by name, in the order of the attributes."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+@dataclass(frozen=True)
+class AdjacencyGraph:
+    """Supervoxels as nodes and their contacts as edges.
+
+    Attributes
+    ----------
+    edges : (m, 2) int32
+        Node pairs i < j in ascending order, one per pair of supervoxels that touch.
+    edge_features : EdgeFeatures
+        m rows.
+    node_features : NodeFeatures
+        One row per supervoxel.
+    """
+
+    edges: NDArray[np.int32]
+    edge_features: EdgeFeatures
+    node_features: NodeFeatures
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of supervoxels."""
+        return len(self.node_features.size)
+
+    def to_networkx(self) -> networkx.Graph:
+        """The graph as ``networkx.Graph``, features as attributes of the same names."""
+        from networkx import Graph
+
+        graph = Graph()
+        graph.add_nodes_from(enumerate(rows(self.node_features.columns(), self.n_nodes)))
+        features = rows(self.edge_features.columns(), len(self.edges))
+        graph.add_edges_from((i, j, row) for (i, j), row in zip(self.edges.tolist(), features, strict=True))
+        return graph
+
+
+def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int) -> list[dict[str, object]]:
+    """One dict per row from one array per column; scalars become Python numbers, vectors stay arrays."""
+    names = list(columns)
+    lists = [column.tolist() if column.ndim == 1 else list(column) for column in columns.values()]
+    return [dict(zip(names, (values[i] for values in lists), strict=True)) for i in range(n)]

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Connectivity: every supervoxel in one piece."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pcgraph.supervoxels.distance import distance, update_means
+
+
+def connect(
+    features: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    owner: NDArray[np.int32],
+) -> NDArray[np.int32]:
+    """Owners such that each one's voxels are connected, renumbered in the order of their first voxel.
+
+    Parameters
+    ----------
+    features : (v, 9) float64
+        Position, unit normal and colour of each voxel.
+    scale : (3,) float64
+        Weights of the VCCS distance.
+    indptr, neighbours : (v + 1,) int64, (e,) int32
+        Touching voxels.
+    owner : (v,) int32, >= 0
+        Supervoxels, perhaps in pieces.
+
+    Returns
+    -------
+    (v,) int32
+        The largest piece of each supervoxel keeps it; voxels of other pieces go, ring by ring, to the nearest
+        supervoxel that touches them.
+    """
+    n_supervoxels = int(owner.max()) + 1
+    kept = np.where(_largest_pieces(indptr, neighbours, owner, n_supervoxels), owner, np.int32(-1))
+    _adopt(features, scale, indptr, neighbours, kept, n_supervoxels)
+    _, first, inverse = np.unique(kept, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int32)
+    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    return rank[inverse]
+
+
+@njit(cache=True)
+def _largest_pieces(
+    indptr: NDArray[np.int64], neighbours: NDArray[np.int32], owner: NDArray[np.int32], n_supervoxels: int
+) -> NDArray[np.bool_]:
+    """Whether each voxel lies in the largest piece of its owner (the first one, if several are as large)."""
+    n = len(owner)
+    piece = np.full(n, -1, np.int32)
+    stack = np.empty(n, np.int32)
+    sizes = np.zeros(n, np.int64)
+    largest = np.full(n_supervoxels, -1, np.int64)
+    n_pieces = 0
+    for start in range(n):
+        if piece[start] >= 0:
+            continue
+        piece[start] = n_pieces
+        stack[0] = start
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            i = stack[depth]
+            sizes[n_pieces] += 1
+            for a in range(indptr[i], indptr[i + 1]):
+                j = neighbours[a]
+                if piece[j] < 0 and owner[j] == owner[i]:
+                    piece[j] = n_pieces
+                    stack[depth] = j
+                    depth += 1
+        s = owner[start]
+        if largest[s] < 0 or sizes[n_pieces] > sizes[largest[s]]:
+            largest[s] = n_pieces
+        n_pieces += 1
+    inside = np.empty(n, np.bool_)
+    for i in range(n):
+        inside[i] = piece[i] == largest[owner[i]]
+    return inside
+
+
+@njit(cache=True)
+def _adopt(
+    features: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    owner: NDArray[np.int32],
+    n_supervoxels: int,
+) -> None:
+    """Nothing; every voxel with owner -1 gets the nearest owner around it, ring by ring."""
+    sums, means = np.zeros((n_supervoxels, 10)), np.zeros((n_supervoxels, 9))
+    update_means(features, owner, sums, means)
+    waiting, adopted = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
+    n_waiting = 0
+    for i in range(len(owner)):
+        if owner[i] < 0:
+            waiting[n_waiting] = i
+            n_waiting += 1
+    while n_waiting > 0:
+        for w in range(n_waiting):
+            adopted[w] = _nearest_owner(waiting[w], features, scale, indptr, neighbours, owner, means)
+        left = 0
+        for w in range(n_waiting):
+            if adopted[w] >= 0:
+                owner[waiting[w]] = adopted[w]
+            else:
+                waiting[left] = waiting[w]
+                left += 1
+        n_waiting = left
+
+
+@njit(cache=True)
+def _nearest_owner(i, features, scale, indptr, neighbours, owner, means):  # type: ignore[no-untyped-def]
+    """Owner of a neighbour of voxel i with the least distance to it, the smaller of equals; -1 if there is none."""
+    nearest, least = -1, np.inf
+    for a in range(indptr[i], indptr[i + 1]):
+        s = owner[neighbours[a]]
+        if s >= 0:
+            d = distance(features, i, means, s, scale)
+            if d < least or (d == least and s < nearest):
+                nearest, least = s, d
+    return nearest

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The segmentation tree: linkages, cuts, and what lies between supervoxel and scene."""
