@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.boundary import BoundaryCost
     from pcgraph.io import read_cloud, write_segmentation
     from pcgraph.segmentation import Segmentation, segment
+    from pcgraph.tree.linkage import ConvexityLinkage, Linkage
     from pcgraph.tree.tree import SegmentationTree
 
 __all__ = [
@@ -27,7 +28,9 @@ __all__ = [
     "Cloud",
     "CloudReadError",
     "CloudWriteError",
+    "ConvexityLinkage",
     "EdgeFeatures",
+    "Linkage",
     "Moments",
     "NodeFeatures",
     "PcgraphError",
@@ -45,7 +48,9 @@ _HOMES = {
     "Cloud": "cloud",
     "CloudReadError": "errors",
     "CloudWriteError": "errors",
+    "ConvexityLinkage": "tree.linkage",
     "EdgeFeatures": "graph.adjacency",
+    "Linkage": "tree.linkage",
     "Moments": "features.moments",
     "NodeFeatures": "features.nodes",
     "PcgraphError": "errors",

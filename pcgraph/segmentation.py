@@ -11,21 +11,21 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.boundary import BoundaryCost
 from pcgraph.graph.contacts import contacts
 from pcgraph.graph.relations import edge_features
 from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, non_negative, positive
 from pcgraph.supervoxels.vccs import VccsWeights, vccs
 from pcgraph.tree.growth import segmentation_tree
+from pcgraph.tree.linkage import ConvexityLinkage, Linkage
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.normals import voxel_normals
 from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.warp import choose_warp
 
 VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0
-OBJECT_ALTITUDE = 0.4
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Segmentation:
         finite.
     graph : AdjacencyGraph
     tree : SegmentationTree
+    surface : Surface
+        The voxels behind the points.
     voxel_size, seed_size : float, metres
         What was used, given or derived.
     viewpoint : (3,) float64, metres, the points' frame
@@ -53,6 +55,7 @@ class Segmentation:
     supervoxels: NDArray[np.int32]
     graph: AdjacencyGraph
     tree: SegmentationTree
+    surface: Surface
     voxel_size: float
     seed_size: float
     viewpoint: NDArray[np.float64]
@@ -79,8 +82,8 @@ def segment(
     spatial_weight: float = 0.4,
     normal_weight: float = 1.0,
     camera: bool | None = None,
-    boundary_cost: BoundaryCost | None = None,
-    object_altitude: float = OBJECT_ALTITUDE,
+    linkage: Linkage | None = None,
+    object_altitude: float | None = None,
 ) -> Segmentation:
     """Segmentation of a point cloud: supervoxels, their adjacency graph, and the tree on it.
 
@@ -105,10 +108,10 @@ def segment(
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
         depth, as a camera's pixels do. Default: organised clouds that lie in front of the viewpoint.
-    boundary_cost : BoundaryCost, optional
-        Cost of an edge, on which the tree rests.
-    object_altitude : float, radians
-        Mean concavity above which two parts are two objects: the altitude of the cut that gives `labels`.
+    linkage : Linkage, optional
+        How the graph becomes a tree; default `ConvexityLinkage()`, whose altitudes are radians of concavity.
+    object_altitude : float, the linkage's unit, optional
+        Altitude above which two parts are two objects: the cut that gives `labels`. Default: the linkage's.
 
     Returns
     -------
@@ -134,21 +137,24 @@ def segment(
         spatial=non_negative("spatial_weight", spatial_weight),
         normal=non_negative("normal_weight", normal_weight),
     )
+    linkage = ConvexityLinkage() if linkage is None else linkage
+    altitude = linkage.object_altitude if object_altitude is None else object_altitude
+    altitude = non_negative("object_altitude", altitude)
     camera = _is_camera(cloud, position) if camera is None else bool(camera)
     grid = voxel_grid(cloud.points, cloud.colors, voxel_size, choose_warp(cloud.points, position, camera))
-    surface = voxel_normals(grid, position, cloud.normals)
-    leaf_of_voxel = vccs(grid, surface, seed_size, weights)
+    facing = voxel_normals(grid, position, cloud.normals)
+    leaf_of_voxel = vccs(grid, facing, seed_size, weights)
     leaf_of_point = leaf_of_voxel[grid.voxel_of_point]
     leaves = moments_of_groups(cloud.points, cloud.colors, leaf_of_point, int(leaf_of_voxel.max()) + 1)
     nodes = node_features(leaves, position)
-    touching = contacts(grid, surface, leaf_of_voxel)
+    touching = contacts(grid, facing, leaf_of_voxel)
     edges = edge_features(nodes, touching)
-    costs = (boundary_cost or BoundaryCost())(edges, touching.voxel_edges)
-    tree = segmentation_tree(touching.edges, costs, touching.voxels.sum(axis=1).astype(float), leaves, position)
-    supervoxels = cloud.spread(leaf_of_point)
-    labels = cloud.spread(tree.cut(altitude=non_negative("object_altitude", object_altitude))[leaf_of_point])
     graph = AdjacencyGraph(touching.edges, edges, nodes)
-    return Segmentation(labels, supervoxels, graph, tree, voxel_size, seed_size, position, camera)
+    tree = segmentation_tree(linkage.merges(graph, leaves), leaves, position)
+    supervoxels = cloud.spread(leaf_of_point)
+    labels = cloud.spread(tree.cut(altitude=altitude)[leaf_of_point])
+    surface = Surface(grid, facing, leaf_of_voxel)
+    return Segmentation(labels, supervoxels, graph, tree, surface, voxel_size, seed_size, position, camera)
 
 
 def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> tuple[float, float]:

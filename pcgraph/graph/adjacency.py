@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.features.columns import rows
 from pcgraph.features.nodes import NodeFeatures
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ class EdgeFeatures:
         Angle between the nodes' normals.
     color_contrast : (m,) float64, 0..sqrt(3)
         Distance of the nodes' mean colours; 0 if the cloud has none.
+    contact_voxels : (m,) int64
+        Voxels of either side that touch the other side.
     contact_length : (m,) float64, metres
         Mean over both rims of the number of touching voxels times their edge length.
     step : (m,) float64, metres
@@ -43,10 +46,16 @@ class EdgeFeatures:
     contact_convexity: NDArray[np.float64]
     normal_angle: NDArray[np.float64]
     color_contrast: NDArray[np.float64]
+    contact_voxels: NDArray[np.int64]
     contact_length: NDArray[np.float64]
     step: NDArray[np.float64]
 
-    def columns(self) -> dict[str, NDArray[np.float64]]:
+    @property
+    def voxel_edge(self) -> NDArray[np.float64]:
+        """Mean edge length of the voxels at each contact, (m,) float64, metres."""
+        return 2.0 * self.contact_length / self.contact_voxels
+
+    def columns(self) -> dict[str, NDArray[np.generic]]:
         """All features by name, in the order of the attributes."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
@@ -83,10 +92,3 @@ class AdjacencyGraph:
         features = rows(self.edge_features.columns(), len(self.edges))
         graph.add_edges_from((i, j, row) for (i, j), row in zip(self.edges.tolist(), features, strict=True))
         return graph
-
-
-def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int) -> list[dict[str, object]]:
-    """One dict per row from one array per column; scalars become Python numbers, vectors stay arrays."""
-    names = list(columns)
-    lists = [column.tolist() if column.ndim == 1 else list(column) for column in columns.values()]
-    return [dict(zip(names, (values[i] for values in lists), strict=True)) for i in range(n)]

@@ -42,18 +42,16 @@ class BoundaryCost:
     step: float = 0.1
     step_limit: float = 3.0
 
-    def __call__(self, features: EdgeFeatures, voxel_edge: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, features: EdgeFeatures) -> NDArray[np.float64]:
         """Costs, (m,) float64, radians, in whole multiples of 2**-20 so that sums of them are exact.
 
         Parameters
         ----------
         features : EdgeFeatures of m edges
-        voxel_edge : (m,) float64, metres
-            Mean edge length of the voxels at the contact.
         """
         bend = (1.0 - self.contact) * self._valley(features.convexity)
         bend += self.contact * self._valley(features.contact_convexity)
-        offset = np.minimum(features.step / voxel_edge, self.step_limit)
+        offset = np.minimum(features.step / features.voxel_edge, self.step_limit)
         return np.rint((bend + self.step * offset) * _COST_STEPS) / _COST_STEPS
 
     def _valley(self, convexity: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -38,11 +38,6 @@ class Contacts:
     normals: NDArray[np.float64]
     lengths: NDArray[np.float64]
 
-    @property
-    def voxel_edges(self) -> NDArray[np.float64]:
-        """Mean edge length of the voxels at each contact, (m,) float64, metres."""
-        return 2.0 * self.lengths / self.voxels.sum(axis=1)
-
 
 def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray[np.int32]) -> Contacts:
     """Contacts between supervoxels: one per pair with voxels in each other's 26-neighbourhood.

@@ -28,6 +28,7 @@ def edge_features(nodes: NodeFeatures, contacts: Contacts) -> EdgeFeatures:
         contact_convexity=signed_convexity(contacts.normals[:, 0], contacts.normals[:, 1], rim_j - rim_i),
         normal_angle=angle_between(nodes.normal[i], nodes.normal[j]),
         color_contrast=np.nan_to_num(np.linalg.norm(nodes.color[j] - nodes.color[i], axis=1)),
+        contact_voxels=contacts.voxels.sum(axis=1),
         contact_length=contacts.lengths,
         step=np.minimum(to_plane_i, to_plane_j),
     )

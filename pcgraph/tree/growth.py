@@ -8,29 +8,19 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.features.moments import Moments, moments_up_tree
-from pcgraph.tree.linkage import average_linkage
+from pcgraph.tree.linkage import Merges
 from pcgraph.tree.tree import SegmentationTree
 
 _GAP_CANDIDATES = 8
 
 
-def segmentation_tree(
-    edges: NDArray[np.int32],
-    costs: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    leaves: Moments,
-    viewpoint: NDArray[np.float64],
-) -> SegmentationTree:
-    """Tree over k nodes whose merges follow average linkage along the edges.
+def segmentation_tree(merges: Merges, leaves: Moments, viewpoint: NDArray[np.float64]) -> SegmentationTree:
+    """Tree over k leaves: a linkage's merges, then those across the gaps.
 
     Parameters
     ----------
-    edges : (m, 2) int32
-        Pairs i < j of leaves, each once.
-    costs : (m,) float64, radians, >= 0
-        Cost of merging over each edge.
-    weights : (m,) float64, > 0
-        What an edge counts in a mean, for example its contact's length.
+    merges : Merges of k leaves
+        Along the edges of their graph.
     leaves : Moments of k leaves
     viewpoint : (3,) float64, metres
 
@@ -40,14 +30,13 @@ def segmentation_tree(
     nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large
     parts apart.
     """
-    n_leaves = len(leaves)
-    pairs, altitudes = average_linkage(n_leaves, edges, costs, weights)
+    n_leaves, n_merges = len(leaves), len(merges.pairs)
     parents = np.arange(2 * n_leaves - 1, dtype=np.int32)
-    parents[pairs] = np.arange(n_leaves, n_leaves + len(pairs), dtype=np.int32)[:, None]
-    parts = _roots(parents[: n_leaves + len(pairs)])[:n_leaves]
-    gaps = _join_parts(parts, leaves, n_leaves + len(pairs))
-    parents[gaps] = np.arange(n_leaves + len(pairs), 2 * n_leaves - 1, dtype=np.int32)[:, None]
-    levels = np.concatenate((np.zeros(n_leaves), altitudes, np.full(len(gaps), np.inf)))
+    parents[merges.pairs] = np.arange(n_leaves, n_leaves + n_merges, dtype=np.int32)[:, None]
+    parts = _roots(parents[: n_leaves + n_merges])[:n_leaves]
+    gaps = _join_parts(parts, leaves, n_leaves + n_merges)
+    parents[gaps] = np.arange(n_leaves + n_merges, 2 * n_leaves - 1, dtype=np.int32)[:, None]
+    levels = np.concatenate((np.zeros(n_leaves), merges.altitudes, np.full(len(gaps), np.inf)))
     return SegmentationTree(parents, levels, moments_up_tree(leaves, parents), viewpoint)
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.features.columns import rows
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import NodeFeatures, node_features
-from pcgraph.graph.adjacency import rows
 
 if TYPE_CHECKING:
     import networkx

@@ -12,8 +12,9 @@ from clouds import refines
 
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
+from pcgraph.tree.average import average_linkage
 from pcgraph.tree.growth import segmentation_tree
-from pcgraph.tree.linkage import average_linkage
+from pcgraph.tree.linkage import Merges
 
 ORIGIN = np.zeros(3)
 
@@ -37,7 +38,7 @@ def test_hand_drawn_graph_of_five_nodes():
     pairs, altitudes = average_linkage(5, edges, costs, weights)
     assert pairs.tolist() == [[0, 1], [3, 4], [2, 5], [6, 7]]
     assert altitudes.tolist() == [1.0, 2.0, 4.0, 7.0]
-    tree = segmentation_tree(edges, costs, weights, leaves_on_a_line(5), ORIGIN)
+    tree = segmentation_tree(Merges(pairs, altitudes), leaves_on_a_line(5), ORIGIN)
     assert tree.parents.tolist() == [5, 5, 7, 6, 6, 7, 8, 8, 8]
     assert tree.altitudes.tolist() == [0, 0, 0, 0, 0, 1, 2, 4, 7]
     assert tree.cut(n=2).tolist() == [0, 0, 0, 1, 1]
@@ -80,7 +81,8 @@ def test_average_linkage_agrees_with_brute_force():
 
 def test_parts_that_do_not_touch_join_last_smallest_first_each_to_the_nearest_larger_one():
     edges = np.array([[0, 1], [1, 2], [5, 6]], np.int32)  # parts {0, 1, 2}, {3}, {4}, {5, 6}
-    tree = segmentation_tree(edges, np.array([0.1, 0.2, 5.0]), np.ones(3), leaves_on_a_line(7, x4=4.4), ORIGIN)
+    merges = Merges(*average_linkage(7, edges, np.array([0.1, 0.2, 5.0]), np.ones(3)))
+    tree = segmentation_tree(merges, leaves_on_a_line(7, x4=4.4), ORIGIN)
     assert np.isinf(tree.altitudes[-3:]).all()
     assert np.isfinite(tree.altitudes[:-3]).all()
     assert tree.cut(altitude=1e9).tolist() == [0, 0, 0, 1, 2, 3, 3]

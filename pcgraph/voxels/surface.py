@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surface as its voxels sample it: what remains of a cloud once its points are labelled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.voxels.grid import VoxelGrid
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Occupied voxels with their normals and supervoxels.
+
+    Attributes
+    ----------
+    grid : VoxelGrid of v voxels
+        Centroids, colours, counts, edge lengths, and which voxels touch.
+    normals : (v, 3) float64
+        Unit normals on the viewpoint's side.
+    supervoxels : (v,) int32
+        Supervoxel of each voxel.
+    """
+
+    grid: VoxelGrid
+    normals: NDArray[np.float64]
+    supervoxels: NDArray[np.int32]
