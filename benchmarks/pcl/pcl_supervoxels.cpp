@@ -8,7 +8,7 @@
 //   VOXEL, SEED              metres
 //   COLOR, SPATIAL, NORMAL   weights
 //   CAMERA   1: single camera transform, 0: none
-//   REPEATS  timed runs; one that is not timed comes first
+//   REPEATS  timed runs, 0 or more; one that is not timed comes first
 //
 // The last line on stdout is JSON; each value is a list over the runs:
 //
@@ -152,8 +152,9 @@ int main(int argc, char** argv) {
     const Cloud::Ptr cloud = read_cloud(argv[1]);
     const Setting setting{std::stof(argv[3]), std::stof(argv[4]), std::stof(argv[5]),
                           std::stof(argv[6]), std::stof(argv[7]), std::stoi(argv[8]) != 0};
-    Result warm_up, result;
-    run(cloud, setting, warm_up);
+    Result result;
+    run(cloud, setting, result);
+    for (auto* times : {&result.vccs_s, &result.vccs_cpu_s, &result.lccp_s, &result.count}) times->clear();
     for (int i = 0; i < std::stoi(argv[9]); ++i) run(cloud, setting, result);
     write(argv[2], result);
   } catch (const std::exception& error) {
