@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pooling and votes: against sums over the points below each node, and a hand-drawn tree."""
+
+from __future__ import annotations
+
+import networkx
+import numpy as np
+import pytest
+
+import pcgraph
+from pcgraph.features.moments import Moments
+from pcgraph.learning.pooling import down, pool_points, pool_up
+from pcgraph.learning.votes import majority, pure_ancestors, spread_votes, votes
+from pcgraph.tree.tree import SegmentationTree
+
+
+def hand_drawn() -> SegmentationTree:
+    """Leaves 0, 1, 2 of 1, 2 and 3 points: (0, 1) -> 3, (3, 2) -> 4."""
+    parents = np.array([3, 3, 4, 4, 4], np.int32)
+    counts = np.array([1, 2, 3, 3, 6])
+    moments = Moments(counts, np.zeros((5, 3)), np.zeros((5, 3, 3)), None)
+    return SegmentationTree(parents, np.array([0, 0, 0, 0.2, 0.5]), moments, np.zeros(3))
+
+
+def leaves_below(tree: SegmentationTree) -> list[list[int]]:
+    graph = tree.to_networkx()
+    return [
+        [x for x in {node, *networkx.descendants(graph, node)} if x < tree.n_leaves]
+        for node in range(len(tree.parents))
+    ]
+
+
+def test_pooling_on_a_tree_drawn_by_hand():
+    tree, values = hand_drawn(), [6.0, 3.0, -1.0]
+    assert pool_up(tree, values, reduce="sum").tolist() == [6, 3, -1, 9, 8]
+    assert pool_up(tree, values).tolist() == [6, 3, -1, 4, 1.5]  # weighted by points
+    assert pool_up(tree, values, weights=[1, 1, 2]).tolist() == [6, 3, -1, 4.5, 1.75]
+    assert pool_up(tree, values, reduce="max").tolist() == [6, 3, -1, 6, 6]
+    assert pool_up(tree, values, reduce="min").tolist() == [6, 3, -1, 3, -1]
+
+
+def test_missing_values_are_left_out():
+    tree = hand_drawn()
+    values = np.array([[np.nan, np.nan], [3.0, np.nan], [np.nan, 5.0]])
+    assert np.array_equal(pool_up(tree, values)[3:], [[3, np.nan], [3, 5]], equal_nan=True)
+    assert np.array_equal(pool_up(tree, values, reduce="max")[3:], [[3, np.nan], [3, 5]], equal_nan=True)
+    assert pool_up(tree, values, reduce="sum")[3:].tolist() == [[3, 0], [3, 5]]
+
+
+@pytest.mark.parametrize("reduce", ["sum", "mean", "max", "min"])
+def test_nodes_hold_what_their_points_do(boxes, reduce):
+    points, _, result = boxes
+    values = np.column_stack((points, np.random.default_rng(0).normal(size=len(points))))
+    values[::7, 3] = np.nan
+    pooled = pool_points(result, values, reduce)
+    direct = getattr(np, f"nan{reduce}")
+    for node, leaves in enumerate(leaves_below(result.tree)):
+        assert pooled[node] == pytest.approx(direct(values[np.isin(result.supervoxels, leaves)], axis=0), rel=1e-9)
+
+
+def test_means_of_the_points_are_the_centroids(boxes):
+    points, _, result = boxes
+    assert pool_points(result, points) == pytest.approx(result.tree.moments.centroids, rel=1e-9, abs=1e-12)
+
+
+def test_votes_count_points(boxes):
+    _, truth, result = boxes
+    labels = np.where(np.arange(len(truth)) % 3 == 0, -1, truth)
+    counts = votes(result, labels)
+    assert counts.dtype == np.int64
+    assert counts[-1].tolist() == np.bincount(labels[labels >= 0]).tolist()
+    node = result.tree.n_leaves + 5
+    below = np.isin(result.supervoxels, leaves_below(result.tree)[node]) & (labels >= 0)
+    assert counts[node].tolist() == np.bincount(labels[below], minlength=3).tolist()
+    assert votes(result, np.full(len(truth), -1)).shape == (len(counts), 0)
+
+
+def test_majority_prefers_the_smaller_of_equals_and_knows_nothing_without_votes():
+    assert majority(np.array([[2, 2], [0, 3], [0, 0]])).tolist() == [0, 1, -1]
+    assert majority(np.empty((2, 0), np.int64)).tolist() == [-1, -1]
+
+
+def test_highest_pure_ancestor_on_a_tree_drawn_by_hand():
+    tree = hand_drawn()
+    leaf_votes = np.array([[9, 1], [0, 0], [0, 8]])
+    counts = pool_up(tree, leaf_votes, reduce="sum")
+    assert pure_ancestors(tree, counts, 0.9).tolist() == [3, 3, 2]
+    assert pure_ancestors(tree, counts, 0.95).tolist() == [-1, -1, 2]
+    assert pure_ancestors(tree, counts, 0.5).tolist() == [4, 4, 4]
+    assert pure_ancestors(tree, counts, 0.9, altitude=0.1).tolist() == [0, -1, 2]
+
+
+def test_one_click_per_object_labels_the_scene(boxes):
+    _, truth, result = boxes
+    clicks = np.full(len(truth), -1)
+    for thing in range(3):
+        at = np.flatnonzero(truth == thing)
+        clicks[at[len(at) // 2]] = thing
+    labels = spread_votes(result, clicks, share=1.0)
+    assert np.mean(labels == truth) > 0.97
+
+
+def test_down_keeps_the_shape_and_marks_what_is_missing():
+    rng = np.random.default_rng(0)
+    points = rng.random((6, 8, 3)) + np.array([0, 0, 2])
+    points[2, 3] = np.nan
+    result = pcgraph.segment(points, voxel_size=0.3)
+    tree = result.tree
+    assert np.array_equal(down(result, np.arange(tree.n_leaves)), result.supervoxels)
+    sizes = down(result, tree.moments.counts, tree.cut_nodes(n=1))
+    assert sizes.shape == (6, 8)
+    assert sizes[2, 3] == -1
+    assert set(sizes.ravel().tolist()) == {47, -1}
+    places = down(result, tree.moments.centroids)
+    assert places.shape == (6, 8, 3)
+    assert np.isnan(places[2, 3]).all()
+    assert np.isfinite(places).all(axis=-1).sum() == 47
+    assert not down(result, np.ones(tree.n_leaves, bool))[2, 3]
+
+
+def test_wrong_input_is_refused(boxes):
+    _, truth, result = boxes
+    tree = result.tree
+    with pytest.raises(ValueError, match="expected values of"):
+        pool_up(tree, np.zeros(3))
+    with pytest.raises(ValueError, match="reduce"):
+        pool_up(tree, np.zeros(tree.n_leaves), reduce="median")
+    with pytest.raises(ValueError, match="reduce"):
+        pool_points(result, truth, "median")
+    with pytest.raises(ValueError, match="weights"):
+        pool_up(tree, np.zeros(tree.n_leaves), weights=np.full(tree.n_leaves, -1.0))
+    with pytest.raises(ValueError, match="points' shape"):
+        pool_points(result, truth[:-1])
+    with pytest.raises(ValueError, match="below n_classes"):
+        votes(result, truth, 2)
+    with pytest.raises(ValueError, match="one row"):
+        down(result, np.zeros(3))
+    with pytest.raises(ValueError, match="per node"):
+        down(result, np.zeros(tree.n_leaves), tree.cut_nodes(n=2))
+    with pytest.raises(ValueError, match="share"):
+        pure_ancestors(tree, votes(result, truth), 1.5)
