@@ -39,7 +39,7 @@ class LabelledCloud:
     @property
     def finite(self) -> NDArray[np.bool_]:
         """(h, w), whether all three coordinates are finite."""
-        return np.isfinite(self.points).all(axis=-1)
+        return np.logical_and.reduce(np.isfinite(self.points), axis=-1)
 
 
 def load_clouds(folder: Path | str = DATA) -> list[LabelledCloud]:

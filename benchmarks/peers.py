@@ -47,6 +47,8 @@ class PclResult:
         Of VCCS and of LCCP (10 degrees, smoothness check on); 0 where PCL gave none, -1 where a point is not finite.
     vccs_s, vccs_cpu_s, lccp_s : (repeats,) float64, seconds
         Clock and processor time of VCCS (setters, setInputCloud, extract), clock time of LCCP with the adjacency.
+    voxels : (repeats,) float64
+        How many.
     """
 
     supervoxels: NDArray[np.int32]
@@ -54,6 +56,7 @@ class PclResult:
     vccs_s: NDArray[np.float64]
     vccs_cpu_s: NDArray[np.float64]
     lccp_s: NDArray[np.float64]
+    voxels: NDArray[np.float64]
 
 
 def pcl_driver() -> Path:
@@ -73,15 +76,15 @@ def pcl_driver() -> Path:
         raise SystemExit(f"{', '.join(missing)} not found: apt-get install cmake pkg-config g++ libpcl-dev")
     if subprocess.run(["pkg-config", "--exists", "pcl_segmentation"], check=False).returncode:
         raise SystemExit("PCL not found: apt-get install libpcl-dev (Debian, Ubuntu)")
-    for command in (["cmake", "-S", SOURCE, "-B", BUILD], ["cmake", "--build", BUILD]):
+    for command in (["cmake", "-S", str(SOURCE), "-B", str(BUILD)], ["cmake", "--build", str(BUILD)]):
         done = subprocess.run(command, check=False, capture_output=True, text=True)
         if done.returncode:
-            raise SystemExit(f"{' '.join(map(str, command))} failed:\n{done.stdout}{done.stderr}")
+            raise SystemExit(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
     return program
 
 
 def run_pcl(points: NDArray[np.float32], colors: NDArray[np.uint8], setting: PclSetting, repeats: int = 1) -> PclResult:
-    """PCL on one organised cloud, (h, w, 3) metres and (h, w, 3) uint8, after a run that is not timed."""
+    """PCL on one organised cloud, (h, w, 3) metres and (h, w, 3) uint8; a run that is not timed comes first."""
     height, width = points.shape[:2]
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder, "cloud"), Path(folder, "labels")
@@ -93,7 +96,7 @@ def run_pcl(points: NDArray[np.float32], colors: NDArray[np.uint8], setting: Pcl
         labels = np.fromfile(target, np.uint32).astype(np.int32).reshape(2, height, width)
     labels[:, ~np.isfinite(points).all(axis=-1)] = -1
     seconds = json.loads(done.stdout.splitlines()[-1])
-    times = (np.array(seconds[name]) for name in ("vccs_s", "vccs_cpu_s", "lccp_s"))
+    times = (np.array(seconds[name]) for name in ("vccs_s", "vccs_cpu_s", "lccp_s", "voxels"))
     return PclResult(labels[0], labels[1], *times)
 
 

@@ -14,7 +14,7 @@
 //
 //   vccs_s, vccs_cpu_s    constructor, setters, setInputCloud and extract; seconds on the clock and of the processor
 //   lccp_s                getSupervoxelAdjacency, setInputSupervoxels and segment: 10 degrees, smoothness check on
-//   supervoxels           number of supervoxels
+//   voxels, supervoxels   how many
 //
 // Neither class uses threads in PCL 1.13.
 
@@ -51,7 +51,7 @@ struct Setting {
 
 struct Result {
   std::vector<std::uint32_t> supervoxels, segments;
-  std::vector<double> vccs_s, vccs_cpu_s, lccp_s, count;
+  std::vector<double> vccs_s, vccs_cpu_s, lccp_s, voxels, count;
 };
 
 class Clock {
@@ -105,6 +105,7 @@ void run(const Cloud::Ptr& cloud, const Setting& setting, Result& result) {
   vccs.extract(clusters);
   result.vccs_s.push_back(vccs_clock.seconds());
   result.vccs_cpu_s.push_back(vccs_clock.cpu_seconds());
+  result.voxels.push_back(double(vccs.getVoxelCentroidCloud()->size()));
   result.count.push_back(double(clusters.size()));
 
   const Clock lccp_clock;
@@ -138,6 +139,7 @@ void write(const std::string& path, const Result& result) {
   print_list("vccs_s", result.vccs_s, ", ");
   print_list("vccs_cpu_s", result.vccs_cpu_s, ", ");
   print_list("lccp_s", result.lccp_s, ", ");
+  print_list("voxels", result.voxels, ", ");
   print_list("supervoxels", result.count, "}\n");
 }
 
@@ -154,7 +156,8 @@ int main(int argc, char** argv) {
                           std::stof(argv[6]), std::stof(argv[7]), std::stoi(argv[8]) != 0};
     Result result;
     run(cloud, setting, result);
-    for (auto* times : {&result.vccs_s, &result.vccs_cpu_s, &result.lccp_s, &result.count}) times->clear();
+    for (auto* list : {&result.vccs_s, &result.vccs_cpu_s, &result.lccp_s, &result.voxels, &result.count})
+      list->clear();
     for (int i = 0; i < std::stoi(argv[9]); ++i) run(cloud, setting, result);
     write(argv[2], result);
   } catch (const std::exception& error) {
