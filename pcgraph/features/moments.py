@@ -6,7 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+
+from pcgraph.features.pooling import pool_moments
 
 
 @dataclass(frozen=True)
@@ -25,12 +28,15 @@ class Moments:
         Sum over the points of (x - centroid)(x - centroid)^T.
     colors : (k, 3) float64, 0..1, or None
         Mean colour.
+    color_scatters : (k, 3, 3) float64, or None
+        Sum over the points of (c - mean colour)(c - mean colour)^T.
     """
 
     counts: NDArray[np.int64]
     centroids: NDArray[np.float64]
     scatters: NDArray[np.float64]
     colors: NDArray[np.float64] | None
+    color_scatters: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         """Number of groups."""
@@ -40,6 +46,11 @@ class Moments:
     def covariances(self) -> NDArray[np.float64]:
         """Scatter over number of points, (k, 3, 3) float64, square metres."""
         return self.scatters / self.counts[:, None, None]
+
+    @property
+    def color_covariances(self) -> NDArray[np.float64] | None:
+        """Scatter of colours over number of points, (k, 3, 3) float64, or None."""
+        return None if self.color_scatters is None else self.color_scatters / self.counts[:, None, None]
 
 
 def moments_of_groups(
@@ -55,22 +66,16 @@ def moments_of_groups(
         Every group has a point at least.
     n_groups : int
     """
-    counts = np.bincount(groups, minlength=n_groups)
-    reference = _group_means(points, groups, counts)
-    residual = points - reference[groups]
-    correction = _group_means(residual, groups, counts)  # the first means round; the second pass mends that
-    residual -= correction[groups]
-    scatters = np.empty((n_groups, 3, 3))
-    for i in range(3):
-        for j in range(i, 3):
-            products = np.bincount(groups, residual[:, i] * residual[:, j], n_groups)
-            scatters[:, i, j] = scatters[:, j, i] = products
-    means = None if colors is None else _group_means(colors, groups, counts)
-    return Moments(counts, reference + correction, scatters, means)
+    counts, firsts = _count(groups, n_groups)
+    centroids, scatters = _mean_and_scatter(points, groups, counts, points[firsts])
+    if colors is None:
+        return Moments(counts, centroids, scatters, None)
+    means, color_scatters = _mean_and_scatter(colors, groups, counts, np.zeros((n_groups, 3)))
+    return Moments(counts, centroids, scatters, means, color_scatters)
 
 
 def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
-    """Moments of every node of a binary tree, from those of its leaves.
+    """Moments of every node of a tree, from those of its leaves.
 
     Parameters
     ----------
@@ -79,25 +84,64 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     parents : (k,) int32
         Parent of each node; larger than the node's own number, except for the root, which is its own parent.
     """
-    from pcgraph.features.pooling import pool_moments
-
-    k, n_leaves = len(parents), len(leaves)
-    counts = np.zeros(k, np.int64)
-    centroids, scatters = np.zeros((k, 3)), np.zeros((k, 3, 3))
-    colors = np.zeros((k, 3))
-    counts[:n_leaves], centroids[:n_leaves], scatters[:n_leaves] = (
-        leaves.counts,
-        leaves.centroids,
-        leaves.scatters,
-    )
-    if leaves.colors is not None:
-        colors[:n_leaves] = leaves.colors
-    pool_moments(parents, counts, centroids, scatters, colors)
-    return Moments(counts, centroids, scatters, None if leaves.colors is None else colors)
+    counts = _with_room(leaves.counts, len(parents))
+    centroids, scatters = _with_room(leaves.centroids, len(parents)), _with_room(leaves.scatters, len(parents))
+    if leaves.colors is None:
+        pool_moments(parents, counts, centroids, scatters)
+        return Moments(counts, centroids, scatters, None)
+    again, colors = _with_room(leaves.counts, len(parents)), _with_room(leaves.colors, len(parents))
+    spread = np.zeros((len(leaves), 3, 3)) if leaves.color_scatters is None else leaves.color_scatters
+    color_scatters = _with_room(spread, len(parents))
+    pool_moments(parents, counts, centroids, scatters)
+    pool_moments(parents, again, colors, color_scatters)
+    return Moments(counts, centroids, scatters, colors, None if leaves.color_scatters is None else color_scatters)
 
 
-def _group_means(
-    values: NDArray[np.float64], groups: NDArray[np.int32], counts: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    sums = [np.bincount(groups, values[:, axis], len(counts)) for axis in range(values.shape[1])]
-    return np.stack(sums, axis=1) / counts[:, None]
+def _with_room(values: NDArray, k: int) -> NDArray:  # type: ignore[type-arg]
+    """The values in the first of k rows, zeros below."""
+    rows = np.zeros((k, *values.shape[1:]), values.dtype)
+    rows[: len(values)] = values
+    return rows
+
+
+@njit(cache=True, nogil=True)
+def _count(groups: NDArray[np.int32], n_groups: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Points per group, and the first point of each."""
+    counts, firsts = np.zeros(n_groups, np.int64), np.zeros(n_groups, np.int64)
+    for i in range(len(groups)):
+        if counts[groups[i]] == 0:
+            firsts[groups[i]] = i
+        counts[groups[i]] += 1
+    return counts, firsts
+
+
+@njit(cache=True, nogil=True)
+def _mean_and_scatter(
+    values: NDArray[np.float64], groups: NDArray[np.int32], counts: NDArray[np.int64], reference: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means (k, 3) and scatters (k, 3, 3) in two passes: about a place in the group first, then about the mean."""
+    k = len(counts)
+    shifts, means, scatters = np.zeros((k, 3)), np.empty((k, 3)), np.zeros((k, 3, 3))
+    for i in range(len(groups)):
+        s = groups[i]
+        for axis in range(3):
+            shifts[s, axis] += values[i, axis] - reference[s, axis]
+    for s in range(k):
+        for axis in range(3):
+            shifts[s, axis] /= counts[s]
+            means[s, axis] = reference[s, axis] + shifts[s, axis]
+    for i in range(len(groups)):
+        s = groups[i]
+        x = values[i, 0] - reference[s, 0] - shifts[s, 0]
+        y = values[i, 1] - reference[s, 1] - shifts[s, 1]
+        z = values[i, 2] - reference[s, 2] - shifts[s, 2]
+        scatters[s, 0, 0] += x * x
+        scatters[s, 0, 1] += x * y
+        scatters[s, 0, 2] += x * z
+        scatters[s, 1, 1] += y * y
+        scatters[s, 1, 2] += y * z
+        scatters[s, 2, 2] += z * z
+    for s in range(k):
+        scatters[s, 1, 0], scatters[s, 2, 0] = scatters[s, 0, 1], scatters[s, 0, 2]
+        scatters[s, 2, 1] = scatters[s, 1, 2]
+    return means, scatters

@@ -6,9 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments
+from pcgraph.voxels.eigen import symmetric_eigen
 
 _NO_PLANE = 1e-5  # second over first standard deviation below which points lie on a line
 
@@ -33,6 +35,8 @@ class NodeFeatures:
         Root mean square distance to the plane, s3.
     color : (k, 3) float64, 0..1
         Mean colour; NaN if the cloud has none.
+    color_covariance : (k, 3, 3) float64
+        Covariance of the points' colours; NaN if the cloud has none.
     """
 
     size: NDArray[np.int64]
@@ -44,10 +48,34 @@ class NodeFeatures:
     scattering: NDArray[np.float64]
     residual: NDArray[np.float64]
     color: NDArray[np.float64]
+    color_covariance: NDArray[np.float64]
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """All features by name, in the order of the attributes."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def verticality(self, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
+        """How steep each node's plane stands, (k,) float64: 0 a floor, 1 a wall, 1 - |normal . up|.
+
+        Parameters
+        ----------
+        up : (3,) float, the points' frame, any length but zero
+            Against gravity. A level camera with y down, as organised clouds have it, needs (0, -1, 0).
+
+        Raises
+        ------
+        ValueError
+            `up` is not three finite numbers, or all are zero.
+
+        Notes
+        -----
+        Source: Hackel et al. 2016. It is no moment, but follows from one, so merged nodes have it too.
+        """
+        direction = np.asarray(up, dtype=np.float64)
+        if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+            raise ValueError(f"expected up as three finite numbers, not all zero, got {up!r}")
+        direction = direction / np.abs(direction).max()  # so that its square neither overflows nor vanishes
+        return np.maximum(1.0 - np.abs(self.normal @ (direction / np.linalg.norm(direction))), 0.0)
 
 
 def node_features(moments: Moments, viewpoint: NDArray[np.float64]) -> NodeFeatures:
@@ -59,35 +87,71 @@ def node_features(moments: Moments, viewpoint: NDArray[np.float64]) -> NodeFeatu
     viewpoint : (3,) float64, metres, the points' frame
     """
     covariance = moments.covariances
-    variances, vectors = np.linalg.eigh(covariance)
-    deviations = np.sqrt(np.maximum(variances, 0.0))
-    low, middle, high = deviations.T
+    low, middle, high, normals = _principal(covariance, viewpoint - moments.centroids)
     scale = np.where(high > 0.0, high, 1.0)
-    colors = moments.colors
+    k = len(moments)
+    colors, spreads = moments.colors, moments.color_covariances
     return NodeFeatures(
         size=moments.counts,
         centroid=moments.centroids,
-        normal=_plane_normals(deviations, vectors, viewpoint - moments.centroids),
+        normal=normals,
         covariance=covariance,
         linearity=(high - middle) / scale,
         planarity=(middle - low) / scale,
         scattering=low / scale,
         residual=low,
-        color=np.full((len(moments), 3), np.nan) if colors is None else colors,
+        color=np.full((k, 3), np.nan) if colors is None else colors,
+        color_covariance=np.full((k, 3, 3), np.nan) if spreads is None else spreads,
     )
 
 
-def _plane_normals(
-    deviations: NDArray[np.float64], vectors: NDArray[np.float64], towards: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Direction of least spread on the viewpoint's side; of points on a line, across it."""
-    normals = vectors[:, :, 0].copy()
-    flat = deviations[:, 1] > _NO_PLANE * deviations[:, 2]
-    line = np.where((deviations[:, 2] > 0.0)[:, None], vectors[:, :, 2], 0.0)
-    across = towards - line * np.einsum("ij,ij->i", line, towards)[:, None]
-    length = np.linalg.norm(across, axis=1)
-    usable = ~flat & (length > 1e-12 * np.linalg.norm(towards, axis=1))
-    normals[usable] = across[usable] / length[usable, None]
-    away = np.einsum("ij,ij->i", normals, towards) < 0.0
-    normals[away] *= -1.0
-    return normals
+@njit(cache=True, nogil=True)
+def _principal(  # type: ignore[no-untyped-def]
+    covariances: NDArray[np.float64], towards: NDArray[np.float64]
+):
+    """Standard deviations, ascending, (k,) each, and plane normals, (k, 3)."""
+    k = len(covariances)
+    deviations, normals = np.empty((3, k)), np.empty((k, 3))
+    matrix, vectors, axes = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for s in range(k):
+        matrix[:] = covariances[s]
+        symmetric_eigen(matrix, vectors)
+        for axis in range(3):
+            rank = 0
+            for other in range(3):  # ties go by number, so that ranks differ
+                below = matrix[other, other] - matrix[axis, axis]
+                rank += below < 0.0 or (below == 0.0 and other < axis)
+            deviations[rank, s] = np.sqrt(max(matrix[axis, axis], 0.0))
+            for i in range(3):
+                axes[rank, i] = vectors[i, axis]
+        _plane_normal(deviations[:, s], axes, towards[s], normals[s])
+    return deviations[0], deviations[1], deviations[2], normals
+
+
+@njit(cache=True, nogil=True)
+def _plane_normal(
+    deviations: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    towards: NDArray[np.float64],
+    normal: NDArray[np.float64],
+) -> None:
+    """Nothing; `normal` becomes the axis of least spread on the viewpoint's side, or, of a line, one across it."""
+    normal[:] = axes[0]
+    if deviations[1] <= _NO_PLANE * deviations[2]:
+        along = 0.0
+        if deviations[2] > 0.0:
+            for i in range(3):
+                along += axes[2, i] * towards[i]
+        squares = reach = 0.0
+        for i in range(3):
+            squares += (towards[i] - along * axes[2, i]) ** 2
+            reach += towards[i] ** 2
+        if squares > 1e-24 * reach:
+            for i in range(3):
+                normal[i] = (towards[i] - along * axes[2, i]) / np.sqrt(squares)
+    facing = 0.0
+    for i in range(3):
+        facing += normal[i] * towards[i]
+    if facing < 0.0:
+        for i in range(3):
+            normal[i] = -normal[i]

@@ -8,13 +8,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def pool_moments(
     parents: NDArray[np.int32],
     counts: NDArray[np.int64],
-    centroids: NDArray[np.float64],
+    means: NDArray[np.float64],
     scatters: NDArray[np.float64],
-    colors: NDArray[np.float64],
 ) -> None:
     """Nothing; the rows of inner nodes, zero at first, become the moments of all their leaves.
 
@@ -22,8 +21,8 @@ def pool_moments(
     ----------
     parents : (k,) int32
         Larger than the node's own number, so one pass in ascending order meets children before parents.
-    counts, centroids, scatters, colors : (k,), (k, 3), (k, 3, 3), (k, 3)
-        As in `pcgraph.Moments`; overwritten.
+    counts, means, scatters : (k,), (k, 3), (k, 3, 3)
+        As in `pcgraph.Moments`, of positions or of colours; overwritten.
 
     Notes
     -----
@@ -39,13 +38,11 @@ def pool_moments(
         spread = n_up * share
         for i in range(3):
             for j in range(3):
-                shift = (centroids[node, i] - centroids[up, i]) * (centroids[node, j] - centroids[up, j])
+                shift = (means[node, i] - means[up, i]) * (means[node, j] - means[up, j])
                 scatters[up, i, j] += scatters[node, i, j] + spread * shift
         for i in range(3):
             if n_up == 0:  # exact copies: a mean must not move by rounding where there is one child only
-                centroids[up, i] = centroids[node, i]
-                colors[up, i] = colors[node, i]
+                means[up, i] = means[node, i]
             else:
-                centroids[up, i] += share * (centroids[node, i] - centroids[up, i])
-                colors[up, i] += share * (colors[node, i] - colors[up, i])
+                means[up, i] += share * (means[node, i] - means[up, i])
         counts[up] = total

@@ -50,46 +50,91 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
     supervoxels : (v,) int32
         Supervoxel of each voxel.
     """
-    voxel, other = _rims(grid.indptr, grid.neighbours, supervoxels)
-    own = supervoxels[voxel].astype(np.int64)
-    low, high = np.minimum(own, other), np.maximum(own, other)
-    n = int(supervoxels.max()) + 1
-    keys, edge = np.unique(low * n + high, return_inverse=True)
-    rim = 2 * edge + (own > other)
-    voxels = np.bincount(rim, minlength=2 * len(keys))
-    positions = _rim_sums(grid.centroids[voxel], rim, len(keys)) / voxels.reshape(-1, 2, 1)
-    sums = _rim_sums(normals[voxel], rim, len(keys))
-    length = np.linalg.norm(sums, axis=2, keepdims=True)
-    edges = np.stack((keys // n, keys % n), axis=1).astype(np.int32)
-    lengths = np.bincount(edge, grid.edge_lengths[voxel], len(keys)) / 2.0
-    return Contacts(edges, voxels.reshape(-1, 2), positions, sums / np.maximum(length, 1e-12), lengths)
+    voxel, other, pair, keys = _rims(grid.indptr, grid.neighbours, supervoxels)
+    order = np.argsort(keys)
+    edge_of_pair = np.empty(len(keys), np.int64)
+    edge_of_pair[order] = np.arange(len(keys))
+    edges = np.stack((keys[order] >> 32, keys[order] & 0xFFFFFFFF), axis=1).astype(np.int32)
+    side = supervoxels[voxel] > other
+    voxels, positions, directions, lengths = _rim_means(
+        voxel, edge_of_pair[pair], side.view(np.uint8), grid.centroids, normals, grid.edge_lengths, len(keys)
+    )
+    return Contacts(edges, voxels, positions, directions, lengths)
 
 
-def _rim_sums(values: NDArray[np.float64], rim: NDArray[np.int64], n_edges: int) -> NDArray[np.float64]:
-    sums = [np.bincount(rim, values[:, axis], 2 * n_edges) for axis in range(3)]
-    return np.stack(sums, axis=1, dtype=np.float64).reshape(n_edges, 2, 3)
-
-
-@njit(cache=True)
-def _rims(
+@njit(cache=True, nogil=True)
+def _rims(  # type: ignore[no-untyped-def]
     indptr: NDArray[np.int64], neighbours: NDArray[np.int32], supervoxels: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Each voxel on a rim, once per other supervoxel that it touches, with that supervoxel."""
-    voxel, other = np.empty(len(neighbours), np.int32), np.empty(len(neighbours), np.int64)
-    seen = np.empty(_MOST_OWNERS, np.int64)
-    used = 0
+):
+    """Each voxel on a rim, once per other supervoxel that it touches: voxel, other, pair; and the pairs' keys.
+
+    Pairs are numbered as they come up; their key is (smaller << 32) + larger.
+    """
+    voxel, other = np.empty(len(neighbours), np.int32), np.empty(len(neighbours), np.int32)
+    pair = np.empty(len(neighbours), np.int32)
+    keys, slots = np.empty(512, np.int64), np.full(2048, -1, np.int32)
+    seen = np.empty(_MOST_OWNERS + 1, np.int32)
+    used = n_keys = 0
     for i in range(len(supervoxels)):
+        own = last = supervoxels[i]
         n_seen = 0
-        for a in range(indptr[i], indptr[i + 1]):
-            s = supervoxels[neighbours[a]]
-            if s == supervoxels[i]:
-                continue
-            for known in range(n_seen):
-                if seen[known] == s:
+        for a in range(indptr[i], indptr[i + 1]):  # without a branch, which would often be guessed wrongly
+            seen[n_seen] = supervoxels[neighbours[a]]
+            n_seen += (seen[n_seen] != own) & (seen[n_seen] != last)
+            last = supervoxels[neighbours[a]]
+        for b in range(n_seen):
+            for known in range(b):
+                if seen[known] == seen[b]:
                     break
             else:
-                seen[n_seen] = s
-                n_seen += 1
-                voxel[used], other[used] = i, s
+                if n_keys == len(keys):
+                    keys, slots = _grown(keys)
+                key = (np.int64(min(seen[b], own)) << 32) + np.int64(max(seen[b], own))
+                slot = _slot(key, keys, slots)
+                if slots[slot] < 0:
+                    slots[slot], keys[n_keys] = n_keys, key
+                    n_keys += 1
+                voxel[used], other[used], pair[used] = i, seen[b], slots[slot]
                 used += 1
-    return voxel[:used].copy(), other[:used].copy()
+    return voxel[:used].copy(), other[:used].copy(), pair[:used].copy(), keys[:n_keys].copy()
+
+
+@njit(cache=True, nogil=True)
+def _slot(key: int, keys: NDArray[np.int64], slots: NDArray[np.int32]) -> int:
+    """Place of a key in the hash table, or the empty place where it belongs."""
+    mask = len(slots) - 1
+    at = ((key * 0x9E3779B97F4A7C1) >> 32) & mask
+    while slots[at] >= 0 and keys[slots[at]] != key:
+        at = (at + 1) & mask
+    return at
+
+
+@njit(cache=True, nogil=True)
+def _grown(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """The same keys with room for as many again, and their hash table, a quarter full."""
+    wide, slots = np.empty(2 * len(keys), np.int64), np.full(8 * len(keys), -1, np.int32)
+    wide[: len(keys)] = keys
+    for number in range(len(keys)):
+        slots[_slot(keys[number], wide, slots)] = number
+    return wide, slots
+
+
+@njit(cache=True, nogil=True)
+def _rim_means(voxel, edge, side, centroids, normals, edge_lengths, m):  # type: ignore[no-untyped-def]
+    """Voxels (m, 2), mean positions and unit mean normals (m, 2, 3), and lengths (m,) of both rims of m edges."""
+    voxels, lengths = np.zeros((m, 2), np.int64), np.zeros(m)
+    positions, directions = np.zeros((m, 2, 3)), np.zeros((m, 2, 3))
+    for row in range(len(voxel)):
+        i, e, s = voxel[row], edge[row], side[row]
+        voxels[e, s] += 1
+        lengths[e] += 0.5 * edge_lengths[i]
+        for axis in range(3):
+            positions[e, s, axis] += centroids[i, axis]
+            directions[e, s, axis] += normals[i, axis]
+    for e in range(m):
+        for s in range(2):
+            squares = directions[e, s, 0] ** 2 + directions[e, s, 1] ** 2 + directions[e, s, 2] ** 2
+            for axis in range(3):
+                positions[e, s, axis] /= voxels[e, s]
+                directions[e, s, axis] /= max(np.sqrt(squares), 1e-12)
+    return voxels, positions, directions, lengths

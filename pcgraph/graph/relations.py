@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.features.nodes import NodeFeatures
@@ -20,20 +21,21 @@ def edge_features(nodes: NodeFeatures, contacts: Contacts) -> EdgeFeatures:
     contacts : Contacts, m of them, between these
     """
     i, j = contacts.edges.T
-    rim_i, rim_j = contacts.positions[:, 0], contacts.positions[:, 1]
-    to_plane_i = _distance_to_plane(rim_j, nodes.centroid[i], nodes.normal[i])
-    to_plane_j = _distance_to_plane(rim_i, nodes.centroid[j], nodes.normal[j])
+    convexity, contact_convexity, normal_angle, step = _relations(
+        contacts.edges, nodes.centroid, nodes.normal, contacts.positions, contacts.normals
+    )
     return EdgeFeatures(
-        convexity=signed_convexity(nodes.normal[i], nodes.normal[j], nodes.centroid[j] - nodes.centroid[i]),
-        contact_convexity=signed_convexity(contacts.normals[:, 0], contacts.normals[:, 1], rim_j - rim_i),
-        normal_angle=angle_between(nodes.normal[i], nodes.normal[j]),
+        convexity=convexity,
+        contact_convexity=contact_convexity,
+        normal_angle=normal_angle,
         color_contrast=np.nan_to_num(np.linalg.norm(nodes.color[j] - nodes.color[i], axis=1)),
         contact_voxels=contacts.voxels.sum(axis=1),
         contact_length=contacts.lengths,
-        step=np.minimum(to_plane_i, to_plane_j),
+        step=step,
     )
 
 
+@njit(cache=True, nogil=True)
 def signed_convexity(
     normal_i: NDArray[np.float64], normal_j: NDArray[np.float64], offset: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -46,16 +48,58 @@ def signed_convexity(
     offset : (m, 3) float64, metres
         From the place of i to the place of j.
     """
-    opening = np.einsum("ij,ij->i", normal_j - normal_i, offset)
-    return angle_between(normal_i, normal_j) * np.sign(opening)
+    signs = np.empty(len(offset))
+    origin = np.zeros(3)
+    for row in range(len(offset)):
+        signs[row] = _bend(normal_i[row], normal_j[row], origin, offset[row])
+    return angle_between(normal_i, normal_j) * signs
 
 
+@njit(cache=True, nogil=True)
 def angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angle, radians, 0..pi, (m,), between rows; by the tangent, which stays exact for small angles."""
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ij,ij->i", a, b))
+    angles = np.empty(len(a))
+    for row in range(len(a)):
+        angles[row] = _angle(a[row], b[row])
+    return angles
 
 
-def _distance_to_plane(
-    points: NDArray[np.float64], origins: NDArray[np.float64], normals: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    return np.abs(np.einsum("ij,ij->i", points - origins, normals))
+@njit(cache=True, nogil=True)
+def _relations(edges, centroids, normals, rims, rim_normals):  # type: ignore[no-untyped-def]
+    """Convexity of nodes and of rims, angle between nodes' normals, and step, (m,) each."""
+    m = len(edges)
+    convexity, contact_convexity, angle, step = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    for e in range(m):
+        i, j = edges[e]
+        angle[e] = _angle(normals[i], normals[j])
+        convexity[e] = angle[e] * _bend(normals[i], normals[j], centroids[i], centroids[j])
+        contact_convexity[e] = _angle(rim_normals[e, 0], rim_normals[e, 1])
+        contact_convexity[e] *= _bend(rim_normals[e, 0], rim_normals[e, 1], rims[e, 0], rims[e, 1])
+        step[e] = min(_height(rims[e, 1], centroids[i], normals[i]), _height(rims[e, 0], centroids[j], normals[j]))
+    return convexity, contact_convexity, angle, step
+
+
+@njit(cache=True, nogil=True)
+def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return np.arctan2(np.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2])  # type: ignore[no-any-return]
+
+
+@njit(cache=True, nogil=True)
+def _bend(
+    normal_i: NDArray[np.float64], normal_j: NDArray[np.float64], at_i: NDArray[np.float64], at_j: NDArray[np.float64]
+) -> float:
+    """1 where the surface bends away from its outside on the way from i to j, -1 where towards it, 0 where neither."""
+    opening = 0.0
+    for axis in range(3):
+        opening += (normal_j[axis] - normal_i[axis]) * (at_j[axis] - at_i[axis])
+    return np.sign(opening)  # type: ignore[no-any-return]
+
+
+@njit(cache=True, nogil=True)
+def _height(point: NDArray[np.float64], origin: NDArray[np.float64], normal: NDArray[np.float64]) -> float:
+    """Distance of a point to a plane."""
+    height = 0.0
+    for axis in range(3):
+        height += (point[axis] - origin[axis]) * normal[axis]
+    return abs(height)
