@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pcgraph.metrics.boundaries import boundary_precision, boundary_recall
-    from pcgraph.metrics.compactness import compactness
+    from pcgraph.metrics.circularity import compactness
     from pcgraph.metrics.explained import explained_variation
     from pcgraph.metrics.fragmentation import FragmentationCurve, fragmentation_curve
     from pcgraph.metrics.information import VariationOfInformation, variation_of_information
@@ -66,7 +66,7 @@ _HOMES = {
     "best_scales": "scales",
     "boundary_precision": "boundaries",
     "boundary_recall": "boundaries",
-    "compactness": "compactness",
+    "compactness": "circularity",
     "contingency": "table",
     "dendrogram_purity": "oracle",
     "explained_variation": "explained",

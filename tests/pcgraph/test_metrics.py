@@ -146,7 +146,9 @@ def test_bad_arguments():
 
 def test_every_public_name_resolves_and_says_what_it_is():
     for name in metrics.__all__:
-        assert getattr(metrics, name).__doc__
+        thing = getattr(metrics, name)
+        assert callable(thing), f"{name} is shadowed by a module"
+        assert thing.__doc__
     assert sorted(metrics.__all__) == dir(metrics)
     with pytest.raises(AttributeError, match="no attribute 'accuracy'"):
         _ = metrics.accuracy
