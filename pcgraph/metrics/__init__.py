@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pcgraph.metrics.boundaries import boundary_precision, boundary_recall
+    from pcgraph.metrics.boundary_levels import BoundaryCurve, boundary_curve
     from pcgraph.metrics.circularity import compactness
     from pcgraph.metrics.explained import explained_variation
     from pcgraph.metrics.fragmentation import FragmentationCurve, fragmentation_curve
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BestScales",
+    "BoundaryCurve",
     "FragmentationCurve",
     "LevelCurve",
     "NeighbourGraph",
@@ -37,6 +39,7 @@ __all__ = [
     "achievable_accuracy",
     "adjusted_rand_index",
     "best_scales",
+    "boundary_curve",
     "boundary_precision",
     "boundary_recall",
     "compactness",
@@ -56,6 +59,7 @@ __all__ = [
 
 _HOMES = {
     "BestScales": "scales",
+    "BoundaryCurve": "boundary_levels",
     "FragmentationCurve": "fragmentation",
     "LevelCurve": "levels",
     "NeighbourGraph": "neighbours",
@@ -64,6 +68,7 @@ _HOMES = {
     "achievable_accuracy": "overlap",
     "adjusted_rand_index": "rand_index",
     "best_scales": "scales",
+    "boundary_curve": "boundary_levels",
     "boundary_precision": "boundaries",
     "boundary_recall": "boundaries",
     "compactness": "circularity",

@@ -10,7 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.metrics.node_table import NodeTable, children
+from pcgraph.metrics.hierarchy import children
+from pcgraph.metrics.node_table import NodeTable
 
 
 @dataclass(frozen=True)

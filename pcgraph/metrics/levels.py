@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.metrics.hierarchy import Cuts
 from pcgraph.metrics.node_table import NodeTable
 from pcgraph.metrics.rand_index import rand_from_pairs
 from pcgraph.metrics.tournament import overlap_of_cuts
@@ -77,25 +78,9 @@ def level_curve(
     if score not in get_args(Score):
         raise ValueError(f"expected a score of {', '.join(get_args(Score))}; got {score!r}")
     table = NodeTable.of(parents, leaves, truth)
-    heights = _checked(altitudes, table)
-    order = table.n_leaves + np.argsort(heights[table.n_leaves :], kind="stable")
-    inner = heights[order]
-    last = np.flatnonzero(np.append(inner[1:] > inner[:-1], True)) if len(order) else order
-    merged = np.bincount(table.parents[:-1], minlength=len(heights))[order] - 1
-    regions = table.n_leaves - np.concatenate([[0], np.cumsum(merged)[last]]).astype(np.int64)
-    values = overlap_of_cuts(table, order) if score == "weighted_overlap" else _additive(table, order, score)
-    chosen = np.concatenate([[0], last + 1])
-    return LevelCurve(score, np.concatenate([[-np.inf], inner[last]]), regions, values[chosen])
-
-
-def _checked(altitudes: ArrayLike, table: NodeTable) -> NDArray[np.float64]:
-    heights = np.asarray(altitudes, np.float64)
-    if heights.shape != table.parents.shape:
-        raise ValueError(f"expected one altitude per node, {table.parents.shape}, got {heights.shape}")
-    inner = heights[table.n_leaves :]
-    if np.isnan(inner).any() or (heights[table.parents[table.n_leaves :]] < inner).any():
-        raise ValueError("expected altitudes that are numbers and do not decrease from child to parent")
-    return heights
+    cuts = Cuts.of(table.parents, altitudes)
+    values = overlap_of_cuts(table, cuts.order) if score == "weighted_overlap" else _additive(table, cuts.order, score)
+    return LevelCurve(score, cuts.altitudes, cuts.regions, values[cuts.done])
 
 
 def _additive(table: NodeTable, order: NDArray[np.int64], score: str) -> NDArray[np.float64]:

@@ -76,16 +76,16 @@ class NeighbourGraph:
             The shape is not the graph's, or a point of the graph has a negative label.
         """
         marked = np.zeros(self.shape, bool)
-        marked.flat[self.members] = self._rim(labels)
+        marked.flat[self.members] = self.rim(labels)
         return marked
 
     def recall(self, labels: ArrayLike, truth: ArrayLike, *, hops: int = 1, tolerance: float | None = None) -> float:
         """Boundary recall BR, 0..1; parameters as for `boundary_recall`."""
-        return self._share_near(self._rim(truth), self._rim(labels), hops, tolerance)
+        return self._share_near(self.rim(truth), self.rim(labels), hops, tolerance)
 
     def precision(self, labels: ArrayLike, truth: ArrayLike, *, hops: int = 1, tolerance: float | None = None) -> float:
         """Boundary precision BP, 0..1; parameters as for `boundary_precision`."""
-        return self._share_near(self._rim(labels), self._rim(truth), hops, tolerance)
+        return self._share_near(self.rim(labels), self.rim(truth), hops, tolerance)
 
     def areas(self) -> NDArray[np.float64]:
         """Area of surface that each point of the graph stands for, (m,), the points' unit squared.
@@ -109,23 +109,25 @@ class NeighbourGraph:
             raise ValueError("expected labels >= 0 for all points of the graph; build it with valid=labels >= 0")
         return own.astype(np.int64)
 
-    def _rim(self, labels: ArrayLike) -> NDArray[np.bool_]:
+    def rim(self, labels: ArrayLike) -> NDArray[np.bool_]:
+        """As `boundary`, but (m,) and of the points in the graph only."""
         own = self.of_members(labels)
         return (own[self.neighbours] != own[:, None]).any(axis=1)
 
-    def _share_near(self, of: NDArray[np.bool_], to: NDArray[np.bool_], hops: int, tolerance: float | None) -> float:
-        """Share of the points `of` near a point of `to`; 1 if there are none, as then none is missed."""
-        if not of.any():
-            return 1.0
-        near = self._within_hops(to, hops)[of] if tolerance is None else self._within_reach(of, to, tolerance)
-        return float(near.mean())
-
-    def _within_hops(self, marked: NDArray[np.bool_], hops: int) -> NDArray[np.bool_]:
+    def within_hops(self, marked: NDArray[np.bool_], hops: int) -> NDArray[np.bool_]:
+        """Points of the graph that reach a marked one, (m,) bool both, in so many steps to a neighbour."""
         if hops < 0:
             raise ValueError(f"expected hops of at least 0, got {hops}")
         for _ in range(hops):
             marked = marked | marked[self.neighbours].any(axis=1)
         return marked
+
+    def _share_near(self, of: NDArray[np.bool_], to: NDArray[np.bool_], hops: int, tolerance: float | None) -> float:
+        """Share of the points `of` near a point of `to`; 1 if there are none, as then none is missed."""
+        if not of.any():
+            return 1.0
+        near = self.within_hops(to, hops)[of] if tolerance is None else self._within_reach(of, to, tolerance)
+        return float(near.mean())
 
     def _within_reach(self, of: NDArray[np.bool_], to: NDArray[np.bool_], tolerance: float) -> NDArray[np.bool_]:
         if not tolerance >= 0:

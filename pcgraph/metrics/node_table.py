@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.metrics.hierarchy import checked_parents, children, count_leaves
 from pcgraph.metrics.table import count_pairs, labelled, ranked
 
 
@@ -63,8 +64,8 @@ class NodeTable:
         ValueError
             The parents are not such a tree, a leaf is not in it, or as `contingency`.
         """
-        up = _checked(parents)
-        n_leaves = int(up.min()) if len(up) > 1 else 1
+        up = checked_parents(parents)
+        n_leaves = count_leaves(up)
         leaf, true = labelled(leaves, truth)
         if leaf.max() >= n_leaves:
             raise ValueError(f"expected leaves 0..{n_leaves - 1} of the tree, got {leaf.max()}")
@@ -98,26 +99,6 @@ class NodeTable:
         best = np.zeros(len(self.parents))
         np.maximum.at(best, self.nodes, values)
         return best
-
-
-def children(parents: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Children of all nodes, ascending: where each node's begin (k + 1,), and the children in a row (k - 1,)."""
-    below = np.arange(len(parents) - 1)
-    row = below[np.argsort(parents[:-1], kind="stable")]
-    starts = np.zeros(len(parents) + 1, np.int64)
-    np.cumsum(np.bincount(parents[:-1], minlength=len(parents)), out=starts[1:])
-    return starts, row
-
-
-def _checked(parents: ArrayLike) -> NDArray[np.int64]:
-    up = np.asarray(parents).astype(np.int64)
-    k = len(up) if up.ndim == 1 else 0
-    if k == 0 or up[-1] != k - 1 or (up[:-1] <= np.arange(k - 1)).any() or (up >= k).any():
-        raise ValueError("expected parents (k,) each larger than its node, the last node its own parent")
-    inner = np.bincount(up[:-1], minlength=k) > 0
-    if k > 1 and not inner[up[:-1].min() :].all():
-        raise ValueError("expected leaves before all other nodes, got a leaf among those; renumber the nodes")
-    return up
 
 
 @njit(cache=True)

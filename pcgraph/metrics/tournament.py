@@ -7,7 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.metrics.node_table import NodeTable, children
+from pcgraph.metrics.hierarchy import children
+from pcgraph.metrics.node_table import NodeTable
 
 
 def overlap_of_cuts(table: NodeTable, order: NDArray[np.int64]) -> NDArray[np.float64]:

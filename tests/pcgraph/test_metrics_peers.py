@@ -14,7 +14,7 @@ from pcgraph import metrics
 
 Labels = NDArray[np.int64]
 seeds = st.integers(0, 2**32 - 1)
-random_cases = settings(max_examples=60, deadline=None)
+random_cases = settings(max_examples=40, deadline=None)
 
 
 def labelling(seed: int) -> tuple[Labels, Labels]:

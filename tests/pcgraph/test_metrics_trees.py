@@ -169,6 +169,23 @@ def test_purity_is_the_mean_over_all_pairs(seed: int):
     assert metrics.dendrogram_purity(parents, leaves, truth) == pytest.approx(np.mean(shares) if shares else 1.0)
 
 
+@given(seeds, st.integers(0, 2))
+@settings(max_examples=30, deadline=None)
+def test_boundaries_of_every_level_are_those_of_its_labelling(seed: int, hops: int):
+    parents, altitudes = random_tree(seed)
+    leaves, truth = random_points(seed, int(parents.min()))
+    seen = (leaves >= 0) & (truth >= 0)
+    graph = metrics.NeighbourGraph.of(np.random.default_rng(seed).normal(size=(60, 3)), seen, k=3)
+    curve = metrics.boundary_curve(graph, parents, altitudes, leaves, truth, hops=hops)
+    for i, height in enumerate(curve.altitudes):
+        labels = np.where(seen, cut_at(parents, altitudes, height)[leaves], -1)
+        recall, precision = graph.recall(labels, truth, hops=hops), graph.precision(labels, truth, hops=hops)
+        assert (curve.recall[i], curve.precision[i]) == pytest.approx((recall, precision))
+        mean = 2 * recall * precision / (recall + precision) if recall + precision > 0 else 0
+        assert curve.f_measure.values[i] == pytest.approx(mean)
+    assert metrics.best_scales([curve.f_measure]).ois == curve.f_measure.values.max()
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_higra_agrees(seed: int):
     hg = pytest.importorskip("higra", reason="Higra is in the bench extra")
@@ -199,6 +216,11 @@ def test_bad_arguments():
         metrics.tree_oracle([2, 4, 4, 4, 4], LEAVES, TRUTH)
     with pytest.raises(ValueError, match=r"leaves 0\.\.2"):
         metrics.tree_oracle(PARENTS, LEAVES + 1, TRUTH)
+    graph = metrics.NeighbourGraph.of(np.random.default_rng(0).normal(size=(8, 3)))
+    with pytest.raises(ValueError, match=r"leaves 0\.\.2"):
+        metrics.boundary_curve(graph, PARENTS, ALTITUDES, LEAVES + 1, TRUTH)
+    with pytest.raises(ValueError, match="hops of at least 0"):
+        metrics.boundary_curve(graph, PARENTS, ALTITUDES, LEAVES, TRUTH, hops=-1)
     with pytest.raises(ValueError, match="one altitude per node"):
         metrics.level_curve(PARENTS, ALTITUDES[:3], LEAVES, TRUTH)
     with pytest.raises(ValueError, match="do not decrease"):
