@@ -3,15 +3,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.columns import rows
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import NodeFeatures, node_features
+from pcgraph.tree.ancestors import ancestor_index
+from pcgraph.tree.cores import core_of_leaf, size_cores
+from pcgraph.tree.energy import Energy
+from pcgraph.tree.optimal import appearance_scales
+from pcgraph.tree.segments import children_of, numbered_segments, tops_below
+from pcgraph.tree.stability import persistences, stable_nodes
 
 if TYPE_CHECKING:
     import networkx
@@ -19,14 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SegmentationTree:
-    """Binary merge tree; every cut of it is a segmentation, and all cuts nest.
+    """Binary merge tree; every cut of it is a segmentation, and all cuts at altitudes nest.
 
     Attributes
     ----------
     parents : (k,) int32
         Parent of each node, larger than the node's own number; the root (last node) is its own parent. The
         first `n_leaves` nodes are the supervoxels, in their order. k = 2 n_leaves - 1.
-    altitudes : (k,) float64, radians
+    altitudes : (k,) float64, the linkage's unit
         Cost at which a node came to be: 0 for leaves, not decreasing with the node's number; infinite where
         parts that do not touch were joined.
     moments : Moments
@@ -45,7 +51,15 @@ class SegmentationTree:
         """Number of supervoxels."""
         return (len(self.parents) + 1) // 2
 
-    def cut(self, n: int | None = None, altitude: float | None = None) -> NDArray[np.int32]:
+    @property
+    def persistence(self) -> NDArray[np.float64]:
+        """Range of altitudes over which each node is a segment of the cuts, (k,) float64.
+
+        Infinite for what never merges below infinity; 0 for nodes born at infinity.
+        """
+        return persistences(self.parents, self.altitudes)
+
+    def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each leaf, (n_leaves,) int32, numbered from 0 in the order of their first leaf.
 
         Points follow in one step: ``tree.cut(n=5)[supervoxels]``, or `Segmentation.cut`, which minds the -1.
@@ -54,29 +68,154 @@ class SegmentationTree:
         ----------
         n : int, 1..n_leaves
             Exact number of segments.
-        altitude : float, radians
+        altitude : float, the linkage's unit
             All merges up to and including this cost are done.
+        min_size : int, points
+            No segment has fewer, unless the whole tree has. What is smaller goes where the tree would have
+            merged it: to the first node above with enough points, and from there down into the larger child.
+            Cuts with the same `min_size` nest.
 
         Raises
         ------
         ValueError
-            Not exactly one of the two is given, n is out of range, or altitude is not a number.
+            Not exactly one of the first two is given, n is out of range (for this `min_size`), altitude is not
+            a number, or `min_size` is not a whole number of at least 1.
         """
-        nodes = self.cut_nodes(n, altitude)
-        _, first, inverse = np.unique(nodes, return_index=True, return_inverse=True)
-        rank = np.empty(len(first), np.int32)
-        rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
-        return rank[inverse]
+        return self._segments(self.cut_nodes(n, altitude, min_size))
 
-    def cut_nodes(self, n: int | None = None, altitude: float | None = None) -> NDArray[np.int32]:
-        """Node of the tree above each leaf after a cut, (n_leaves,) int32; parameters as for `cut`."""
-        last = self.n_leaves + self._merges(n, altitude)
-        up = np.where(self.parents < last, self.parents, np.arange(len(self.parents), dtype=np.int32))
-        while True:  # pointer jumping: as many rounds as the logarithm of the depth
-            further = up[up]
-            if np.array_equal(further, up):
-                return up[: self.n_leaves].copy()
-            up = further
+    def cut_nodes(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
+        """Node of the tree for each leaf after a cut, (n_leaves,) int32; parameters as for `cut`.
+
+        The node is above the leaf, except for leaves that went to another segment because of `min_size`.
+        """
+        if _whole("min_size", min_size) == 1:
+            last = self.n_leaves + self._merges(n, altitude, self.n_leaves)
+            return tops_below(self.parents, last)[: self.n_leaves].copy()
+        cores = size_cores(self.parents, self.moments.counts, min_size)
+        n_cores = len(cores.joins) + 1
+        merges = self._merges(n, altitude, n_cores)
+        last = self.n_leaves + merges
+        if n is not None:  # so many of the merges that join cores
+            last = int(cores.joins[merges - 1]) + 1 if merges > 0 else 0
+        return tops_below(self.parents, last)[cores.of_leaf]
+
+    def cut_stable(self, min_size: int = 1) -> NDArray[np.int32]:
+        """Segment of each leaf in the most stable segmentation, (n_leaves,) int32, numbered as in `cut`.
+
+        Of all ways to choose nodes, none above another, the one with the largest sum of points x persistence
+        (excess of mass, Campello et al. 2015). Segments may come from different altitudes. Persistence ends at
+        the largest finite altitude, so a scene that is one piece is never one segment for that alone.
+
+        Parameters
+        ----------
+        min_size : int, points
+            A merge with fewer points does not end a segment's life, and no segment has fewer.
+
+        Raises
+        ------
+        ValueError
+            `min_size` is not a whole number of at least 1.
+        """
+        return self._segments(self.cut_stable_nodes(min_size))
+
+    def cut_stable_nodes(self, min_size: int = 1) -> NDArray[np.int32]:
+        """Node of the tree for each leaf, (n_leaves,) int32; as `cut_stable`."""
+        counts = self.moments.counts
+        least = min(_whole("min_size", min_size), int(counts[-1]))
+        chosen = stable_nodes(self.parents, self.altitudes, counts, least)
+        if not chosen.any():  # only parts that do not touch, each too small
+            chosen[-1] = True
+        return core_of_leaf(self.parents, children_of(self.parents), counts, chosen)
+
+    def cut_optimal(self, energy: Energy, scale: float) -> NDArray[np.int32]:
+        """Segment of each leaf in the cut of least energy, (n_leaves,) int32, numbered as in `cut`.
+
+        Of all ways to cut the tree, at one altitude or at several, the one with the least sum over its segments
+        of data + scale x complexity. Cuts at rising scales nest. Parts that do not touch stay apart.
+
+        Parameters
+        ----------
+        energy : Energy
+            k rows, for example `plane_energy(tree)`.
+        scale : float, >= 0
+            Their lambda.
+
+        Raises
+        ------
+        ValueError
+            The energy has another number of rows, or scale is not a number >= 0.
+        """
+        return self.by_energy(energy).cut(altitude=_scale(scale))
+
+    def by_energy(self, energy: Energy) -> SegmentationTree:
+        """The same merges with the scale as altitude: the persistent hierarchy of optimal cuts.
+
+        Its cut at an altitude is the optimal cut at that scale (Guigues et al. 2006). A node that belongs to no
+        optimal cut comes to be together with one above it. Inner nodes are renumbered in the order of scales.
+
+        Raises
+        ------
+        ValueError
+            The energy has another number of rows than the tree has nodes, or leaves with infinite data.
+        """
+        if len(energy.data) != len(self.parents) or np.isinf(energy.data[: self.n_leaves]).any():
+            raise ValueError(
+                f"expected an energy with {len(self.parents)} rows, finite for leaves, got {len(energy.data)}; "
+                "make it from this tree"
+            )
+        data = np.where(np.isinf(self.altitudes), np.inf, energy.data)
+        return self.with_altitudes(appearance_scales(self.parents, data, energy.complexity))
+
+    def with_altitudes(self, altitudes: ArrayLike) -> SegmentationTree:
+        """The same merges at other altitudes; inner nodes are renumbered so that these do not decrease.
+
+        Parameters
+        ----------
+        altitudes : (k,) float
+            0 for leaves; a node's is not above its parent's. Of equal ones the order stays.
+
+        Raises
+        ------
+        ValueError
+            The altitudes are not as above.
+        """
+        levels = np.asarray(altitudes, np.float64)
+        leaves = slice(0, self.n_leaves)
+        if levels.shape != self.parents.shape or levels[leaves].any() or not (levels <= levels[self.parents]).all():
+            raise ValueError(
+                f"expected altitudes ({len(self.parents)},), 0 for leaves and not above the parent's, "
+                f"got shape {levels.shape}; give one per node in the tree's order"
+            )
+        inner = self.n_leaves + np.argsort(levels[self.n_leaves :], kind="stable")
+        order = np.concatenate((np.arange(self.n_leaves), inner))
+        rank = np.empty(len(order), np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
+        columns = {field.name: getattr(self.moments, field.name) for field in fields(self.moments)}
+        moved = {name: None if values is None else values[order] for name, values in columns.items()}
+        return SegmentationTree(rank[self.parents[order]], levels[order], Moments(**moved), self.viewpoint)
+
+    def edge_saliency(self, pairs: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Altitude at which the two leaves of each pair become one segment, (m,) float64, the linkage's unit.
+
+        On the edges of the graph this is the ultrametric contour map: edges above a level are the boundaries of
+        the cut at that altitude.
+
+        Parameters
+        ----------
+        pairs : (m, 2) int32, 0..n_leaves - 1
+            For example ``graph.edges``.
+
+        Raises
+        ------
+        ValueError
+            Pairs are not (m, 2), or not leaves.
+        """
+        leaves = np.asarray(pairs)
+        if leaves.ndim != 2 or leaves.shape[1] != 2 or (leaves.size and not 0 <= leaves.min() <= leaves.max()):
+            raise ValueError(f"expected pairs (m, 2) of leaves, got shape {leaves.shape}")
+        if leaves.size and leaves.max() >= self.n_leaves:
+            raise ValueError(f"expected leaves below {self.n_leaves}, got {leaves.max()}")
+        return self.altitudes[ancestor_index(self.parents).of_pairs(leaves.astype(np.int32))]
 
     def features(self) -> NodeFeatures:
         """Features of all k nodes, from their moments."""
@@ -92,13 +231,29 @@ class SegmentationTree:
         tree.add_edges_from((up, node) for node, up in enumerate(self.parents.tolist()) if up != node)
         return tree
 
-    def _merges(self, n: int | None, altitude: float | None) -> int:
+    def _segments(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
+        return numbered_segments(nodes, len(self.parents))
+
+    def _merges(self, n: int | None, altitude: float | None, most: int) -> int:
+        """Number of merges that a cut does; of a tree with `most` segments at its finest."""
         if n is not None and altitude is None:
-            if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 1 <= n <= self.n_leaves:
-                raise ValueError(f"expected a whole number n of 1..{self.n_leaves} segments, got {n!r}")
-            return self.n_leaves - int(n)
+            if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 1 <= n <= most:
+                raise ValueError(f"expected a whole number n of 1..{most} segments, got {n!r}")
+            return most - int(n)
         if altitude is None or n is not None:
             raise ValueError(f"expected either n or altitude, got n={n} and altitude={altitude}")
         if np.isnan(altitude):
-            raise ValueError("expected an altitude in radians, got NaN")
+            raise ValueError("expected an altitude in the linkage's unit, got NaN")
         return int(np.searchsorted(self.altitudes[self.n_leaves :], altitude, side="right"))
+
+
+def _whole(name: str, value: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"expected {name} as a whole number of at least 1, got {value!r}")
+    return int(value)
+
+
+def _scale(value: float) -> float:
+    if not value >= 0.0:
+        raise ValueError(f"expected a scale of at least 0, got {value!r}")
+    return float(value)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Energies of segmentations: what a segment costs by its points, and what by its outline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.tree.ancestors import ancestor_index
+
+if TYPE_CHECKING:
+    from pcgraph.tree.tree import SegmentationTree
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energy of a segmentation at a scale: sum over its segments of data + scale x complexity.
+
+    Attributes
+    ----------
+    data : (k,) float64
+        How badly each node of a tree fits its points as one segment.
+    complexity : (k,) float64
+        What each node costs as a segment; a node's is at most the sum of its children's. Ones count segments.
+
+    Raises
+    ------
+    ValueError
+        The two are not one-dimensional and of one length, a value is NaN, or a complexity infinite.
+    """
+
+    data: NDArray[np.float64]
+    complexity: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.data.ndim != 1 or self.data.shape != self.complexity.shape:
+            raise ValueError(
+                f"expected data and complexity (k,) of one length, got {self.data.shape} and {self.complexity.shape}"
+            )
+        if np.isnan(self.data).any() or not np.isfinite(self.complexity).all():
+            raise ValueError("expected data without NaN and finite complexity; check the values given")
+
+
+def plane_energy(tree: SegmentationTree, graph: AdjacencyGraph | None = None) -> Energy:
+    """Mumford-Shah energy with planes: squared distances to each segment's best plane, and outlines.
+
+    Parameters
+    ----------
+    tree : SegmentationTree
+    graph : AdjacencyGraph, optional
+        Of the tree's leaves. With it complexity is the length of contact with other segments in metres, and the
+        scale has square metres x points per metre. Without it complexity counts segments, and the scale has
+        square metres x points.
+    """
+    residual = np.linalg.eigvalsh(tree.moments.scatters)[:, 0]
+    return Energy(np.maximum(residual, 0.0), _complexity(tree, graph))
+
+
+def variance_energy(tree: SegmentationTree, values: ArrayLike, graph: AdjacencyGraph | None = None) -> Energy:
+    """Piecewise constant Mumford-Shah energy: squared distances of leaves' values to their segment's mean.
+
+    Parameters
+    ----------
+    tree : SegmentationTree
+    values : (n_leaves, d) float
+        For example colours or normals of the supervoxels; each leaf counts as often as it has points.
+    graph : AdjacencyGraph, optional
+        As for `plane_energy`.
+
+    Raises
+    ------
+    ValueError
+        Values are not (n_leaves, d), or not finite.
+    """
+    rows = np.asarray(values, np.float64)
+    if rows.ndim != 2 or len(rows) != tree.n_leaves or not np.isfinite(rows).all():
+        raise ValueError(f"expected finite values ({tree.n_leaves}, d), got shape {rows.shape}; give one row per leaf")
+    return Energy(_variances(tree.parents, tree.moments.counts, rows), _complexity(tree, graph))
+
+
+def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[np.float64]:
+    """Length of each node's contact with everything outside it, (k,) float64, metres.
+
+    Parameters
+    ----------
+    tree : SegmentationTree
+    graph : AdjacencyGraph
+        Of the tree's leaves.
+    """
+    k, lengths = len(tree.parents), graph.edge_features.contact_length
+    outlines = np.bincount(graph.edges.ravel(), np.repeat(lengths, 2), k)
+    # An edge is inside from the lowest common ancestor of its ends upwards: there both its sides leave the outline.
+    meeting = ancestor_index(tree.parents).of_pairs(graph.edges)
+    outlines -= 2.0 * np.bincount(meeting, lengths, k)
+    _sum_up(tree.parents, outlines)
+    return np.maximum(outlines, 0.0)
+
+
+def _complexity(tree: SegmentationTree, graph: AdjacencyGraph | None) -> NDArray[np.float64]:
+    return np.ones(len(tree.parents)) if graph is None else boundary_lengths(tree, graph)
+
+
+@njit(cache=True)
+def _sum_up(parents: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+    for node in range(len(parents) - 1):
+        values[parents[node]] += values[node]
+
+
+@njit(cache=True)
+def _variances(
+    parents: NDArray[np.int32], counts: NDArray[np.int64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sums of squares about each node's mean, by the pairwise update of Chan, Golub and LeVeque 1979."""
+    k, d = len(parents), values.shape[1]
+    sums, means, seen = np.zeros(k), np.zeros((k, d)), np.zeros(k, np.int64)
+    for node in range(k):
+        if node < len(values):
+            means[node] = values[node]
+        up = parents[node]
+        if up == node:
+            continue
+        total = seen[up] + counts[node]
+        share = counts[node] / total
+        for i in range(d):
+            gap = means[node, i] - means[up, i]
+            sums[up] += seen[up] * share * gap * gap
+            means[up, i] += share * gap
+        sums[up] += sums[node]
+        seen[up] = total
+    return sums
