@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.boundary import BoundaryCost
     from pcgraph.io import read_cloud, write_segmentation
     from pcgraph.segmentation import Segmentation, segment
+    from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth, Vccs
     from pcgraph.tree.linkage import ConvexityLinkage, Linkage
     from pcgraph.tree.tree import SegmentationTree
 
@@ -36,6 +37,9 @@ __all__ = [
     "PcgraphError",
     "Segmentation",
     "SegmentationTree",
+    "SupervoxelMethod",
+    "SurfaceGrowth",
+    "Vccs",
     "metrics",
     "read_cloud",
     "segment",
@@ -56,6 +60,9 @@ _HOMES = {
     "PcgraphError": "errors",
     "Segmentation": "segmentation",
     "SegmentationTree": "tree.tree",
+    "SupervoxelMethod": "supervoxels.method",
+    "SurfaceGrowth": "supervoxels.method",
+    "Vccs": "supervoxels.method",
     "read_cloud": "io",
     "segment": "segmentation",
     "write_segmentation": "io",

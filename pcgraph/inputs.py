@@ -24,21 +24,21 @@ class CleanCloud:
     normals : (n, 3) float64, unit length, or zero where none was given, or None
     shape : (s,) or (h, w)
         Leading shape of what came in.
-    finite : (s,) or (h * w,) bool
-        Which points those are.
+    kept : (n,) int64
+        Flat indices of those points.
     """
 
     points: NDArray[np.float64]
     colors: NDArray[np.float64] | None
     normals: NDArray[np.float64] | None
     shape: tuple[int, ...]
-    finite: NDArray[np.bool_]
+    kept: NDArray[np.int64]
 
     def spread(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
         """Labels of the finite points in the shape of what came in, -1 elsewhere."""
-        full = np.full(len(self.finite), -1, np.int32)
-        full[self.finite] = labels
-        return full.reshape(self.shape)
+        full = np.full(self.shape, -1, np.int32)
+        full.reshape(-1)[self.kept] = labels
+        return full
 
 
 def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike | None) -> CleanCloud:
@@ -56,14 +56,14 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     flat = array.reshape(-1, 3)
     if not len(flat):
         raise ValueError("expected at least one point, got an empty cloud")
-    finite = np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2])
-    if not finite.any():
+    kept = np.flatnonzero(np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2]))
+    if not len(kept):
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
-    kept = np.ascontiguousarray(flat[finite], dtype=np.float64)
-    largest = float(np.abs(bounding_box(kept)).max())
+    places = flat.take(kept, axis=0).astype(np.float64)
+    largest = float(np.abs(bounding_box(places)).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
-    return CleanCloud(kept, _colors(colors, shape, finite), _normals(normals, shape, finite), shape, finite)
+    return CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept)
 
 
 def clean_viewpoint(viewpoint: ArrayLike | None, points: NDArray[np.float64], organised: bool) -> NDArray[np.float64]:
@@ -122,12 +122,14 @@ def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray
     return array.reshape(-1, 3)
 
 
-def _colors(colors: ArrayLike | None, shape: tuple[int, ...], finite: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
     if colors is None:
         return None
-    array = _same_shape("colors", colors, shape)[finite]
+    array = _same_shape("colors", colors, shape).take(kept, axis=0)
     if array.dtype == np.uint8:
-        return array.astype(np.float64) / 255.0
+        shades = array.astype(np.float64)
+        shades *= 1.0 / 255.0
+        return shades
     if array.dtype.kind != "f":
         raise ValueError(f"expected colors as uint8 (0..255) or float (0..1), got {array.dtype}")
     shades = array.astype(np.float64)
@@ -136,12 +138,10 @@ def _colors(colors: ArrayLike | None, shape: tuple[int, ...], finite: NDArray[np
     return shades
 
 
-def _normals(
-    normals: ArrayLike | None, shape: tuple[int, ...], finite: NDArray[np.bool_]
-) -> NDArray[np.float64] | None:
+def _normals(normals: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
     if normals is None:
         return None
-    array = _same_shape("normals", normals, shape)[finite].astype(np.float64)
+    array = _same_shape("normals", normals, shape).take(kept, axis=0).astype(np.float64)
     array[~np.isfinite(array).all(axis=1)] = 0.0
     array /= np.maximum(np.abs(array).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
     return array / np.maximum(np.linalg.norm(array, axis=1, keepdims=True), 1e-300)

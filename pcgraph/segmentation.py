@@ -14,12 +14,11 @@ from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import contacts
 from pcgraph.graph.relations import edge_features
 from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, non_negative, positive
-from pcgraph.supervoxels.vccs import VccsWeights, vccs
+from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth
 from pcgraph.tree.growth import segmentation_tree
 from pcgraph.tree.linkage import ConvexityLinkage, Linkage
 from pcgraph.tree.tree import SegmentationTree
-from pcgraph.voxels.grid import voxel_grid
-from pcgraph.voxels.normals import voxel_normals
+from pcgraph.voxels.grid import VoxelGrid, voxel_grid, voxel_means
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.warp import choose_warp
@@ -78,10 +77,8 @@ def segment(
     *,
     voxel_size: float | None = None,
     seed_size: float | None = None,
-    color_weight: float = 0.1,
-    spatial_weight: float = 0.4,
-    normal_weight: float = 1.0,
     camera: bool | None = None,
+    method: SupervoxelMethod | None = None,
     linkage: Linkage | None = None,
     object_altitude: float | None = None,
 ) -> Segmentation:
@@ -103,11 +100,11 @@ def segment(
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
     seed_size : float, metres, optional
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 6 times `voxel_size`.
-    color_weight, spatial_weight, normal_weight : float, >= 0
-        Their w_c, w_s, w_n.
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
         depth, as a camera's pixels do. Default: organised clouds that lie in front of the viewpoint.
+    method : SupervoxelMethod, optional
+        How voxels become supervoxels; default `SurfaceGrowth()`.
     linkage : Linkage, optional
         How the graph becomes a tree; default `ConvexityLinkage()`, whose altitudes are radians of concavity.
     object_altitude : float, the linkage's unit, optional
@@ -132,19 +129,16 @@ def segment(
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud.points, len(cloud.shape) == 2)
     voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
-    weights = VccsWeights(
-        color=non_negative("color_weight", color_weight),
-        spatial=non_negative("spatial_weight", spatial_weight),
-        normal=non_negative("normal_weight", normal_weight),
-    )
+    method = SurfaceGrowth() if method is None else method
     linkage = ConvexityLinkage() if linkage is None else linkage
     altitude = linkage.object_altitude if object_altitude is None else object_altitude
     altitude = non_negative("object_altitude", altitude)
     camera = _is_camera(cloud, position) if camera is None else bool(camera)
     grid = voxel_grid(cloud.points, cloud.colors, voxel_size, choose_warp(cloud.points, position, camera))
-    facing = voxel_normals(grid, position, cloud.normals)
-    leaf_of_voxel = vccs(grid, facing, seed_size, weights)
-    leaf_of_point = leaf_of_voxel[grid.voxel_of_point]
+    planes = method.planes(grid, position)
+    facing = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
+    leaf_of_voxel = method.supervoxels(grid, facing, seed_size)
+    leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, leaf_of_voxel)
     leaves = moments_of_groups(cloud.points, cloud.colors, leaf_of_point, int(leaf_of_voxel.max()) + 1)
     nodes = node_features(leaves, position)
     touching = contacts(grid, facing, leaf_of_voxel)
@@ -170,3 +164,11 @@ def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None)
 
 def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
     return len(cloud.shape) == 2 and bool((cloud.points[:, 2] > viewpoint[2]).all())
+
+
+def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of the given normals of each voxel's points; the estimate where there is none."""
+    means = voxel_means(given, grid)
+    length = np.linalg.norm(means, axis=1, keepdims=True)
+    usable = length > 1e-6
+    return np.where(usable, means / np.where(usable, length, 1.0), estimated)

@@ -7,45 +7,48 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.supervoxels.distance import distance, update_means
+from pcgraph.supervoxels.distance import Metric, distance, update_means
+from pcgraph.voxels.grid import VoxelGrid
 
 
 def connect(
-    features: NDArray[np.float64],
-    scale: NDArray[np.float64],
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
-    owner: NDArray[np.int32],
+    grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, owner: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """Owners such that each one's voxels are connected, renumbered in the order of their first voxel.
+    """Owners such that each one's voxels are connected, (v,) int32, renumbered in the order of their first voxel.
+
+    The largest piece of each supervoxel keeps it; voxels of other pieces go, ring by ring, to the nearest
+    supervoxel that touches them.
 
     Parameters
     ----------
+    grid : VoxelGrid of v voxels
     features : (v, 9) float64
-        Position, unit normal and colour of each voxel.
-    scale : (3,) float64
-        Weights of the VCCS distance.
-    indptr, neighbours : (v + 1,) int64, (e,) int32
-        Touching voxels.
+        From `voxel_features`.
+    metric : Metric
     owner : (v,) int32, >= 0
         Supervoxels, perhaps in pieces.
-
-    Returns
-    -------
-    (v,) int32
-        The largest piece of each supervoxel keeps it; voxels of other pieces go, ring by ring, to the nearest
-        supervoxel that touches them.
     """
     n_supervoxels = int(owner.max()) + 1
-    kept = np.where(_largest_pieces(indptr, neighbours, owner, n_supervoxels), owner, np.int32(-1))
-    _adopt(features, scale, indptr, neighbours, kept, n_supervoxels)
-    _, first, inverse = np.unique(kept, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int32)
-    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
-    return rank[inverse]
+    lists = grid.indptr, grid.neighbours
+    kept = np.where(_largest_pieces(*lists, owner, n_supervoxels), owner, np.int32(-1))
+    _adopt(features, metric, *lists, kept, n_supervoxels)
+    return _renumber(kept, n_supervoxels)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
+def _renumber(owner: NDArray[np.int32], n_supervoxels: int) -> NDArray[np.int32]:
+    """Owners numbered without gaps in the order of their first voxel."""
+    names, numbered = np.full(n_supervoxels, -1, np.int32), np.empty_like(owner)
+    used = 0
+    for i in range(len(owner)):
+        if names[owner[i]] < 0:
+            names[owner[i]] = used
+            used += 1
+        numbered[i] = names[owner[i]]
+    return numbered
+
+
+@njit(cache=True, nogil=True)
 def _largest_pieces(
     indptr: NDArray[np.int64], neighbours: NDArray[np.int32], owner: NDArray[np.int32], n_supervoxels: int
 ) -> NDArray[np.bool_]:
@@ -82,10 +85,10 @@ def _largest_pieces(
     return inside
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _adopt(
     features: NDArray[np.float64],
-    scale: NDArray[np.float64],
+    metric: Metric,
     indptr: NDArray[np.int64],
     neighbours: NDArray[np.int32],
     owner: NDArray[np.int32],
@@ -102,7 +105,7 @@ def _adopt(
             n_waiting += 1
     while n_waiting > 0:
         for w in range(n_waiting):
-            adopted[w] = _nearest_owner(waiting[w], features, scale, indptr, neighbours, owner, means)
+            adopted[w] = _nearest_owner(waiting[w], features, metric, indptr, neighbours, owner, means)
         left = 0
         for w in range(n_waiting):
             if adopted[w] >= 0:
@@ -113,14 +116,14 @@ def _adopt(
         n_waiting = left
 
 
-@njit(cache=True)
-def _nearest_owner(i, features, scale, indptr, neighbours, owner, means):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def _nearest_owner(i, features, metric, indptr, neighbours, owner, means):  # type: ignore[no-untyped-def]
     """Owner of a neighbour of voxel i with the least distance to it, the smaller of equals; -1 if there is none."""
     nearest, least = -1, np.inf
     for a in range(indptr[i], indptr[i + 1]):
         s = owner[neighbours[a]]
         if s >= 0:
-            d = distance(features, i, means, s, scale)
+            d = distance(features, i, means, s, metric)
             if d < least or (d == least and s < nearest):
                 nearest, least = s, d
     return nearest

@@ -3,25 +3,54 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-
-@njit(cache=True)
-def distance(
-    features: NDArray[np.float64], i: int, means: NDArray[np.float64], s: int, scale: NDArray[np.float64]
-) -> float:
-    """VCCS distance of voxel i to supervoxel s, given rows of (position, unit normal, colour)."""
-    space = tint = cosine = 0.0
-    for axis in range(3):
-        space += (features[i, axis] - means[s, axis]) ** 2
-        cosine += features[i, 3 + axis] * means[s, 3 + axis]
-        tint += (features[i, 6 + axis] - means[s, 6 + axis]) ** 2
-    return scale[0] * np.sqrt(space) + scale[1] * (1.0 - cosine) + scale[2] * np.sqrt(tint)
+from pcgraph.voxels.grid import VoxelGrid
 
 
-@njit(cache=True)
+class Metric(NamedTuple):
+    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'|, with |n . n'| where `two_sided`.
+
+    Attributes
+    ----------
+    spatial : float, 1 / metres
+    normal, color : float
+    two_sided : bool
+        Whether opposite normals are the same.
+    """
+
+    spatial: float
+    normal: float
+    color: float
+    two_sided: bool
+
+
+def voxel_features(grid: VoxelGrid, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows (place in the warped space, unit normal, colour) of the voxels, (v, 9) float64."""
+    features = np.zeros((grid.n_voxels, 9))
+    features[:, :3], features[:, 3:6] = grid.warped, normals
+    if grid.colors is not None:
+        features[:, 6:] = grid.colors
+    return features
+
+
+@njit(cache=True, nogil=True)
+def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], s: int, metric: Metric) -> float:
+    """Distance D of voxel i to supervoxel s, given rows of `voxel_features`."""
+    x, y, z = features[i, 0] - means[s, 0], features[i, 1] - means[s, 1], features[i, 2] - means[s, 2]
+    cosine = features[i, 3] * means[s, 3] + features[i, 4] * means[s, 4] + features[i, 5] * means[s, 5]
+    r, g, b = features[i, 6] - means[s, 6], features[i, 7] - means[s, 7], features[i, 8] - means[s, 8]
+    if metric.two_sided:
+        cosine = abs(cosine)
+    away, tint = np.sqrt(x * x + y * y + z * z), np.sqrt(r * r + g * g + b * b)
+    return metric.spatial * away + metric.normal * (1.0 - cosine) + metric.color * tint
+
+
+@njit(cache=True, nogil=True)
 def update_means(
     features: NDArray[np.float64],
     owner: NDArray[np.int32],
@@ -41,7 +70,6 @@ def update_means(
             sums[s, 9] += 1.0
     for s in range(len(sums)):
         if sums[s, 9] > 0.0:
-            length = np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2)
+            length = max(np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2), 1e-12)
             for column in range(9):
-                divisor = max(length, 1e-12) if 3 <= column < 6 else sums[s, 9]
-                means[s, column] = sums[s, column] / divisor
+                means[s, column] = sums[s, column] / (length if 3 <= column < 6 else sums[s, 9])

@@ -9,7 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.parallel import in_blocks
 from pcgraph.voxels.bounds import bounding_box
+from pcgraph.voxels.touching import touching
 from pcgraph.voxels.warp import Warp
 
 # Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points'
@@ -80,53 +82,127 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
         The cloud spans so many voxels that a grid coordinate cannot be written as a whole number.
     """
     scaled = warp.forward(points) / size
-    cells = np.floor(scaled)
-    keys, pitch = _keys(cells, size)
+    keys, pitch = cell_keys(scaled, size)
     order = np.argsort(keys)
     ordered = keys[order]
-    first = np.concatenate(([True], ordered[1:] != ordered[:-1]))
-    voxel_of_point = np.empty(len(points), np.int32)
-    voxel_of_point[order] = np.cumsum(first, dtype=np.int32) - 1
-    unique_keys = ordered[first]
-    counts = np.bincount(voxel_of_point)
-    offsets = np.rint((scaled - cells) * _STEPS_PER_VOXEL)
-    inside = _means(offsets, voxel_of_point, counts) / _STEPS_PER_VOXEL
-    warped = (cells[order[first]] + inside) * size
+    starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
+    n_voxels = len(starts) - 1
+    voxel_of_point, warped = np.empty(len(points), np.int32), np.empty((n_voxels, 3))
+    in_blocks(_gather, n_voxels, starts, order, scaled, voxel_of_point, warped)
+    warped *= size
     centroids = warp.backward(warped)
     if colors is not None:
-        colors = _means(np.rint(colors * _COLOR_STEPS), voxel_of_point, counts) / _COLOR_STEPS
-    indptr, neighbours = _adjacency(unique_keys, *pitch)
+        colors = _sorted_means(colors, starts, order, _COLOR_STEPS)
+    indptr, neighbours = touching(ordered[starts[:-1]], *pitch)
     lengths = size * warp.scale(centroids)
+    counts = np.diff(starts)
     return VoxelGrid(size, voxel_of_point, counts, warped, centroids, lengths, colors, indptr, neighbours)
 
 
-def sparse_means(
-    values: NDArray[np.float64], voxel_of_point: NDArray[np.int32], counts: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def voxel_means(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
     """Mean of point values in [-1, 1] per voxel, (v, c), independent of the points' order."""
-    return _means(np.rint(values * _STEPS_PER_VOXEL), voxel_of_point, counts) / _STEPS_PER_VOXEL
+    order = np.argsort(grid.voxel_of_point)
+    starts = np.concatenate(([0], np.cumsum(grid.counts)))
+    return _sorted_means(values, starts, order, _STEPS_PER_VOXEL)
 
 
-def _means(
-    whole: NDArray[np.float64], voxel_of_point: NDArray[np.int32], counts: NDArray[np.int64]
+def _sorted_means(
+    values: NDArray[np.float64], starts: NDArray[np.int64], order: NDArray[np.int64], steps: float
 ) -> NDArray[np.float64]:
-    sums = [np.bincount(voxel_of_point, whole[:, axis], len(counts)) for axis in range(whole.shape[1])]
-    return np.stack(sums, axis=1) / counts[:, None]
+    means = np.empty((len(starts) - 1, values.shape[1]))
+    in_blocks(_average, len(means), starts, order, values, steps, means)
+    return means
 
 
-def _keys(cells: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """One whole number per point that sorts like (x, y, z), and what a step in x and in y adds to it."""
-    low, high = bounding_box(cells)
+@njit(cache=True, nogil=True)
+def _gather(
+    start: int,
+    stop: int,
+    starts: NDArray[np.int64],
+    order: NDArray[np.int64],
+    scaled: NDArray[np.float64],
+    voxel_of_point: NDArray[np.int32],
+    warped: NDArray[np.float64],
+) -> None:
+    """Each point learns its voxel, each voxel the mean of its points in units of a voxel."""
+    for v in range(start, stop):
+        x = y = z = 0
+        first = order[starts[v]]
+        cell_x, cell_y, cell_z = np.floor(scaled[first, 0]), np.floor(scaled[first, 1]), np.floor(scaled[first, 2])
+        for at in range(starts[v], starts[v + 1]):
+            p = order[at]
+            voxel_of_point[p] = v
+            x += np.int64(np.rint((scaled[p, 0] - cell_x) * _STEPS_PER_VOXEL))
+            y += np.int64(np.rint((scaled[p, 1] - cell_y) * _STEPS_PER_VOXEL))
+            z += np.int64(np.rint((scaled[p, 2] - cell_z) * _STEPS_PER_VOXEL))
+        total = (starts[v + 1] - starts[v]) * _STEPS_PER_VOXEL
+        warped[v, 0], warped[v, 1], warped[v, 2] = cell_x + x / total, cell_y + y / total, cell_z + z / total
+
+
+@njit(cache=True, nogil=True)
+def _average(
+    start: int,
+    stop: int,
+    starts: NDArray[np.int64],
+    order: NDArray[np.int64],
+    values: NDArray[np.float64],
+    steps: float,
+    means: NDArray[np.float64],
+) -> None:
+    """Means of values by voxel, summed as whole numbers."""
+    for v in range(start, stop):
+        n = starts[v + 1] - starts[v]
+        for c in range(values.shape[1]):
+            total = 0
+            for at in range(starts[v], starts[v + 1]):
+                total += np.int64(np.rint(values[order[at], c] * steps))
+            means[v, c] = total / (n * steps)
+
+
+def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
+    """One whole number per place that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
+
+    Parameters
+    ----------
+    scaled : (n, 3) float64
+        Places in units of a cell; cells are the unit cubes.
+    size : float, metres
+        Edge length of a cell, for the message.
+
+    Raises
+    ------
+    ValueError
+        The places span so many cells that the numbers do not fit.
+    """
+    cells = scaled
+    low, high = np.floor(bounding_box(scaled))
     if not _fits(high - low):
-        cells = np.stack([_without_gaps(cells[:, axis]) for axis in range(3)], axis=1)
+        cells = np.stack([_without_gaps(np.floor(scaled[:, axis])) for axis in range(3)], axis=1)
         low, high = bounding_box(cells)
         if not _fits(high - low):
             raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
     # Two spare cells per axis keep a row's end from touching the next row's start.
     extent = (high - low).astype(np.int64) + 3
-    whole = (cells - low).astype(np.int64)
     pitch = (int(extent[1] * extent[2]), int(extent[2]))
-    return whole[:, 0] * pitch[0] + whole[:, 1] * pitch[1] + whole[:, 2], pitch
+    keys = np.empty(len(cells), np.int64)
+    in_blocks(_number_cells, len(cells), cells, low, *pitch, keys)
+    return keys, pitch
+
+
+@njit(cache=True, nogil=True)
+def _number_cells(
+    start: int,
+    stop: int,
+    cells: NDArray[np.float64],
+    low: NDArray[np.float64],
+    pitch_x: int,
+    pitch_y: int,
+    keys: NDArray[np.int64],
+) -> None:
+    """Keys of cells, given by their coordinates or by places in them."""
+    for p in range(start, stop):
+        x, y = np.int64(np.floor(cells[p, 0]) - low[0]), np.int64(np.floor(cells[p, 1]) - low[1])
+        keys[p] = x * pitch_x + y * pitch_y + np.int64(np.floor(cells[p, 2]) - low[2])
 
 
 def _fits(span: NDArray[np.float64]) -> bool:
@@ -137,31 +213,3 @@ def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:
     """Same order and same touching pairs, but no gap wider than one empty cell."""
     values, inverse = np.unique(cells, return_inverse=True)
     return np.concatenate(([0.0], np.cumsum(np.minimum(np.diff(values), 2.0))))[inverse]
-
-
-@njit(cache=True)
-def _adjacency(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """CSR lists of touching voxels: nine pointers walk the sorted keys, each three voxels of a row wide."""
-    n = keys.size
-    indptr = np.zeros(n + 1, np.int64)
-    neighbours = np.empty(0, np.int32)
-    for filling in (False, True):
-        pointers = np.zeros(9, np.int64)
-        used = 0
-        for i in range(n):
-            for row in range(9):
-                target = keys[i] + (row // 3 - 1) * pitch_x + (row % 3 - 1) * pitch_y - 1
-                at = pointers[row]
-                while at < n and keys[at] < target:
-                    at += 1
-                pointers[row] = at
-                while at < n and keys[at] <= target + 2:
-                    if at != i:
-                        if filling:
-                            neighbours[used] = at
-                        used += 1
-                    at += 1
-            indptr[i + 1] = used
-        if not filling:
-            neighbours = np.empty(used, np.int32)
-    return indptr, neighbours

@@ -6,7 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+
+from pcgraph.parallel import in_blocks
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,9 @@ class CameraWarp(Warp):
 
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64; points must lie in front of the viewpoint."""
-        local = points - self.viewpoint
-        depth = local[:, 2]
-        warped = np.stack((local[:, 0] / depth, local[:, 1] / depth, np.log(depth / self.reference_depth)), axis=1)
-        return warped * self.reference_depth
+        warped = np.empty((len(points), 3))
+        in_blocks(_see, len(points), points, self.viewpoint, self.reference_depth, warped)
+        return warped
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of warped positions."""
@@ -63,6 +65,24 @@ class CameraWarp(Warp):
     def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth over reference depth, (n,) float64."""
         return (points[:, 2] - self.viewpoint[2]) / self.reference_depth
+
+
+@njit(cache=True, nogil=True)
+def _see(
+    start: int,
+    stop: int,
+    points: NDArray[np.float64],
+    viewpoint: NDArray[np.float64],
+    reference_depth: float,
+    warped: NDArray[np.float64],
+) -> None:
+    """Points as a camera sees them, in metres at the reference depth."""
+    for p in range(start, stop):
+        depth = points[p, 2] - viewpoint[2]
+        scale = reference_depth / depth
+        warped[p, 0] = (points[p, 0] - viewpoint[0]) * scale
+        warped[p, 1] = (points[p, 1] - viewpoint[1]) * scale
+        warped[p, 2] = -np.log(scale) * reference_depth
 
 
 def choose_warp(points: NDArray[np.float64], viewpoint: NDArray[np.float64], camera: bool) -> Warp:

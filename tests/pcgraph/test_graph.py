@@ -65,7 +65,12 @@ def test_contact_length_is_the_length_of_the_seam():
     right = left + np.array([0.21, 0.0, 0.0])
     colors = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(left), axis=0)
     result = pcgraph.segment(
-        np.vstack([left, right]), colors, voxel_size=0.0199, seed_size=0.1, color_weight=9.0, viewpoint=(0, 0, 0)
+        np.vstack([left, right]),
+        colors,
+        voxel_size=0.0199,
+        seed_size=0.1,
+        method=pcgraph.SurfaceGrowth(color_weight=9.0),
+        viewpoint=(0, 0, 0),
     )
     graph = result.graph
     red = graph.node_features.color[:, 0] > 0.5
@@ -79,7 +84,11 @@ def test_step_is_the_height_between_parallel_planes():
     low = patch((0, 0, 0), (0.3, 0, 0), (0, 0.3, 0))
     high = patch((0.31, 0, height), (0.3, 0, 0), (0, 0.3, 0))
     result = pcgraph.segment(
-        np.vstack([low, high]), viewpoint=(0.3, 0.15, 3), voxel_size=0.025, seed_size=0.15, spatial_weight=1.0
+        np.vstack([low, high]),
+        viewpoint=(0.3, 0.15, 3),
+        voxel_size=0.025,
+        seed_size=0.15,
+        method=pcgraph.SurfaceGrowth(spatial_weight=1.0),
     )
     nodes, graph = result.graph.node_features, result.graph
     flat = nodes.residual < 1e-6

@@ -19,7 +19,7 @@ from pcgraph.voxels.warp import choose_warp
 
 
 def assert_covered_and_connected(points, result):
-    """Every finite point has a label; every supervoxel is one piece of the voxel grid."""
+    """Every finite point has a label; the voxels that hold points of a supervoxel are one piece of the grid."""
     flat = np.asarray(points, float).reshape(-1, 3)
     finite = np.isfinite(flat).all(axis=1)
     for labels in (result.labels, result.supervoxels):
@@ -30,13 +30,18 @@ def assert_covered_and_connected(points, result):
     warp = choose_warp(flat[finite], result.viewpoint, result.camera)
     grid = voxel_grid(flat[finite], None, result.voxel_size, warp)
     leaf = result.supervoxels.reshape(-1)[finite]
-    owner = np.full(grid.n_voxels, -1)
-    owner[grid.voxel_of_point] = leaf
-    assert np.array_equal(owner[grid.voxel_of_point], leaf)  # a voxel is never shared
-    row = np.repeat(np.arange(grid.n_voxels), np.diff(grid.indptr))
-    same = owner[row] == owner[grid.neighbours]
-    entries = (np.ones(same.sum()), (row[same], grid.neighbours[same]))
-    pieces, _ = connected_components(csr_array(entries, shape=(grid.n_voxels,) * 2), directed=False)
+    # Of a voxel on a boundary the points may belong to several supervoxels: each of its shares is a piece.
+    shares = np.unique(np.stack((grid.voxel_of_point, leaf), axis=1), axis=0)
+    assert np.array_equal(np.unique(shares[:, 0]), np.arange(grid.n_voxels))
+    at = {(voxel, owner): piece for piece, (voxel, owner) in enumerate(shares.tolist())}
+    links = [
+        (piece, at[other, owner])
+        for (voxel, owner), piece in at.items()
+        for other in grid.neighbours[grid.indptr[voxel] : grid.indptr[voxel + 1]].tolist()
+        if (other, owner) in at
+    ]
+    matrix = csr_array((np.ones(len(links)), np.array(links, int).reshape(-1, 2).T), shape=(len(shares),) * 2)
+    pieces, _ = connected_components(matrix, directed=False)
     assert pieces == result.graph.n_nodes == leaf.max() + 1
 
 

@@ -32,7 +32,6 @@ BAD = {
     "NaN voxel": ((POINTS,), {"voxel_size": float("nan")}, "voxel_size"),
     "word voxel": ((POINTS,), {"voxel_size": "small"}, "voxel_size"),
     "small seed": ((POINTS,), {"voxel_size": 0.2, "seed_size": 0.1}, "seed_size of at least"),
-    "negative weight": ((POINTS,), {"color_weight": -1}, "color_weight"),
     "behind the camera": ((POINTS - 0.5,), {"camera": True, "viewpoint": (0, 0, 0)}, "in front of"),
     "NaN altitude": ((POINTS,), {"object_altitude": float("nan")}, "object_altitude"),
 }
@@ -64,3 +63,11 @@ def test_inputs_are_left_alone():
     pcgraph.segment(points, normals=normals)
     assert np.array_equal(points, POINTS)
     assert np.array_equal(normals, POINTS)
+
+
+@pytest.mark.parametrize("method", [pcgraph.SurfaceGrowth, pcgraph.Vccs])
+def test_weights_of_methods_are_checked(method):
+    with pytest.raises(ValueError, match="color_weight"):
+        method(color_weight=-1)
+    with pytest.raises(ValueError, match="normal_weight"):
+        method(normal_weight=float("nan"))

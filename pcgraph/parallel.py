@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops over many elements, cut into one block per thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Thread
+
+from numba import config
+
+_SMALLEST_BLOCK = 4096  # elements; starting a thread costs as much as some thousands of them
+
+
+def in_blocks(kernel: Callable[..., None], n: int, *arguments: object) -> None:
+    """Nothing; `kernel(start, stop, *arguments)` has run for blocks that cover 0..n, at the same time.
+
+    Threads are started anew and joined: no pool outlives the call, so a process may fork at any time and
+    several threads may call at once. As many run as ``NUMBA_NUM_THREADS`` says, by default one per core.
+
+    Parameters
+    ----------
+    kernel : callable compiled with ``nogil=True``
+        Writes only what belongs to its own block, so that no result depends on the number of threads. An error in
+        it would be lost: it must not raise.
+    n : int
+    arguments
+        Handed on to every call.
+    """
+    blocks = max(1, min(int(config.NUMBA_NUM_THREADS), n // _SMALLEST_BLOCK))
+    bounds = [n * block // blocks for block in range(blocks + 1)]
+    others = [Thread(target=kernel, args=(bounds[b], bounds[b + 1], *arguments)) for b in range(1, blocks)]
+    for thread in others:
+        thread.start()
+    kernel(bounds[0], bounds[1], *arguments)
+    for thread in others:
+        thread.join()

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Supervoxels that grow over touching voxels, and compete for those on their boundaries."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pcgraph.parallel import in_blocks
+from pcgraph.supervoxels.distance import Metric, distance, update_means
+from pcgraph.voxels.grid import VoxelGrid
+
+_SWEEPS = 3
+
+
+def grow(
+    grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, seeds: NDArray[np.int32], seed_size: float
+) -> NDArray[np.int32]:
+    """Supervoxel of each voxel, (v,) int32: what each seed reached first or, early on, is nearer to.
+
+    A connected part of the grid without a seed becomes one supervoxel.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    features : (v, 9) float64
+        From `voxel_features`.
+    metric : Metric
+    seeds : (k,) int32
+        Distinct voxels.
+    seed_size : float, metres
+        During the first 1.8 seed_size / voxel size sweeps, as in PCL, a voxel may go over to a nearer supervoxel.
+    """
+    greedy_sweeps = max(1, int(1.8 * seed_size / grid.size) - 1)
+    owner = _grow(features, metric, grid.indptr, grid.neighbours, seeds, greedy_sweeps)
+    _own_the_rest(grid.indptr, grid.neighbours, owner, len(seeds))
+    return owner
+
+
+def settle_boundaries(grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, owner: NDArray[np.int32]) -> None:
+    """Nothing; voxels on a boundary have gone over to the nearest supervoxel that touches them, a few times.
+
+    First all voxels on a boundary are looked at, later those next to one that moved. All voxels of a sweep choose
+    at once, by the means before it.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    features : (v, 9) float64
+        From `voxel_features`.
+    metric : Metric
+    owner : (v,) int32, >= 0
+        Supervoxel of each voxel; overwritten. Pieces may come off.
+    """
+    n = int(owner.max()) + 1
+    sums, means = np.empty((n, 10)), np.empty((n, 9))
+    queued = np.zeros(len(owner), np.bool_)
+    active = _boundary(grid.indptr, grid.neighbours, owner)
+    for _ in range(_SWEEPS):
+        update_means(features, owner, sums, means)
+        chosen = np.empty_like(active)
+        lists = grid.indptr, grid.neighbours
+        in_blocks(_choose, len(active), active, features, metric, *lists, owner, means, chosen)
+        active = _move(active, chosen, *lists, owner, queued)
+        if not len(active):
+            return
+
+
+@njit(cache=True, nogil=True)
+def _grow(
+    features: NDArray[np.float64],
+    metric: Metric,
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    seeds: NDArray[np.int32],
+    greedy_sweeps: int,
+) -> NDArray[np.int32]:
+    """Owners after growth from the seeds, -1 where none came; early sweeps may also take from a worse owner."""
+    n = len(features)
+    owner, claim = np.full(n, -1, np.int32), np.full(n, -1, np.int32)
+    best = np.full(n, np.inf)
+    sums, means = np.zeros((len(seeds), 10)), np.zeros((len(seeds), 9))
+    frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
+    for s in range(len(seeds)):
+        frontier[s], owner[seeds[s]] = seeds[s], s
+        best[seeds[s]] = 0.0
+    n_frontier, sweep = len(seeds), 0
+    while n_frontier > 0:
+        update_means(features, owner, sums, means)
+        n_touched = 0
+        for f in range(n_frontier):
+            i = frontier[f]
+            s = owner[i]
+            for a in range(indptr[i], indptr[i + 1]):
+                j = neighbours[a]
+                if owner[j] == s or (owner[j] >= 0 and sweep >= greedy_sweeps):
+                    continue
+                d = distance(features, j, means, s, metric)
+                if d < best[j] or (d == best[j] and claim[j] > s):
+                    if claim[j] < 0:
+                        touched[n_touched] = j
+                        n_touched += 1
+                    best[j], claim[j] = d, s
+        for t in range(n_touched):
+            j = touched[t]
+            owner[j], claim[j] = claim[j], -1
+        frontier, touched = touched, frontier
+        n_frontier, sweep = n_touched, sweep + 1
+    return owner
+
+
+@njit(cache=True, nogil=True)
+def _own_the_rest(
+    indptr: NDArray[np.int64], neighbours: NDArray[np.int32], owner: NDArray[np.int32], n_supervoxels: int
+) -> None:
+    """Nothing; each connected part of the voxels without owner becomes a supervoxel of its own."""
+    stack = np.empty(len(owner), np.int32)
+    for start in range(len(owner)):
+        if owner[start] >= 0:
+            continue
+        owner[start], stack[0], depth = n_supervoxels, start, 1
+        while depth > 0:
+            depth -= 1
+            i = stack[depth]
+            for a in range(indptr[i], indptr[i + 1]):
+                j = neighbours[a]
+                if owner[j] < 0:
+                    owner[j], stack[depth] = n_supervoxels, j
+                    depth += 1
+        n_supervoxels += 1
+
+
+@njit(cache=True, nogil=True)
+def _boundary(indptr: NDArray[np.int64], neighbours: NDArray[np.int32], owner: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Voxels that touch another supervoxel, ascending."""
+    found = np.empty(len(owner), np.int32)
+    used = 0
+    for i in range(len(owner)):
+        for a in range(indptr[i], indptr[i + 1]):
+            if owner[neighbours[a]] != owner[i]:
+                found[used] = i
+                used += 1
+                break
+    return found[:used].copy()
+
+
+@njit(cache=True, nogil=True)
+def _choose(
+    start: int,
+    stop: int,
+    active: NDArray[np.int32],
+    features: NDArray[np.float64],
+    metric: Metric,
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    owner: NDArray[np.int32],
+    means: NDArray[np.float64],
+    chosen: NDArray[np.int32],
+) -> None:
+    """The nearest of the supervoxels around each active voxel; of equals its own, else the smaller number."""
+    for q in range(start, stop):
+        i = active[q]
+        own = nearest = owner[i]
+        least, last = -1.0, own
+        for a in range(indptr[i], indptr[i + 1]):
+            s = owner[neighbours[a]]
+            if s in (own, last, nearest):
+                continue
+            last = s
+            if least < 0.0:
+                least = distance(features, i, means, own, metric)
+            d = distance(features, i, means, s, metric)
+            if d < least or (d == least and nearest != own and s < nearest):
+                nearest, least = s, d
+        chosen[q] = nearest
+
+
+@njit(cache=True, nogil=True)
+def _move(
+    active: NDArray[np.int32],
+    chosen: NDArray[np.int32],
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    owner: NDArray[np.int32],
+    queued: NDArray[np.bool_],
+) -> NDArray[np.int32]:
+    """The voxels to look at next: those that moved and those that touch them. Owners become what was chosen."""
+    following = np.empty(len(owner), np.int32)
+    used = 0
+    for q in range(len(active)):
+        i = active[q]
+        if owner[i] != chosen[q]:
+            owner[i] = chosen[q]
+            for a in range(indptr[i] - 1, indptr[i + 1]):
+                j = i if a < indptr[i] else neighbours[a]
+                if not queued[j]:
+                    queued[j] = True
+                    following[used] = j
+                    used += 1
+    for q in range(used):
+        queued[following[q]] = False
+    return following[:used].copy()
