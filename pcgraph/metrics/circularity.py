@@ -10,7 +10,7 @@ from pcgraph.metrics.neighbours import NeighbourGraph
 from pcgraph.metrics.table import ranked
 
 
-def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int = 8) -> float:
+def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int = 24) -> float:
     """CO, 0..1: mean over the points of how close their segment is to a disc of the same area.
 
     Schick et al. 2012 take 4 pi area / perimeter^2, but the perimeter of a patch of points, some of it at depth
@@ -22,7 +22,7 @@ def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int
     Parameters
     ----------
     points : (n, 3) or (h, w, 3) float, or NeighbourGraph
-        Any frame and unit; a graph saves the search for neighbours.
+        Any frame and unit; a graph saves the search for neighbours, and its own k holds.
     labels : (n,) or (h, w) int
         Points negative are left out; with a graph there must be none among its points.
     k : int, >= 1
@@ -42,11 +42,13 @@ def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int
 def _circularity(
     points: NDArray[np.float64], areas: NDArray[np.float64], segment: NDArray[np.int64], n: int
 ) -> NDArray[np.float64]:
-    """Circularity of each segment, (n,), 0..1; 1 for segments whose points all lie in one place."""
+    """Circularity of each segment, (n,), 0..1; 0 for lines, and 1 where all points lie in one place."""
     area = np.bincount(segment, areas, n)
-    whole = np.where(area > 0, area, 1.0)
-    centroids = np.stack([np.bincount(segment, areas * axis, n) for axis in points.T], axis=1) / whole[:, None]
+    weights = np.where(area[segment] > 0, areas, 1.0)
+    whole = np.bincount(segment, weights, n)
+    centroids = np.stack([np.bincount(segment, weights * axis, n) for axis in points.T], axis=1) / whole[:, None]
     squares = ((points - centroids[segment]) ** 2).sum(axis=1)
     # A point is a small disc of its area, with a second moment of its own.
-    moment = np.bincount(segment, areas * (squares + areas / (2 * np.pi)), n) / whole
-    return np.where(area > 0, np.minimum(1.0, area / (2 * np.pi * np.where(area > 0, moment, 1.0))), 1.0)
+    moment = np.bincount(segment, weights * (squares + areas / (2 * np.pi)), n) / whole
+    somewhere = moment > 0
+    return np.where(somewhere, np.minimum(1.0, area / (2 * np.pi * np.where(somewhere, moment, 1.0))), 1.0)
