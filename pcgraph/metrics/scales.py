@@ -50,8 +50,13 @@ def best_scales(curves: Sequence[LevelCurve]) -> BestScales:
     sign = -1.0 if curves[0].score in _LOWER_IS_BETTER else 1.0
     every = np.unique(np.concatenate([curve.altitudes for curve in curves]))
     means = np.mean([curve.at(every) for curve in curves], axis=0)
-    best = int(np.argmax(sign * means))
-    tops = [int(np.argmax(sign * curve.values)) for curve in curves]
+    best = _first_best(sign * means)
+    tops = [_first_best(sign * curve.values) for curve in curves]
     values = np.array([curve.values[top] for curve, top in zip(curves, tops, strict=True)])
     heights = np.array([curve.altitudes[top] for curve, top in zip(curves, tops, strict=True)])
     return BestScales(float(means[best]), float(every[best]), float(values.mean()), heights, values)
+
+
+def _first_best(values: NDArray[np.float64]) -> int:
+    """Place of the first value that is the largest, but for the rounding of sums."""
+    return int(np.argmax(values >= values.max() - 1e-12))

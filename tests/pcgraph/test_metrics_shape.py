@@ -61,7 +61,7 @@ def test_pieces_and_salt_are_not_compact():
 def test_random_points_are_some_percent_low():
     flat = np.zeros((8000, 3))
     flat[:, :2] = np.random.default_rng(1).random((8000, 2)) - 0.5
-    assert only((flat**2).sum(axis=1) < 0.4**2, flat) == pytest.approx(0.955, abs=0.03)
+    assert only((flat**2).sum(axis=1) < 0.4**2, flat) == pytest.approx(0.93, abs=0.03)
 
 
 def test_lines_have_no_area():
