@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learned linkage: the probability of a boundary, fitted on labelled clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pcgraph.features.moments import Moments
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.tree.average import average_linkage
+from pcgraph.tree.edge_model import EdgeModel, edge_evidence
+from pcgraph.tree.growth import segmentation_tree
+from pcgraph.tree.linkage import Linkage, Merges
+
+if TYPE_CHECKING:
+    from pcgraph.segmentation import Segmentation
+    from pcgraph.tree.tree import SegmentationTree
+
+_STEPS = float(1 << 20)
+_PURE = 0.8  # share of a supervoxel's points that must agree before an edge at it teaches anything
+_PLATEAU = 0.002  # overlap below the best that still counts as best
+_ALTITUDES = np.linspace(0.05, 0.95, 37)
+
+
+@dataclass(frozen=True)
+class LearnedLinkage(Linkage):
+    """Average linkage of the probability of a boundary, weighted by contact; altitudes are 0..1.
+
+    Attributes
+    ----------
+    model : EdgeModel
+        Logistic regression on `edge_evidence`; its `object_altitude` is the linkage's.
+
+    Notes
+    -----
+    Few edges are boundaries (0.6 % on tables with things), so both classes weigh the same in the fit. On twelve
+    such clouds boosted trees on the same columns did much worse than this linear model (docs/tree.md).
+    """
+
+    model: EdgeModel
+
+    @property
+    def object_altitude(self) -> float:  # type: ignore[override]
+        """Probability of a boundary above which two parts are two objects: the model's."""
+        return self.model.object_altitude
+
+    def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
+        """Merges, the least likely boundary first."""
+        costs = np.rint(self.model(graph) * _STEPS) / _STEPS  # whole multiples, so that sums of them are exact
+        weights = graph.edge_features.contact_voxels.astype(np.float64)
+        return Merges(*average_linkage(graph.n_nodes, graph.edges, costs, weights))
+
+    @classmethod
+    def fit(cls, segmentations: Sequence[Segmentation], truths: Sequence[ArrayLike]) -> LearnedLinkage:
+        """Linkage fitted on labelled clouds; its `object_altitude` is amid those with the best mean overlap on these.
+
+        Parameters
+        ----------
+        segmentations : sequence of Segmentation
+            Their graphs are what is learned from; the linkage that they were made with does not matter.
+        truths : sequence of int arrays
+            True object of each point, in the shape of each segmentation's labels; negative where unknown.
+
+        Raises
+        ------
+        ImportError
+            scikit-learn is not installed.
+        ValueError
+            Numbers or shapes do not fit, or the edges are not of both kinds.
+        """
+        if len(segmentations) != len(truths) or not len(truths):
+            raise ValueError(f"expected a truth for each segmentation, got {len(segmentations)} and {len(truths)}")
+        tables = [_Table.of(result, truth) for result, truth in zip(segmentations, truths, strict=True)]
+        model = _fit_edges([result.graph for result in segmentations], tables)
+        trees = [_tree(cls(model), result) for result in segmentations]
+        overlaps = [[t.overlap(tree.cut(altitude=a)) for a in _ALTITUDES] for tree, t in zip(trees, tables, strict=True)]
+        mean = np.mean(overlaps, axis=0)
+        best = float(np.median(_ALTITUDES[mean >= mean.max() - _PLATEAU]))  # not the peak: the peak is luck
+        fitted = {name: getattr(model, name) for name in ("names", "means", "scales", "coefficients", "intercept")}
+        return cls(EdgeModel(**fitted, object_altitude=best))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Nothing; writes the model as JSON (`EdgeModel.save`)."""
+        self.model.save(path)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> LearnedLinkage:
+        """Linkage from a file that `save` wrote; needs no scikit-learn (`EdgeModel.load`)."""
+        return cls(EdgeModel.load(path))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Points per pair of leaf and true object: what of a truth matters to leaves."""
+
+    leaf: NDArray[np.int64]
+    truth: NDArray[np.int64]
+    points: NDArray[np.int64]
+    n_leaves: int
+
+    @classmethod
+    def of(cls, result: Segmentation, truth: ArrayLike) -> _Table:
+        true = np.asarray(truth)
+        if true.shape != result.supervoxels.shape:
+            raise ValueError(f"expected a truth of shape {result.supervoxels.shape}, got {true.shape}")
+        both = (true >= 0) & (result.supervoxels >= 0)
+        names, column = np.unique(true[both], return_inverse=True)
+        keys, points = np.unique(result.supervoxels[both] * np.int64(len(names)) + column, return_counts=True)
+        return cls(keys // max(len(names), 1), keys % max(len(names), 1), points, result.graph.n_nodes)
+
+    def majority(self) -> NDArray[np.int64]:
+        """True object of each leaf, -1 where none holds most of its points."""
+        order = np.argsort(self.points, kind="stable")
+        best, most = np.full(self.n_leaves, -1, np.int64), np.zeros(self.n_leaves)
+        best[self.leaf[order]] = self.truth[order]
+        most[self.leaf[order]] = self.points[order]
+        total = np.bincount(self.leaf, self.points, self.n_leaves)
+        return np.where(most >= _PURE * np.maximum(total, 1), best, -1)
+
+    def overlap(self, segments: NDArray[np.int32]) -> float:
+        """Weighted overlap of the leaves' segments, as `pcgraph.metrics.weighted_overlap` of the points."""
+        segment = segments[self.leaf].astype(np.int64)
+        keys, pair = np.unique(segment * (self.truth.max() + 1) + self.truth, return_inverse=True)
+        common = np.bincount(pair, self.points)
+        found, true = keys // (self.truth.max() + 1), keys % (self.truth.max() + 1)
+        size, extent = np.bincount(segment, self.points), np.bincount(self.truth, self.points)
+        best = np.zeros(len(extent))
+        np.maximum.at(best, true, common / (size[found] + extent[true] - common))
+        return float(best @ extent / extent.sum())
+
+
+def _fit_edges(graphs: list[AdjacencyGraph], tables: list[_Table]) -> EdgeModel:
+    try:
+        from sklearn.linear_model import LogisticRegression
+    except ModuleNotFoundError as error:
+        raise ImportError("expected scikit-learn for LearnedLinkage.fit; install the extra `learn`") from error
+    evidence, answers = [], []
+    for graph, table in zip(graphs, tables, strict=True):
+        sides = table.majority()[graph.edges]
+        known = (sides >= 0).all(axis=1)
+        columns = edge_evidence(graph)
+        evidence.append(np.stack(list(columns.values()), axis=1)[known])
+        answers.append((sides[:, 0] != sides[:, 1])[known])
+    rows, boundary = np.concatenate(evidence), np.concatenate(answers)
+    if boundary.all() or not boundary.any():
+        raise ValueError("expected edges inside objects and edges between them; give clouds where objects touch")
+    means, scales = rows.mean(axis=0), rows.std(axis=0)
+    scales[scales == 0.0] = 1.0
+    regression = LogisticRegression(class_weight="balanced", max_iter=1000).fit((rows - means) / scales, boundary)
+    weights, intercept = regression.coef_[0].tolist(), float(regression.intercept_[0])
+    return EdgeModel(tuple(columns), tuple(means.tolist()), tuple(scales.tolist()), tuple(weights), intercept, 0.5)
+
+
+def _tree(linkage: Linkage, result: Segmentation) -> SegmentationTree:
+    moments, n = result.tree.moments, result.graph.n_nodes
+    leaves = Moments(moments.counts[:n], moments.centroids[:n], moments.scatters[:n], None)
+    return segmentation_tree(linkage.merges(result.graph, leaves), leaves, result.viewpoint)
