@@ -45,9 +45,7 @@ def ancestor_index(parents: NDArray[np.int32]) -> AncestorIndex:
 
 
 @njit(cache=True)
-def _link(
-    parents: NDArray[np.int32], children: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _link(parents: NDArray[np.int32], children: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     k = len(parents)
     n_leaves = (k + 1) // 2
     links, merges = np.arange(n_leaves).astype(np.int32), np.full(n_leaves, k, np.int32)

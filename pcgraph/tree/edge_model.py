@@ -121,16 +121,14 @@ class EdgeModel:
             raise ValueError(f"expected a file of format {_FORMAT!r}, got {path}; write it with EdgeModel.save")
         if set(content) != {field.name for field in fields(cls)}:
             raise ValueError(f"expected the fields of EdgeModel, got {sorted(content)} in {path}")
-        names, numbers = content["names"], [content[key] for key in ("means", "scales", "coefficients")]
-        if not all(isinstance(column, list) for column in (names, *numbers)):
-            raise ValueError(f"expected lists of names and numbers in {path}; write it with EdgeModel.save")
-        columns = [tuple(_number(value) for value in column) for column in numbers]
-        return cls(
-            tuple(map(str, names)), *columns, _number(content["intercept"]), _number(content["object_altitude"])
-        )
+        if not isinstance(content["names"], list) or not all(isinstance(name, str) for name in content["names"]):
+            raise ValueError(f"expected a list of names in {path}; write it with EdgeModel.save")
+        means, scales, weights = (_numbers(content[key]) for key in ("means", "scales", "coefficients"))
+        intercept, altitude = _numbers([content["intercept"], content["object_altitude"]])
+        return cls(tuple(content["names"]), means, scales, weights, intercept, altitude)
 
 
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"expected a number in a model, got {value!r}")
-    return float(value)
+def _numbers(values: object) -> tuple[float, ...]:
+    if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
+        raise ValueError(f"expected numbers in a model, got {values!r}; write it with EdgeModel.save")
+    return tuple(float(value) for value in values)

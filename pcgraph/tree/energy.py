@@ -93,7 +93,7 @@ def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[n
         Of the tree's leaves.
     """
     k, lengths = len(tree.parents), graph.edge_features.contact_length
-    outlines = np.bincount(graph.edges.ravel(), np.repeat(lengths, 2), k)
+    outlines = np.bincount(graph.edges.ravel(), np.repeat(lengths, 2), k).astype(np.float64)
     # An edge is inside from the lowest common ancestor of its ends upwards: there both its sides leave the outline.
     meeting = ancestor_index(tree.parents).of_pairs(graph.edges)
     outlines -= 2.0 * np.bincount(meeting, lengths, k)

@@ -20,7 +20,7 @@ class FelzenszwalbLinkage(Linkage):
 
     Attributes
     ----------
-    object_altitude : float
+    object_altitude, part_altitude : float
         Their k, in units of the edge weight times supervoxels.
 
     Notes
@@ -29,7 +29,8 @@ class FelzenszwalbLinkage(Linkage):
     supervoxels' normals, squared if convex (Dai et al. 2017). A region's size is its number of supervoxels.
     """
 
-    object_altitude: float = 1.0
+    object_altitude: float = 5.0
+    part_altitude: float = 0.5
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest scale first."""

@@ -41,6 +41,8 @@ class LccpLinkage(Linkage):
         Spacing of the supervoxels; default: the median distance between the centroids of those that touch.
     object_altitude : float
         1 for their segmentation.
+    part_altitude : float
+        Angle over pi up to which convex edges join parts; 20 degrees.
 
     Notes
     -----
@@ -53,6 +55,7 @@ class LccpLinkage(Linkage):
     common_neighbours: int = 0
     seed_size: float | None = None
     object_altitude: float = 1.0
+    part_altitude: float = 1.0 / 9.0
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges inside objects, then merges of objects."""
@@ -81,7 +84,9 @@ class LccpLinkage(Linkage):
         return convex
 
 
-def _is_sane(crease: NDArray[np.float64], towards: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_sane(
+    crease: NDArray[np.float64], towards: NDArray[np.float64], angle: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Whether the crease of two planes lies across the line between the patches; parallel planes have none."""
     between = angle_between(crease, towards)
     folded = np.minimum(between, np.pi - between)
@@ -101,9 +106,7 @@ def _common_neighbours(graph: AdjacencyGraph, convex: NDArray[np.bool_]) -> NDAr
     return np.asarray(common.sum(axis=1)).astype(np.int64)
 
 
-def _merges_between(
-    graph: AdjacencyGraph, pairs: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def _merges_between(graph: AdjacencyGraph, pairs: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Average linkage, by angle between normals over pi, of what earlier merges made."""
     n, done = graph.n_nodes, graph.n_nodes + len(pairs)
     parents = np.arange(done, dtype=np.int32)
@@ -113,7 +116,7 @@ def _merges_between(
     across = ends[:, 0] != ends[:, 1]
     lengths = graph.edge_features.contact_voxels[across].astype(np.float64)
     keys, edge = np.unique(ends[across] @ np.array([len(top), 1]), return_inverse=True)
-    weights = np.bincount(edge, lengths, len(keys))
+    weights = np.bincount(edge, lengths, len(keys)).astype(np.float64)
     means = np.bincount(edge, lengths * graph.edge_features.normal_angle[across] / np.pi, len(keys)) / weights
     quotient = np.stack((keys // len(top), keys % len(top)), axis=1).astype(np.int32)
     between, altitudes = average_linkage(len(top), quotient, means, weights)

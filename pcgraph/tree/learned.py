@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -50,6 +50,11 @@ class LearnedLinkage(Linkage):
         """Probability of a boundary above which two parts are two objects: the model's."""
         return self.model.object_altitude
 
+    @property
+    def part_altitude(self) -> float:  # type: ignore[override]
+        """Half of that: what is learned from are objects, so nothing was learned about parts."""
+        return 0.5 * self.model.object_altitude
+
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least likely boundary first."""
         costs = np.rint(self.model(graph) * _STEPS) / _STEPS  # whole multiples, so that sums of them are exact
@@ -79,11 +84,12 @@ class LearnedLinkage(Linkage):
         tables = [_Table.of(result, truth) for result, truth in zip(segmentations, truths, strict=True)]
         model = _fit_edges([result.graph for result in segmentations], tables)
         trees = [_tree(cls(model), result) for result in segmentations]
-        overlaps = [[t.overlap(tree.cut(altitude=a)) for a in _ALTITUDES] for tree, t in zip(trees, tables, strict=True)]
+        overlaps = [
+            [t.overlap(tree.cut(altitude=a)) for a in _ALTITUDES] for tree, t in zip(trees, tables, strict=True)
+        ]
         mean = np.mean(overlaps, axis=0)
         best = float(np.median(_ALTITUDES[mean >= mean.max() - _PLATEAU]))  # not the peak: the peak is luck
-        fitted = {name: getattr(model, name) for name in ("names", "means", "scales", "coefficients", "intercept")}
-        return cls(EdgeModel(**fitted, object_altitude=best))
+        return cls(replace(model, object_altitude=best))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Nothing; writes the model as JSON (`EdgeModel.save`)."""

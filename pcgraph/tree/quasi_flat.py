@@ -20,7 +20,7 @@ class QuasiFlatLinkage(Linkage):
     ----------
     cost : BoundaryCost
         Cost of an edge.
-    object_altitude : float, radians
+    object_altitude, part_altitude : float, radians
 
     Notes
     -----
@@ -29,7 +29,8 @@ class QuasiFlatLinkage(Linkage):
     """
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
-    object_altitude: float = 0.2
+    object_altitude: float = 0.11
+    part_altitude: float = 0.05
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the cheapest edge first."""

@@ -49,7 +49,7 @@ def _strongest_contacts(links, merges, altitudes, indptr, neighbours, supervoxel
         seen = own  # neighbours come in runs of one supervoxel
         for a in range(indptr[voxel], indptr[voxel + 1]):
             other = supervoxels[neighbours[a]]
-            if other == own or other == seen:
+            if other in (own, seen):
                 continue
             seen = other
             level = altitudes[common_ancestor(links, merges, own, other)]

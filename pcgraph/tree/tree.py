@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -99,6 +99,24 @@ class SegmentationTree:
             last = int(cores.joins[merges - 1]) + 1 if merges > 0 else 0
         return tops_below(self.parents, last)[cores.of_leaf]
 
+    def levels(self, altitudes: ArrayLike) -> NDArray[np.int32]:
+        """Segment of each leaf at several altitudes, (n_leaves, l) int32: supervoxel, part, object, scene.
+
+        With rising altitudes every column refines the next one.
+
+        Parameters
+        ----------
+        altitudes : (l,) float, the linkage's unit
+            For example ``[0.0, linkage.part_altitude, linkage.object_altitude, np.inf]``.
+
+        Raises
+        ------
+        ValueError
+            An altitude is not a number.
+        """
+        columns = [self.cut(altitude=level) for level in np.asarray(altitudes, np.float64).ravel().tolist()]
+        return np.stack(columns, axis=1) if columns else np.empty((self.n_leaves, 0), np.int32)
+
     def cut_stable(self, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each leaf in the most stable segmentation, (n_leaves,) int32, numbered as in `cut`.
 
@@ -190,9 +208,7 @@ class SegmentationTree:
         order = np.concatenate((np.arange(self.n_leaves), inner))
         rank = np.empty(len(order), np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
-        columns = {field.name: getattr(self.moments, field.name) for field in fields(self.moments)}
-        moved = {name: None if values is None else values[order] for name, values in columns.items()}
-        return SegmentationTree(rank[self.parents[order]], levels[order], Moments(**moved), self.viewpoint)
+        return SegmentationTree(rank[self.parents[order]], levels[order], _rows(self.moments, order), self.viewpoint)
 
     def edge_saliency(self, pairs: NDArray[np.int32]) -> NDArray[np.float64]:
         """Altitude at which the two leaves of each pair become one segment, (m,) float64, the linkage's unit.
@@ -245,6 +261,11 @@ class SegmentationTree:
         if np.isnan(altitude):
             raise ValueError("expected an altitude in the linkage's unit, got NaN")
         return int(np.searchsorted(self.altitudes[self.n_leaves :], altitude, side="right"))
+
+
+def _rows(moments: Moments, order: NDArray[np.int64]) -> Moments:
+    columns: dict[str, Any] = {field.name: getattr(moments, field.name) for field in fields(moments)}
+    return Moments(**{name: None if values is None else values[order] for name, values in columns.items()})
 
 
 def _whole(name: str, value: int) -> int:

@@ -26,8 +26,8 @@ class WardLinkage(Linkage):
         Weight of unit normals.
     color : float
         Weight of colours, 0..1.
-    object_altitude : float
-        Increase of the sum of squares above which two parts are two objects.
+    object_altitude, part_altitude : float
+        Increase of the sum of squares above which two pieces are two objects, or two parts.
 
     Notes
     -----
@@ -38,8 +38,9 @@ class WardLinkage(Linkage):
 
     position: float = 0.0
     normal: float = 1.0
-    color: float = 0.5
-    object_altitude: float = 2.0
+    color: float = 0.0
+    object_altitude: float = 6.0
+    part_altitude: float = 0.5
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest increase first."""
@@ -53,12 +54,12 @@ class MumfordShahLinkage(Linkage):
 
     Attributes
     ----------
-    plane : float, per square voxel
-        Weight of squared distances to a region's least-squares plane, in voxel edges.
+    plane : float, per voxel
+        Weight of distances to a region's least-squares plane, in voxel edges.
     normal, color : float
         Weights of unit normals and of colours, 0..1, as piecewise constant data.
-    object_altitude : float
-        Scale at which a boundary is worth less than the error it saves.
+    object_altitude, part_altitude : float
+        Scale at which objects, or parts, are read off.
 
     Notes
     -----
@@ -67,10 +68,11 @@ class MumfordShahLinkage(Linkage):
     smallest first (Koepfler et al. 1994). |A| as for `WardLinkage`.
     """
 
-    plane: float = 0.3
-    normal: float = 1.0
+    plane: float = 1.0
+    normal: float = 0.0
     color: float = 0.0
-    object_altitude: float = 1.0
+    object_altitude: float = 10.0
+    part_altitude: float = 0.1
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest scale first."""
