@@ -129,7 +129,9 @@ def fit_primitives(moments: PrimitiveMoments, *, gain: float = 2.0, noise: float
         cylinder_point=centroid + tube,
         cylinder_radius=tube_radius,
         cylinder_residual=cylinder_residual,
-        best=_simplest(*(np.maximum(r, floor) for r in (flatness, sphere_residual, cylinder_residual)), gain),
+        best=_simplest(
+            np.maximum(flatness, floor), np.maximum(sphere_residual, floor), np.maximum(cylinder_residual, floor), gain
+        ),
     )
 
 

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Occlusion edges: what hides what, by how much, along which rim, and what goes on behind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pcgraph
+from pcgraph.graph.bearings import bearing_image
+from pcgraph.graph.occlusion import occlusions
+from pcgraph.voxels.surface import Surface
+
+HEIGHT, WIDTH, FOCAL = 120, 160, 130.0
+
+
+def rays():
+    """Directions of a camera's pixels, (h, w, 3), with z = 1."""
+    u, v = np.meshgrid(np.arange(WIDTH) - (WIDTH - 1) / 2, np.arange(HEIGHT) - (HEIGHT - 1) / 2)
+    return np.stack((u / FOCAL, v / FOCAL, np.ones_like(u)), axis=-1)
+
+
+def plate_before_wall():
+    """A square plate of 0.4 m at depth 1 m before a wall at depth 2 m, (h, w, 3), metres."""
+    points = rays()
+    front = (np.abs(points[..., 0]) < 0.2) & (np.abs(points[..., 1]) < 0.2)
+    return points * np.where(front, 1.0, 2.0)[..., None]
+
+
+def pixels(result, points):
+    """Voxel of each pixel, -1 where there is no point."""
+    image = np.full(points.shape[:2], -1, np.int32)
+    image[np.isfinite(points).all(axis=2)] = result.surface.grid.voxel_of_point
+    return image
+
+
+def segmented(points, **options):
+    return pcgraph.segment(points, voxel_size=0.02, seed_size=0.1, viewpoint=(0, 0, 0), **options)
+
+
+def occluded(result, image=None, **options):
+    return occlusions(result.surface, result.graph.node_features, result.viewpoint, image, **options)
+
+
+@pytest.mark.parametrize("organised", [True, False])
+@pytest.mark.parametrize("camera", [True, False])
+def test_a_plate_before_a_wall(organised, camera):
+    points = plate_before_wall()
+    result = segmented(points, camera=camera)
+    found = occluded(result, pixels(result, points) if organised else None)
+    nodes = result.graph.node_features
+    depth = nodes.centroid[:, 2]
+    assert len(found.pairs) > 8
+    assert depth[found.pairs[:, 0]] == pytest.approx(1.0, abs=1e-6)
+    assert depth[found.pairs[:, 1]] == pytest.approx(2.0, abs=1e-6)
+    # Along a ray off the axis the gap of 1 m grows by the secant, 1.04 at the corners; so it does with the half cell.
+    assert np.all((found.gap > 0.97) & (found.gap < 1.1))
+    assert found.length.sum() == pytest.approx(1.6, rel=0.4)  # the outline, counted in voxels
+    assert not {*map(tuple, found.pairs.tolist())} & {*map(tuple, result.graph.edges.tolist())}
+    # Outwards from the middle of the plate, square to the line of sight.
+    outwards = np.einsum("ij,ij->i", found.direction, nodes.centroid[found.pairs[:, 0]] * [1.0, 1.0, 0.0])
+    assert np.sum(found.length[outwards > 0.0]) > 0.9 * np.sum(found.length)  # the rest are corners
+    assert np.linalg.norm(found.direction, axis=1) == pytest.approx(1.0)
+    assert np.all(np.abs(found.direction[:, 2]) < 0.3)
+    assert list(found.columns()) == ["gap", "length", "direction"]
+
+
+@pytest.mark.parametrize("organised", [True, False])
+def test_the_wall_goes_on_behind_the_plate(organised):
+    points = plate_before_wall()
+    result = segmented(points)
+    behind = occluded(result, pixels(result, points) if organised else None).continuations
+    assert len(behind.pairs) > 8
+    assert np.all(behind.pairs[:, 0] < behind.pairs[:, 1])
+    assert result.graph.node_features.centroid[behind.pairs.ravel(), 2] == pytest.approx(2.0, abs=1e-6)
+    assert behind.coplanar.all()
+    assert behind.angle == pytest.approx(0.0, abs=1e-6)
+    assert behind.offset == pytest.approx(0.0, abs=1e-6)
+    assert np.all((behind.width > 0.7) & (behind.width < 1.0))  # the shadow of 0.4 m at twice the distance
+    centroid = result.graph.node_features.centroid
+    sides = np.abs(centroid[behind.pairs[:, 1]] - centroid[behind.pairs[:, 0]])
+    assert np.all(sides[:, :2].max(axis=1) > 0.7)  # from one side of the plate to the other
+
+
+def test_a_wall_that_jumps_behind_the_plate_does_not_go_on():
+    points = plate_before_wall()
+    right = (rays()[..., 0] > 0.0) & (points[..., 2] > 1.5)
+    points[right] *= 1.5
+    result = segmented(points)
+    depth = result.graph.node_features.centroid[:, 2]
+    behind = occluded(result).continuations
+    across = np.abs(np.diff(depth[behind.pairs], axis=1)[:, 0]) > 0.5
+    assert across.any()
+    assert not behind.coplanar[across].any()
+    assert np.all(behind.offset[across] > 0.9)
+
+
+@pytest.mark.parametrize("band", [0, 6, 40])
+def test_looks_across_the_shadow_of_the_projector_but_not_across_everything(band):
+    points = plate_before_wall()
+    front = points[..., 2] < 1.5
+    shadow = np.zeros_like(front)
+    for step in range(1, band + 1):  # pixels; to the left of the plate
+        shadow |= np.roll(front, -step, axis=1) & ~front
+    points[shadow] = np.nan
+    result = segmented(points)
+    nodes = result.graph.node_features
+    found = occluded(result)
+    left, right = (found.length[sign * found.direction[:, 0] > 0.9].sum() for sign in (-1.0, 1.0))
+    assert right == pytest.approx(0.4, rel=0.3)
+    assert left == pytest.approx(0.4, rel=0.3) if band < 40 else left < 0.05  # but for the corners
+    assert np.all(nodes.centroid[found.pairs[:, 0], 2] < 1.5)
+
+
+@pytest.mark.parametrize("organised", [True, False])
+def test_a_floor_seen_at_a_slant_hides_nothing(organised):
+    points = rays()
+    points *= (1.0 / np.maximum(points[..., 1] + 0.05 * points[..., 2], 0.02))[..., None]  # y + z / 20 = 1 m below
+    points[points[..., 2] > 2.5] = np.nan  # farther away pixels lie further apart than voxels
+    result = pcgraph.segment(points, voxel_size=0.04, seed_size=0.2)
+    assert result.graph.n_nodes > 20
+    found = occluded(result, pixels(result, points) if organised else None)
+    assert len(found.pairs) == 0
+    assert len(found.continuations.pairs) == 0
+    assert found.gap.dtype == found.length.dtype == np.float64
+    assert found.direction.shape == (0, 3)
+
+
+def test_a_crease_hides_nothing():
+    points = rays()
+    points *= (1.5 / (1.0 + 0.6 * np.abs(points[..., 0])))[..., None]  # two walls that meet in a ridge
+    assert len(occluded(segmented(points)).pairs) == 0
+
+
+def test_a_ball_before_a_wall():
+    points = rays()
+    unit = points / np.linalg.norm(points, axis=2, keepdims=True)
+    center, radius = np.array([0.0, 0.0, 1.2]), 0.25
+    along = unit @ center
+    inside = radius**2 - (center @ center - along**2)
+    hit = inside > 0.0
+    points = np.where(hit[..., None], unit * (along - np.sqrt(np.maximum(inside, 0.0)))[..., None], 2.0 * points)
+    result = segmented(points)
+    ball = result.graph.node_features.centroid[:, 2] < 1.5
+    found = occluded(result)
+    assert len(found.pairs) > 5
+    assert ball[found.pairs[:, 0]].all()
+    assert not ball[found.pairs[:, 1]].any()
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.0, 3.0])
+def test_a_panorama_has_no_seam(turn):
+    """A pillar of 0.3 m before the round wall of a room, wherever it stands."""
+    rng = np.random.default_rng(0)
+    azimuth = np.repeat(np.linspace(0.0, 2.0 * np.pi, 600, endpoint=False), 60)
+    rise = np.tile(np.linspace(-0.4, 0.4, 60), 600)
+    pillar = np.abs(azimuth - np.pi) < 0.15
+    distance = np.where(pillar, 1.0, 3.0) * (1.0 + 1e-6 * rng.random(len(azimuth)))
+    angle = azimuth + turn
+    points = np.column_stack((np.cos(angle), np.sin(angle), rise)) * distance[:, None]
+    result = pcgraph.segment(points, viewpoint=(0, 0, 0), voxel_size=0.06, seed_size=0.5)
+    image = bearing_image(result.surface, result.viewpoint)
+    assert image.wraps
+    assert np.mean(image.voxels >= 0) > 0.9
+    near = np.hypot(*result.graph.node_features.centroid[:, :2].T) < 2.0
+    found = occluded(result)
+    assert near[found.pairs[:, 0]].all()
+    assert not near[found.pairs[:, 1]].any()
+    assert found.length.sum() == pytest.approx(
+        2 * 0.8, rel=0.4
+    )  # both sides of the pillar, 0.8 m high, aslant to voxels
+    assert found.gap == pytest.approx(2.0, abs=0.3)
+
+
+def test_both_kinds_of_image_and_any_order_of_points_agree():
+    points = plate_before_wall()
+    result = segmented(points, camera=False)
+    shuffled = segmented(np.random.default_rng(1).permutation(points.reshape(-1, 3)), camera=False)
+    once, again = occluded(result), occluded(shuffled)
+    assert np.array_equal(once.pairs, again.pairs)
+    assert once.gap == pytest.approx(again.gap, rel=1e-9)
+    assert np.array_equal(once.continuations.pairs, again.continuations.pairs)
+    by_pixel = {*map(tuple, occluded(result, pixels(result, points)).pairs.tolist())}
+    by_voxel = {*map(tuple, once.pairs.tolist())}
+    assert len(by_pixel & by_voxel) > 0.7 * len(by_pixel | by_voxel)
+
+
+@pytest.mark.parametrize("points", [np.zeros((1, 3)), np.ones((5, 3)), np.outer(np.arange(9.0), [0.0, 0.0, 1.0])])
+def test_degenerate_clouds_hide_nothing(points):
+    result = pcgraph.segment(points, viewpoint=(0, 0, 0), voxel_size=0.1)
+    assert len(occluded(result).pairs) == 0
+
+
+def test_the_nearest_voxel_is_seen():
+    points = np.vstack([plate_before_wall().reshape(-1, 3), rays().reshape(-1, 3) * 2.5])  # a second, hidden wall
+    result = pcgraph.segment(points, viewpoint=(0, 0, 0), voxel_size=0.02, seed_size=0.1)
+    image = bearing_image(result.surface, result.viewpoint)
+    depth = result.surface.grid.centroids[image.voxels[image.voxels >= 0], 2]
+    assert np.mean(depth > 2.25) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"viewpoint": (0, 0)}, "viewpoint"),
+        ({"viewpoint": (0, 0, np.nan)}, "viewpoint"),
+        ({"reach": 0.0}, "reach"),
+        ({"least_gap": np.inf}, "least_gap"),
+        ({"image": np.zeros((2, 2))}, "image as"),
+        ({"image": np.full((2, 2), 10**6)}, "image with voxels"),
+    ],
+)
+def test_wrong_arguments_are_refused(boxes, wrong, message):
+    result = boxes[2]
+    arguments = {"viewpoint": (0, 0, 0), **wrong}
+    with pytest.raises(ValueError, match=message):
+        occlusions(result.surface, result.graph.node_features, **arguments)
+
+
+def test_hand_drawn_image():
+    """Five voxels in a row, near, far, near, far, far, as the five pixels of an image see them."""
+    grid = pcgraph.segment(
+        np.array([[-2.0, 0, 1], [-2, 0, 2], [0, 0, 1], [2, 0, 2], [4, 0, 2]]) * [0.1, 0.1, 1.0],
+        viewpoint=(0, 0, 0), voxel_size=0.05, seed_size=0.05, camera=False,
+    ).surface.grid  # fmt: skip
+    order = np.lexsort((grid.centroids[:, 2], grid.centroids[:, 0]))
+    assert order.tolist() == [0, 1, 2, 3, 4]  # voxels are in the order of their coordinates
+    surface = Surface(grid, np.tile([0.0, 0.0, -1.0], (5, 1)), np.arange(5, dtype=np.int32))
+    from pcgraph.features.moments import moments_of_groups
+    from pcgraph.features.nodes import node_features
+
+    nodes = node_features(moments_of_groups(grid.centroids, None, surface.supervoxels, 5), np.zeros(3))
+    found = occlusions(surface, nodes, (0, 0, 0), np.array([[0, 1, 2, -1, 3, 4]]), reach=20.0)
+    assert found.pairs.tolist() == [[0, 1], [2, 1], [2, 3]]
+    far, near = np.hypot(0.2, 2.0), np.hypot(0.2, 1.0)
+    assert found.gap == pytest.approx([far - near, far - 1.0, far - 1.0])
+    assert found.length == pytest.approx(0.05)
+    assert found.continuations.pairs.tolist() == [[1, 3]]
+    assert found.continuations.width == pytest.approx(0.4)
+    assert found.continuations.crossings.tolist() == [1]
+    assert found.continuations.coplanar.all()
