@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Objects on a support: what stands on a table, a floor or a shelf."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from pcgraph.detection.boxes import OrientedBox, plane_basis, standing_box, tight_box
+from pcgraph.detection.fragments import joined_fragments
+from pcgraph.detection.hulls import inside_outline, outline
+from pcgraph.detection.planes import Planes, find_planes, voxel_edges
+from pcgraph.detection.shapes import Shape, fit_shape
+from pcgraph.inputs import non_negative
+from pcgraph.segmentation import Segmentation
+
+LEAST_CLEARANCE = 0.5  # voxel edges between the support and the centroid of a supervoxel above it
+LEAST_HEIGHT = 3.0  # voxel edges
+LEAST_SUPERVOXELS = 0.5  # median supervoxels, in points
+GAP = 8.0  # voxel edges, across which the inside of a cup may belong to its outside
+NARROW = 0.5  # the same, in lengths of the larger one's footprint
+LEVEL = 2.0  # voxel edges by which their tops may differ
+
+
+@dataclass(frozen=True)
+class DetectedObject:
+    """One thing on a support.
+
+    Attributes
+    ----------
+    supervoxels : (s,) int32
+        Ascending.
+    count : int
+        Number of points.
+    box : OrientedBox
+        Standing on the support: smallest rectangle around the footprint (its longer side first) times the
+        height (third axis, away from the support).
+    free_box : OrientedBox
+        Small box in any pose, longest axis first.
+    shape : Shape
+        Which of plane, box, ball and cylinder fits its voxels.
+    """
+
+    supervoxels: NDArray[np.int32]
+    count: int
+    box: OrientedBox
+    free_box: OrientedBox
+    shape: Shape
+
+    @property
+    def height(self) -> float:
+        """Of its highest point above the support, metres."""
+        return float(self.box.size[2])
+
+
+def objects_on(
+    segmentation: Segmentation,
+    planes: Planes | None = None,
+    support: int | None = None,
+    *,
+    points: ArrayLike | None = None,
+    margin: float | None = None,
+    min_height: float | None = None,
+    min_points: int | None = None,
+) -> list[DetectedObject]:
+    """Objects on a plane, the one with most points first.
+
+    Parameters
+    ----------
+    segmentation : Segmentation
+    planes : Planes, optional
+        Default: `find_planes(segmentation)`.
+    support : int, optional
+        Index of the plane they stand on. Default: the largest horizontal one.
+    points : the points that were segmented, optional
+        Boxes are drawn around these; without them around the centroids of voxels, so up to half a voxel per side
+        too small.
+    margin : float, metres, optional
+        How far beyond the convex outline of the plane a supervoxel's centroid may lie. Default: 1 voxel.
+    min_height : float, metres, optional
+        Least height of an object above the plane. Default: 3 voxels.
+    min_points : int, optional
+        Least number of points. Default: half that of the median supervoxel.
+
+    Returns
+    -------
+    list of DetectedObject
+        Empty if there is no horizontal plane, or nothing on it. A box covers what was seen: hidden sides are not
+        guessed, except that it reaches down to the support.
+
+    Raises
+    ------
+    ValueError
+        An argument is not as above, or there is no plane of that index.
+
+    Notes
+    -----
+    An object is a connected part of one segment (`Segmentation.labels`) that does not belong to the support and
+    lies above it. A piece that lies mostly within the box of a larger one goes to it, and so does one that hangs
+    beside another without reaching the support, such as the inside of a cup (`fragments.joined_fragments`).
+    """
+    planes = find_planes(segmentation) if planes is None else planes
+    index = _support(planes, support)
+    if index is None:
+        return []
+    edge = float(np.median(segmentation.surface.grid.edge_lengths))
+    sizes = segmentation.graph.node_features.size
+    reach = edge if margin is None else non_negative("margin", margin)
+    lowest = LEAST_HEIGHT * edge if min_height is None else non_negative("min_height", min_height)
+    fewest = LEAST_SUPERVOXELS * float(np.median(sizes)) if min_points is None else min_points
+    up = planes.normals[index] * (-1.0 if planes.normals[index] @ planes.up < -0.5 else 1.0)
+    bottom = float(up @ planes.centroids[index])
+    above = _above(segmentation, planes, index, up, bottom, reach)
+    places, leaf_of_place = _places(segmentation, points)
+    found = []
+    for leaves in _gathered(segmentation, planes, index, _pieces(segmentation, above), up, bottom, edge):
+        member, count = places[np.isin(leaf_of_place, leaves)], int(sizes[leaves].sum())
+        box = standing_box(member, up, bottom)
+        if box.size[2] >= lowest and count >= fewest:
+            found.append(DetectedObject(leaves, count, box, tight_box(member), _shape(segmentation, leaves, up)))
+    return sorted(found, key=lambda thing: (-thing.count, int(thing.supervoxels[0])))
+
+
+def object_labels(segmentation: Segmentation, objects: list[DetectedObject]) -> NDArray[np.int32]:
+    """Index of each point's object in the points' shape, int32; -1 where it belongs to none or is not finite."""
+    of_leaf = np.full(segmentation.tree.n_leaves, -1, np.int32)
+    for i, thing in enumerate(objects):
+        of_leaf[thing.supervoxels] = i
+    return segmentation.on_points(of_leaf)
+
+
+def _shape(segmentation: Segmentation, leaves: NDArray[np.int32], up: NDArray[np.float64]) -> Shape:
+    surface = segmentation.surface
+    member = np.isin(surface.supervoxels, leaves)
+    return fit_shape(surface.grid.centroids[member], surface.normals[member], up)
+
+
+def _support(planes: Planes, support: int | None) -> int | None:
+    if support is not None:
+        if not 0 <= support < len(planes):
+            raise ValueError(f"expected a support of 0..{len(planes) - 1}, got {support!r}")
+        return int(support)
+    level = np.flatnonzero(planes.roles == "horizontal")
+    return int(level[0]) if len(level) else None
+
+
+def _above(
+    segmentation: Segmentation, planes: Planes, index: int, up: NDArray[np.float64], bottom: float, margin: float
+) -> NDArray[np.bool_]:
+    """Which supervoxels lie above the plane within its outline, without being part of it."""
+    basis = plane_basis(up)
+    edges = voxel_edges(segmentation)
+    centroids = segmentation.graph.node_features.centroid
+    inside = inside_outline(centroids @ basis.T, outline(planes.outlines[index] @ basis.T), margin)
+    clear = centroids @ up - bottom > LEAST_CLEARANCE * edges
+    return inside & clear & (planes.plane_of_supervoxel != index)
+
+
+def _pieces(segmentation: Segmentation, above: NDArray[np.bool_]) -> list[NDArray[np.int32]]:
+    """Connected parts of segments among the chosen supervoxels, most points first."""
+    n, labels = segmentation.tree.n_leaves, segmentation.labels.ravel()
+    segment = np.zeros(n, np.int32)
+    seen = labels >= 0
+    segment[segmentation.supervoxels.ravel()[seen]] = labels[seen]
+    i, j = segmentation.graph.edges.T
+    kept = above[i] & above[j] & (segment[i] == segment[j])
+    links = csr_array((np.ones(int(kept.sum()), np.int8), (i[kept], j[kept])), shape=(n, n))
+    _, part = connected_components(links, directed=False)
+    leaves = np.flatnonzero(above).astype(np.int32)
+    parts = [leaves[part[leaves] == p] for p in np.unique(part[leaves])]
+    sizes = segmentation.graph.node_features.size
+    return sorted(parts, key=lambda part: (-int(sizes[part].sum()), int(part[0])))
+
+
+def _places(segmentation: Segmentation, points: ArrayLike | None) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Points, or centroids of voxels, (q, 3), with their supervoxels."""
+    if points is None:
+        return segmentation.surface.grid.centroids, segmentation.surface.supervoxels
+    array = np.asarray(points)
+    if array.shape != (*segmentation.supervoxels.shape, 3):
+        raise ValueError(f"expected points of shape {(*segmentation.supervoxels.shape, 3)}, got {array.shape}")
+    finite = segmentation.supervoxels >= 0
+    return array[finite].astype(np.float64), segmentation.supervoxels[finite]
+
+
+def _gathered(
+    segmentation: Segmentation,
+    planes: Planes,
+    index: int,
+    pieces: list[NDArray[np.int32]],
+    up: NDArray[np.float64],
+    bottom: float,
+    edge: float,
+) -> list[NDArray[np.int32]]:
+    """Supervoxels of objects, from those of their pieces."""
+    if not pieces:
+        return []
+    surface, (i, j) = segmentation.surface, segmentation.graph.edges.T
+    support = planes.plane_of_supervoxel == index
+    at_support = np.zeros(segmentation.tree.n_leaves, bool)
+    at_support[i[support[j]]] = at_support[j[support[i]]] = True
+    members = [np.isin(surface.supervoxels, leaves) for leaves in pieces]
+    places, normals = [surface.grid.centroids[m] for m in members], [surface.normals[m] for m in members]
+    boxes = [standing_box(place, up, bottom) for place in places]
+    inside = np.array([[box.contains(place, edge).mean() for place in places] for box in boxes])
+    floating = np.array([not at_support[leaves].any() for leaves in pieces])
+    reach = np.minimum(GAP * edge, NARROW * np.array([box.size[0] for box in boxes]))
+    part = joined_fragments(places, normals, [place @ up for place in places], floating, inside, reach, LEVEL * edge)
+    return [
+        np.sort(np.concatenate([leaves for leaves, its in zip(pieces, part, strict=True) if its == p]))
+        for p in range(int(part.max()) + 1)
+    ]

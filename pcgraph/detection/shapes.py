@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shapes of objects: which of plane, box, ball and closed cylinder fits what was seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.detection.boxes import OrientedBox, plane_basis, standing_box, tight_box
+from pcgraph.features.primitive_moments import primitive_moments
+from pcgraph.features.primitives import fit_primitives
+
+Kind = Literal["plane", "box", "ball", "cylinder"]
+
+ROUNDS = 6
+FEWEST = 0.05  # share of the points that a side of a box needs to be moved to them
+SIDEWAYS = 0.5  # |normal . axis| above which a point counts to the ends of a cylinder, not to its wall
+THICK = 2.0  # thickness of a box over the residual of its plane, at least
+GAIN = 0.7  # a plane has to be beaten by this factor: boxes, balls and cylinders contain planes as limits
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What fits points best.
+
+    Attributes
+    ----------
+    kind : "plane", "box", "ball" or "cylinder"
+    residual : float, metres
+        Root mean square distance of the points to its surface.
+    residuals : dict from kind to float, metres
+        The same for all kinds tried.
+    center : (3,) float64, metres, the points' frame
+        Of box, ball and cylinder (halfway between its ends as seen); of a plane, the points' mean.
+    axis : (3,) float64
+        Unit: the cylinder's axis, the plane's normal, the box's longest side; zero for a ball.
+    radius : float, metres
+        Of ball and cylinder; NaN otherwise.
+    box : OrientedBox or None
+        The fitted box, if that is the kind.
+    """
+
+    kind: Kind
+    residual: float
+    residuals: dict[Kind, float]
+    center: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    radius: float
+    box: OrientedBox | None
+
+
+def fit_shape(
+    points: NDArray[np.float64], normals: NDArray[np.float64], up: NDArray[np.float64] | None = None
+) -> Shape:
+    """Shape whose surface lies nearest to points, by root mean square distance.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+        n >= 1; parts of the surface may be missing.
+    normals : (n, 3) float64
+        Unit normals at the points.
+    up : (3,) float64, optional
+        Unit vector along which boxes and cylinders are likely to stand: tried besides other poses.
+    """
+    moments = primitive_moments(points, normals, np.zeros(len(points), np.int32), 1)
+    round_shapes = fit_primitives(moments)
+    flat = Shape(
+        "plane",
+        float(round_shapes.plane_residual[0]),
+        {},
+        points.mean(axis=0),
+        round_shapes.plane_normal[0],
+        float("nan"),
+        None,
+    )
+    # A flat patch has room for a flat box in its noise.
+    found = [flat, *(b for b in _boxes(points, up) if b.box is not None and b.box.size.min() > THICK * flat.residual)]
+    center, radius = round_shapes.sphere_center[0], float(round_shapes.sphere_radius[0])
+    if np.isfinite(radius):
+        distance = np.linalg.norm(points - center, axis=1) - radius
+        found.append(Shape("ball", _rms(distance), {}, center, np.zeros(3), radius, None))
+    axes = [round_shapes.cylinder_axis[0]] + ([] if up is None else [up])
+    for axis in axes:
+        found += _cylinder(points, normals, axis)
+    residuals: dict[Kind, float] = {}
+    for shape in found:
+        residuals[shape.kind] = min(shape.residual, residuals.get(shape.kind, np.inf))
+    best = min(found, key=lambda shape: shape.residual * (GAIN if shape.kind == "plane" else 1.0))
+    return Shape(best.kind, best.residual, residuals, best.center, best.axis, best.radius, best.box)
+
+
+def _boxes(points: NDArray[np.float64], up: NDArray[np.float64] | None) -> list[Shape]:
+    shapes = []
+    for around in [tight_box(points)] + ([] if up is None else [standing_box(points, up)]):
+        box = _settled(points, around)
+        longest = box.axes[int(box.size.argmax())]
+        shapes.append(Shape("box", _rms(box.distances(points)), {}, box.center, longest, float("nan"), box))
+    return shapes
+
+
+def _settled(points: NDArray[np.float64], box: OrientedBox) -> OrientedBox:
+    """The box with its sides moved from the outermost points to the middle of the points near them."""
+    low, high = -box.size / 2.0, box.size / 2.0
+    local = box.local(points)
+    for _ in range(ROUNDS):
+        gaps = np.concatenate((np.abs(local - low), np.abs(local - high)), axis=1)
+        side = gaps.argmin(axis=1)
+        for axis in range(3):
+            for limits, number in ((low, axis), (high, axis + 3)):
+                near = local[side == number, axis]
+                if len(near) >= FEWEST * len(local):
+                    limits[axis] = float(np.median(near))
+        low, high = np.minimum(low, high), np.maximum(low, high)
+    return OrientedBox(box.center + (low + high) / 2.0 @ box.axes, box.axes, high - low)
+
+
+def _cylinder(points: NDArray[np.float64], normals: NDArray[np.float64], axis: NDArray[np.float64]) -> list[Shape]:
+    """Closed cylinder about an axis of this direction; none if no wall is seen."""
+    wall = np.abs(normals @ axis) < SIDEWAYS
+    basis = plane_basis(axis)
+    flat = points @ basis.T
+    if wall.sum() < 5:
+        return []
+    circle = _circle(flat[wall])
+    if circle is None:
+        return []
+    center, radius = circle
+    height = points @ axis
+    low, high = float(height.min()), float(height.max())
+    capped = ~wall & (height > (low + high) / 2.0)
+    if capped.sum() >= FEWEST * len(points):
+        high = float(np.median(height[capped]))
+    across = np.linalg.norm(flat - center, axis=1) - radius
+    along = np.abs(height - (low + high) / 2.0) - (high - low) / 2.0
+    beyond = np.hypot(np.maximum(across, 0.0), np.maximum(along, 0.0))
+    # The lower end stands on something and is not seen: only the upper one counts as surface.
+    inside = np.minimum(-across, np.abs(high - height))
+    distance = np.where((across <= 0.0) & (along <= 0.0), inside, beyond)
+    middle = center @ basis + (low + high) / 2.0 * axis
+    return [Shape("cylinder", _rms(distance), {}, middle, axis, radius, None)]
+
+
+def _circle(flat: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:
+    """Centre and radius of the circle near points (n, 2): algebraic first, then least squares of distances."""
+    mean = flat.mean(axis=0)
+    local = flat - mean
+    scale = float(np.sqrt((local**2).sum(axis=1).mean()))
+    if scale == 0.0:
+        return None
+    local = local / scale
+    design = np.column_stack((2.0 * local, np.ones(len(local))))
+    solution, _, rank, _ = np.linalg.lstsq(design, (local**2).sum(axis=1), rcond=1e-6)
+    if rank < 3:
+        return None
+    center = solution[:2]
+    for _ in range(ROUNDS):  # Gauss-Newton on distance - radius; the mean distance is the best radius
+        offset = local - center
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+        toward = offset / distance[:, None]
+        slope = toward - toward.mean(axis=0)
+        center = center + np.linalg.lstsq(slope, distance - distance.mean(), rcond=1e-3)[0]
+    radius = float(np.linalg.norm(local - center, axis=1).mean())
+    if not radius < 100.0:  # of the points' own size: straight
+        return None
+    return mean + scale * center, scale * radius
+
+
+def _rms(distances: NDArray[np.float64]) -> float:
+    return float(np.sqrt((distances**2).mean()))
