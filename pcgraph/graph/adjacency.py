@@ -4,16 +4,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.columns import rows
 from pcgraph.features.nodes import NodeFeatures
+from pcgraph.graph.boundary import BoundaryStrength
 
 if TYPE_CHECKING:
     import networkx
+    from scipy.sparse import csr_array
 
 
 @dataclass(frozen=True)
@@ -55,9 +59,15 @@ class EdgeFeatures:
         """Mean edge length of the voxels at each contact, (m,) float64, metres."""
         return 2.0 * self.contact_length / self.contact_voxels
 
+    @property
+    def boundary_strength(self) -> NDArray[np.float64]:
+        """How probably each edge is an object's boundary, (m,) float64, 0..1; `BoundaryStrength` says how."""
+        return BoundaryStrength()(self)
+
     def columns(self) -> dict[str, NDArray[np.generic]]:
-        """All features by name, in the order of the attributes."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """All features by name, in the order of the attributes; `boundary_strength` last."""
+        measured = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**measured, "boundary_strength": self.boundary_strength}
 
 
 @dataclass(frozen=True)
@@ -92,3 +102,59 @@ class AdjacencyGraph:
         features = rows(self.edge_features.columns(), len(self.edges))
         graph.add_edges_from((i, j, row) for (i, j), row in zip(self.edges.tolist(), features, strict=True))
         return graph
+
+    def to_csr(self, weights: str | ArrayLike | None = None) -> csr_array:
+        """The graph as a symmetric SciPy matrix, (k, k) float64, 2 m stored entries, columns ascending.
+
+        Parameters
+        ----------
+        weights : str or (m,) numbers, optional
+            Name of an edge feature, or a number per edge. Default: 1 for every edge.
+
+        Raises
+        ------
+        ValueError
+            There is no such feature, or the numbers are not (m,) or not finite.
+
+        Notes
+        -----
+        Weights of zero are stored, and `connected_components` and `dijkstra` of `scipy.sparse.csgraph` take them for
+        edges; but `minimum_spanning_tree` leaves them out of its result. Pass ``weights + 1`` there: the tree is the
+        same.
+        """
+        from pcgraph.graph.export import csr
+
+        return csr(self, weights)
+
+    def to_pyg(self, up: ArrayLike | None = None) -> dict[str, object]:
+        """Arrays named as PyTorch Geometric names them; every edge occurs in both directions.
+
+        ``x`` (k, f) float32: size, normal, covariance, linearity, planarity, scattering, residual, and, if known,
+        verticality and colours; ``x_names``, a list of f. ``pos`` (k, 3) float32, metres: centroids from the origin
+        ``pos_origin`` (3,) float64, their mean, for float32 holds no far-away frame. ``edge_index`` (2, 2 m) int64:
+        first all edges as they are, then all reversed. ``edge_attr`` (2 m, g) float32, ``edge_attr_names``: all edge
+        features, none of which has a direction.
+
+        Parameters
+        ----------
+        up : (3,) float, the points' frame, optional
+            Against gravity; for verticality, which is left out without it.
+        """
+        from pcgraph.graph.export import pyg
+
+        return pyg(self, up)
+
+    def write_graphml(self, path: str | PathLike[str]) -> None:
+        """Nothing; writes the graph with all features, vectors as scalars (``normal_x``), whole or not at all.
+
+        ``networkx.read_graphml(path, node_type=int)`` reads it back.
+
+        Raises
+        ------
+        CloudWriteError
+            The place cannot be written.
+        """
+        from pcgraph.graph.export import graphml
+        from pcgraph.io.atomic import write_bytes
+
+        write_bytes(Path(path), graphml(self))
