@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import subprocess
 import tempfile
@@ -110,6 +111,7 @@ def run_lin(points: NDArray[np.float32], resolution: float) -> tuple[NDArray[np.
     import _py4dgeo
     import py4dgeo
 
+    logging.getLogger("py4dgeo").setLevel(logging.ERROR)  # its progress would go to stdout and to a file beside us
     finite = np.isfinite(points).all(axis=-1)
     found = points[finite].astype(np.float64)
     cells = np.floor(found / LIN_VOXEL_M).astype(np.int64)
