@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,7 @@ class LccpLinkage(Linkage):
     Rules as in PCL's lccp_segmentation.hpp.
     """
 
-    concavity_tolerance: float = np.deg2rad(10.0)
+    concavity_tolerance: float = math.radians(10.0)
     smoothness: bool = True
     sanity: bool = False
     common_neighbours: int = 0

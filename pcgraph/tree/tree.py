@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -265,7 +265,7 @@ class SegmentationTree:
 
 def _rows(moments: Moments, order: NDArray[np.int64]) -> Moments:
     columns: dict[str, Any] = {field.name: getattr(moments, field.name) for field in fields(moments)}
-    return Moments(**{name: None if values is None else values[order] for name, values in columns.items()})
+    return replace(moments, **{name: values[order] for name, values in columns.items() if values is not None})
 
 
 def _whole(name: str, value: int) -> int:

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of trees and cuts, for every linkage, over random graphs."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from itertools import pairwise
+
+import networkx
+import numpy as np
+import pytest
+from clouds import refines
+from graphs import SHAPES, leaf_sets, random_graph, tree_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pcgraph.features.moments import Moments
+from pcgraph.features.nodes import node_features
+from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
+from pcgraph.tree.edge_model import EdgeModel
+from pcgraph.tree.energy import Energy, plane_energy, variance_energy
+from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
+from pcgraph.tree.lccp import LccpLinkage
+from pcgraph.tree.learned import LearnedLinkage
+from pcgraph.tree.linkage import ConvexityLinkage
+from pcgraph.tree.quasi_flat import QuasiFlatLinkage
+from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
+
+MODEL = EdgeModel(("contact_concavity", "step_voxels"), (0.2, 0.1), (0.5, 0.2), (1.5, 0.7), -0.3, 0.4)
+LINKAGES = [
+    ConvexityLinkage(),
+    FelzenszwalbLinkage(),
+    LccpLinkage(),
+    LccpLinkage(sanity=True, common_neighbours=1),
+    LearnedLinkage(MODEL),
+    MumfordShahLinkage(plane=1.0, normal=0.3, color=0.2),
+    QuasiFlatLinkage(),
+    WardLinkage(position=0.2, color=0.5),
+]
+over_linkages = pytest.mark.parametrize("linkage", LINKAGES, ids=lambda linkage: type(linkage).__name__)
+over_graphs = given(shape=st.sampled_from(SHAPES), n=st.integers(1, 24), seed=st.integers(0, 2**31), ties=st.booleans())
+quick = settings(max_examples=15, deadline=None)
+
+
+@over_linkages
+@quick
+@over_graphs
+def test_merges_cover_each_component_at_rising_altitudes(linkage, shape, n, seed, ties):
+    graph, leaves, _, _ = random_graph(shape, n, np.random.default_rng(seed), ties)
+    merges = linkage.merges(graph, leaves)
+    touching = networkx.Graph(graph.edges.tolist())
+    touching.add_nodes_from(range(n))
+    assert len(merges.pairs) == len(merges.altitudes) == n - networkx.number_connected_components(touching)
+    assert np.isfinite(merges.altitudes).all()
+    assert (merges.altitudes >= 0.0).all()
+    assert (np.diff(merges.altitudes) >= 0.0).all()
+    assert (merges.pairs < n + np.arange(len(merges.pairs))[:, None]).all()
+    assert len(np.unique(merges.pairs)) == merges.pairs.size
+    tree = tree_of(linkage, graph, leaves)
+    assert not tree.altitudes[:n].any()
+    assert not np.isnan(tree.altitudes).any()
+    parts = tree.cut(altitude=np.finfo(float).max)
+    found = {frozenset(np.flatnonzero(parts == part).tolist()) for part in np.unique(parts)}
+    assert found == {frozenset(part) for part in networkx.connected_components(touching)}
+    joined = tree.edge_saliency(graph.edges)
+    assert np.isfinite(joined).all()
+    # Nothing merges without an edge: every merged node is connected by edges inside it.
+    for below in leaf_sets(tree)[n : n + len(merges.pairs)]:
+        assert networkx.is_connected(touching.subgraph(below))
+
+
+@over_linkages
+@quick
+@over_graphs
+def test_cuts_never_cross(linkage, shape, n, seed, ties):
+    rng = np.random.default_rng(seed)
+    graph, leaves, _, _ = random_graph(shape, n, rng, ties)
+    tree = tree_of(linkage, graph, leaves)
+    by_number = [tree.cut(n=count) for count in range(n, 0, -1)]
+    assert [int(cut.max()) + 1 for cut in by_number] == list(range(n, 0, -1))
+    levels = np.unique(np.concatenate(([0.0], tree.altitudes, tree.altitudes[np.isfinite(tree.altitudes)] * 0.7)))
+    for family in (by_number, list(tree.levels(levels).T)):
+        assert all(refines(fine, coarse) for fine, coarse in pairwise(family))
+    assert all(cut[0] == 0 and (np.diff(np.maximum.accumulate(cut)) <= 1).all() for cut in by_number)
+
+
+@over_linkages
+@quick
+@over_graphs
+def test_cuts_of_a_least_size_have_it_and_never_cross(linkage, shape, n, seed, ties):
+    graph, leaves, _, _ = random_graph(shape, n, np.random.default_rng(seed), ties)
+    tree = tree_of(linkage, graph, leaves)
+    least = 1 + seed % 25
+    cuts = list(np.stack([tree.cut(altitude=level, min_size=least) for level in np.unique(tree.altitudes)]))
+    finest = int(tree.cut(altitude=-1.0, min_size=least).max()) + 1
+    by_number = [tree.cut(n=count, min_size=least) for count in range(finest, 0, -1)]
+    assert [int(cut.max()) + 1 for cut in by_number] == list(range(finest, 0, -1))
+    stable = tree.cut_stable(least)
+    for family in (cuts, by_number):
+        assert all(refines(fine, coarse) for fine, coarse in pairwise(family))
+    for cut in (*cuts, *by_number, stable):
+        assert np.bincount(cut, leaves.counts).min() >= min(least, leaves.counts.sum())
+
+
+@over_linkages
+@quick
+@over_graphs
+def test_optimal_cuts_at_rising_scales_never_cross(linkage, shape, n, seed, ties):
+    rng = np.random.default_rng(seed)
+    graph, leaves, _, _ = random_graph(shape, n, rng, ties)
+    tree = tree_of(linkage, graph, leaves)
+    values = rng.integers(0, 3, (n, 2)) if ties else rng.normal(size=(n, 2))
+    for energy in (plane_energy(tree), plane_energy(tree, graph), variance_energy(tree, values, graph)):
+        by_scale = tree.by_energy(energy)
+        assert (by_scale.altitudes[1:] >= by_scale.altitudes[:-1]).all()
+        scales = np.unique(np.concatenate(([0.0], by_scale.altitudes[np.isfinite(by_scale.altitudes)], [1e9])))
+        cuts = [tree.cut_optimal(energy, scale) for scale in scales.tolist()]
+        assert all(refines(fine, coarse) for fine, coarse in pairwise(cuts))
+        assert refines(cuts[-1], tree.cut(altitude=np.finfo(float).max))  # parts that do not touch stay apart
+        costs = [_energy(tree, cut, energy, scale) for cut, scale in zip(cuts, scales.tolist(), strict=True)]
+        for level in np.unique(tree.altitudes[np.isfinite(tree.altitudes)]):
+            other = tree.cut(altitude=level)
+            for scale, cost in zip(scales.tolist(), costs, strict=True):
+                assert cost <= _energy(tree, other, energy, scale) * (1.0 + 1e-9) + 1e-9
+
+
+def _energy(tree, cut, energy: Energy, scale):
+    node_of = {leaves: node for node, leaves in enumerate(leaf_sets(tree))}
+    nodes = [node_of[frozenset(np.flatnonzero(cut == segment).tolist())] for segment in range(cut.max() + 1)]
+    return float((energy.data + scale * energy.complexity)[nodes].sum())
+
+
+@over_linkages
+@quick
+@over_graphs
+def test_moments_of_every_node_are_those_of_its_points(linkage, shape, n, seed, ties):
+    graph, leaves, points, leaf = random_graph(shape, n, np.random.default_rng(seed), ties)
+    tree = tree_of(linkage, graph, leaves)
+    tree = tree.by_energy(plane_energy(tree)) if seed % 2 else tree
+    for node, below in enumerate(leaf_sets(tree)):
+        mine = points[np.isin(leaf, list(below))]
+        mean = mine.mean(axis=0)
+        scatter = (mine - mean).T @ (mine - mean)
+        assert tree.moments.counts[node] == len(mine)
+        assert tree.moments.centroids[node] == pytest.approx(mean, rel=1e-6, abs=1e-9)
+        assert np.abs(tree.moments.scatters[node] - scatter).max() <= 1e-6 * np.abs(scatter).max()
+
+
+@over_linkages
+@quick
+@given(shape=st.sampled_from(SHAPES), n=st.integers(1, 24), seed=st.integers(0, 2**31))
+def test_names_of_nodes_do_not_matter(linkage, shape, n, seed):
+    rng = np.random.default_rng(seed)
+    graph, leaves, _, _ = random_graph(shape, n, rng)
+    name = rng.permutation(n)  # new name of each node
+    there = renamed(graph, leaves, name, rng)
+    first, second = tree_of(linkage, graph, leaves), tree_of(linkage, *there)
+    finite = int(np.isfinite(first.altitudes).sum())
+    assert first.altitudes == pytest.approx(second.altitudes, rel=1e-9, abs=1e-12)
+    sets, other = leaf_sets(first)[:finite], leaf_sets(second)[:finite]
+    levels = dict(zip(other, second.altitudes, strict=False))
+    for below, altitude in zip(sets, first.altitudes, strict=False):
+        mapped = frozenset(int(name[leaf]) for leaf in below)
+        assert levels[mapped] == pytest.approx(altitude, rel=1e-9, abs=1e-12)
+
+
+def renamed(graph, leaves, name, rng):
+    """The same graph with new names and its edges in another order, not each from the smaller node to the larger."""
+    old = np.argsort(name)
+    order = rng.permutation(len(graph.edges))
+    edges = name[graph.edges[order]].astype(np.int32)
+    columns = {field.name: getattr(graph.edge_features, field.name)[order] for field in fields(EdgeFeatures)}
+    assert leaves.colors is not None
+    moved = Moments(leaves.counts[old], leaves.centroids[old], leaves.scatters[old], leaves.colors[old])
+    nodes = node_features(moved, np.array([0.0, 0.0, 50.0]))
+    return AdjacencyGraph(edges, EdgeFeatures(**columns), nodes), moved
+
+
+@over_linkages
+def test_a_long_chain_neither_recurses_nor_hangs(linkage):
+    n = 100_000 if not isinstance(linkage, FelzenszwalbLinkage) else 20_000
+    rng = np.random.default_rng(0)
+    graph, leaves = long_chain(n, rng)
+    tree = tree_of(linkage, graph, leaves)
+    assert tree.altitudes[-1] < np.inf
+    assert tree.cut(n=7).max() == 6
+    assert tree.cut_stable().max() >= 0
+    assert tree.cut_optimal(plane_energy(tree, graph), 1.0).max() >= 0
+
+
+def long_chain(n, rng):
+    from graphs import made
+
+    ends = np.arange(n - 1)
+    rows = {"convexity": -np.arange(1.0, n) / n, "contact_convexity": -np.arange(1.0, n) / n}
+    rows |= {"contact_voxels": np.full(n - 1, 2), "contact_length": np.ones(n - 1)}
+    features = made(EdgeFeatures, n - 1, normal_angle=np.arange(1.0, n) / n, **rows)
+    centroids = np.column_stack((np.arange(n), rng.random(n), np.zeros(n)))
+    leaves = Moments(np.ones(n, np.int64), centroids, np.zeros((n, 3, 3)), rng.random((n, 3)))
+    nodes = node_features(leaves, np.array([0.0, 0.0, 50.0]))
+    return AdjacencyGraph(np.stack((ends, ends + 1), axis=1).astype(np.int32), features, nodes), leaves
