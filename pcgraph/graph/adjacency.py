@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.columns import rows
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
 
@@ -65,9 +64,8 @@ class EdgeFeatures:
         return BoundaryStrength()(self)
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
-        """All features by name, in the order of the attributes; `boundary_strength` last."""
-        measured = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {**measured, "boundary_strength": self.boundary_strength}
+        """All features by name, in the order of the attributes."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 @dataclass(frozen=True)
@@ -94,14 +92,10 @@ class AdjacencyGraph:
         return len(self.node_features.size)
 
     def to_networkx(self) -> networkx.Graph:
-        """The graph as ``networkx.Graph``, features as attributes of the same names."""
-        from networkx import Graph
+        """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names."""
+        from pcgraph.graph.export import edge_columns, network
 
-        graph = Graph()
-        graph.add_nodes_from(enumerate(rows(self.node_features.columns(), self.n_nodes)))
-        features = rows(self.edge_features.columns(), len(self.edges))
-        graph.add_edges_from((i, j, row) for (i, j), row in zip(self.edges.tolist(), features, strict=True))
-        return graph
+        return network(self, self.node_features.columns(), edge_columns(self))
 
     def to_csr(self, weights: str | ArrayLike | None = None) -> csr_array:
         """The graph as a symmetric SciPy matrix, (k, k) float64, 2 m stored entries, columns ascending.
@@ -109,7 +103,7 @@ class AdjacencyGraph:
         Parameters
         ----------
         weights : str or (m,) numbers, optional
-            Name of an edge feature, or a number per edge. Default: 1 for every edge.
+            Name of an edge feature or `boundary_strength`, or a number per edge. Default: 1 for every edge.
 
         Raises
         ------
@@ -133,7 +127,7 @@ class AdjacencyGraph:
         verticality and colours; ``x_names``, a list of f. ``pos`` (k, 3) float32, metres: centroids from the origin
         ``pos_origin`` (3,) float64, their mean, for float32 holds no far-away frame. ``edge_index`` (2, 2 m) int64:
         first all edges as they are, then all reversed. ``edge_attr`` (2 m, g) float32, ``edge_attr_names``: all edge
-        features, none of which has a direction.
+        features and `boundary_strength`, none of which has a direction.
 
         Parameters
         ----------

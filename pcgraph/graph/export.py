@@ -12,9 +12,28 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.columns import rows, scalar_columns
 
 if TYPE_CHECKING:
+    import networkx
     from scipy.sparse import csr_array
 
     from pcgraph.graph.adjacency import AdjacencyGraph
+
+
+def edge_columns(graph: AdjacencyGraph) -> dict[str, NDArray[np.generic]]:
+    """Edge features by name, and `boundary_strength`, which follows from them."""
+    return {**graph.edge_features.columns(), "boundary_strength": graph.edge_features.boundary_strength}
+
+
+def network(
+    graph: AdjacencyGraph, nodes: dict[str, NDArray[np.generic]], edges: dict[str, NDArray[np.generic]]
+) -> networkx.Graph:
+    """The graph with these columns as attributes of nodes and edges."""
+    from networkx import Graph
+
+    result = Graph()
+    result.add_nodes_from(enumerate(rows(nodes, graph.n_nodes)))
+    features = rows(edges, len(graph.edges))
+    result.add_edges_from((i, j, row) for (i, j), row in zip(graph.edges.tolist(), features, strict=True))
+    return result
 
 
 def csr(graph: AdjacencyGraph, weights: str | ArrayLike | None) -> csr_array:
@@ -37,7 +56,7 @@ def pyg(graph: AdjacencyGraph, up: ArrayLike | None) -> dict[str, object]:
     if up is not None:
         nodes["verticality"] = graph.node_features.verticality(up)
     nodes = scalar_columns(nodes)
-    edges = scalar_columns(graph.edge_features.columns())
+    edges = scalar_columns(edge_columns(graph))
     origin = centroids.mean(axis=0)
     attributes = _table(edges, len(graph.edges))
     return {
@@ -53,15 +72,11 @@ def pyg(graph: AdjacencyGraph, up: ArrayLike | None) -> dict[str, object]:
 
 def graphml(graph: AdjacencyGraph) -> bytes:
     """A GraphML document; see `AdjacencyGraph.write_graphml`."""
-    from networkx import Graph
     from networkx.readwrite.graphml import write_graphml_xml
 
-    plain = Graph()
-    plain.add_nodes_from(enumerate(rows(scalar_columns(graph.node_features.columns()), graph.n_nodes)))
-    features = rows(scalar_columns(graph.edge_features.columns()), len(graph.edges))
-    plain.add_edges_from((i, j, row) for (i, j), row in zip(graph.edges.tolist(), features, strict=True))
     stream = io.BytesIO()
-    write_graphml_xml(plain, stream)
+    nodes, edges = scalar_columns(graph.node_features.columns()), scalar_columns(edge_columns(graph))
+    write_graphml_xml(network(graph, nodes, edges), stream)
     return stream.getvalue()
 
 
@@ -70,7 +85,7 @@ def _weights(graph: AdjacencyGraph, weights: str | ArrayLike | None) -> NDArray[
     if weights is None:
         return np.ones(m)
     if isinstance(weights, str):
-        columns = graph.edge_features.columns()
+        columns = edge_columns(graph)
         if weights not in columns:
             raise ValueError(f"expected weights to name one of {', '.join(columns)}, got {weights!r}")
         return columns[weights].astype(np.float64)

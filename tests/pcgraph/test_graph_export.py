@@ -130,8 +130,9 @@ def test_graphml_reads_back_as_the_same_graph(coloured, boxes, with_colors, tmp_
         assert known["covariance_xz"] == graph.node_features.covariance[node, 0, 2]
         assert ("color_g" in known) == with_colors
         assert np.isfinite(list(known.values())).all()
-    for (i, j), *row in zip(graph.edges.tolist(), *graph.edge_features.columns().values(), strict=True):
-        assert [read.edges[i, j][name] for name in graph.edge_features.columns()] == row
+    columns = {**graph.edge_features.columns(), "boundary_strength": graph.edge_features.boundary_strength}
+    for (i, j), *row in zip(graph.edges.tolist(), *columns.values(), strict=True):
+        assert read.edges[i, j] == dict(zip(columns, row, strict=True))
     assert [path.name for path in tmp_path.iterdir()] == ["graph.graphml"]
 
 
@@ -169,5 +170,5 @@ def test_the_snippets_of_the_docs_run(tmp_path):
 
 def test_the_docs_name_every_feature(coloured):
     text = (ROOT / "docs" / "graph.md").read_text(encoding="utf-8")
-    for name in [*coloured.node_features.columns(), *coloured.edge_features.columns()]:
+    for name in [*coloured.node_features.columns(), *coloured.edge_features.columns(), "boundary_strength"]:
         assert f"`{name}`" in text, name
