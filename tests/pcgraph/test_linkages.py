@@ -12,6 +12,7 @@ import scipy.cluster.hierarchy as scipy_hierarchy
 from graphs import edges_of, hand_graph, leaf_sets, random_graph, tree_of, unit_leaves
 from scipy.spatial.distance import squareform
 
+from pcgraph.features.moments import moments_of_groups
 from pcgraph.tree.average import average_linkage
 from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage, normal_contrast
 from pcgraph.tree.lccp import LccpLinkage
@@ -134,9 +135,8 @@ def test_mumford_shah_grows_planes_before_it_bends_them():
     square = np.stack(np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5)), axis=-1).reshape(-1, 2)
     flat = np.column_stack((square, np.zeros(25)))
     wall = np.column_stack((np.zeros(25), square[:, 1], square[:, 0]))
-    pieces = [flat + [1, 0, 0], flat, wall, wall + [0, 0, 1], flat + [-1, 0, 2]]
-    from pcgraph.features.moments import moments_of_groups
-
+    shifts = np.array([[1.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1], [-1, 0, 2]])
+    pieces = [piece + shift for piece, shift in zip((flat, flat, wall, wall, flat), shifts, strict=True)]
     leaves = moments_of_groups(np.vstack(pieces), None, np.repeat(np.arange(5), 25).astype(np.int32), 5)
     merges = MumfordShahLinkage(plane=1.0).merges(hand_graph(CHAIN), leaves)
     assert {tuple(pair) for pair in merges.pairs[:2].tolist()} == {(0, 1), (2, 3)}
@@ -255,10 +255,8 @@ def test_ward_and_mumford_shah_know_no_units_nor_density():
     for linkage in (WardLinkage(position=0.1, color=1.0), MumfordShahLinkage(normal=0.5, color=0.5)):
         graph, leaves, points, leaf = random_graph("random", 12, np.random.default_rng(2))
         twice = np.concatenate((leaf, leaf))
-        from pcgraph.features.moments import moments_of_groups
-
         scale = 1000.0
-        colors = np.repeat(leaves.colors[leaf], 1, axis=0)
+        colors = leaves.colors[leaf]
         plain = moments_of_groups(points, colors, leaf, 12)
         dense = moments_of_groups(scale * np.vstack((points, points)), np.vstack((colors, colors)), twice, 12)
         features = replace(graph.edge_features, contact_length=graph.edge_features.contact_length * scale)
