@@ -114,7 +114,9 @@ def _principal(  # type: ignore[no-untyped-def]
     deviations, normals = np.empty((3, k)), np.empty((k, 3))
     matrix, vectors, axes = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for s in range(k):
-        matrix[:] = covariances[s]
+        for i in range(3):
+            for j in range(3):
+                matrix[i, j] = covariances[s, i, j]
         symmetric_eigen(matrix, vectors)
         for axis in range(3):
             rank = 0
@@ -124,22 +126,24 @@ def _principal(  # type: ignore[no-untyped-def]
             deviations[rank, s] = np.sqrt(max(matrix[axis, axis], 0.0))
             for i in range(3):
                 axes[rank, i] = vectors[i, axis]
-        _plane_normal(deviations[:, s], axes, towards[s], normals[s])
+        _plane_normal(deviations[1, s], deviations[2, s], axes, towards[s], normals[s])
     return deviations[0], deviations[1], deviations[2], normals
 
 
 @njit(cache=True, nogil=True)
 def _plane_normal(
-    deviations: NDArray[np.float64],
+    middle: float,
+    high: float,
     axes: NDArray[np.float64],
     towards: NDArray[np.float64],
     normal: NDArray[np.float64],
 ) -> None:
     """Nothing; `normal` becomes the axis of least spread on the viewpoint's side, or, of a line, one across it."""
-    normal[:] = axes[0]
-    if deviations[1] <= _NO_PLANE * deviations[2]:
+    for i in range(3):
+        normal[i] = axes[0, i]
+    if middle <= _NO_PLANE * high:
         along = 0.0
-        if deviations[2] > 0.0:
+        if high > 0.0:
             for i in range(3):
                 along += axes[2, i] * towards[i]
         squares = reach = 0.0

@@ -113,8 +113,8 @@ def _slot(key: int, keys: NDArray[np.int64], slots: NDArray[np.int32]) -> int:
 def _grown(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """The same keys with room for as many again, and their hash table, a quarter full."""
     wide, slots = np.empty(2 * len(keys), np.int64), np.full(8 * len(keys), -1, np.int32)
-    wide[: len(keys)] = keys
     for number in range(len(keys)):
+        wide[number] = keys[number]
         slots[_slot(keys[number], wide, slots)] = number
     return wide, slots
 

@@ -91,6 +91,23 @@ def test_moments_keep_their_digits_far_from_the_origin():
     assert far.scatters == pytest.approx(at_home.scatters, rel=1e-12, abs=1e-15)
 
 
+def test_the_order_of_points_changes_nothing_but_rounding():
+    points, colors, normals, groups = clustered_points(np.random.default_rng(5), 6, 1e3)
+    order = np.random.default_rng(6).permutation(len(points))
+    for once, again in (
+        (
+            moments_of_groups(points, colors, groups, 6),
+            moments_of_groups(points[order], colors[order], groups[order], 6),
+        ),
+        (
+            primitive_moments(points, normals, groups, 6),
+            primitive_moments(points[order], normals[order], groups[order], 6),
+        ),
+    ):
+        for name, column in vars(once).items():
+            assert column == pytest.approx(vars(again)[name], rel=1e-9, abs=1e-9), name
+
+
 def test_an_outlier_that_comes_first_costs_no_digits():
     rng = np.random.default_rng(2)
     points = np.vstack([[1e6, 0.0, 0.0], rng.normal(0.0, 1e-3, (10_000, 3))])

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import pcgraph
 from pcgraph.graph.bearings import bearing_image
@@ -189,6 +191,28 @@ def test_both_kinds_of_image_and_any_order_of_points_agree():
 def test_degenerate_clouds_hide_nothing(points):
     result = pcgraph.segment(points, viewpoint=(0, 0, 0), voxel_size=0.1)
     assert len(occluded(result).pairs) == 0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(-6.0, 6.0), st.floats(0.01, 0.5), st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_any_cloud_from_anywhere(seed, n, exponent, voxel, inside):
+    rng = np.random.default_rng(seed)
+    scale = 10.0**exponent
+    viewpoint = scale * (rng.random(3) + (0.0 if inside else 1.5))
+    result = pcgraph.segment(scale * rng.random((n, 3)), viewpoint=viewpoint, voxel_size=scale * voxel)
+    found = occluded(result)
+    behind = found.continuations
+    for pairs in (found.pairs, behind.pairs):
+        assert pairs.shape[1:] == (2,)
+        assert np.all((pairs >= 0) & (pairs < result.graph.n_nodes))
+        assert np.all(pairs[:, 0] != pairs[:, 1])
+        keys = pairs[:, 0].astype(np.int64) * result.graph.n_nodes + pairs[:, 1]
+        assert np.all(np.diff(keys) > 0)
+    assert np.all(found.gap >= 3.0 * scale * voxel * (1.0 - 1e-9))
+    assert np.all(found.length >= scale * voxel * (1.0 - 1e-9))
+    for column in (found.gap, found.length, found.direction, behind.width, behind.angle, behind.offset):
+        assert np.isfinite(column).all()
+    assert np.all(behind.crossings > 0)
 
 
 def test_the_nearest_voxel_is_seen():
