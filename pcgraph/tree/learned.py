@@ -9,13 +9,14 @@ from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.tree.average import average_linkage
 from pcgraph.tree.edge_model import EdgeModel, edge_evidence
 from pcgraph.tree.growth import segmentation_tree
+from pcgraph.tree.leaf_truth import LeafTruth, leaf_truth
 from pcgraph.tree.linkage import Linkage, Merges
 
 if TYPE_CHECKING:
@@ -81,7 +82,8 @@ class LearnedLinkage(Linkage):
         """
         if len(segmentations) != len(truths) or not len(truths):
             raise ValueError(f"expected a truth for each segmentation, got {len(segmentations)} and {len(truths)}")
-        tables = [_Table.of(result, truth) for result, truth in zip(segmentations, truths, strict=True)]
+        pairs = zip(segmentations, truths, strict=True)
+        tables = [leaf_truth(result.supervoxels, truth, result.graph.n_nodes) for result, truth in pairs]
         model = _fit_edges([result.graph for result in segmentations], tables)
         trees = [_tree(cls(model), result) for result in segmentations]
         overlaps = [
@@ -101,54 +103,14 @@ class LearnedLinkage(Linkage):
         return cls(EdgeModel.load(path))
 
 
-@dataclass(frozen=True)
-class _Table:
-    """Points per pair of leaf and true object: what of a truth matters to leaves."""
-
-    leaf: NDArray[np.int64]
-    truth: NDArray[np.int64]
-    points: NDArray[np.int64]
-    n_leaves: int
-
-    @classmethod
-    def of(cls, result: Segmentation, truth: ArrayLike) -> _Table:
-        true = np.asarray(truth)
-        if true.shape != result.supervoxels.shape:
-            raise ValueError(f"expected a truth of shape {result.supervoxels.shape}, got {true.shape}")
-        both = (true >= 0) & (result.supervoxels >= 0)
-        names, column = np.unique(true[both], return_inverse=True)
-        keys, points = np.unique(result.supervoxels[both] * np.int64(len(names)) + column, return_counts=True)
-        return cls(keys // max(len(names), 1), keys % max(len(names), 1), points, result.graph.n_nodes)
-
-    def majority(self) -> NDArray[np.int64]:
-        """True object of each leaf, -1 where none holds most of its points."""
-        order = np.argsort(self.points, kind="stable")
-        best, most = np.full(self.n_leaves, -1, np.int64), np.zeros(self.n_leaves)
-        best[self.leaf[order]] = self.truth[order]
-        most[self.leaf[order]] = self.points[order]
-        total = np.bincount(self.leaf, self.points, self.n_leaves)
-        return np.where(most >= _PURE * np.maximum(total, 1), best, -1)
-
-    def overlap(self, segments: NDArray[np.int32]) -> float:
-        """Weighted overlap of the leaves' segments, as `pcgraph.metrics.weighted_overlap` of the points."""
-        segment = segments[self.leaf].astype(np.int64)
-        keys, pair = np.unique(segment * (self.truth.max() + 1) + self.truth, return_inverse=True)
-        common = np.bincount(pair, self.points)
-        found, true = keys // (self.truth.max() + 1), keys % (self.truth.max() + 1)
-        size, extent = np.bincount(segment, self.points), np.bincount(self.truth, self.points)
-        best = np.zeros(len(extent))
-        np.maximum.at(best, true, common / (size[found] + extent[true] - common))
-        return float(best @ extent / extent.sum())
-
-
-def _fit_edges(graphs: list[AdjacencyGraph], tables: list[_Table]) -> EdgeModel:
+def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeModel:
     try:
         from sklearn.linear_model import LogisticRegression
     except ModuleNotFoundError as error:
         raise ImportError("expected scikit-learn for LearnedLinkage.fit; install the extra `learn`") from error
     evidence, answers = [], []
     for graph, table in zip(graphs, tables, strict=True):
-        sides = table.majority()[graph.edges]
+        sides = table.majority(_PURE)[graph.edges]
         known = (sides >= 0).all(axis=1)
         columns = edge_evidence(graph)
         evidence.append(np.stack(list(columns.values()), axis=1)[known])

@@ -16,6 +16,7 @@ from sklearn.linear_model import LogisticRegression
 import pcgraph
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.tree.edge_model import EdgeModel, edge_evidence
+from pcgraph.tree.leaf_truth import leaf_truth
 from pcgraph.tree.learned import LearnedLinkage
 
 MODEL = EdgeModel(("concavity", "step_voxels"), (0.2, 1.0), (0.5, 2.0), (1.5, 0.25), -0.5, 0.4)
@@ -109,6 +110,19 @@ def test_other_files_are_refused(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(ValueError, match="expected"):
         EdgeModel.load(path)
+
+
+def test_truth_of_leaves_by_hand():
+    supervoxels = np.array([0, 0, 0, 0, 0, 1, 1, 2, -1, 3], np.int32)
+    truth = np.array([5, 5, 5, 5, 9, 9, 5, 9, 9, -1])
+    table = leaf_truth(supervoxels, truth, 4)
+    assert table.majority(0.8).tolist() == [0, -1, 1, -1]
+    assert table.majority(0.5)[[0, 2, 3]].tolist() == [0, 1, -1]
+    for segments in ([0, 1, 2, 3], [0, 0, 1, 1], [0, 1, 1, 0], [0, 0, 0, 0]):
+        cut = np.array(segments, np.int32)
+        known = truth >= 0
+        labels = np.append(cut, -1)[supervoxels]
+        assert table.overlap(cut) == pytest.approx(pcgraph.metrics.weighted_overlap(labels[known], truth[known]))
 
 
 def test_evidence_that_this_version_does_not_know_is_refused():
