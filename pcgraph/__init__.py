@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
     from pcgraph.graph.boundary import BoundaryCost
     from pcgraph.io import read_cloud, write_segmentation
-    from pcgraph.segmentation import Segmentation, segment
+    from pcgraph.pipeline import segment, update
+    from pcgraph.segmentation import Segmentation
     from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth, Vccs
     from pcgraph.tree.linkage import ConvexityLinkage, Linkage
     from pcgraph.tree.tree import SegmentationTree
@@ -43,6 +44,7 @@ __all__ = [
     "metrics",
     "read_cloud",
     "segment",
+    "update",
     "write_segmentation",
 ]
 
@@ -64,7 +66,8 @@ _HOMES = {
     "SurfaceGrowth": "supervoxels.method",
     "Vccs": "supervoxels.method",
     "read_cloud": "io",
-    "segment": "segmentation",
+    "segment": "pipeline",
+    "update": "pipeline",
     "write_segmentation": "io",
 }
 

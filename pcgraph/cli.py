@@ -95,7 +95,7 @@ def _segmentation(
     viewpoint: tuple[float, ...] | None,
 ) -> tuple[Cloud, Segmentation]:
     from pcgraph.io import read_cloud
-    from pcgraph.segmentation import segment as segment_points
+    from pcgraph.pipeline import segment as segment_points
 
     cloud = read_cloud(path)
     stored = cloud.viewpoint

@@ -66,19 +66,28 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     return CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept)
 
 
-def clean_viewpoint(viewpoint: ArrayLike | None, points: NDArray[np.float64], organised: bool) -> NDArray[np.float64]:
-    """The viewpoint, (3,) float64, metres: as given, or by the rule that `pcgraph.segment` documents."""
+def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64]:
+    """The viewpoint, (3,) or (n, 3) float64, metres: as given, or by the rule that `pcgraph.segment` documents."""
     if viewpoint is not None:
-        position = _numbers("viewpoint", viewpoint).astype(np.float64)
-        if position.shape != (3,) or not np.isfinite(position).all():
-            raise ValueError(f"expected a viewpoint of three finite coordinates in metres, got {viewpoint!r}")
+        given = _numbers("viewpoint", viewpoint).astype(np.float64)
+        per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
+        position = given.reshape(-1, 3).take(cloud.kept, axis=0) if per_point else given
+        if position.shape not in ((3,), cloud.points.shape) or not np.isfinite(position).all():
+            raise ValueError(
+                f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
+                f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
+            )
         return position
-    low, high = bounding_box(points)
-    if organised or (low > 0.0).any() or (high < 0.0).any():
+    low, high = bounding_box(cloud.points)
+    if len(cloud.shape) == 2 or (low > 0.0).any() or (high < 0.0).any():
         return np.zeros(3)
     above = (low + high) / 2.0
     above[2] += 10.0 * float(np.linalg.norm(high - low)) + 1e-3
     return above
+
+
+def _excerpt(values: NDArray[np.float64]) -> str:
+    return f"of {values.tolist()}" if values.size <= 4 else "with NaN or infinite values"
 
 
 def positive(name: str, value: float) -> float:
@@ -94,6 +103,14 @@ def non_negative(name: str, value: float) -> float:
     number = _number(value)
     if not 0.0 <= number < float("inf"):
         raise ValueError(f"expected {name} to be a finite number, not negative, got {value!r}")
+    return number
+
+
+def fraction(name: str, value: float) -> float:
+    """The value as float, if it is in 0..1 without 1; ValueError otherwise."""
+    number = _number(value)
+    if not 0.0 <= number < 1.0:
+        raise ValueError(f"expected {name} of at least 0 and below 1, got {value!r}")
     return number
 
 

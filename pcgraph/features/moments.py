@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.features.pooling import pool_moments
+from pcgraph.features.pooling import pool_means, pool_moments
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Moments:
         Mean colour.
     color_scatters : (k, 3, 3) float64, or None
         Sum over the points of (c - mean colour)(c - mean colour)^T.
+    normals : (k, 3) float64, or None
+        Mean of the unit normals of the surface, on its outer side; short where they point in many directions.
     """
 
     counts: NDArray[np.int64]
@@ -37,10 +40,20 @@ class Moments:
     scatters: NDArray[np.float64]
     colors: NDArray[np.float64] | None
     color_scatters: NDArray[np.float64] | None = None
+    normals: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         """Number of groups."""
         return len(self.counts)
+
+    def __getitem__(self, groups: slice | NDArray[np.int64]) -> Moments:
+        """Moments of some of the groups."""
+        return replace(self, **{name: values[groups] for name, values in self.columns().items()})
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The arrays that are there, by name."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: values for name, values in columns.items() if values is not None}
 
     @property
     def covariances(self) -> NDArray[np.float64]:
@@ -86,15 +99,35 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     """
     counts = _with_room(leaves.counts, len(parents))
     centroids, scatters = _with_room(leaves.centroids, len(parents)), _with_room(leaves.scatters, len(parents))
-    if leaves.colors is None:
-        pool_moments(parents, counts, centroids, scatters)
-        return Moments(counts, centroids, scatters, None)
-    again, colors = _with_room(leaves.counts, len(parents)), _with_room(leaves.colors, len(parents))
-    spread = np.zeros((len(leaves), 3, 3)) if leaves.color_scatters is None else leaves.color_scatters
-    color_scatters = _with_room(spread, len(parents))
     pool_moments(parents, counts, centroids, scatters)
-    pool_moments(parents, again, colors, color_scatters)
-    return Moments(counts, centroids, scatters, colors, None if leaves.color_scatters is None else color_scatters)
+    colors = color_scatters = normals = None
+    if leaves.colors is not None:
+        again, colors = _with_room(leaves.counts, len(parents)), _with_room(leaves.colors, len(parents))
+        spread = np.zeros((len(leaves), 3, 3)) if leaves.color_scatters is None else leaves.color_scatters
+        pooled = _with_room(spread, len(parents))
+        pool_moments(parents, again, colors, pooled)
+        color_scatters = None if leaves.color_scatters is None else pooled
+    if leaves.normals is not None:
+        normals = _with_room(leaves.normals, len(parents))
+        pool_means(parents, counts, len(leaves), normals)
+    return Moments(counts, centroids, scatters, colors, color_scatters, normals)
+
+
+def joined_moments(first: Moments, second: Moments, groups: NDArray[np.integer], n_groups: int) -> Moments:
+    """Moments of `n_groups` groups: those of the first, in their order, and of the second, in these groups.
+
+    Parameters
+    ----------
+    first : Moments of k groups, k <= n_groups
+    second : Moments of q groups
+        With colours and normals as the first has them.
+    groups : (q,) int
+        Distinct; numbers from k on are new groups. All n_groups occur in one of the two.
+    """
+    columns = {name: np.concatenate((values, getattr(second, name))) for name, values in first.columns().items()}
+    both = replace(first, **columns)
+    above = len(both) + np.concatenate((np.arange(len(first)), groups, np.arange(n_groups)))
+    return moments_up_tree(both, above.astype(np.int32))[len(both) :]
 
 
 def _with_room(values: NDArray, k: int) -> NDArray:  # type: ignore[type-arg]

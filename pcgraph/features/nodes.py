@@ -25,8 +25,8 @@ class NodeFeatures:
         Number of points.
     centroid : (k, 3) float64, metres, the points' frame
     normal : (k, 3) float64
-        Unit normal of the least-squares plane, on the viewpoint's side; of points on a line, the direction
-        across it that faces the viewpoint most.
+        Unit normal of the least-squares plane, on the outer side of the surface, that is the side of the mean of
+        its voxels' normals; of points on a line, the direction across it that is nearest to that mean.
     covariance : (k, 3, 3) float64, square metres
     linearity, planarity, scattering : (k,) float64, 0..1
         (s1 - s2) / s1, (s2 - s3) / s1 and s3 / s1 for standard deviations s1 >= s2 >= s3; their sum is 1, and
@@ -78,16 +78,17 @@ class NodeFeatures:
         return np.maximum(1.0 - np.abs(self.normal @ (direction / np.linalg.norm(direction))), 0.0)
 
 
-def node_features(moments: Moments, viewpoint: NDArray[np.float64]) -> NodeFeatures:
+def node_features(moments: Moments) -> NodeFeatures:
     """Features of every group of points.
 
     Parameters
     ----------
     moments : Moments of k groups
-    viewpoint : (3,) float64, metres, the points' frame
+        Without normals the signs of the planes' normals are arbitrary.
     """
     covariance = moments.covariances
-    low, middle, high, normals = _principal(covariance, viewpoint - moments.centroids)
+    towards = np.zeros_like(moments.centroids) if moments.normals is None else moments.normals
+    low, middle, high, normals = _principal(covariance, towards)
     scale = np.where(high > 0.0, high, 1.0)
     k = len(moments)
     colors, spreads = moments.colors, moments.color_covariances

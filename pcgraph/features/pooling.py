@@ -46,3 +46,29 @@ def pool_moments(
             else:
                 means[up, i] += share * (means[node, i] - means[up, i])
         counts[up] = total
+
+
+@njit(cache=True, nogil=True)
+def pool_means(
+    parents: NDArray[np.int32], counts: NDArray[np.int64], n_leaves: int, means: NDArray[np.float64]
+) -> None:
+    """Nothing; the rows of inner nodes, zero at first, become the means over all their points.
+
+    Parameters
+    ----------
+    parents : (k,) int32
+        Larger than the node's own number.
+    counts : (k,) int64
+        Points of every node.
+    n_leaves : int
+        The first rows, which are given.
+    means : (k, c) float64
+        Overwritten.
+    """
+    for node in range(len(parents)):
+        up = parents[node]
+        for column in range(means.shape[1]):
+            if node >= n_leaves:
+                means[node, column] /= counts[node]
+            if up != node:
+                means[up, column] += counts[node] * means[node, column]

@@ -12,7 +12,7 @@ from pcgraph.voxels.grid import VoxelGrid
 
 
 def connect(
-    grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, owner: NDArray[np.int32]
+    grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, owner: NDArray[np.int32], n_known: int
 ) -> NDArray[np.int32]:
     """Owners such that each one's voxels are connected, (v,) int32, renumbered in the order of their first voxel.
 
@@ -27,19 +27,23 @@ def connect(
     metric : Metric
     owner : (v,) int32, >= 0
         Supervoxels, perhaps in pieces.
+    n_known : int
+        The first so many are in one piece and keep their numbers.
     """
     n_supervoxels = int(owner.max()) + 1
     lists = grid.indptr, grid.neighbours
     kept = np.where(_largest_pieces(*lists, owner, n_supervoxels), owner, np.int32(-1))
     _adopt(features, metric, *lists, kept, n_supervoxels)
-    return _renumber(kept, n_supervoxels)
+    return _renumber(kept, n_supervoxels, n_known)
 
 
 @njit(cache=True, nogil=True)
-def _renumber(owner: NDArray[np.int32], n_supervoxels: int) -> NDArray[np.int32]:
+def _renumber(owner: NDArray[np.int32], n_supervoxels: int, n_known: int) -> NDArray[np.int32]:
     """Owners numbered without gaps in the order of their first voxel."""
     names, numbered = np.full(n_supervoxels, -1, np.int32), np.empty_like(owner)
-    used = 0
+    for s in range(n_known):
+        names[s] = s
+    used = n_known
     for i in range(len(owner)):
         if names[owner[i]] < 0:
             names[owner[i]] = used

@@ -15,7 +15,12 @@ _SWEEPS = 3
 
 
 def grow(
-    grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, seeds: NDArray[np.int32], seed_size: float
+    grid: VoxelGrid,
+    features: NDArray[np.float64],
+    metric: Metric,
+    seeds: NDArray[np.int32],
+    seed_size: float,
+    known: NDArray[np.int32],
 ) -> NDArray[np.int32]:
     """Supervoxel of each voxel, (v,) int32: what each seed reached first or, early on, is nearer to.
 
@@ -28,17 +33,29 @@ def grow(
         From `voxel_features`.
     metric : Metric
     seeds : (k,) int32
-        Distinct voxels.
+        Distinct voxels; those that are known are no seeds.
     seed_size : float, metres
         During the first 1.8 seed_size / voxel size sweeps, as in PCL, a voxel may go over to a nearer supervoxel.
+    known : (v,) int32
+        Supervoxels that exist already and keep their voxels, but may grow; -1 elsewhere.
     """
     greedy_sweeps = max(1, int(1.8 * seed_size / grid.size) - 1)
-    owner = _grow(features, metric, grid.indptr, grid.neighbours, seeds, greedy_sweeps)
-    _own_the_rest(grid.indptr, grid.neighbours, owner, len(seeds))
+    seeds = seeds[known[seeds] < 0]
+    owner, n_known = known.copy(), int(known.max()) + 1
+    owner[seeds] = np.arange(n_known, n_known + len(seeds), dtype=np.int32)
+    n_owners = n_known + len(seeds)
+    _grow(features, metric, grid.indptr, grid.neighbours, known >= 0, owner, n_owners, greedy_sweeps)
+    _own_the_rest(grid.indptr, grid.neighbours, owner, n_owners)
     return owner
 
 
-def settle_boundaries(grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, owner: NDArray[np.int32]) -> None:
+def settle_boundaries(
+    grid: VoxelGrid,
+    features: NDArray[np.float64],
+    metric: Metric,
+    owner: NDArray[np.int32],
+    fixed: NDArray[np.bool_],
+) -> None:
     """Nothing; voxels on a boundary have gone over to the nearest supervoxel that touches them, a few times.
 
     First all voxels on a boundary are looked at, later those next to one that moved. All voxels of a sweep choose
@@ -52,11 +69,14 @@ def settle_boundaries(grid: VoxelGrid, features: NDArray[np.float64], metric: Me
     metric : Metric
     owner : (v,) int32, >= 0
         Supervoxel of each voxel; overwritten. Pieces may come off.
+    fixed : (v,) bool
+        Voxels that stay.
     """
     n = int(owner.max()) + 1
     sums, means = np.empty((n, 10)), np.empty((n, 9))
-    queued = np.zeros(len(owner), np.bool_)
+    queued = fixed.copy()
     active = _boundary(grid.indptr, grid.neighbours, owner)
+    active = active[~fixed[active]]
     for _ in range(_SWEEPS):
         update_means(features, owner, sums, means)
         chosen = np.empty_like(active)
@@ -73,19 +93,22 @@ def _grow(
     metric: Metric,
     indptr: NDArray[np.int64],
     neighbours: NDArray[np.int32],
-    seeds: NDArray[np.int32],
+    fixed: NDArray[np.bool_],
+    owner: NDArray[np.int32],
+    n_owners: int,
     greedy_sweeps: int,
-) -> NDArray[np.int32]:
-    """Owners after growth from the seeds, -1 where none came; early sweeps may also take from a worse owner."""
+) -> None:
+    """Nothing; owners have spread as far as there are voxels. Early sweeps may also take from a worse owner."""
     n = len(features)
-    owner, claim = np.full(n, -1, np.int32), np.full(n, -1, np.int32)
-    best = np.full(n, np.inf)
-    sums, means = np.zeros((len(seeds), 10)), np.zeros((len(seeds), 9))
+    claim, best = np.full(n, -1, np.int32), np.full(n, np.inf)
+    sums, means = np.zeros((n_owners, 10)), np.zeros((n_owners, 9))
     frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
-    for s in range(len(seeds)):
-        frontier[s], owner[seeds[s]] = seeds[s], s
-        best[seeds[s]] = 0.0
-    n_frontier, sweep = len(seeds), 0
+    n_frontier, sweep = 0, 0
+    for i in range(n):
+        if owner[i] >= 0:
+            best[i] = -1.0 if fixed[i] else 0.0  # no distance is below -1
+            frontier[n_frontier] = i
+            n_frontier += 1
     while n_frontier > 0:
         update_means(features, owner, sums, means)
         n_touched = 0
@@ -107,7 +130,6 @@ def _grow(
             owner[j], claim[j] = claim[j], -1
         frontier, touched = touched, frontier
         n_frontier, sweep = n_touched, sweep + 1
-    return owner
 
 
 @njit(cache=True, nogil=True)
@@ -185,7 +207,10 @@ def _move(
     owner: NDArray[np.int32],
     queued: NDArray[np.bool_],
 ) -> NDArray[np.int32]:
-    """The voxels to look at next: those that moved and those that touch them. Owners become what was chosen."""
+    """The voxels to look at next: those that moved and those that touch them, but no fixed ones (queued).
+
+    Owners become what was chosen.
+    """
     following = np.empty(len(owner), np.int32)
     used = 0
     for q in range(len(active)):

@@ -43,8 +43,12 @@ class SupervoxelMethod(ABC):
         """The plane on which each voxel lies, seen from (3,) or (v, 3) float64, metres."""
 
     @abstractmethod
-    def supervoxels(self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float) -> NDArray[np.int32]:
-        """Supervoxel of each voxel, (v,) int32, numbered without gaps in the order of their first voxel.
+    def supervoxels(
+        self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, known: NDArray[np.int32]
+    ) -> NDArray[np.int32]:
+        """Supervoxel of each voxel, (v,) int32, numbered from 0 without gaps.
+
+        Those known keep their numbers and voxels; others follow in the order of their first voxel.
 
         Every voxel has one, and every supervoxel is connected in the 26-neighbourhood.
 
@@ -55,6 +59,8 @@ class SupervoxelMethod(ABC):
             Unit normals.
         seed_size : float, metres
             Spacing of supervoxels, their R_seed.
+        known : (v,) int32
+            Supervoxels from an earlier scan, numbered from 0 without gaps; -1 elsewhere.
         """
 
     @abstractmethod
@@ -82,13 +88,15 @@ class SurfaceGrowth(SupervoxelMethod):
         """Planes of windows that do not reach over an edge."""
         return local_planes(grid, viewpoints, reach=3)
 
-    def supervoxels(self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float) -> NDArray[np.int32]:
+    def supervoxels(
+        self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, known: NDArray[np.int32]
+    ) -> NDArray[np.int32]:
         """Supervoxels by growth and k-means sweeps along their boundaries."""
         metric = Metric(self.spatial_weight / seed_size, self.normal_weight, self.color_weight, two_sided=False)
         features = voxel_features(grid, normals)
-        owner = grow(grid, features, metric, seed_voxels(grid, seed_size), seed_size)
-        settle_boundaries(grid, features, metric, owner)
-        return connect(grid, features, metric, owner)
+        owner = grow(grid, features, metric, seed_voxels(grid, seed_size), seed_size, known)
+        settle_boundaries(grid, features, metric, owner, known >= 0)
+        return connect(grid, features, metric, owner, int(known.max()) + 1)
 
     def supervoxel_of_point(
         self, points: NDArray[np.float64], grid: VoxelGrid, planes: LocalPlanes, supervoxels: NDArray[np.int32]
@@ -113,12 +121,14 @@ class Vccs(SupervoxelMethod):
         """Planes of the windows around the voxels, two rings wide."""
         return local_planes(grid, viewpoints, reach=0)
 
-    def supervoxels(self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float) -> NDArray[np.int32]:
+    def supervoxels(
+        self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, known: NDArray[np.int32]
+    ) -> NDArray[np.int32]:
         """Supervoxels by growth from seeds."""
         metric = Metric(self.spatial_weight / seed_size, self.normal_weight, self.color_weight, two_sided=True)
         features = voxel_features(grid, normals)
-        owner = grow(grid, features, metric, seed_voxels(grid, seed_size), seed_size)
-        return connect(grid, features, metric, owner)
+        owner = grow(grid, features, metric, seed_voxels(grid, seed_size), seed_size, known)
+        return connect(grid, features, metric, owner, int(known.max()) + 1)
 
     def supervoxel_of_point(
         self, points: NDArray[np.float64], grid: VoxelGrid, planes: LocalPlanes, supervoxels: NDArray[np.int32]

@@ -14,7 +14,7 @@ from pcgraph.tree.tree import SegmentationTree
 _GAP_CANDIDATES = 8
 
 
-def segmentation_tree(merges: Merges, leaves: Moments, viewpoint: NDArray[np.float64]) -> SegmentationTree:
+def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
     """Tree over k leaves: a linkage's merges, then those across the gaps.
 
     Parameters
@@ -22,7 +22,6 @@ def segmentation_tree(merges: Merges, leaves: Moments, viewpoint: NDArray[np.flo
     merges : Merges of k leaves
         Along the edges of their graph.
     leaves : Moments of k leaves
-    viewpoint : (3,) float64, metres
 
     Notes
     -----
@@ -37,7 +36,7 @@ def segmentation_tree(merges: Merges, leaves: Moments, viewpoint: NDArray[np.flo
     gaps = _join_parts(parts, leaves, n_leaves + n_merges)
     parents[gaps] = np.arange(n_leaves + n_merges, 2 * n_leaves - 1, dtype=np.int32)[:, None]
     levels = np.concatenate((np.zeros(n_leaves), merges.altitudes, np.full(len(gaps), np.inf)))
-    return SegmentationTree(parents, levels, moments_up_tree(leaves, parents), viewpoint)
+    return SegmentationTree(parents, levels, moments_up_tree(leaves, parents))
 
 
 def _roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -126,6 +126,4 @@ def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeMod
 
 
 def _tree(linkage: Linkage, result: Segmentation) -> SegmentationTree:
-    moments, n = result.tree.moments, result.graph.n_nodes
-    leaves = Moments(moments.counts[:n], moments.centroids[:n], moments.scatters[:n], None)
-    return segmentation_tree(linkage.merges(result.graph, leaves), leaves, result.viewpoint)
+    return segmentation_tree(linkage.merges(result.graph, result.leaves), result.leaves)

@@ -37,14 +37,11 @@ class SegmentationTree:
         parts that do not touch were joined.
     moments : Moments
         k rows: additive moments of the points below each node.
-    viewpoint : (3,) float64, metres, the points' frame
-        Side to which nodes' normals point.
     """
 
     parents: NDArray[np.int32]
     altitudes: NDArray[np.float64]
     moments: Moments
-    viewpoint: NDArray[np.float64]
 
     @property
     def n_leaves(self) -> int:
@@ -208,7 +205,7 @@ class SegmentationTree:
         order = np.concatenate((np.arange(self.n_leaves), inner))
         rank = np.empty(len(order), np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
-        return SegmentationTree(rank[self.parents[order]], levels[order], _rows(self.moments, order), self.viewpoint)
+        return SegmentationTree(rank[self.parents[order]], levels[order], self.moments[order])
 
     def edge_saliency(self, pairs: NDArray[np.int32]) -> NDArray[np.float64]:
         """Altitude at which the two leaves of each pair become one segment, (m,) float64, the linkage's unit.
@@ -235,7 +232,7 @@ class SegmentationTree:
 
     def features(self) -> NodeFeatures:
         """Features of all k nodes, from their moments."""
-        return node_features(self.moments, self.viewpoint)
+        return node_features(self.moments)
 
     def to_networkx(self) -> networkx.DiGraph:
         """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features."""

@@ -29,6 +29,10 @@ class VoxelGrid:
     ----------
     size : float, metres
         Edge length of a voxel in the warped space. The grid is aligned with the origin of that space.
+    warp : Warp
+        To that space.
+    cells : (v, 3) float64
+        Grid coordinates, whole numbers.
     voxel_of_point : (n,) int32
         Voxel of each point.
     counts : (v,) int64
@@ -48,6 +52,8 @@ class VoxelGrid:
     """
 
     size: float
+    warp: Warp
+    cells: NDArray[np.float64]
     voxel_of_point: NDArray[np.int32]
     counts: NDArray[np.int64]
     warped: NDArray[np.float64]
@@ -96,7 +102,8 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
     indptr, neighbours = touching(ordered[starts[:-1]], *pitch)
     lengths = size * warp.scale(centroids)
     counts = np.diff(starts)
-    return VoxelGrid(size, voxel_of_point, counts, warped, centroids, lengths, colors, indptr, neighbours)
+    cells = np.floor(scaled[order[starts[:-1]]])
+    return VoxelGrid(size, warp, cells, voxel_of_point, counts, warped, centroids, lengths, colors, indptr, neighbours)
 
 
 def voxel_means(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
@@ -126,7 +133,7 @@ def _gather(
 ) -> None:
     """Each point learns its voxel, each voxel the mean of its points in units of a voxel."""
     for v in range(start, stop):
-        x = y = z = 0
+        x = y = z = np.int64(0)
         first = order[starts[v]]
         cell_x, cell_y, cell_z = np.floor(scaled[first, 0]), np.floor(scaled[first, 1]), np.floor(scaled[first, 2])
         for at in range(starts[v], starts[v + 1]):
@@ -153,7 +160,7 @@ def _average(
     for v in range(start, stop):
         n = starts[v + 1] - starts[v]
         for c in range(values.shape[1]):
-            total = 0
+            total = np.int64(0)
             for at in range(starts[v], starts[v + 1]):
                 total += np.int64(np.rint(values[order[at], c] * steps))
             means[v, c] = total / (n * steps)

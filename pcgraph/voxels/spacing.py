@@ -4,10 +4,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-_SAMPLE = 4096
+from pcgraph.parallel import in_blocks
+from pcgraph.voxels.bounds import bounding_box
+
+_SAMPLE = 4096  # points whose nearest neighbour is sought
+_CROWD = 1 << 16  # points among which it is sought, about
+_BLOCKS = 16  # of space, along each axis
 _NO_SPACING_M = 0.01
 
 
@@ -26,11 +32,15 @@ def median_spacing(points: NDArray[np.float64]) -> float:
 
     Notes
     -----
-    Source: Lin et al. 2018 start from the same median, their lambda_0.
+    Source: Lin et al. 2018 start from the same median, their lambda_0. Of large clouds only some blocks of space
+    are looked at, all points of each.
     """
-    distances = _nearest(points)
+    crowd = points
+    while len(crowd) > 2 * _CROWD and len(smaller := _some_blocks(crowd)) < len(crowd):
+        crowd = smaller
+    distances = _nearest(crowd)
     if not distances.all():
-        distances = _nearest(np.unique(points, axis=0))
+        distances = _nearest(np.unique(crowd, axis=0))
     distances = distances[(distances > 0.0) & np.isfinite(distances)]
     return float(np.median(distances)) if len(distances) else _NO_SPACING_M
 
@@ -40,7 +50,40 @@ def _nearest(points: NDArray[np.float64]) -> NDArray[np.float64]:
     if len(points) > _SAMPLE:  # the smallest hashes: as good as random, yet a property of the points
         bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
         hashes = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)) >> 17
-        mixed = (hashes[:, 0] ^ hashes[:, 1] ^ hashes[:, 2]) * np.uint64(0xD6E8FEB86659FD93)
-        sample = points[np.argpartition(mixed, _SAMPLE)[:_SAMPLE]]
+        sample = points[np.argpartition(_mixed(hashes[:, 0] ^ hashes[:, 1] ^ hashes[:, 2]), _SAMPLE)[:_SAMPLE]]
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     return tree.query(sample, k=2)[0][:, 1]
+
+
+def _some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The points of as many blocks of space as it takes for a crowd, the blocks by their hashes."""
+    low, high = bounding_box(points)
+    edge = float((high - low).max()) / _BLOCKS
+    if not edge > 0.0:
+        return points
+    block = np.empty(len(points), np.int32)
+    in_blocks(_find_block, len(points), points, low, edge, block)
+    counts = np.bincount(block, minlength=_BLOCKS**3)
+    order = np.argsort(_mixed(np.arange(_BLOCKS**3).astype(np.uint64)), kind="stable")
+    taken = np.zeros(_BLOCKS**3, bool)
+    taken[order] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
+    return points[np.flatnonzero(taken[block])]
+
+
+@njit(cache=True, nogil=True)
+def _find_block(
+    start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], edge: float, block: NDArray[np.int32]
+) -> None:
+    """Number of the block of space in which each point lies."""
+    last = _BLOCKS - 1
+    for p in range(start, stop):
+        x = min(int((points[p, 0] - low[0]) / edge), last)
+        y = min(int((points[p, 1] - low[1]) / edge), last)
+        z = min(int((points[p, 2] - low[2]) / edge), last)
+        block[p] = (x * _BLOCKS + y) * _BLOCKS + z
+
+
+def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Whole numbers without a pattern, by one step of a multiplicative hash."""
+    spread = values * np.uint64(0xD6E8FEB86659FD93)
+    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)

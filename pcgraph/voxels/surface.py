@@ -28,3 +28,10 @@ class Surface:
     grid: VoxelGrid
     normals: NDArray[np.float64]
     supervoxels: NDArray[np.int32]
+
+    def mean_normals(self, n_supervoxels: int) -> NDArray[np.float64]:
+        """Mean normal of each supervoxel's voxels, weighted by their points, (n_supervoxels, 3) float64."""
+        weights = self.grid.counts.astype(np.float64)
+        total = np.bincount(self.supervoxels, weights, n_supervoxels)
+        sums = [np.bincount(self.supervoxels, weights * self.normals[:, axis], n_supervoxels) for axis in range(3)]
+        return np.stack(sums, axis=1) / total[:, None]

@@ -16,6 +16,9 @@ from pcgraph.parallel import in_blocks
 class Warp:
     """The identity: voxels of one size everywhere."""
 
+    def check(self, points: NDArray[np.float64]) -> None:
+        """ValueError if a point has no place in the warped space."""
+
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64, metres, of points (n, 3) in metres."""
         return points
@@ -50,6 +53,14 @@ class CameraWarp(Warp):
     viewpoint: NDArray[np.float64]
     reference_depth: float
 
+    def check(self, points: NDArray[np.float64]) -> None:
+        """ValueError if a point does not lie in front of the camera."""
+        if points[:, 2].min() <= self.viewpoint[2]:
+            raise ValueError(
+                f"camera=True expects all points in front of the viewpoint (z > {self.viewpoint[2]:g} m), "
+                f"got z down to {points[:, 2].min():g} m; pass camera=False"
+            )
+
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64; points must lie in front of the viewpoint."""
         warped = np.empty((len(points), 3))
@@ -65,6 +76,47 @@ class CameraWarp(Warp):
     def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth over reference depth, (n,) float64."""
         return (points[:, 2] - self.viewpoint[2]) / self.reference_depth
+
+
+@dataclass(frozen=True)
+class RangeWarp(Warp):
+    """Voxels that grow with a power of the range, in all directions around a scanner.
+
+    A point at range r goes, along its ray, to r0 (r / r0)^(1 - growth). So voxels are as wide as their size times
+    (r / r0)^growth across the ray, and wider by 1 / (1 - growth) along it. There is no seam and no pole.
+
+    Attributes
+    ----------
+    viewpoint : (3,) float64, metres
+        Where the scanner stood.
+    reference_range : float, metres
+        Range at which the warp keeps lengths across the ray.
+    growth : float, 0..1, without 1
+    """
+
+    viewpoint: NDArray[np.float64]
+    reference_range: float
+    growth: float
+
+    def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Warped positions, (n, 3) float64, about the viewpoint."""
+        local = points - self.viewpoint
+        local *= (_lengths(local) / self.reference_range)[:, None] ** -self.growth
+        return local
+
+    def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points, (n, 3) float64, metres, of warped positions."""
+        stretch = (_lengths(warped) / self.reference_range) ** (self.growth / (1.0 - self.growth))
+        return warped * stretch[:, None] + self.viewpoint
+
+    def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(r / r0)^growth, (n,) float64."""
+        return (_lengths(points - self.viewpoint) / self.reference_range) ** self.growth
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths of rows, (n,) float64; the least positive number for a row of zeros."""
+    return np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), np.finfo(np.float64).tiny)
 
 
 @njit(cache=True, nogil=True)
@@ -85,8 +137,10 @@ def _see(
         warped[p, 2] = -np.log(scale) * reference_depth
 
 
-def choose_warp(points: NDArray[np.float64], viewpoint: NDArray[np.float64], camera: bool) -> Warp:
-    """Camera warp about the median depth, or the identity.
+def choose_warp(
+    points: NDArray[np.float64], viewpoint: NDArray[np.float64], camera: bool, range_growth: float = 0.0
+) -> Warp:
+    """Camera warp about the median depth, range warp about the median range, or the identity.
 
     Parameters
     ----------
@@ -95,18 +149,21 @@ def choose_warp(points: NDArray[np.float64], viewpoint: NDArray[np.float64], cam
     viewpoint : (3,) float64, metres
     camera : bool
         Whether a camera at the viewpoint that looks along +z took the points.
+    range_growth : float, 0..1, without 1
+        Power of the range with which voxels grow; 0 for voxels of one size.
 
     Raises
     ------
     ValueError
-        `camera` is true and a point does not lie in front of it.
+        `camera` is true and a point does not lie in front of it, or voxels grow with range as well.
     """
+    if camera and range_growth:
+        raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
+    if range_growth:
+        distance = float(np.median(_lengths(points - viewpoint)))
+        return RangeWarp(viewpoint, distance, range_growth) if distance > 1e-300 else Warp()
     if not camera:
         return Warp()
-    depth = points[:, 2] - viewpoint[2]
-    if depth.min() <= 0.0:
-        raise ValueError(
-            f"camera=True expects all points in front of the viewpoint (z > {viewpoint[2]:g} m), "
-            f"got z down to {points[:, 2].min():g} m; pass camera=False"
-        )
-    return CameraWarp(viewpoint, float(np.median(depth)))
+    warp = CameraWarp(viewpoint, float(np.median(points[:, 2])) - float(viewpoint[2]))
+    warp.check(points)
+    return warp

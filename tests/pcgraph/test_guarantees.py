@@ -15,7 +15,6 @@ from scipy.sparse.csgraph import connected_components
 
 import pcgraph
 from pcgraph.voxels.grid import voxel_grid
-from pcgraph.voxels.warp import choose_warp
 
 
 def assert_covered_and_connected(points, result):
@@ -27,8 +26,7 @@ def assert_covered_and_connected(points, result):
         assert labels.shape == np.shape(points)[:-1]
         assert np.array_equal(labels.reshape(-1) >= 0, finite)
         assert np.array_equal(np.unique(labels[labels >= 0]), np.arange(labels.max() + 1))
-    warp = choose_warp(flat[finite], result.viewpoint, result.camera)
-    grid = voxel_grid(flat[finite], None, result.voxel_size, warp)
+    grid = voxel_grid(flat[finite], None, result.voxel_size, result.surface.grid.warp)
     leaf = result.supervoxels.reshape(-1)[finite]
     # Of a voxel on a boundary the points may belong to several supervoxels: each of its shares is a piece.
     shares = np.unique(np.stack((grid.voxel_of_point, leaf), axis=1), axis=0)

@@ -19,7 +19,7 @@ def hand_drawn() -> SegmentationTree:
     parents = np.array([3, 3, 4, 4, 4], np.int32)
     counts = np.array([1, 2, 3, 3, 6])
     moments = Moments(counts, np.zeros((5, 3)), np.zeros((5, 3, 3)), None)
-    return SegmentationTree(parents, np.array([0, 0, 0, 0.2, 0.5]), moments, np.zeros(3))
+    return SegmentationTree(parents, np.array([0, 0, 0, 0.2, 0.5]), moments)
 
 
 def leaves_below(tree: SegmentationTree) -> list[list[int]]:

@@ -34,6 +34,7 @@ def test_public_names():
         "metrics",
         "read_cloud",
         "segment",
+        "update",
         "write_segmentation",
     ]
     for name in pcgraph.__all__:

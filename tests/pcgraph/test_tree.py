@@ -16,8 +16,6 @@ from pcgraph.tree.average import average_linkage
 from pcgraph.tree.growth import segmentation_tree
 from pcgraph.tree.linkage import Merges
 
-ORIGIN = np.zeros(3)
-
 
 def leaves_on_a_line(n, **moved):
     """One point per leaf at x = 0, 1, ..., n - 1, or where `moved` says."""
@@ -38,7 +36,7 @@ def test_hand_drawn_graph_of_five_nodes():
     pairs, altitudes = average_linkage(5, edges, costs, weights)
     assert pairs.tolist() == [[0, 1], [3, 4], [2, 5], [6, 7]]
     assert altitudes.tolist() == [1.0, 2.0, 4.0, 7.0]
-    tree = segmentation_tree(Merges(pairs, altitudes), leaves_on_a_line(5), ORIGIN)
+    tree = segmentation_tree(Merges(pairs, altitudes), leaves_on_a_line(5))
     assert tree.parents.tolist() == [5, 5, 7, 6, 6, 7, 8, 8, 8]
     assert tree.altitudes.tolist() == [0, 0, 0, 0, 0, 1, 2, 4, 7]
     assert tree.cut(n=2).tolist() == [0, 0, 0, 1, 1]
@@ -82,7 +80,7 @@ def test_average_linkage_agrees_with_brute_force():
 def test_parts_that_do_not_touch_join_last_smallest_first_each_to_the_nearest_larger_one():
     edges = np.array([[0, 1], [1, 2], [5, 6]], np.int32)  # parts {0, 1, 2}, {3}, {4}, {5, 6}
     merges = Merges(*average_linkage(7, edges, np.array([0.1, 0.2, 5.0]), np.ones(3)))
-    tree = segmentation_tree(merges, leaves_on_a_line(7, x4=4.4), ORIGIN)
+    tree = segmentation_tree(merges, leaves_on_a_line(7, x4=4.4))
     assert np.isinf(tree.altitudes[-3:]).all()
     assert np.isfinite(tree.altitudes[:-3]).all()
     assert tree.cut(altitude=1e9).tolist() == [0, 0, 0, 1, 2, 3, 3]
@@ -113,7 +111,7 @@ def test_moments_are_exact_at_every_node(boxes):
     from pcgraph.features.moments import moments_up_tree
 
     pooled = moments_up_tree(leaves, tree.parents)
-    features = node_features(pooled, result.viewpoint)
+    features = node_features(pooled)
     below = np.zeros((len(tree.parents), tree.n_leaves), bool)
     below[: tree.n_leaves] = np.eye(tree.n_leaves, dtype=bool)
     for node, up in enumerate(tree.parents[:-1]):

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From points to supervoxels, graph, tree and objects: the whole algorithm, for a first scan and for later ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
+from pcgraph.features.nodes import node_features
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.contacts import contacts
+from pcgraph.graph.relations import edge_features
+from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, fraction, non_negative, positive
+from pcgraph.segmentation import Segmentation
+from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth
+from pcgraph.tree.growth import segmentation_tree
+from pcgraph.tree.linkage import ConvexityLinkage, Linkage
+from pcgraph.voxels.bounds import bounding_box
+from pcgraph.voxels.grid import VoxelGrid, voxel_grid, voxel_means
+from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.surface import Surface
+from pcgraph.voxels.union import grid_union
+from pcgraph.voxels.warp import choose_warp
+
+VOXELS_PER_SPACING = 3.5
+SEEDS_PER_VOXEL = 6.0
+
+
+def segment(
+    points: ArrayLike,
+    colors: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    *,
+    voxel_size: float | None = None,
+    seed_size: float | None = None,
+    camera: bool | None = None,
+    range_growth: float = 0.0,
+    method: SupervoxelMethod | None = None,
+    linkage: Linkage | None = None,
+    object_altitude: float | None = None,
+) -> Segmentation:
+    """Segmentation of a point cloud: supervoxels, their adjacency graph, and the tree on it.
+
+    Parameters
+    ----------
+    points : (n, 3) or (h, w, 3) float or integer, metres, any frame
+        NaN and infinite points are left out and labelled -1. Organised points (h, w, 3) are taken for a
+        camera's image in the camera's frame (z forward) unless `viewpoint` or `camera` say otherwise.
+    colors : same shape, uint8 0..255 or float 0..1, optional
+    normals : same shape, float, optional
+        Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
+    viewpoint : (3,) or points' shape float, metres, the points' frame, optional
+        Where the sensor stood, for all points or for each; estimated normals point to its side, and convexity
+        depends on that. Default: the origin for organised clouds and for clouds whose bounding box leaves the
+        origin out; otherwise a place high above (+z) the box.
+    voxel_size : float, metres, optional
+        Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
+    seed_size : float, metres, optional
+        Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 6 times `voxel_size`.
+    camera : bool, optional
+        Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
+        depth, as a camera's pixels do. Default: organised clouds that lie in front of the viewpoint.
+    range_growth : float, 0..1, without 1
+        Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
+        scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece.
+    method : SupervoxelMethod, optional
+        How voxels become supervoxels; default `SurfaceGrowth()`.
+    linkage : Linkage, optional
+        How the graph becomes a tree; default `ConvexityLinkage()`, whose altitudes are radians of concavity.
+    object_altitude : float, the linkage's unit, optional
+        Altitude above which two parts are two objects: the cut that gives `labels`. Default: the linkage's.
+
+    Returns
+    -------
+    Segmentation
+        Every finite point has a supervoxel, every supervoxel is connected (26-neighbourhood of occupied
+        voxels), the same points give the same result in any order (up to the rounding of sums) and at any
+        number of threads.
+
+    Raises
+    ------
+    ValueError
+        A shape, dtype or value is not as above, or no point is finite.
+
+    Notes
+    -----
+    Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
+    """
+    cloud = clean_cloud(points, colors, normals)
+    position = clean_viewpoint(viewpoint, cloud)
+    voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
+    camera = _is_camera(cloud, position) if camera is None else bool(camera)
+    warp = choose_warp(cloud.points, position, camera, fraction("range_growth", range_growth))
+    grid = voxel_grid(cloud.points, cloud.colors, voxel_size, warp)
+    scan = _Scan(cloud, position, grid, _outside(grid, position), np.full(grid.n_voxels, -1, np.int32), seed_size)
+    return _segmentation(scan, None, method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
+
+
+def update(
+    earlier: Segmentation,
+    points: ArrayLike,
+    colors: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    *,
+    method: SupervoxelMethod | None = None,
+    linkage: Linkage | None = None,
+    object_altitude: float | None = None,
+) -> Segmentation:
+    """Segmentation of a scene after one more scan of it.
+
+    Supervoxels keep their numbers and what they hold: the new points join those whose voxels they fall into, or
+    beside which they lie on the same surface, or found new ones. Graph and tree are made anew, over all that has
+    been seen. The points of earlier scans are not needed, and a scan costs time for its own points and for the
+    voxels of the scene, not for the points seen before.
+
+    Parameters
+    ----------
+    earlier : Segmentation
+        Of the scans so far; its voxel size, seed size and grid are used again.
+    points, colors, normals, viewpoint
+        The new scan in the same frame; as for `pcgraph.segment`.
+    method, linkage, object_altitude
+        As for `pcgraph.segment`.
+
+    Returns
+    -------
+    Segmentation
+        `labels` and `supervoxels` are those of the new points; `graph`, `tree` and `surface` those of the whole
+        scene. Points of an earlier scan keep their supervoxels, so their objects are now
+        ``result.tree.cut(altitude=...)[earlier.supervoxels]``.
+
+    Raises
+    ------
+    ValueError
+        As for `pcgraph.segment`; or the earlier scan's voxels grow with a camera's depth and a new point does not
+        lie in front of that camera (segment the first scan with ``camera=False``); or one scan has colours and
+        the other none.
+
+    Notes
+    -----
+    Nothing is ever taken away: what has moved between the scans is there twice.
+    """
+    cloud = clean_cloud(points, colors, normals)
+    position = clean_viewpoint(viewpoint, cloud)
+    before = earlier.surface
+    before.grid.warp.check(cloud.points)
+    seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp)
+    union = grid_union(before.grid, seen)
+    known = np.full(union.grid.n_voxels, -1, np.int32)
+    known[union.first] = before.supervoxels
+    outside = np.empty((union.grid.n_voxels, 3))
+    outside[union.second] = _outside(seen, position)
+    outside[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
+    scan = _Scan(cloud, position, union.grid, outside, known, earlier.seed_size)
+    return _segmentation(scan, earlier, method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Points to be segmented, and what they lie in.
+
+    Attributes
+    ----------
+    cloud : CleanCloud of n points
+    viewpoint : (3,) or (n, 3) float64, metres
+    grid : VoxelGrid of v voxels
+        All that has been seen; its `voxel_of_point` speaks of these points.
+    outside : (3,) or (v, 3) float64, metres
+        A place on the outer side of each voxel's surface.
+    known : (v,) int32
+        Supervoxels of earlier scans, -1 elsewhere.
+    seed_size : float, metres
+    """
+
+    cloud: CleanCloud
+    viewpoint: NDArray[np.float64]
+    grid: VoxelGrid
+    outside: NDArray[np.float64]
+    known: NDArray[np.int32]
+    seed_size: float
+
+
+def _segmentation(
+    scan: _Scan,
+    earlier: Segmentation | None,
+    method: SupervoxelMethod,
+    linkage: Linkage,
+    object_altitude: float | None,
+) -> Segmentation:
+    """The algorithm from voxels on."""
+    altitude = linkage.object_altitude if object_altitude is None else object_altitude
+    altitude = non_negative("object_altitude", altitude)
+    cloud, grid = scan.cloud, scan.grid
+    planes = method.planes(grid, scan.outside)
+    normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
+    if earlier is not None:
+        normals[scan.known >= 0] = earlier.surface.normals
+    supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.known)
+    leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
+    surface = Surface(grid, normals, supervoxels)
+    leaves = _leaves(cloud, surface, leaf_of_point, earlier)
+    nodes = node_features(leaves)
+    touching = contacts(grid, normals, supervoxels)
+    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes)
+    tree = segmentation_tree(linkage.merges(graph, leaves), leaves)
+    labels = cloud.spread(tree.cut(altitude=altitude)[leaf_of_point])
+    return Segmentation(labels, cloud.spread(leaf_of_point), graph, tree, surface, scan.seed_size, scan.viewpoint)
+
+
+def _leaves(
+    cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: Segmentation | None
+) -> Moments:
+    """Moments of the supervoxels' points, with those of earlier scans."""
+    n_leaves = int(surface.supervoxels.max()) + 1
+    if earlier is None:
+        leaves = moments_of_groups(cloud.points, cloud.colors, leaf_of_point, n_leaves)
+    else:
+        found, group = np.unique(leaf_of_point, return_inverse=True)
+        gained = moments_of_groups(cloud.points, cloud.colors, group.astype(np.int32), len(found))
+        leaves = joined_moments(earlier.leaves, gained, found, n_leaves)
+    return replace(leaves, normals=surface.mean_normals(n_leaves))
+
+
+def _outside(grid: VoxelGrid, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From where the voxels were seen: one place, (3,), or the mean of those of each voxel's points, (v, 3)."""
+    if position.ndim == 1:
+        return position
+    low, high = bounding_box(position)
+    middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
+    return middle + reach * voxel_means((position - middle) / reach, grid)
+
+
+def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> tuple[float, float]:
+    if voxel_size is None:
+        spacing = VOXELS_PER_SPACING * median_spacing(cloud.points)
+        voxel_size = spacing if seed_size is None else min(spacing, positive("seed_size", seed_size))
+    voxel = positive("voxel_size", voxel_size)
+    seed = SEEDS_PER_VOXEL * voxel if seed_size is None else positive("seed_size", seed_size)
+    if seed < voxel:
+        raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
+    return voxel, seed
+
+
+def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
+    return len(cloud.shape) == 2 and bool((cloud.points[:, 2] > viewpoint[2]).all())
+
+
+def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of the given normals of each voxel's points; the estimate where there is none."""
+    means = voxel_means(given, grid)
+    length = np.linalg.norm(means, axis=1, keepdims=True)
+    usable = length > 1e-6
+    return np.where(usable, means / np.where(usable, length, 1.0), estimated)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several viewpoints, growing voxels, and one scan after another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clouds import patch, same_partition, two_boxes_on_a_plane
+from test_guarantees import assert_covered_and_connected
+
+import pcgraph
+from pcgraph.features.moments import moments_of_groups
+from pcgraph.voxels.warp import RangeWarp
+
+
+def plate():
+    """A thin upright plate seen from both sides, with where each point was seen from."""
+    front, back = patch((0, 0, 0), (0.5, 0, 0), (0, 0, 0.5)), patch((0, 0.2, 0), (0.5, 0, 0), (0, 0, 0.5))
+    seen_from = np.vstack([np.tile((0.2, -2.0, 0.2), (len(front), 1)), np.tile((0.2, 2.0, 0.2), (len(back), 1))])
+    return np.vstack([front, back]), seen_from
+
+
+def test_one_viewpoint_per_point_turns_each_normal_to_its_own():
+    points, seen_from = plate()
+    result = pcgraph.segment(points, viewpoint=seen_from)
+    front = result.surface.grid.centroids[:, 1] < 0.1
+    assert result.surface.normals[front] == pytest.approx(np.tile((0, -1, 0), (front.sum(), 1)), abs=1e-9)
+    assert result.surface.normals[~front] == pytest.approx(np.tile((0, 1, 0), ((~front).sum(), 1)), abs=1e-9)
+    nodes = result.graph.node_features
+    assert (np.sign(nodes.normal[:, 1]) == np.sign(nodes.centroid[:, 1] - 0.1)).all()
+
+
+def test_nodes_face_where_given_normals_point():
+    points, _ = plate()
+    inwards = np.zeros_like(points)
+    inwards[:, 1] = np.where(points[:, 1] < 0.1, 1.0, -1.0)
+    nodes = pcgraph.segment(points, normals=inwards).graph.node_features
+    assert (np.sign(nodes.normal[:, 1]) == np.sign(0.1 - nodes.centroid[:, 1])).all()
+
+
+def test_viewpoints_of_another_shape_are_refused():
+    points, seen_from = plate()
+    with pytest.raises(ValueError, match="viewpoint of three finite coordinates in metres, or one per point"):
+        pcgraph.segment(points, viewpoint=seen_from[:-1])
+    seen_from[3, 1] = np.nan
+    with pytest.raises(ValueError, match="finite at finite points"):
+        pcgraph.segment(points, viewpoint=seen_from)
+    points[3] = np.nan  # of a point that is not there, the viewpoint does not matter
+    assert pcgraph.segment(points, viewpoint=seen_from).supervoxels[3] == -1
+
+
+@pytest.mark.parametrize("growth", [0.3, 0.5, 0.9])
+def test_range_warp_is_its_own_inverse_and_scales_as_it_says(growth):
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, 20, (500, 3))
+    warp = RangeWarp(np.array([1.0, 2.0, 0.5]), 10.0, growth)
+    warped = warp.forward(points)
+    assert warp.backward(warped) == pytest.approx(points, rel=1e-9)
+    across = np.cross(points - warp.viewpoint, rng.normal(size=(500, 3)))
+    across *= 1e-6 / np.linalg.norm(across, axis=1, keepdims=True)
+    steps = np.linalg.norm(warp.forward(points + across) - warped, axis=1)
+    assert 1e-6 / steps == pytest.approx(warp.scale(points), rel=1e-4)
+
+
+def scanned_ground(n=20000):
+    """Ground around a scanner 2 m above it, as thin with range as a scanner sees it."""
+    rng = np.random.default_rng(1)
+    angle, down = rng.uniform(0, 2 * np.pi, n), rng.uniform(0.03, 0.9, n)  # radians
+    reach = 2.0 / np.tan(down)
+    return np.column_stack((reach * np.cos(angle), reach * np.sin(angle), np.zeros(n)))
+
+
+def test_voxels_that_grow_with_range_keep_far_ground_in_one_piece():
+    points = scanned_ground()
+    plain = pcgraph.segment(points, viewpoint=(0, 0, 2))
+    grown = pcgraph.segment(points, viewpoint=(0, 0, 2), range_growth=0.5)
+    assert_covered_and_connected(points, grown)
+    far = np.linalg.norm(points, axis=1) > 20
+    assert len(np.unique(grown.labels[far])) < 0.5 * len(np.unique(plain.labels[far]))
+    middle = np.median(np.linalg.norm(points - np.array((0, 0, 2)), axis=1))
+    ranges = np.linalg.norm(grown.surface.grid.centroids - np.array((0, 0, 2)), axis=1)
+    assert grown.surface.grid.edge_lengths == pytest.approx(grown.voxel_size * np.sqrt(ranges / middle))
+
+
+def test_range_growth_is_checked():
+    with pytest.raises(ValueError, match="range_growth of at least 0 and below 1"):
+        pcgraph.segment(scanned_ground(50), range_growth=1.0)
+    with pytest.raises(ValueError, match="voxels grow in one way"):
+        pcgraph.segment(scanned_ground(50) + 5.0, range_growth=0.5, camera=True)
+
+
+@pytest.fixture(scope="module")
+def halves():
+    """Two boxes on a plane, scanned in two overlapping parts, and the whole."""
+    points, _, viewpoint = two_boxes_on_a_plane()
+    left, right = points[points[:, 0] < 0.9], points[points[:, 0] > 0.8]
+    first = pcgraph.segment(left, viewpoint=viewpoint, voxel_size=0.035, seed_size=0.2)
+    return left, right, viewpoint, first, pcgraph.update(first, right, viewpoint=viewpoint)
+
+
+def test_an_update_keeps_supervoxels_and_adds_to_them(halves):
+    left, right, _, first, second = halves
+    assert second.supervoxels.shape == (len(right),)
+    assert second.supervoxels.min() >= 0
+    assert second.graph.n_nodes > first.graph.n_nodes
+    n = first.graph.n_nodes
+    everything = np.vstack([left, right])
+    leaf = np.concatenate((first.supervoxels, second.supervoxels))
+    direct = moments_of_groups(everything, None, leaf, second.graph.n_nodes)
+    assert second.leaves.counts.tolist() == direct.counts.tolist()
+    assert second.leaves.centroids == pytest.approx(direct.centroids, rel=1e-9)
+    assert second.leaves.scatters == pytest.approx(direct.scatters, abs=1e-9)
+    assert (second.leaves.counts[:n] >= first.leaves.counts).all()
+    assert second.tree.moments.counts[-1] == len(everything)
+
+
+def test_objects_of_an_update_are_those_of_the_whole(halves):
+    left, right, viewpoint, first, second = halves
+    objects = second.tree.cut(altitude=0.4)
+    labels = np.concatenate((objects[first.supervoxels], objects[second.supervoxels]))
+    whole = pcgraph.segment(np.vstack([left, right]), viewpoint=viewpoint, voxel_size=0.035, seed_size=0.2)
+    assert np.array_equal(objects[second.supervoxels], second.labels)
+    assert pcgraph.metrics.weighted_overlap(labels, whole.labels) > 0.97
+
+
+def test_scanning_the_same_again_adds_no_supervoxel(halves):
+    left, _, viewpoint, first, _ = halves
+    again = pcgraph.update(first, left, viewpoint=viewpoint)
+    assert again.graph.n_nodes == first.graph.n_nodes
+    assert np.array_equal(again.surface.supervoxels, first.surface.supervoxels)
+    assert again.leaves.counts.tolist() == (2 * first.leaves.counts).tolist()
+    assert same_partition(again.tree.cut(altitude=0.4), first.tree.cut(altitude=0.4))
+
+
+def test_updates_that_do_not_fit_are_refused(halves):
+    left, _, viewpoint, first, _ = halves
+    with pytest.raises(ValueError, match="colours with both scans or with neither"):
+        pcgraph.update(first, left, np.full(left.shape, 0.5), viewpoint=viewpoint)
+    image = (left[:3000] + 1.0).reshape(50, 60, 3)
+    seen_by_camera = pcgraph.segment(image)
+    with pytest.raises(ValueError, match="camera=False"):
+        pcgraph.update(seen_by_camera, left - 9.0, viewpoint=viewpoint)
