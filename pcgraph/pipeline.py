@@ -222,7 +222,7 @@ def _leaves(
     else:
         found, group = np.unique(leaf_of_point, return_inverse=True)
         gained = moments_of_groups(cloud.points, cloud.colors, group.astype(np.int32), len(found))
-        leaves = joined_moments(earlier.leaves, gained, found, n_leaves)
+        leaves = joined_moments(replace(earlier.leaves, normals=None), gained, found, n_leaves)
     return replace(leaves, normals=surface.mean_normals(n_leaves))
 
 

@@ -64,7 +64,8 @@ def _some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     block = np.empty(len(points), np.int32)
     in_blocks(_find_block, len(points), points, low, edge, block)
     counts = np.bincount(block, minlength=_BLOCKS**3)
-    order = np.argsort(_mixed(np.arange(_BLOCKS**3).astype(np.uint64)), kind="stable")
+    numbers: NDArray[np.uint64] = np.arange(_BLOCKS**3, dtype=np.uint64)
+    order = np.argsort(_mixed(numbers), kind="stable")
     taken = np.zeros(_BLOCKS**3, bool)
     taken[order] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
     return points[np.flatnonzero(taken[block])]
