@@ -234,7 +234,7 @@ def _describe(
 ) -> Planes:
     p = int(regions.max(initial=-1)) + 1
     moments = moments_of_regions(leaves.moments, regions, p)
-    features = node_features(moments, segmentation.viewpoint)
+    features = node_features(moments)
     normals = features.normal
     grid, plane_of_voxel = segmentation.surface.grid, regions[segmentation.surface.supervoxels]
     corners, outlines = np.empty((p, 4, 3)), []

@@ -7,14 +7,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.features.moments import Moments
+from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.voxels.eigen import symmetric_eigen
 
 SLACK = 4.0  # how far, in tolerances, a surface may sag from its plane steadily: real sensors bend tables
 
 
 def moments_of_regions(leaves: Moments, regions: NDArray[np.int32], n_regions: int) -> Moments:
-    """Moments of groups of supervoxels, exactly those of their points; without colours.
+    """Moments of groups of supervoxels, exactly those of their points.
 
     Parameters
     ----------
@@ -22,18 +22,8 @@ def moments_of_regions(leaves: Moments, regions: NDArray[np.int32], n_regions: i
     regions : (n,) int32, 0..n_regions - 1 or -1 for none
         Every region has a supervoxel at least.
     """
-    member = regions >= 0
-    region, counts = regions[member], leaves.counts[member]
-    totals = np.bincount(region, counts, n_regions)
-    reference = leaves.centroids[member][np.unique(region, return_index=True)[1]]
-    offset = leaves.centroids[member] - reference[region]
-    means = np.stack([np.bincount(region, counts * offset[:, a], n_regions) / totals for a in range(3)], axis=1)
-    offset -= means[region]
-    parts = leaves.scatters[member] + counts[:, None, None] * offset[:, :, None] * offset[:, None, :]
-    scatters = np.stack([np.bincount(region, parts[:, a, b], n_regions) for a in range(3) for b in range(3)], axis=1)
-    return Moments(
-        np.rint(totals).astype(np.int64), reference + means, scatters.reshape(-1, 3, 3).astype(np.float64), None
-    )
+    members = np.flatnonzero(regions >= 0)
+    return grouped_moments(leaves[members], regions[members], n_regions)
 
 
 @njit(cache=True)

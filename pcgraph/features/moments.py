@@ -126,8 +126,21 @@ def joined_moments(first: Moments, second: Moments, groups: NDArray[np.integer],
     """
     columns = {name: np.concatenate((values, getattr(second, name))) for name, values in first.columns().items()}
     both = replace(first, **columns)
-    above = len(both) + np.concatenate((np.arange(len(first)), groups, np.arange(n_groups)))
-    return moments_up_tree(both, above.astype(np.int32))[len(both) :]
+    return grouped_moments(both, np.concatenate((np.arange(len(first)), groups)), n_groups)
+
+
+def grouped_moments(parts: Moments, groups: NDArray[np.integer], n_groups: int) -> Moments:
+    """Moments of groups of parts, exactly those of all their points.
+
+    Parameters
+    ----------
+    parts : Moments of q parts
+    groups : (q,) int, 0..n_groups - 1
+        Every group has a part at least.
+    n_groups : int
+    """
+    above = len(parts) + np.concatenate((groups, np.arange(n_groups)))
+    return moments_up_tree(parts, above.astype(np.int32))[len(parts) :]
 
 
 def _with_room(values: NDArray, k: int) -> NDArray:  # type: ignore[type-arg]

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -258,11 +258,6 @@ class SegmentationTree:
         if np.isnan(altitude):
             raise ValueError("expected an altitude in the linkage's unit, got NaN")
         return int(np.searchsorted(self.altitudes[self.n_leaves :], altitude, side="right"))
-
-
-def _rows(moments: Moments, order: NDArray[np.int64]) -> Moments:
-    columns: dict[str, Any] = {field.name: getattr(moments, field.name) for field in fields(moments)}
-    return replace(moments, **{name: values[order] for name, values in columns.items() if values is not None})
 
 
 def _whole(name: str, value: int) -> int:

@@ -15,7 +15,6 @@ from pcgraph.tree.growth import segmentation_tree
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.tree import SegmentationTree
 
-VIEWPOINT = np.array([0.0, 0.0, 50.0])
 SHAPES = ("random", "chain", "star", "complete", "parts", "no edges")
 
 
@@ -47,7 +46,7 @@ def random_graph(
     places = rng.integers(0, 3, (n, 3)).astype(float) * 4.0 if ties else rng.normal(size=(n, 3)) * 4.0
     points = places[leaf] + rng.normal(size=(len(leaf), 3)) * np.array([1.0, 1.0, 0.2])
     leaves = moments_of_groups(points, rng.random(points.shape), leaf, n)
-    nodes = node_features(leaves, VIEWPOINT)
+    nodes = node_features(leaves)
     edges = edges_of(shape, n, rng)
     i, j = edges.T
     angles = rng.integers(-2, 3, len(edges)) * 0.5 if ties else rng.uniform(-1.5, 1.5, len(edges))
@@ -95,15 +94,13 @@ def unit_leaves(n: int, counts: object = None, x: object = None) -> Moments:
 
 
 def tree_of(linkage: Linkage, graph: AdjacencyGraph, leaves: Moments) -> SegmentationTree:
-    return segmentation_tree(linkage.merges(graph, leaves), leaves, VIEWPOINT)
+    return segmentation_tree(linkage.merges(graph, leaves), leaves)
 
 
 def hand_tree(pairs: list[list[int]], altitudes: list[float], counts: object = None) -> SegmentationTree:
     """Tree of these merges over leaves of so many points."""
     leaves = unit_leaves(len(pairs) + 1, counts)
-    return segmentation_tree(
-        Merges(np.array(pairs, np.int32).reshape(-1, 2), np.array(altitudes, float)), leaves, VIEWPOINT
-    )
+    return segmentation_tree(Merges(np.array(pairs, np.int32).reshape(-1, 2), np.array(altitudes, float)), leaves)
 
 
 def leaf_sets(tree: SegmentationTree) -> list[frozenset[int]]:

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 from clouds import refines
-from graphs import VIEWPOINT, hand_graph, hand_tree, leaf_sets, random_graph, tree_of
+from graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
 
 from pcgraph.features.moments import Moments
 from pcgraph.tree.energy import Energy, boundary_lengths, plane_energy, variance_energy
@@ -258,7 +258,7 @@ def test_a_hundred_thousand_leaves_take_a_second(shape):
     rng = np.random.default_rng(8)
     altitudes = np.concatenate((np.zeros(n), np.sort(rng.random(n - 1))))
     moments = Moments(counts, np.zeros((k, 3)), np.zeros((k, 3, 3)), None)
-    tree = SegmentationTree(parents, altitudes, moments, VIEWPOINT)
+    tree = SegmentationTree(parents, altitudes, moments)
     energy = Energy(rng.random(k) * counts, np.ones(k))
     pairs = rng.integers(0, n, (3 * n, 2)).astype(np.int32)
     calls = (

@@ -172,7 +172,7 @@ def renamed(graph, leaves, name, rng):
     columns = {field.name: getattr(graph.edge_features, field.name)[order] for field in fields(EdgeFeatures)}
     assert leaves.colors is not None
     moved = Moments(leaves.counts[old], leaves.centroids[old], leaves.scatters[old], leaves.colors[old])
-    nodes = node_features(moved, np.array([0.0, 0.0, 50.0]))
+    nodes = node_features(moved)
     return AdjacencyGraph(edges, EdgeFeatures(**columns), nodes), moved
 
 
@@ -197,5 +197,5 @@ def long_chain(n, rng):
     features = made(EdgeFeatures, n - 1, normal_angle=np.arange(1.0, n) / n, **rows)
     centroids = np.column_stack((np.arange(n), rng.random(n), np.zeros(n)))
     leaves = Moments(np.ones(n, np.int64), centroids, np.zeros((n, 3, 3)), rng.random((n, 3)))
-    nodes = node_features(leaves, np.array([0.0, 0.0, 50.0]))
+    nodes = node_features(leaves)
     return AdjacencyGraph(np.stack((ends, ends + 1), axis=1).astype(np.int32), features, nodes), leaves
