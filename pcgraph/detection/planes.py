@@ -150,10 +150,8 @@ def voxel_edges(segmentation: Segmentation) -> NDArray[np.float64]:
 
 
 def _flat_leaves(segmentation: Segmentation, tolerance: float | None, angle: float) -> FlatLeaves:
-    nodes, tree = segmentation.graph.node_features, segmentation.tree
-    n = tree.n_leaves
-    of_nodes = tree.moments
-    moments = Moments(of_nodes.counts[:n], of_nodes.centroids[:n], of_nodes.scatters[:n], None)
+    nodes, moments = segmentation.graph.node_features, segmentation.leaves
+    n = len(moments)
     edge = voxel_edges(segmentation)
     if tolerance is None:
         noise = surface_noise(nodes.residual, edge, nodes.size)

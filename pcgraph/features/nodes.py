@@ -139,7 +139,7 @@ def _plane_normal(
     towards: NDArray[np.float64],
     normal: NDArray[np.float64],
 ) -> None:
-    """Nothing; `normal` becomes the axis of least spread on the viewpoint's side, or, of a line, one across it."""
+    """Nothing; `normal` becomes the axis of least spread on the outer side, or, of a line, one across it."""
     for i in range(3):
         normal[i] = axes[0, i]
     if middle <= _NO_PLANE * high:

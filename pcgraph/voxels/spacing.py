@@ -50,7 +50,9 @@ def _nearest(points: NDArray[np.float64]) -> NDArray[np.float64]:
     if len(points) > _SAMPLE:  # the smallest hashes: as good as random, yet a property of the points
         bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
         hashes = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)) >> 17
-        sample = points[np.argpartition(_mixed((hashes[:, 0] ^ hashes[:, 1] ^ hashes[:, 2]).view(np.uint64)), _SAMPLE)[:_SAMPLE]]
+        sample = points[
+            np.argpartition(_mixed((hashes[:, 0] ^ hashes[:, 1] ^ hashes[:, 2]).view(np.uint64)), _SAMPLE)[:_SAMPLE]
+        ]
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     return tree.query(sample, k=2)[0][:, 1]
 

@@ -105,7 +105,8 @@ def test_the_order_of_points_changes_nothing_but_rounding():
         ),
     ):
         for name, column in vars(once).items():
-            assert column == pytest.approx(vars(again)[name], rel=1e-9, abs=1e-9), name
+            if column is not None:
+                assert column == pytest.approx(vars(again)[name], rel=1e-9, abs=1e-9), name
 
 
 def test_an_outlier_that_comes_first_costs_no_digits():

@@ -65,7 +65,7 @@ def test_edge_features_of_a_hand_drawn_roof_and_gutter():
     normals = np.array([[-root, 0.0, root], [root, 0.0, root], [0.0, 0.0, 1.0]])
     centroids = np.array([[-1.0, 0.0, -1.0], [1.0, 0.0, -1.0], [3.0, 0.0, -2.1]])
     colors = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.0, 0.4]])
-    nodes = node_features(moments_of_groups(centroids, colors, np.arange(3, dtype=np.int32), 3), np.array([0, 0, 99.0]))
+    nodes = node_features(moments_of_groups(centroids, colors, np.arange(3, dtype=np.int32), 3))
     nodes = replace(nodes, normal=normals)
     rims = np.array([[[0.0, 0, 0], [0.0, 0, 0]], [[2.0, 0, -2.0], [2.0, 0, -2.1]]])
     touching = Contacts(

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -253,7 +255,8 @@ def test_hand_drawn_image():
     from pcgraph.features.moments import moments_of_groups
     from pcgraph.features.nodes import node_features
 
-    nodes = node_features(moments_of_groups(grid.centroids, None, surface.supervoxels, 5))
+    moments = moments_of_groups(grid.centroids, None, surface.supervoxels, 5)
+    nodes = node_features(replace(moments, normals=surface.normals))
     found = occlusions(surface, nodes, (0, 0, 0), np.array([[0, 1, 2, -1, 3, 4]]), reach=20.0)
     assert found.pairs.tolist() == [[0, 1], [2, 1], [2, 3]]
     far, near = np.hypot(0.2, 2.0), np.hypot(0.2, 1.0)
