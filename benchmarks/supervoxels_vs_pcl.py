@@ -21,7 +21,7 @@ The last line printed is JSON:
     cpu_ratio           PCL's processor time over ours, the least of the settings
     million_points_s, million_points_gb, and million_points_cpu_s: processor time, on busy machines the steadier figure
     base_gb             peak of the same process before it loads the points: interpreter, modules, kernels
-    scaling_exponent, largest_points, largest_s, largest_gb
+    scaling_exponent (clock), scaling_exponent_cpu (processor time), largest_points, largest_s, largest_gb
 
 Usage: python benchmarks/supervoxels_vs_pcl.py [--data FOLDER] [--rounds 3] [--largest 20e6] [--threads 2]
 """
@@ -147,9 +147,11 @@ def of_rooms(largest: int, rounds: int) -> dict[str, Any]:
         result["million_points_cpu_s"] = round(runs[MILLION]["cpu_seconds"], 3)
         result["million_points_gb"] = round(runs[MILLION]["peak_gb"], 3)
         result["base_gb"] = round(runs[MILLION]["base_gb"], 3)
-    n, seconds = np.array(list(runs), float), np.array([run["seconds"] for run in runs.values()])
+    n = np.array(list(runs), float)
     if len(n) > 1:
-        result["scaling_exponent"] = round(float(np.polyfit(np.log(n), np.log(seconds / np.log(n)), 1)[0]), 3)
+        for key, column in (("scaling_exponent", "seconds"), ("scaling_exponent_cpu", "cpu_seconds")):
+            seconds = np.array([run[column] for run in runs.values()])
+            result[key] = round(float(np.polyfit(np.log(n), np.log(seconds / np.log(n)), 1)[0]), 3)
     last = runs[largest]
     result |= {"largest_points": largest, "largest_s": round(last["seconds"], 2)}
     return result | {"largest_gb": round(last["peak_gb"], 2)}
