@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+from pcgraph.features.powers import sums_of_powers
 from pcgraph.features.primitive_moments import PrimitiveMoments, pool_up_tree, primitive_moments
 from pcgraph.features.primitives import Primitive, fit_primitives
 
@@ -132,6 +133,21 @@ def test_two_halves_are_the_whole():
     for name, column in united.items():
         assert column == pytest.approx(direct[name], rel=1e-6, abs=1e-9), name
     assert united["sphere_radius"][0] == pytest.approx(0.1, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cylinder"])
+def test_the_origin_of_the_powers_need_not_be_the_centroid(shape):
+    """Far from the frame's origin centroids round; what counts is the place about which powers were summed."""
+    rng = np.random.default_rng(11)
+    points, normals = sphere(rng, np.pi / 3.0) if shape == "sphere" else cylinder(rng, np.pi / 3.0)[:2]
+    at_centroid = moments(points, normals)
+    moved = np.array([1e-4, -2e-4, 3e-4])
+    powers = sums_of_powers(points, np.zeros(N, np.int32), at_centroid.centers + moved, at_centroid.scales)
+    beside = replace(at_centroid, centers=at_centroid.centers + moved, powers=powers)
+    expected, found = fit_primitives(at_centroid).columns(), fit_primitives(beside).columns()
+    for name in ("plane_offset", "plane_residual", f"{shape}_radius", "sphere_center"):
+        assert found[name] == pytest.approx(expected[name], abs=1e-5), name
+    assert found[f"{shape}_residual"] < 3e-4  # a root of rounding
 
 
 def test_noise_speaks_for_the_simpler_shape():

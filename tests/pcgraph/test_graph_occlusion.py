@@ -11,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pcgraph
+from pcgraph.features.moments import moments_of_groups
+from pcgraph.features.nodes import node_features
 from pcgraph.graph.bearings import bearing_image
 from pcgraph.graph.occlusion import occlusions
 from pcgraph.voxels.surface import Surface
@@ -243,26 +245,48 @@ def test_wrong_arguments_are_refused(boxes, wrong, message):
         occlusions(result.surface, result.graph.node_features, **arguments)
 
 
-def test_hand_drawn_image():
-    """Five voxels in a row, near, far, near, far, far, as the five pixels of an image see them."""
+def drawn(places, image, **options):
+    """Occlusions between lone voxels of 5 cm at these places (x, z), metres, that face the origin, in this image."""
+    points = np.array([(x, 0.01, z) for x, z in places])
     grid = pcgraph.segment(
-        np.array([[-2.0, 0, 1], [-2, 0, 2], [0, 0, 1], [2, 0, 2], [4, 0, 2]]) * [0.1, 0.1, 1.0],
-        viewpoint=(0, 0, 0), voxel_size=0.05, seed_size=0.05, camera=False,
-    ).surface.grid  # fmt: skip
-    order = np.lexsort((grid.centroids[:, 2], grid.centroids[:, 0]))
-    assert order.tolist() == [0, 1, 2, 3, 4]  # voxels are in the order of their coordinates
-    surface = Surface(grid, np.tile([0.0, 0.0, -1.0], (5, 1)), np.arange(5, dtype=np.int32))
-    from pcgraph.features.moments import moments_of_groups
-    from pcgraph.features.nodes import node_features
+        points, viewpoint=(0, 0, 0), voxel_size=0.05, seed_size=0.05, normals=np.tile([0, 0, -1.0], (len(points), 1))
+    ).surface.grid
+    owners = np.arange(len(points), dtype=np.int32)
+    assert np.array_equal(grid.voxel_of_point, owners)  # voxels are in the order of their coordinates
+    facing = np.tile([0.0, 0.0, -1.0], (len(points), 1))
+    nodes = node_features(replace(moments_of_groups(grid.centroids, None, owners, len(points)), normals=facing))
+    surface = Surface(grid, facing, owners)
+    return occlusions(surface, nodes, (0, 0, 0), np.array(image), **options)
 
-    moments = moments_of_groups(grid.centroids, None, surface.supervoxels, 5)
-    nodes = node_features(replace(moments, normals=surface.normals))
-    found = occlusions(surface, nodes, (0, 0, 0), np.array([[0, 1, 2, -1, 3, 4]]), reach=20.0)
+
+def test_a_row_of_near_and_far():
+    found = drawn([(-0.2, 1.0), (-0.2, 2.0), (0.01, 1.0), (0.2, 2.0), (0.4, 2.0)], [[0, 1, 2, -1, 3, 4]], reach=20.0)
     assert found.pairs.tolist() == [[0, 1], [2, 1], [2, 3]]
-    far, near = np.hypot(0.2, 2.0), np.hypot(0.2, 1.0)
-    assert found.gap == pytest.approx([far - near, far - 1.0, far - 1.0])
+    far, near, middle = np.hypot(0.2, 2.0), np.hypot(0.2, 1.0), 1.0
+    assert found.gap == pytest.approx([far - near, far - middle, far - middle], abs=1e-4)
     assert found.length == pytest.approx(0.05)
     assert found.continuations.pairs.tolist() == [[1, 3]]
     assert found.continuations.width == pytest.approx(0.4)
     assert found.continuations.crossings.tolist() == [1]
     assert found.continuations.coplanar.all()
+
+
+def test_things_in_front_of_things_nest_like_brackets():
+    """A wall, before it a box, before that a stick: the box goes on behind the stick, the wall behind both."""
+    places = [(-0.3, 3.0), (-0.2, 2.0), (0.01, 1.0), (0.2, 2.0), (0.6, 3.0)]
+    found = drawn(places, [[0, 1, 2, 3, 4]], reach=30.0)
+    assert found.pairs.tolist() == [[1, 0], [2, 1], [2, 3], [3, 4]]
+    assert found.continuations.pairs.tolist() == [[0, 4], [1, 3]]
+
+
+def test_a_hole_ends_all_hiding():
+    """What vanished does not come out again beyond a gap wider than the reach: too much may have happened there."""
+    places = [(-1.0, 2.0), (-0.4, 1.0), (0.6, 1.0), (1.4, 2.0)]
+    assert drawn(places, [[0, 1, 2, 3]], reach=30.0).continuations.pairs.tolist() == [[0, 3]]
+    assert len(drawn(places, [[0, 1, 2, 3]], reach=8.0).pairs) == 2
+    assert len(drawn(places, [[0, 1, 2, 3]], reach=8.0).continuations.pairs) == 0
+
+
+def test_what_touches_is_not_apart():
+    assert len(drawn([(0.01, 1.01), (0.06, 1.06)], [[0, 1]], least_gap=0.5).pairs) == 0
+    assert drawn([(0.01, 1.01), (0.06, 1.11)], [[0, 1]], least_gap=0.5).pairs.tolist() == [[0, 1]]
