@@ -152,13 +152,13 @@ class SegmentationTree:
         ----------
         energy : Energy
             k rows, for example `plane_energy(tree)`.
-        scale : float, >= 0
+        scale : float, >= 0, finite
             Their lambda.
 
         Raises
         ------
         ValueError
-            The energy has another number of rows, or scale is not a number >= 0.
+            The energy has another number of rows, or scale is not a finite number >= 0.
         """
         return self.by_energy(energy).cut(altitude=_scale(scale))
 
@@ -267,6 +267,6 @@ def _whole(name: str, value: int) -> int:
 
 
 def _scale(value: float) -> float:
-    if not value >= 0.0:
-        raise ValueError(f"expected a scale of at least 0, got {value!r}")
+    if not 0.0 <= value < np.inf:
+        raise ValueError(f"expected a finite scale of at least 0, got {value!r}")
     return float(value)

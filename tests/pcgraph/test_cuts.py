@@ -185,8 +185,9 @@ def test_wrong_energies_are_refused(tree):
         Energy(np.full(9, np.nan), np.ones(9))
     with pytest.raises(ValueError, match="9 rows"):
         tree.cut_optimal(Energy(np.zeros(5), np.ones(5)), 1.0)
-    with pytest.raises(ValueError, match="scale"):
-        tree.cut_optimal(Energy(np.zeros(9), np.ones(9)), float("nan"))
+    for scale in (float("nan"), -1.0, np.inf):
+        with pytest.raises(ValueError, match="scale"):
+            tree.cut_optimal(Energy(np.zeros(9), np.ones(9)), scale)
     with pytest.raises(ValueError, match="values"):
         variance_energy(tree, np.zeros((4, 3)))
     with pytest.raises(ValueError, match="not above the parent"):
