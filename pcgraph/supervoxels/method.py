@@ -94,7 +94,8 @@ class SurfaceGrowth(SupervoxelMethod):
         """Supervoxels by growth and k-means sweeps along their boundaries."""
         metric = Metric(self.spatial_weight / seed_size, self.normal_weight, self.color_weight, two_sided=False)
         features = voxel_features(grid, normals)
-        owner = grow(grid, features, metric, seed_voxels(grid, seed_size), seed_size, known)
+        seeds = seed_voxels(grid, normals, seed_size, two_sided=False)
+        owner = grow(grid, features, metric, seeds, seed_size, known)
         settle_boundaries(grid, features, metric, owner, known >= 0)
         return connect(grid, features, metric, owner, int(known.max()) + 1)
 
@@ -127,7 +128,8 @@ class Vccs(SupervoxelMethod):
         """Supervoxels by growth from seeds."""
         metric = Metric(self.spatial_weight / seed_size, self.normal_weight, self.color_weight, two_sided=True)
         features = voxel_features(grid, normals)
-        owner = grow(grid, features, metric, seed_voxels(grid, seed_size), seed_size, known)
+        seeds = seed_voxels(grid, normals, seed_size, two_sided=True)
+        owner = grow(grid, features, metric, seeds, seed_size, known)
         return connect(grid, features, metric, owner, int(known.max()) + 1)
 
     def supervoxel_of_point(

@@ -13,7 +13,7 @@ from pcgraph.parallel import in_blocks
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import VoxelGrid
 
-_OWN_BONUS = 0.9  # the window around the voxel itself wins unless another is better by this factor
+_OWN_BONUS = 0.7  # the window around the voxel itself wins unless another is better by this factor
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Methods of supervoxels: what each promises beyond coverage and connectivity."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from clouds import SPACING, patch, two_boxes_on_a_plane
+from test_guarantees import DEGENERATE, assert_covered_and_connected
+
+import pcgraph
+from pcgraph.metrics import undersegmentation_error
+
+
+@pytest.mark.parametrize("method", [pcgraph.SurfaceGrowth(), pcgraph.Vccs()], ids=["surface", "vccs"])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_every_method_covers_and_connects(method, name):
+    assert_covered_and_connected(DEGENERATE[name], pcgraph.segment(DEGENERATE[name], method=method))
+
+
+def test_supervoxels_keep_to_the_edges_of_a_step():
+    """A floor and a block's front and top: every point on the right side, to within a point, though voxels straddle."""
+    faces = [
+        patch((0, 0, 0), (0.6, 0, 0), (0, 0.3, 0)),
+        patch((0, 0.3, 0.0), (0.6, 0, 0), (0, 0, 0.2)),
+        patch((0, 0.3, 0.2), (0.6, 0, 0), (0, 0.3, 0)),
+    ]
+    points, truth = np.vstack(faces), np.repeat([0, 1, 2], [len(face) for face in faces])
+    on_an_edge = (abs(points[:, 1] - 0.3) < 1e-9) & ((abs(points[:, 2]) < 1e-9) | (abs(points[:, 2] - 0.2) < 1e-9))
+    settings = {"voxel_size": 3.7 * SPACING, "seed_size": 0.15, "viewpoint": (0.3, -3, 2)}
+    surface = pcgraph.segment(points, **settings).supervoxels
+    vccs = pcgraph.segment(points, **settings, method=pcgraph.Vccs()).supervoxels
+    error = undersegmentation_error(surface[~on_an_edge], truth[~on_an_edge])
+    assert error < 0.003
+    assert undersegmentation_error(vccs[~on_an_edge], truth[~on_an_edge]) > 3 * error + 0.01
+
+
+def test_both_faces_of_a_thin_plate_are_one_to_vccs_and_two_to_surface_growth():
+    front = patch((0, 0, 0), (0.3, 0, 0), (0, 0, 0.3))
+    points = np.vstack([front, front + (0.0, 0.012, 0.0)])  # noqa: RUF005
+    viewpoints = np.repeat([[0.15, -2.0, 0.15], [0.15, 2.0, 0.15]], len(front), axis=0)
+    normals = np.sign(viewpoints - points) * (0.0, 1.0, 0.0)
+    options = {"voxel_size": 0.011, "seed_size": 0.12, "viewpoint": viewpoints}
+    for method, mixed in ((pcgraph.Vccs(), True), (pcgraph.SurfaceGrowth(), False)):
+        supervoxels = pcgraph.segment(points, None, normals, **options, method=method).supervoxels
+        of_front, of_back = set(supervoxels[: len(front)]), set(supervoxels[len(front) :])
+        assert bool(of_front & of_back) is mixed
+
+
+def test_colour_weight_makes_supervoxels_keep_to_colours():
+    points = patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0))
+    truth = ((points[:, 0] * 1.7 + points[:, 1]) % 0.37 > 0.15).astype(int)
+    colors = np.where(truth[:, None] == 1, (1.0, 0.2, 0.1), (0.1, 0.3, 0.9))
+    options = {"voxel_size": 2 * SPACING, "seed_size": 0.12}
+    blind = pcgraph.segment(points, colors, **options, method=pcgraph.SurfaceGrowth(color_weight=0.0))
+    seeing = pcgraph.segment(points, colors, **options, method=pcgraph.SurfaceGrowth(color_weight=2.0))
+    error = undersegmentation_error(seeing.supervoxels, truth)
+    assert error < 0.6 * undersegmentation_error(blind.supervoxels, truth)
+
+
+CODE = """
+import sys, hashlib
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from clouds import two_boxes_on_a_plane
+import pcgraph
+points, _, viewpoint = two_boxes_on_a_plane()
+points = np.vstack([points + (0.0, 0.0, 0.002 * k) for k in range(4)])  # enough for several blocks
+result = pcgraph.segment(points, points % 1.0, viewpoint=viewpoint)
+digest = hashlib.sha256()
+for array in (result.supervoxels, result.labels, result.surface.normals, result.tree.parents, result.tree.altitudes):
+    digest.update(np.ascontiguousarray(array).tobytes())
+digest.update(result.tree.moments.scatters.tobytes())
+print(digest.hexdigest())
+"""
+
+
+def test_the_number_of_threads_changes_no_byte():
+    here = os.path.dirname(__file__)
+    digests = set()
+    for threads in ("1", "2", "3", "7"):
+        environment = {**os.environ, "NUMBA_NUM_THREADS": threads}
+        done = subprocess.run(
+            [sys.executable, "-c", CODE, here], capture_output=True, text=True, check=True, env=environment, timeout=300
+        )
+        digests.add(done.stdout)
+    assert len(digests) == 1
+    points, _, _ = two_boxes_on_a_plane()
+    assert 4 * len(points) > 2 * 4096 * 7  # blocks for all seven

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Voxels: keys and neighbours by brute force, eigenvectors against LAPACK, spacing, planes beside edges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clouds import patch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
+from pcgraph.voxels.grid import voxel_grid
+from pcgraph.voxels.planes import local_planes
+from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.warp import Warp
+
+
+def six(matrix):
+    """xx, yy, zz, xy, xz, yz of a symmetric matrix."""
+    return np.array([matrix[0, 0], matrix[1, 1], matrix[2, 2], matrix[0, 1], matrix[0, 2], matrix[1, 2]])
+
+
+@settings(max_examples=200, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), spread=st.floats(-8.0, 0.0), scale=st.floats(-12.0, 12.0))
+def test_closed_form_normal_is_lapacks_or_declined(seed, spread, scale):
+    rng = np.random.default_rng(seed)
+    axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    values = np.sort(10.0 ** np.array([spread + rng.uniform(-8, 0), spread, 0.0])) * 10.0**scale
+    matrix = axes @ np.diag(values) @ axes.T
+    matrix = (matrix + matrix.T) / 2.0
+    normal = np.empty(3)
+    least = plane_normal(six(matrix), normal)
+    if least < 0.0:
+        assert values[1] - values[0] < 1e-3 * values.sum()  # too close to a line or a ball for the closed form
+        return
+    exact_values, exact = np.linalg.eigh(matrix)
+    assert least == pytest.approx(exact_values[0], abs=1e-11 * values.sum())
+    assert abs(normal @ exact[:, 0]) == pytest.approx(1.0, abs=1e-8)
+    assert normal @ normal == pytest.approx(1.0, abs=1e-12)
+
+
+@settings(max_examples=200, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), rank=st.integers(0, 3))
+def test_rotations_give_lapacks_eigenvalues(seed, rank):
+    rng = np.random.default_rng(seed)
+    factor = rng.normal(size=(3, rank)) * 10.0 ** rng.uniform(-6, 0, rank)
+    matrix = factor @ factor.T
+    diagonal, vectors = matrix.copy(), np.empty((3, 3))
+    symmetric_eigen(diagonal, vectors)
+    scale = max(np.trace(matrix), 1e-300)
+    assert np.sort(np.diag(diagonal)) == pytest.approx(np.linalg.eigvalsh(matrix), abs=1e-13 * scale)
+    assert vectors.T @ vectors == pytest.approx(np.eye(3), abs=1e-12)
+    assert vectors @ np.diag(np.diag(diagonal)) @ vectors.T == pytest.approx(matrix, abs=1e-12 * scale)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300), levels=st.integers(1, 9))
+def test_voxels_and_neighbours_are_those_of_brute_force(seed, n, levels):
+    rng = np.random.default_rng(seed)
+    points = rng.integers(-levels, levels, (n, 3)) + rng.uniform(0.1, 0.9, (n, 3))
+    grid = voxel_grid(points, points * 0.0 + 0.25, 1.0, Warp())
+    cells, inverse = np.unique(np.floor(points), axis=0, return_inverse=True)
+    assert np.array_equal(grid.cells, cells)
+    assert np.array_equal(grid.voxel_of_point, inverse.ravel())
+    assert np.array_equal(grid.counts, np.bincount(inverse.ravel()))
+    for voxel, cell in enumerate(cells):
+        near = np.flatnonzero(np.abs(cells - cell).max(axis=1) == 1)
+        assert np.array_equal(grid.neighbours[grid.indptr[voxel] : grid.indptr[voxel + 1]], near)
+        assert grid.centroids[voxel] == pytest.approx(points[inverse.ravel() == voxel].mean(axis=0), abs=1e-6)
+    assert grid.colors == pytest.approx(0.25, abs=1e-5)
+
+
+def test_spacing_of_a_large_lattice_is_its_step():
+    x, y = np.meshgrid(np.arange(700) * 0.01, np.arange(400) * 0.013)
+    points = np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size)))
+    assert median_spacing(points) == pytest.approx(0.01, rel=1e-9)
+    order = np.random.default_rng(0).permutation(len(points))
+    assert median_spacing(points[order]) == median_spacing(points)
+
+
+def test_spacing_of_many_random_points_is_that_of_a_tree_over_all():
+    rng = np.random.default_rng(1)
+    points = rng.random((300_000, 3)) * (4.0, 3.0, 0.0)
+    expected = np.sqrt(np.log(2.0) / (np.pi * 300_000 / 12.0))  # median nearest distance of a Poisson process
+    assert median_spacing(points) == pytest.approx(expected, rel=0.05)
+    with_outliers = np.vstack([points, [[1e9, -1e12, 3.0]]])
+    assert median_spacing(with_outliers) == pytest.approx(expected, rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def crease():
+    """Voxels of a floor that meets a wall at a right angle, noise 1 mm, with the true normals and the distance."""
+    floor, wall = patch((0, 0, 0), (1, 0, 0), (0, 0.6, 0)), patch((0, 0.6, 0), (1, 0, 0), (0, 0, 0.6))
+    points = np.vstack([floor, wall]) + np.random.default_rng(2).normal(0, 0.001, (len(floor) + len(wall), 3))
+    grid = voxel_grid(points, None, 0.03, Warp())
+    above, before = grid.centroids[:, 2], 0.6 - grid.centroids[:, 1]
+    truth = np.where((above < before)[:, None], (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+    return grid, truth, np.maximum(above, before)
+
+
+def angles(grid, truth, reach):
+    normals = local_planes(grid, np.array([0.5, -3.0, 3.0]), reach).normals
+    return np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normals, truth), -1.0, 1.0)))
+
+
+def test_normals_do_not_round_off_a_crease(crease):
+    grid, truth, away = crease
+    beside = (away > 0.03) & (away < 0.06)
+    assert np.median(angles(grid, truth, 0)[beside]) > 10.0  # a window across the crease
+    assert np.median(angles(grid, truth, 3)[beside]) < 1.5
+
+
+def test_normals_on_plain_ground_average_noise(crease):
+    grid, truth, away = crease
+    plain = away > 0.15
+    assert np.median(angles(grid, truth, 3)[plain]) < 1.3 * np.median(angles(grid, truth, 0)[plain])
+
+
+def test_planes_go_through_their_surface(crease):
+    grid, _, away = crease
+    planes = local_planes(grid, np.array([0.5, -3.0, 3.0]), 3)
+    offset = np.abs(np.einsum("ij,ij->i", planes.normals, grid.centroids - planes.origins))
+    assert np.percentile(offset[away > 0.03], 99) < 0.003
