@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Descriptors of supervoxels for a classifier: their own, their neighbours' and their ancestors'."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+
+from pcgraph.detection.planes import find_planes
+from pcgraph.features.nodes import NodeFeatures
+from pcgraph.features.primitive_moments import pool_up_tree, primitive_moments
+from pcgraph.features.primitives import Primitives, fit_primitives
+from pcgraph.segmentation import Segmentation
+
+GROWTH = 4.0  # each ancestor that is asked has so many times the points of the one before
+EDGE_COLUMNS = ("convexity", "contact_convexity", "normal_angle", "color_contrast", "step")
+
+
+def leaf_descriptors(
+    segmentation: Segmentation,
+    up: ArrayLike | None = None,
+    *,
+    pose: bool = True,
+    neighbours: int = 1,
+    ancestors: int = 3,
+) -> tuple[NDArray[np.float64], list[str]]:
+    """What is known of each supervoxel, (n_leaves, f) float64, finite, and the names of the columns.
+
+    Parameters
+    ----------
+    segmentation : Segmentation
+    up : (3,) float, optional
+        Against gravity, in the points' frame. Default: the normal of the largest plane.
+    pose : bool
+        Whether height and slope are told; height above the lowest supervoxel if `up` is given, above the largest
+        plane otherwise.
+    neighbours : int, >= 0
+        Rings of the graph of which a supervoxel learns the mean, weighted by length of contact; with the first
+        also mean, smallest and largest of its edges' features.
+    ancestors : int, >= 0
+        Nodes of the tree of which it learns all that it knows of itself: with 4, 16, 64, ... times the points of
+        the median supervoxel; with the first also its segment in `Segmentation.labels`.
+    """
+    tree = segmentation.tree
+    direction, ground = _upright(segmentation, up) if pose else (None, 0.0)
+    nodes, names = _node_descriptors(segmentation, direction, ground)
+    leaves = nodes[: tree.n_leaves]
+    blocks, titles = [leaves], list(names)
+    if neighbours > 0:
+        edges, edge_names = _edge_summary(segmentation)
+        blocks.append(edges)
+        titles += edge_names
+        mean = _contact_means(segmentation)
+        around = leaves
+        for ring in range(1, neighbours + 1):
+            around = mean @ around
+            blocks.append(around - leaves)
+            titles += [f"neighbours {ring}: {name}" for name in names]
+    if ancestors > 0:
+        heights = _finite(tree.altitudes)
+        chosen = [("segment", _segments(segmentation))]
+        size = float(np.median(tree.moments.counts[: tree.n_leaves]))
+        for level in range(1, ancestors + 1):
+            least = size * GROWTH**level
+            chosen.append((f"ancestor {level}", _climb(tree.parents, tree.altitudes, tree.moments.counts, least)))
+        for title, node in chosen:
+            at = node[: tree.n_leaves]
+            blocks += [nodes[at], heights[at, None], heights[tree.parents[at], None]]
+            titles += [f"{title}: {name}" for name in [*names, "altitude", "altitude above"]]
+    return np.concatenate(blocks, axis=1), titles
+
+
+def _upright(segmentation: Segmentation, up: ArrayLike | None) -> tuple[NDArray[np.float64], float]:
+    """Unit vector against gravity, and the ground's position along it."""
+    planes = find_planes(segmentation, up=up)
+    centroids = segmentation.graph.node_features.centroid
+    if up is not None or not len(planes):
+        direction = planes.up if planes.up.any() else segmentation.graph.node_features.normal[0]
+        return direction, float((centroids @ direction).min())
+    return planes.up, float(planes.offsets[0])
+
+
+def _node_descriptors(
+    segmentation: Segmentation, up: NDArray[np.float64] | None, ground: float
+) -> tuple[NDArray[np.float64], list[str]]:
+    """The same columns for all k nodes of the tree."""
+    features = segmentation.tree.features()
+    deviations = np.sqrt(np.maximum(np.linalg.eigvalsh(features.covariance), 0.0))
+    shades = np.sqrt(np.maximum(np.einsum("kii->ki", features.color_covariance), 0.0))
+    columns = {
+        "thickness": deviations[:, 0],
+        "width": deviations[:, 1],
+        "length": deviations[:, 2],
+        "linearity": features.linearity,
+        "planarity": features.planarity,
+        "scattering": features.scattering,
+        **{f"{name} mean": features.color[:, i] for i, name in enumerate(("red", "green", "blue"))},
+        **{f"{name} spread": shades[:, i] for i, name in enumerate(("red", "green", "blue"))},
+        **_curved(_primitives(segmentation), deviations[:, 2]),
+    }
+    if up is not None:
+        columns |= _posed(features, up, ground)
+    return np.nan_to_num(np.stack(list(columns.values()), axis=1), posinf=0.0), list(columns)
+
+
+def _posed(features: NodeFeatures, up: NDArray[np.float64], ground: float) -> dict[str, NDArray[np.float64]]:
+    rise = features.normal @ up
+    spread = np.einsum("a,kab,b->k", up, features.covariance, up)
+    return {
+        "height": features.centroid @ up - ground,
+        "facing up": rise,
+        "level": np.abs(rise),
+        "vertical spread": np.sqrt(np.maximum(spread, 0.0)),
+    }
+
+
+def _primitives(segmentation: Segmentation) -> Primitives:
+    """Planes, spheres and cylinders through the voxels of every node."""
+    tree, surface, own = segmentation.tree, segmentation.surface, segmentation.graph.node_features
+    # Each supervoxel's centroid joins its voxels, so that none is without points.
+    places = np.concatenate((surface.grid.centroids, own.centroid))
+    normals = np.concatenate((surface.normals, own.normal))
+    leaf = np.concatenate((surface.supervoxels, np.arange(tree.n_leaves, dtype=np.int32)))
+    return fit_primitives(pool_up_tree(primitive_moments(places, normals, leaf, tree.n_leaves), tree.parents))
+
+
+def _curved(fits: Primitives, length: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """How round nodes are: residuals over length, and length over radius (0 where flat)."""
+    scale = np.where(length > 0.0, length, 1.0)
+    return {
+        "plane residual": fits.plane_residual / scale,
+        "sphere residual": fits.sphere_residual / scale,
+        "cylinder residual": fits.cylinder_residual / scale,
+        "sphere bend": length / fits.sphere_radius,
+        "cylinder bend": length / fits.cylinder_radius,
+    }
+
+
+def _contact_means(segmentation: Segmentation) -> csr_array:
+    """Matrix, (n_leaves, n_leaves), that takes values to the mean over the neighbours; to 0 without any."""
+    graph = segmentation.graph
+    (i, j), weight = graph.edges.T, graph.edge_features.contact_length
+    n = graph.n_nodes
+    links = csr_array((np.tile(weight, 2), (np.append(i, j), np.append(j, i))), shape=(n, n))
+    total = np.asarray(links.sum(axis=1)).ravel()
+    alone = total == 0.0  # they are their own neighbours, so that nothing differs
+    links.data /= np.repeat(np.where(alone, 1.0, total), np.diff(links.indptr))
+    return links + csr_array((alone.astype(float), (np.arange(n), np.arange(n))), shape=(n, n))
+
+
+def _edge_summary(segmentation: Segmentation) -> tuple[NDArray[np.float64], list[str]]:
+    """Mean, least and most of each feature over a supervoxel's edges; 0 without any."""
+    graph = segmentation.graph
+    n, ends = graph.n_nodes, np.append(graph.edges[:, 0], graph.edges[:, 1])
+    weight = np.tile(graph.edge_features.contact_length, 2)
+    total = np.bincount(ends, weight, n)
+    columns, names = [], []
+    for name in EDGE_COLUMNS:
+        values = np.tile(np.asarray(getattr(graph.edge_features, name), np.float64), 2)
+        least, most = np.full(n, np.inf), np.full(n, -np.inf)
+        np.minimum.at(least, ends, values)
+        np.maximum.at(most, ends, values)
+        columns += [np.bincount(ends, weight * values, n) / np.where(total > 0.0, total, 1.0), least, most]
+        names += [f"edges: {kind} {name}" for kind in ("mean", "least", "most")]
+    table = np.stack(columns, axis=1)
+    table[~np.isfinite(table)] = 0.0
+    return table, names
+
+
+def _segments(segmentation: Segmentation) -> NDArray[np.int32]:
+    """Highest node above each node whose points all have one label in `Segmentation.labels`, (k,) int32."""
+    tree, seen = segmentation.tree, segmentation.labels.ravel() >= 0
+    low, high = np.full(len(tree.parents), np.iinfo(np.int32).max, np.int32), np.full(len(tree.parents), -1, np.int32)
+    leaf, label = segmentation.supervoxels.ravel()[seen], segmentation.labels.ravel()[seen]
+    low[leaf] = high[leaf] = label
+    return _uniform_tops(tree.parents, low, high)
+
+
+def _finite(altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Altitudes with infinity twice as high as the highest finite one."""
+    known = np.isfinite(altitudes)
+    return np.where(known, altitudes, 2.0 * altitudes[known].max(initial=0.0))
+
+
+@njit(cache=True)
+def _climb(
+    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], least: float
+) -> NDArray[np.int32]:
+    """First node at or above each node with `least` points, short of those that join what does not touch."""
+    reached = np.arange(len(parents), dtype=np.int32)
+    for node in range(len(parents) - 1, -1, -1):  # parents before children
+        up = parents[node]
+        if counts[node] < least and up != node and altitudes[up] < np.inf:
+            reached[node] = reached[up]
+    return reached
+
+
+@njit(cache=True)
+def _uniform_tops(parents: NDArray[np.int32], low: NDArray[np.int32], high: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Highest node above each node, below which `low` and `high` of all leaves are one value."""
+    for node in range(len(parents)):
+        up = parents[node]
+        low[up], high[up] = min(low[up], low[node]), max(high[up], high[node])
+    top = np.arange(len(parents), dtype=np.int32)
+    for node in range(len(parents) - 1, -1, -1):
+        up = parents[node]
+        if up != node and low[up] == high[up]:
+            top[node] = top[up]
+    return top
