@@ -10,71 +10,108 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pcgraph import metrics
+    from pcgraph import detection, learning, metrics
     from pcgraph.cloud import Cloud
     from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
     from pcgraph.features.moments import Moments
     from pcgraph.features.nodes import NodeFeatures
+    from pcgraph.features.primitives import Primitives
     from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
-    from pcgraph.graph.boundary import BoundaryCost
+    from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
+    from pcgraph.graph.occlusion import Occlusions
     from pcgraph.io import read_cloud, write_segmentation
     from pcgraph.pipeline import segment, update
     from pcgraph.segmentation import Segmentation
     from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth, Vccs
+    from pcgraph.tree.energy import plane_energy, variance_energy
+    from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
+    from pcgraph.tree.lccp import LccpLinkage
+    from pcgraph.tree.learned import LearnedLinkage
     from pcgraph.tree.linkage import ConvexityLinkage, Linkage
+    from pcgraph.tree.quasi_flat import QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree
+    from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
+    from pcgraph.voxels.surface import Surface
 
 __all__ = [
     "AdjacencyGraph",
     "BoundaryCost",
+    "BoundaryStrength",
     "Cloud",
     "CloudReadError",
     "CloudWriteError",
     "ConvexityLinkage",
     "EdgeFeatures",
+    "FelzenszwalbLinkage",
+    "LccpLinkage",
+    "LearnedLinkage",
     "Linkage",
     "Moments",
+    "MumfordShahLinkage",
     "NodeFeatures",
+    "Occlusions",
     "PcgraphError",
+    "Primitives",
+    "QuasiFlatLinkage",
     "Segmentation",
     "SegmentationTree",
     "SupervoxelMethod",
+    "Surface",
     "SurfaceGrowth",
     "Vccs",
+    "WardLinkage",
+    "detection",
+    "learning",
     "metrics",
+    "plane_energy",
     "read_cloud",
     "segment",
     "update",
+    "variance_energy",
     "write_segmentation",
 ]
+
+_SUBPACKAGES = ("detection", "learning", "metrics")
 
 _HOMES = {
     "AdjacencyGraph": "graph.adjacency",
     "BoundaryCost": "graph.boundary",
+    "BoundaryStrength": "graph.boundary",
     "Cloud": "cloud",
     "CloudReadError": "errors",
     "CloudWriteError": "errors",
     "ConvexityLinkage": "tree.linkage",
     "EdgeFeatures": "graph.adjacency",
+    "FelzenszwalbLinkage": "tree.felzenszwalb",
+    "LccpLinkage": "tree.lccp",
+    "LearnedLinkage": "tree.learned",
     "Linkage": "tree.linkage",
     "Moments": "features.moments",
+    "MumfordShahLinkage": "tree.ward",
     "NodeFeatures": "features.nodes",
+    "Occlusions": "graph.occlusion",
     "PcgraphError": "errors",
+    "Primitives": "features.primitives",
+    "QuasiFlatLinkage": "tree.quasi_flat",
     "Segmentation": "segmentation",
     "SegmentationTree": "tree.tree",
     "SupervoxelMethod": "supervoxels.method",
+    "Surface": "voxels.surface",
     "SurfaceGrowth": "supervoxels.method",
     "Vccs": "supervoxels.method",
+    "WardLinkage": "tree.ward",
+    "plane_energy": "tree.energy",
     "read_cloud": "io",
     "segment": "pipeline",
     "update": "pipeline",
+    "variance_energy": "tree.energy",
     "write_segmentation": "io",
 }
 
 
 def __getattr__(name: str) -> object:
-    if name == "metrics":
-        return import_module("pcgraph.metrics")
+    if name in _SUBPACKAGES:
+        return import_module(f"pcgraph.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'pcgraph' has no attribute {name!r}")
     return getattr(import_module(f"pcgraph.{_HOMES[name]}"), name)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +20,13 @@ if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+
+
+class Method(StrEnum):
+    """Methods of supervoxels by name."""
+
+    SURFACE = "surface"
+    VCCS = "vccs"
 
 
 @app.callback()
@@ -43,6 +51,13 @@ def segment(
     objects: Annotated[
         int | None, typer.Option(help="Exact number of segments. Default: as many as concavity calls for.")
     ] = None,
+    method: Annotated[
+        Method, typer.Option(help="How supervoxels form: 'surface' keeps to edges within a point, 'vccs' is PCL's.")
+    ] = Method.SURFACE,
+    range_growth: Annotated[
+        float,
+        typer.Option(help="Power of the range with which voxels grow, 0 to 1; 0.5 suits scanners. Default: 0."),
+    ] = 0.0,
     color: Annotated[bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")] = True,
     viewpoint: Annotated[
         tuple[float, float, float] | None,
@@ -59,7 +74,8 @@ def segment(
     start = time.perf_counter()
     try:
         targets = _targets(cloud, out)
-        read, result = _segmentation(cloud, voxel_size, seed_size, color, viewpoint)
+        sizes = {"voxel_size": voxel_size, "seed_size": seed_size, "range_growth": range_growth}
+        read, result = _segmentation(cloud, method, color, viewpoint, sizes)
         labels = result.labels if objects is None else result.cut(n=objects)
         _write(targets, read, result, labels)
     except (PcgraphError, ValueError, MemoryError) as error:
@@ -88,14 +104,11 @@ def _targets(cloud: Path, out: Path | None) -> list[Path]:
 
 
 def _segmentation(
-    path: Path,
-    voxel_size: float | None,
-    seed_size: float | None,
-    color: bool,
-    viewpoint: tuple[float, ...] | None,
+    path: Path, method: Method, color: bool, viewpoint: tuple[float, ...] | None, sizes: dict[str, float | None]
 ) -> tuple[Cloud, Segmentation]:
     from pcgraph.io import read_cloud
     from pcgraph.pipeline import segment as segment_points
+    from pcgraph.supervoxels.method import SurfaceGrowth, Vccs
 
     cloud = read_cloud(path)
     stored = cloud.viewpoint
@@ -103,9 +116,17 @@ def _segmentation(
         stored = None  # PCD writers put zeros where they know nothing
     position = stored if viewpoint is None else viewpoint
     colors = cloud.colors if color else None
+    chosen = SurfaceGrowth() if method is Method.SURFACE else Vccs()
+    camera = False if sizes["range_growth"] else None
     try:
         result = segment_points(
-            cloud.points, colors, cloud.normals, position, voxel_size=voxel_size, seed_size=seed_size
+            cloud.points,
+            colors,
+            cloud.normals,
+            position,
+            camera=camera,
+            method=chosen,
+            **sizes,  # type: ignore[arg-type]
         )
     except ValueError as error:
         raise CloudReadError(f"cannot segment {path}: {error}") from None

@@ -4,15 +4,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.warp import CameraWarp
+
+if TYPE_CHECKING:
+    from pcgraph.features.primitives import Primitives
+    from pcgraph.graph.occlusion import Occlusions
 
 
 @dataclass(frozen=True)
@@ -66,3 +71,62 @@ class Segmentation:
     def on_points(self, values: NDArray[np.int32], missing: int = -1) -> NDArray[np.int32]:
         """Values of supervoxels, (k,) int32, on the points; `missing` where a point is not finite."""
         return np.append(values, values.dtype.type(missing))[self.supervoxels]
+
+    def saliency(self) -> NDArray[np.float64]:
+        """Boundary strength of each point in the input's shape, the altitudes' unit; NaN where not finite.
+
+        The largest altitude at which the supervoxel of the point's voxel merges with one that the voxel touches: 0
+        inside supervoxels, and what is left above a level are the boundaries of the cut at that altitude.
+        """
+        from pcgraph.tree.saliency import point_saliency
+
+        return self._spread(point_saliency(self.tree, self.surface), np.nan)
+
+    def occlusions(self) -> Occlusions:
+        """Which supervoxels hide which from the viewpoint, and what may go on behind them.
+
+        Neighbours in an organised input's image, or in bearing where there is no image.
+
+        Raises
+        ------
+        ValueError
+            The points were seen from more than one place; `pcgraph.graph.occlusion.occlusions` takes one at a time.
+        """
+        from pcgraph.graph.occlusion import occlusions
+
+        if self.viewpoint.ndim != 1:
+            raise ValueError("expected one viewpoint, got one per point; call graph.occlusion.occlusions for each scan")
+        image = self._spread(self.surface.grid.voxel_of_point, -1) if self.supervoxels.ndim == 2 else None
+        return occlusions(self.surface, self.graph.node_features, self.viewpoint, image)
+
+    def primitives(self, points: ArrayLike) -> Primitives:
+        """Plane, sphere and cylinder fitted to every node of the tree, supervoxels first.
+
+        Parameters
+        ----------
+        points : as given to `pcgraph.segment`
+
+        Raises
+        ------
+        ValueError
+            The shape is another, or the segmentation holds points of earlier scans, which are not among these.
+        """
+        from pcgraph.features.primitive_moments import pool_up_tree, primitive_moments
+        from pcgraph.features.primitives import fit_primitives
+
+        given = np.asarray(points)
+        inside = self.supervoxels >= 0
+        if given.shape != (*self.supervoxels.shape, 3):
+            raise ValueError(f"expected the points that were segmented, {(*inside.shape, 3)}, got {given.shape}")
+        if np.count_nonzero(inside) != self.tree.moments.counts[-1]:
+            raise ValueError("expected all points of the scene in one scan; primitives need the points of every scan")
+        normals = self.surface.normals[self.surface.grid.voxel_of_point]
+        groups = self.supervoxels[inside]
+        leaves = primitive_moments(given[inside].astype(np.float64), normals, groups, self.tree.n_leaves)
+        return fit_primitives(pool_up_tree(leaves, self.tree.parents))
+
+    def _spread(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
+        """Values of the finite points in the input's shape."""
+        full = np.full(self.supervoxels.shape, missing, values.dtype)
+        full[self.supervoxels >= 0] = values
+        return full

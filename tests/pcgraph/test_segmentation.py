@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a segmentation answers beyond its labels: saliency, occlusions, primitives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clouds import patch, two_boxes_on_a_plane
+
+import pcgraph
+from pcgraph.features.primitives import Primitive
+
+
+def test_saliency_above_a_level_is_the_boundary_of_that_cut(boxes):
+    points, _, result = boxes
+    saliency = result.saliency()
+    assert saliency.shape == (len(points),)
+    grid, voxels = result.surface.grid, result.surface.supervoxels
+    for altitude in (0.02, 0.3):
+        segments = result.tree.cut(altitude=altitude)[voxels]
+        row = np.repeat(np.arange(grid.n_voxels), np.diff(grid.indptr))
+        edge = np.zeros(grid.n_voxels, bool)
+        np.logical_or.at(edge, row, segments[row] != segments[grid.neighbours])
+        assert np.array_equal(saliency > altitude, edge[grid.voxel_of_point])
+
+
+def test_saliency_of_missing_points_is_nan():
+    rows, columns = np.mgrid[0:40, 0:50]
+    depth = np.where(columns > 25, 0.8, 1.0)
+    points = np.stack(((columns - 25) / 50 * depth, (rows - 20) / 50 * depth, depth), axis=-1)
+    points[3, 4] = np.nan
+    result = pcgraph.segment(points)
+    saliency = result.saliency()
+    assert saliency.shape == (40, 50)
+    assert np.array_equal(np.isnan(saliency), np.isnan(points[..., 0]))
+
+
+def test_the_front_plate_hides_the_wall_behind_it():
+    rows, columns = np.mgrid[0:60, 0:80]
+    plate = (abs(rows - 30) < 12) & (abs(columns - 40) < 15)
+    depth = np.where(plate, 0.6, 1.2)
+    points = np.stack(((columns - 40) / 80 * depth, (rows - 30) / 80 * depth, depth), axis=-1)
+    result = pcgraph.segment(points)
+    found = result.occlusions()
+    of_plate = set(result.supervoxels[plate].tolist())
+    assert len(found.pairs) > 0
+    assert {int(front) for front, _ in found.pairs} <= of_plate
+    assert not {int(behind) for _, behind in found.pairs} & of_plate
+    assert found.gap == pytest.approx(0.6, abs=0.1)
+
+
+def test_occlusions_need_one_viewpoint():
+    points, _, viewpoint = two_boxes_on_a_plane()
+    result = pcgraph.segment(points, viewpoint=np.tile(viewpoint, (len(points), 1)))
+    with pytest.raises(ValueError, match="one viewpoint"):
+        result.occlusions()
+
+
+def test_primitives_of_a_ball_on_a_floor():
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(6000, 3))
+    ball = 0.2 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + (0.5, 0.5, 0.2)
+    seen = ball[ball[:, 2] > 0.1]
+    floor = patch((0, 0, 0), (1, 0, 0), (0, 1, 0))
+    points = np.vstack([floor[np.hypot(*(floor[:, :2] - 0.5).T) > 0.18], seen])
+    result = pcgraph.segment(points, viewpoint=(0.5, 0.5, 3))
+    primitives = result.primitives(points)
+    nodes = result.tree.cut_nodes(n=2)
+    of_ball = nodes[result.supervoxels[-1]]
+    assert primitives.best[of_ball] == Primitive.SPHERE
+    assert primitives.sphere_radius[of_ball] == pytest.approx(0.2, rel=0.02)
+    assert primitives.sphere_center[of_ball] == pytest.approx((0.5, 0.5, 0.2), abs=0.01)
+    assert primitives.best[nodes[result.supervoxels[0]]] == Primitive.PLANE
+
+
+def test_primitives_need_all_points():
+    points, _, viewpoint = two_boxes_on_a_plane()
+    result = pcgraph.segment(points, viewpoint=viewpoint)
+    with pytest.raises(ValueError, match="the points that were segmented"):
+        result.primitives(points[:-1])
+    with pytest.raises(ValueError, match="all points of the scene in one scan"):
+        pcgraph.update(result, points, viewpoint=viewpoint).primitives(points)
