@@ -54,7 +54,6 @@ def stable_nodes(
 def _choose(parents, children, levels, across_gap, counts, min_size):  # type: ignore[no-untyped-def]
     k = len(parents)
     own, best = np.zeros(k), np.zeros(k)
-    top = np.zeros(k, np.bool_)  # whether the branch that passes here ends here
     taken = np.zeros(k, np.bool_)
     for node in range(k):
         a, b = children[node]
@@ -68,11 +67,9 @@ def _choose(parents, children, levels, across_gap, counts, min_size):  # type: i
         if a >= 0 and (counts[a] < min_size) != (counts[b] < min_size):
             own[node] = own[a] if counts[a] >= min_size else own[b]  # the branch goes on
         own[node] += counts[node] * (levels[up] - levels[node])
-        sibling = children[up, 0] if children[up, 1] == node else children[up, 1]
-        top[node] = up == node or across_gap[up] or counts[sibling] >= min_size
-        best[node] = below
-        if top[node] and own[node] >= below:
-            best[node], taken[node] = own[node], True
+        # Where a branch goes on, the node above has all of this and more, so it takes over by itself.
+        taken[node] = own[node] >= below
+        best[node] = max(own[node], below)
     for node in range(k - 2, -1, -1):
         if taken[parents[node]]:
             taken[node] = True

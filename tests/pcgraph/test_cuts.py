@@ -75,6 +75,14 @@ def test_the_most_stable_cut_of_five_leaves(tree):
     assert late.cut_stable(min_size=1000).tolist() == [0, 0, 0, 0, 0]
 
 
+def test_a_merge_with_something_small_does_not_end_a_life():
+    # Leaves of 50, 50, 1 and 100 points; [0, 1] lasts from 1 to 1.6 (60), with leaf 2 from 1.6 to 2.2 (60.6): either
+    # alone is less than what leaves 0 and 1 have (50 each), both together are more.
+    tree = hand_tree([[0, 1], [2, 4], [3, 5]], [1.0, 1.6, 2.2], [50, 50, 1, 100])
+    assert tree.cut_stable().tolist() == [0, 1, 2, 3]
+    assert tree.cut_stable(min_size=10).tolist() == [0, 0, 0, 1]
+
+
 def test_the_most_stable_cut_is_the_best_antichain():
     rng = np.random.default_rng(1)
     for _ in range(30):
