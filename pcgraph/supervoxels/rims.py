@@ -19,7 +19,7 @@ def settle_points(
 ) -> NDArray[np.int32]:
     """Supervoxel of each point, (n,) int32: its voxel's or one that touches its voxel.
 
-    A point p takes the supervoxel of the voxel i, its own or one around it, with the least
+    A point p takes the supervoxel of the voxel i, its own or one around it of another supervoxel, with the least
     (n_i . (p - o_i))^2 + (0.3 |p - x_i|)^2, where n_i, o_i is the plane and x_i the centroid of voxel i. Voxels
     that would lose all their points keep them, so every supervoxel stays connected, and none vanishes.
 
@@ -32,31 +32,12 @@ def settle_points(
     supervoxels : (v,) int32
     """
     chosen = np.empty(len(points), np.int32)
-    lists = grid.indptr, grid.neighbours
-    rim = np.empty(grid.n_voxels, np.bool_)
-    in_blocks(_find_rims, grid.n_voxels, *lists, supervoxels, rim)
-    surface = grid.centroids, planes.normals, planes.origins
-    in_blocks(_settle, len(points), points, grid.voxel_of_point, rim, *lists, *surface, supervoxels, chosen)
-    _keep_every_voxel(grid.voxel_of_point, supervoxels, chosen)
+    lists = grid.order, grid.starts, grid.indptr, grid.neighbours
+    surface = np.empty((grid.n_voxels, 8))  # a voxel's row fills one line of the cache
+    surface[:, :3], surface[:, 3:6] = grid.centroids, planes.normals
+    surface[:, 6] = np.einsum("ij,ij->i", planes.normals, planes.origins - grid.centroids)
+    in_blocks(_settle, grid.n_voxels, points, *lists, surface, supervoxels, chosen)
     return chosen
-
-
-@njit(cache=True, nogil=True)
-def _find_rims(
-    start: int,
-    stop: int,
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
-    supervoxels: NDArray[np.int32],
-    rim: NDArray[np.bool_],
-) -> None:
-    """Which voxels touch another supervoxel."""
-    for i in range(start, stop):
-        rim[i] = False
-        for a in range(indptr[i], indptr[i + 1]):
-            if supervoxels[neighbours[a]] != supervoxels[i]:
-                rim[i] = True
-                break
 
 
 @njit(cache=True, nogil=True)
@@ -64,46 +45,52 @@ def _settle(
     start: int,
     stop: int,
     points: NDArray[np.float64],
-    voxel_of_point: NDArray[np.int32],
-    rim: NDArray[np.bool_],
+    order: NDArray[np.int64],
+    starts: NDArray[np.int64],
     indptr: NDArray[np.int64],
     neighbours: NDArray[np.int32],
-    centroids: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    origins: NDArray[np.float64],
+    surface: NDArray[np.float64],
     supervoxels: NDArray[np.int32],
     chosen: NDArray[np.int32],
 ) -> None:
     """The supervoxel of the voxel on whose plane, and near which, each point lies; of equals its own voxel's."""
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
-    for p in range(start, stop):
-        v = voxel_of_point[p]
-        chosen[p] = supervoxels[v]
-        if not rim[v]:
+    place, plane, cost = np.empty((3, 27)), np.empty((4, 27)), np.empty(27)
+    owner = np.empty(27, np.int32)
+    for v in range(start, stop):
+        own = supervoxels[v]
+        rim = False
+        for a in range(indptr[v], indptr[v + 1]):
+            rim |= supervoxels[neighbours[a]] != own
+        for at in range(starts[v], starts[v + 1]):
+            chosen[order[at]] = own
+        if not rim:
             continue
-        least = np.inf
-        for a in range(indptr[v] - 1, indptr[v + 1]):
+        n = 0
+        for a in range(indptr[v] - 1, indptr[v + 1]):  # places and planes of the voxels around, about this voxel
             i = v if a < indptr[v] else neighbours[a]
-            x, y, z = points[p, 0] - centroids[i, 0], points[p, 1] - centroids[i, 1], points[p, 2] - centroids[i, 2]
-            off = (
-                normals[i, 0] * (points[p, 0] - origins[i, 0])
-                + normals[i, 1] * (points[p, 1] - origins[i, 1])
-                + normals[i, 2] * (points[p, 2] - origins[i, 2])
-            )
-            cost = off * off + weight * (x * x + y * y + z * z)
-            if cost < least:
-                least, chosen[p] = cost, supervoxels[i]
-
-
-@njit(cache=True, nogil=True)
-def _keep_every_voxel(
-    voxel_of_point: NDArray[np.int32], supervoxels: NDArray[np.int32], chosen: NDArray[np.int32]
-) -> None:
-    """Nothing; points of voxels that none of them chose go back to their voxel's supervoxel."""
-    kept = np.zeros(len(supervoxels), np.bool_)
-    for p in range(len(chosen)):
-        if chosen[p] == supervoxels[voxel_of_point[p]]:
-            kept[voxel_of_point[p]] = True
-    for p in range(len(chosen)):
-        if not kept[voxel_of_point[p]]:
-            chosen[p] = supervoxels[voxel_of_point[p]]
+            if i != v and supervoxels[i] == own:
+                continue
+            plane[3, n], owner[n] = surface[i, 6], supervoxels[i]
+            for axis in range(3):
+                place[axis, n] = surface[i, axis] - surface[v, axis]
+                plane[axis, n] = surface[i, 3 + axis]
+                plane[3, n] += plane[axis, n] * place[axis, n]
+            n += 1
+        stay = 0
+        for at in range(starts[v], starts[v + 1]):
+            p = order[at]
+            x, y, z = points[p, 0] - surface[v, 0], points[p, 1] - surface[v, 1], points[p, 2] - surface[v, 2]
+            for i in range(n):
+                off = plane[0, i] * x + plane[1, i] * y + plane[2, i] * z - plane[3, i]
+                away = (place[0, i] - x) ** 2 + (place[1, i] - y) ** 2 + (place[2, i] - z) ** 2
+                cost[i] = off * off + weight * away
+            best = 0
+            for i in range(1, n):
+                if cost[i] < cost[best]:
+                    best = i
+            chosen[p] = owner[best]
+            stay += chosen[p] == own
+        if stay == 0:
+            for at in range(starts[v], starts[v + 1]):
+                chosen[order[at]] = own

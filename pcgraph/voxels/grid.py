@@ -35,6 +35,10 @@ class VoxelGrid:
         Grid coordinates, whole numbers.
     voxel_of_point : (n,) int32
         Voxel of each point.
+    order : (n,) int64
+        Points voxel by voxel, within a voxel in any order.
+    starts : (v + 1,) int64
+        ``order[starts[i]:starts[i + 1]]`` are the points of voxel i.
     counts : (v,) int64
         Points per voxel.
     warped : (v, 3) float64, metres of the warped space
@@ -55,6 +59,8 @@ class VoxelGrid:
     warp: Warp
     cells: NDArray[np.float64]
     voxel_of_point: NDArray[np.int32]
+    order: NDArray[np.int64]
+    starts: NDArray[np.int64]
     counts: NDArray[np.int64]
     warped: NDArray[np.float64]
     centroids: NDArray[np.float64]
@@ -103,20 +109,19 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
     lengths = size * warp.scale(centroids)
     counts = np.diff(starts)
     cells = np.floor(scaled[order[starts[:-1]]])
-    return VoxelGrid(size, warp, cells, voxel_of_point, counts, warped, centroids, lengths, colors, indptr, neighbours)
+    members = voxel_of_point, order, starts, counts
+    return VoxelGrid(size, warp, cells, *members, warped, centroids, lengths, colors, indptr, neighbours)
 
 
 def voxel_means(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
-    """Mean of point values in [-1, 1] per voxel, (v, c), independent of the points' order."""
-    order = np.argsort(grid.voxel_of_point)
-    starts = np.concatenate(([0], np.cumsum(grid.counts)))
-    return _sorted_means(values, starts, order, _STEPS_PER_VOXEL)
+    """Mean of vectors of points, (n, 3), in [-1, 1], per voxel, (v, 3), independent of the points' order."""
+    return _sorted_means(values, grid.starts, grid.order, _STEPS_PER_VOXEL)
 
 
 def _sorted_means(
     values: NDArray[np.float64], starts: NDArray[np.int64], order: NDArray[np.int64], steps: float
 ) -> NDArray[np.float64]:
-    means = np.empty((len(starts) - 1, values.shape[1]))
+    means = np.empty((len(starts) - 1, 3))
     in_blocks(_average, len(means), starts, order, values, steps, means)
     return means
 
@@ -156,14 +161,16 @@ def _average(
     steps: float,
     means: NDArray[np.float64],
 ) -> None:
-    """Means of values by voxel, summed as whole numbers."""
+    """Means of vectors by voxel, summed as whole numbers."""
     for v in range(start, stop):
-        n = starts[v + 1] - starts[v]
-        for c in range(values.shape[1]):
-            total = np.int64(0)
-            for at in range(starts[v], starts[v + 1]):
-                total += np.int64(np.rint(values[order[at], c] * steps))
-            means[v, c] = total / (n * steps)
+        x = y = z = np.int64(0)
+        for at in range(starts[v], starts[v + 1]):
+            p = order[at]
+            x += np.int64(np.rint(values[p, 0] * steps))
+            y += np.int64(np.rint(values[p, 1] * steps))
+            z += np.int64(np.rint(values[p, 2] * steps))
+        total = max(starts[v + 1] - starts[v], 1) * steps
+        means[v, 0], means[v, 1], means[v, 2] = x / total, y / total, z / total
 
 
 def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:

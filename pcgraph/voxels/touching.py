@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks
 
+_MOST = 26
+
 
 def touching(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """The 26-neighbourhood of occupied voxels as CSR lists, indptr (v + 1,) and neighbours (e,), ascending.
@@ -20,11 +22,12 @@ def touching(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> tuple[NDArr
     pitch_x, pitch_y : int
         What a step in x and in y adds to a key.
     """
-    indptr = np.zeros(len(keys) + 1, np.int64)
-    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, indptr, np.empty(0, np.int32))
-    np.cumsum(indptr, out=indptr)
+    counts = np.empty(len(keys), np.int64)
+    room = np.empty((len(keys), _MOST), np.int32)
+    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, room)
+    indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     neighbours = np.empty(indptr[-1], np.int32)
-    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, indptr, neighbours)
+    in_blocks(_pack, len(keys), indptr, room, neighbours)
     return indptr, neighbours
 
 
@@ -35,32 +38,38 @@ def _walk(
     keys: NDArray[np.int64],
     pitch_x: int,
     pitch_y: int,
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
+    counts: NDArray[np.int64],
+    room: NDArray[np.int32],
 ) -> None:
-    """Lengths of the lists if `neighbours` is empty, else the lists: nine pointers walk the sorted keys.
-
-    Each pointer follows one row of three voxels around the voxel at hand.
-    """
+    """The lists, one row each: nine pointers walk the sorted keys, each along one row of three voxels around."""
     n = len(keys)
     pointers = np.empty(9, np.int64)
+    shifts = np.empty(9, np.int64)
     for row in range(9):
-        shift = (row // 3 - 1) * pitch_x + (row % 3 - 1) * pitch_y - 1
-        pointers[row] = np.searchsorted(keys, keys[start] + shift) if start < stop else 0
+        shifts[row] = (row // 3 - 1) * pitch_x + (row % 3 - 1) * pitch_y - 1
+        pointers[row] = np.searchsorted(keys, keys[start] + shifts[row]) if start < stop else 0
     for i in range(start, stop):
-        used = indptr[i]
         count = 0
         for row in range(9):
-            target = keys[i] + (row // 3 - 1) * pitch_x + (row % 3 - 1) * pitch_y - 1
+            target = keys[i] + shifts[row]
             at = pointers[row]
             while at < n and keys[at] < target:
                 at += 1
             pointers[row] = at
             while at < n and keys[at] <= target + 2:
                 if at != i:
-                    if len(neighbours) > 0:
-                        neighbours[used + count] = at
+                    room[i, count] = at
                     count += 1
                 at += 1
-        if len(neighbours) == 0:
-            indptr[i + 1] = count
+        counts[i] = count
+
+
+@njit(cache=True, nogil=True)
+def _pack(
+    start: int, stop: int, indptr: NDArray[np.int64], room: NDArray[np.int32], neighbours: NDArray[np.int32]
+) -> None:
+    """The lists one after the other."""
+    for i in range(start, stop):
+        first = indptr[i]
+        for q in range(indptr[i + 1] - first):
+            neighbours[first + q] = room[i, q]

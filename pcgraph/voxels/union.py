@@ -19,7 +19,8 @@ class GridUnion:
     Attributes
     ----------
     grid : VoxelGrid of v voxels
-        Means weighted by points. Its `voxel_of_point` speaks of the second grid's points.
+        Means weighted by points. Its `voxel_of_point`, `order` and `starts` speak of the second grid's points, its
+        `counts` of those of both.
     first, second : (v1,), (v2,) int64
         Where the voxels of either grid went.
     """
@@ -59,6 +60,9 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
     centroids = a.warp.backward(warped)
     lengths = a.size * a.warp.scale(centroids)
     voxel_of_point = second[b.voxel_of_point].astype(np.int32)
+    starts = np.zeros(len(counts) + 1, np.int64)
+    starts[second + 1] = b.counts
+    members = voxel_of_point, b.order, np.cumsum(starts)
     lists = touching(unique_keys, *pitch)
-    grid = VoxelGrid(a.size, a.warp, cells[at], voxel_of_point, counts, warped, centroids, lengths, colors, *lists)
+    grid = VoxelGrid(a.size, a.warp, cells[at], *members, counts, warped, centroids, lengths, colors, *lists)
     return GridUnion(grid, first, second)
