@@ -60,7 +60,7 @@ class Case:
         """Tree, and the seconds that it took."""
         start = time.perf_counter()
         merges = linkage.merges(self.result.graph, self.leaves)
-        tree = segmentation_tree(merges, self.leaves, self.result.viewpoint)
+        tree = segmentation_tree(merges, self.leaves)
         return tree, time.perf_counter() - start
 
 
@@ -84,10 +84,8 @@ def main() -> None:
 
 def _case(cloud) -> Case:  # type: ignore[no-untyped-def]
     result = pcgraph.segment(cloud.points, cloud.colors)
-    n, moments = result.graph.n_nodes, result.tree.moments
-    colors = None if moments.colors is None else moments.colors[:n]
-    leaves = Moments(moments.counts[:n], moments.centroids[:n], moments.scatters[:n], colors)
-    return Case(result, cloud.objects, leaf_truth(result.supervoxels, cloud.objects, n), leaves)
+    table = leaf_truth(result.supervoxels, cloud.objects, result.graph.n_nodes)
+    return Case(result, cloud.objects, table, result.leaves)
 
 
 def _fit_without(cases: list[Case], left_out: int) -> LearnedLinkage:

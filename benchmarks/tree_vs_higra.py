@@ -96,7 +96,7 @@ def cut_times(p: Problem, pairs: NDArray[np.int32], altitudes: NDArray[np.float6
     levels = np.concatenate((np.zeros(p.n), altitudes))
     k, rng = len(parents), np.random.default_rng(0)
     nothing = Moments(np.ones(k, np.int64), np.zeros((k, 3)), np.zeros((k, 3, 3)), None)
-    tree = SegmentationTree(parents, levels, nothing, np.zeros(3))
+    tree = SegmentationTree(parents, levels, nothing)
     other = higra.Tree(parents.astype(np.int64))
     higra.CptHierarchy.link(other, p.graph)
     sizes = higra.attribute_area(other)

@@ -21,7 +21,6 @@ from pcgraph.tree.linkage import Linkage, Merges
 
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
-    from pcgraph.tree.tree import SegmentationTree
 
 _STEPS = float(1 << 20)
 _PURE = 0.8  # share of a supervoxel's points that must agree before an edge at it teaches anything
@@ -85,7 +84,8 @@ class LearnedLinkage(Linkage):
         pairs = zip(segmentations, truths, strict=True)
         tables = [leaf_truth(result.supervoxels, truth, result.graph.n_nodes) for result, truth in pairs]
         model = _fit_edges([result.graph for result in segmentations], tables)
-        trees = [_tree(cls(model), result) for result in segmentations]
+        linkage = cls(model)
+        trees = [segmentation_tree(linkage.merges(r.graph, r.leaves), r.leaves) for r in segmentations]
         overlaps = [
             [t.overlap(tree.cut(altitude=a)) for a in _ALTITUDES] for tree, t in zip(trees, tables, strict=True)
         ]
@@ -123,7 +123,3 @@ def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeMod
     regression = LogisticRegression(class_weight="balanced", max_iter=1000).fit((rows - means) / scales, boundary)
     weights, intercept = regression.coef_[0].tolist(), float(regression.intercept_[0])
     return EdgeModel(tuple(columns), tuple(means.tolist()), tuple(scales.tolist()), tuple(weights), intercept, 0.5)
-
-
-def _tree(linkage: Linkage, result: Segmentation) -> SegmentationTree:
-    return segmentation_tree(linkage.merges(result.graph, result.leaves), result.leaves)
