@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pcgraph.learning.descriptors import leaf_descriptors
     from pcgraph.learning.pooling import down, pool_points, pool_up
     from pcgraph.learning.transfer import labels_at
-    from pcgraph.learning.votes import majority, pure_ancestors, spread_votes, votes
+    from pcgraph.learning.voting import majority, pure_ancestors, spread_votes, votes
 
 __all__ = [
     "NodeClassifier",
@@ -31,12 +31,12 @@ _HOMES = {
     "down": "pooling",
     "labels_at": "transfer",
     "leaf_descriptors": "descriptors",
-    "majority": "votes",
+    "majority": "voting",
     "pool_points": "pooling",
     "pool_up": "pooling",
-    "pure_ancestors": "votes",
-    "spread_votes": "votes",
-    "votes": "votes",
+    "pure_ancestors": "voting",
+    "spread_votes": "voting",
+    "votes": "voting",
 }
 
 

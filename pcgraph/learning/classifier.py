@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.learning.descriptors import leaf_descriptors
 from pcgraph.learning.pooling import down
-from pcgraph.learning.votes import votes
+from pcgraph.learning.voting import votes
 from pcgraph.segmentation import Segmentation
 
 _TREES = 100

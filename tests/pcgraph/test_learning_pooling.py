@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import importlib
+
 import networkx
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import pytest
 import pcgraph
 from pcgraph.features.moments import Moments
 from pcgraph.learning.pooling import down, pool_points, pool_up
-from pcgraph.learning.votes import majority, pure_ancestors, spread_votes, votes
+from pcgraph.learning.voting import majority, pure_ancestors, spread_votes, votes
 from pcgraph.tree.tree import SegmentationTree
 
 
@@ -139,3 +141,12 @@ def test_wrong_input_is_refused(boxes):
         down(result, np.zeros(tree.n_leaves), tree.cut_nodes(n=2))
     with pytest.raises(ValueError, match="share"):
         pure_ancestors(tree, votes(result, truth), 1.5)
+
+
+@pytest.mark.parametrize("package", ["learning", "detection"])
+def test_public_names_are_things_not_modules(package):
+    rooms = importlib.import_module(f"pcgraph.{package}")
+    for name in rooms.__all__:
+        thing = getattr(rooms, name)
+        assert callable(thing), f"{name} is shadowed by a module"
+        assert thing.__doc__
