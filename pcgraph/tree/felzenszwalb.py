@@ -29,7 +29,7 @@ class FelzenszwalbLinkage(Linkage):
     supervoxels' normals, squared if convex (Dai et al. 2017). A region's size is its number of supervoxels.
     """
 
-    object_altitude: float = 5.0
+    object_altitude: float = 20.0
     part_altitude: float = 0.5
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:

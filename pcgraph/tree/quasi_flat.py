@@ -29,7 +29,7 @@ class QuasiFlatLinkage(Linkage):
     """
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
-    object_altitude: float = 0.11
+    object_altitude: float = 0.12
     part_altitude: float = 0.05
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:

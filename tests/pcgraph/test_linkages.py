@@ -130,6 +130,15 @@ def test_mumford_shah_counts_the_boundary_that_a_merge_removes():
     assert altitudes == pytest.approx([0.2, 0.5, 12.0, 6 / 5 * (5.5 - 0.5) ** 2])
 
 
+def test_contacts_with_the_same_third_region_add_up():
+    # A triangle of values 0, 1, 4 and contacts of 1: {0, 1} costs 1/2, then 2/3 3.5^2 over a contact of 2.
+    triangle = np.array([[0, 1], [0, 2], [1, 2]], np.int32)
+    _, altitudes = least_increase_linkage(value_regions([0.0, 1.0, 4.0]), triangle, np.ones(3))
+    assert altitudes == pytest.approx([0.5, 2 / 3 * 3.5**2 / 2])
+    _, without = least_increase_linkage(value_regions([0.0, 1.0, 4.0]), triangle, None)
+    assert without == pytest.approx([0.5, 2 / 3 * 3.5**2])
+
+
 def test_mumford_shah_grows_planes_before_it_bends_them():
     # A floor (nodes 0, 1) and a wall (2, 3) of unit squares, and a lid (4) parallel to the floor but higher up.
     square = np.stack(np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5)), axis=-1).reshape(-1, 2)
