@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.voxels.grid import VoxelGrid, cell_keys
+from pcgraph.voxels.grid import VoxelGrid, cell_keys, sorted_keys
 
 
 def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, two_sided: bool) -> NDArray[np.int32]:
@@ -32,8 +32,7 @@ def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float,
     Source: Papon et al. 2013, section 3.2. Parts of the surface that hold no seed are left to `grow`.
     """
     keys, _ = cell_keys(grid.warped / seed_size, seed_size)
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
+    ordered, order = sorted_keys(keys)
     starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
     ratio = seed_size / grid.size  # a cell counts if it holds a tenth of a plane, or half of a line
     enough = min(0.1 * ratio**2, 0.5 * ratio)

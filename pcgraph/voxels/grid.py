@@ -36,7 +36,7 @@ class VoxelGrid:
     voxel_of_point : (n,) int32
         Voxel of each point.
     order : (n,) int64
-        Points voxel by voxel, within a voxel in any order.
+        Points voxel by voxel, ascending within each.
     starts : (v + 1,) int64
         ``order[starts[i]:starts[i + 1]]`` are the points of voxel i.
     counts : (v,) int64
@@ -95,8 +95,7 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
     """
     scaled = warp.forward(points) / size
     keys, pitch = cell_keys(scaled, size)
-    order = np.argsort(keys)
-    ordered = keys[order]
+    ordered, order = sorted_keys(keys)
     starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
     n_voxels = len(starts) - 1
     voxel_of_point, warped = np.empty(len(points), np.int32), np.empty((n_voxels, 3))
@@ -201,6 +200,20 @@ def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int6
     keys = np.empty(len(cells), np.int64)
     in_blocks(_number_cells, len(cells), cells, low, *pitch, keys)
     return keys, pitch
+
+
+def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys, none negative, in ascending order, and where each was; equal ones stay in their order.
+
+    Key and place go into one number where they fit, as numbers sort three times faster than their places do.
+    """
+    bits = int(len(keys) - 1).bit_length()
+    if int(keys.max()) >= 1 << (62 - bits):
+        order = np.argsort(keys, kind="stable")
+        return keys[order], order
+    both = (keys << bits) | np.arange(len(keys))
+    both.sort()
+    return both >> bits, both & ((1 << bits) - 1)
 
 
 @njit(cache=True, nogil=True)
