@@ -12,10 +12,14 @@ from graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
 
 from pcgraph.features.moments import Moments
 from pcgraph.tree.energy import Energy, boundary_lengths, plane_energy, variance_energy
+from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
+from pcgraph.tree.lccp import LccpLinkage
 from pcgraph.tree.linkage import ConvexityLinkage
+from pcgraph.tree.quasi_flat import QuasiFlatLinkage
 from pcgraph.tree.saliency import point_saliency, voxel_saliency
 from pcgraph.tree.segments import children_of
 from pcgraph.tree.tree import SegmentationTree
+from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
 
 #            8 (9)               Leaves 0..4; nodes 5..8 at these altitudes. Points of the leaves: 40, 30, 2, 20, 8.
 #           /     \
@@ -241,6 +245,18 @@ def test_saliency_above_a_level_is_the_boundary_of_that_cut(boxes):
         assert boundary.any()
     assert np.array_equal(point_saliency(tree, surface), strength[grid.voxel_of_point])
     assert len(point_saliency(tree, surface)) == len(points)
+
+
+@pytest.mark.parametrize(
+    "linkage",
+    [FelzenszwalbLinkage(), LccpLinkage(), MumfordShahLinkage(), QuasiFlatLinkage(), WardLinkage()],
+    ids=lambda linkage: type(linkage).__name__,
+)
+def test_faces_of_boxes_are_the_parts_of_other_linkages_too(boxes, linkage):
+    result = boxes[2]
+    expected = result.tree.cut(altitude=ConvexityLinkage().part_altitude)
+    parts = tree_of(linkage, result.graph, result.leaves).cut(altitude=linkage.part_altitude)
+    assert np.array_equal(parts, expected)
 
 
 def test_faces_of_boxes_are_parts_and_boxes_are_objects(boxes):
