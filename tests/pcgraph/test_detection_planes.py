@@ -117,7 +117,8 @@ def test_a_ball_on_the_table_is_found_with_its_radius():
     table = patch((0, 0, 0), (1, 0, 0), (0, 1, 0))
     table = table[np.linalg.norm(table[:, :2] - 0.5, axis=1) > 0.12]
     ball = sphere(0.12, 6000)
-    ball = ball[ball[:, 2] > -0.1] + [0.5, 0.5, 0.12]
+    seen = (ball * (np.array([0.0, -1.5, 1.88]) - ball)).sum(axis=1) > 0  # the side that faces the viewpoint
+    ball = ball[seen & (ball[:, 2] > -0.1)] + [0.5, 0.5, 0.12]
     noise = 0.0005 * np.random.default_rng(0).normal(size=(len(table) + len(ball), 3))
     result = pcgraph.segment(np.vstack((table, ball)) + noise, viewpoint=(0.5, -1, 2), voxel_size=0.015)
     found = objects_on(result)

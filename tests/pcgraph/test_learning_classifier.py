@@ -32,7 +32,8 @@ def test_rooms_are_learned_from_rooms(rooms):
     floor_and_walls = (classes[3] == 0) | (classes[3] == 1)
     predicted = taught.predict(results[3], ups[3])
     assert np.mean(predicted[floor_and_walls] == classes[3][floor_and_walls]) > 0.97
-    assert taught.score(results[3], classes[3], ups[3]) > 0.85
+    guess = np.bincount(classes[3][classes[3] >= 0]).max() / (classes[3] >= 0).sum()
+    assert taught.score(results[3], classes[3], ups[3]) > guess + 0.2
     both = taught.score(results[2:], classes[2:], ups[2:])
     parts = [taught.score(results[i], classes[i], ups[i]) for i in (2, 3)]
     sizes = [(classes[i] >= 0).sum() for i in (2, 3)]
