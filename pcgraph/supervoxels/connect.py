@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.supervoxels.distance import Metric, distance, update_means
+from pcgraph.supervoxels.distance import Metric, distance, set_means, sum_features
 from pcgraph.voxels.grid import VoxelGrid
 
 
@@ -99,8 +99,8 @@ def _adopt(
     n_supervoxels: int,
 ) -> None:
     """Nothing; every voxel with owner -1 gets the nearest owner around it, ring by ring."""
-    sums, means = np.zeros((n_supervoxels, 10)), np.zeros((n_supervoxels, 9))
-    update_means(features, owner, sums, means)
+    means = np.zeros((n_supervoxels, 9))
+    set_means(sum_features(features, owner, n_supervoxels), means)
     waiting, adopted = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
     n_waiting = 0
     for i in range(len(owner)):

@@ -51,23 +51,26 @@ def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], 
 
 
 @njit(cache=True, nogil=True)
-def update_means(
-    features: NDArray[np.float64],
-    owner: NDArray[np.int32],
-    sums: NDArray[np.float64],
-    means: NDArray[np.float64],
-) -> None:
-    """Nothing; `means` become the supervoxels' mean rows, normals at unit length (empty ones stay).
-
-    Sums are taken anew, in voxel order, rather than kept up to date: so they carry no history of rounding.
-    """
-    sums[:] = 0.0
+def sum_features(features: NDArray[np.float64], owner: NDArray[np.int32], n_owners: int) -> NDArray[np.float64]:
+    """Sums of the features of each supervoxel's voxels, and their number, (n_owners, 10) float64, in voxel order."""
+    sums = np.zeros((n_owners, 10))
     for i in range(len(owner)):
-        s = owner[i]
-        if s >= 0:
-            for column in range(9):
-                sums[s, column] += features[i, column]
-            sums[s, 9] += 1.0
+        if owner[i] >= 0:
+            add_features(features, i, sums, owner[i], 1.0)
+    return sums
+
+
+@njit(cache=True, nogil=True, inline="always")
+def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64], s: int, sign: float) -> None:
+    """Nothing; voxel i has joined supervoxel s (sign 1) or left it (sign -1)."""
+    for column in range(9):
+        sums[s, column] += sign * features[i, column]
+    sums[s, 9] += sign
+
+
+@njit(cache=True, nogil=True)
+def set_means(sums: NDArray[np.float64], means: NDArray[np.float64]) -> None:
+    """Nothing; `means`, (k, 9), become the supervoxels' mean rows, normals at unit length (empty ones stay)."""
     for s in range(len(sums)):
         if sums[s, 9] > 0.0:
             length = max(np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2), 1e-12)

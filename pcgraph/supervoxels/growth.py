@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks
-from pcgraph.supervoxels.distance import Metric, distance, update_means
+from pcgraph.supervoxels.distance import Metric, add_features, distance, set_means, sum_features
 from pcgraph.voxels.grid import VoxelGrid
 
 _SWEEPS = 3
@@ -73,16 +73,16 @@ def settle_boundaries(
         Voxels that stay.
     """
     n = int(owner.max()) + 1
-    sums, means = np.empty((n, 10)), np.empty((n, 9))
+    sums, means = sum_features(features, owner, n), np.empty((n, 9))
     queued = fixed.copy()
     active = _boundary(grid.indptr, grid.neighbours, owner)
     active = active[~fixed[active]]
     for _ in range(_SWEEPS):
-        update_means(features, owner, sums, means)
+        set_means(sums, means)
         chosen = np.empty_like(active)
         lists = grid.indptr, grid.neighbours
         in_blocks(_choose, len(active), active, features, metric, *lists, owner, means, chosen)
-        active = _move(active, chosen, *lists, owner, queued)
+        active = _move(active, chosen, features, *lists, owner, sums, queued)
         if not len(active):
             return
 
@@ -101,7 +101,7 @@ def _grow(
     """Nothing; owners have spread as far as there are voxels. Early sweeps may also take from a worse owner."""
     n = len(features)
     claim, best = np.full(n, -1, np.int32), np.full(n, np.inf)
-    sums, means = np.zeros((n_owners, 10)), np.zeros((n_owners, 9))
+    sums, means = sum_features(features, owner, n_owners), np.zeros((n_owners, 9))
     frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
     n_frontier, sweep = 0, 0
     for i in range(n):
@@ -110,7 +110,7 @@ def _grow(
             frontier[n_frontier] = i
             n_frontier += 1
     while n_frontier > 0:
-        update_means(features, owner, sums, means)
+        set_means(sums, means)
         n_touched = 0
         for f in range(n_frontier):
             i = frontier[f]
@@ -127,6 +127,9 @@ def _grow(
                     best[j], claim[j] = d, s
         for t in range(n_touched):
             j = touched[t]
+            if owner[j] >= 0:
+                add_features(features, j, sums, owner[j], -1.0)
+            add_features(features, j, sums, claim[j], 1.0)
             owner[j], claim[j] = claim[j], -1
         frontier, touched = touched, frontier
         n_frontier, sweep = n_touched, sweep + 1
@@ -202,9 +205,11 @@ def _choose(
 def _move(
     active: NDArray[np.int32],
     chosen: NDArray[np.int32],
+    features: NDArray[np.float64],
     indptr: NDArray[np.int64],
     neighbours: NDArray[np.int32],
     owner: NDArray[np.int32],
+    sums: NDArray[np.float64],
     queued: NDArray[np.bool_],
 ) -> NDArray[np.int32]:
     """The voxels to look at next: those that moved and those that touch them, but no fixed ones (queued).
@@ -216,6 +221,8 @@ def _move(
     for q in range(len(active)):
         i = active[q]
         if owner[i] != chosen[q]:
+            add_features(features, i, sums, owner[i], -1.0)
+            add_features(features, i, sums, chosen[q], 1.0)
             owner[i] = chosen[q]
             for a in range(indptr[i] - 1, indptr[i + 1]):
                 j = i if a < indptr[i] else neighbours[a]

@@ -11,6 +11,7 @@ from pcgraph.parallel import in_blocks
 from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.planes import LocalPlanes
 
+_MOST = 26  # voxels around a voxel
 _PLACE_WEIGHT = 0.3  # of a metre along the surface against one off the plane
 
 
@@ -55,8 +56,7 @@ def _settle(
 ) -> None:
     """The supervoxel of the voxel on whose plane, and near which, each point lies; of equals its own voxel's."""
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
-    place, plane, cost = np.empty((3, 27)), np.empty((4, 27)), np.empty(27)
-    owner = np.empty(27, np.int32)
+    near, owner = np.empty((_MOST, 8)), np.empty(_MOST, np.int32)
     for v in range(start, stop):
         own = supervoxels[v]
         rim = False
@@ -67,29 +67,27 @@ def _settle(
         if not rim:
             continue
         n = 0
-        for a in range(indptr[v] - 1, indptr[v + 1]):  # places and planes of the voxels around, about this voxel
-            i = v if a < indptr[v] else neighbours[a]
-            if i != v and supervoxels[i] == own:
-                continue
-            plane[3, n], owner[n] = surface[i, 6], supervoxels[i]
-            for axis in range(3):
-                place[axis, n] = surface[i, axis] - surface[v, axis]
-                plane[axis, n] = surface[i, 3 + axis]
-                plane[3, n] += plane[axis, n] * place[axis, n]
-            n += 1
+        for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around
+            i = neighbours[a]
+            if supervoxels[i] != own:
+                for column in range(7):
+                    near[n, column] = surface[i, column]
+                owner[n] = supervoxels[i]
+                n += 1
         stay = 0
         for at in range(starts[v], starts[v + 1]):
             p = order[at]
+            chosen[p] = own
             x, y, z = points[p, 0] - surface[v, 0], points[p, 1] - surface[v, 1], points[p, 2] - surface[v, 2]
+            off = surface[v, 3] * x + surface[v, 4] * y + surface[v, 5] * z - surface[v, 6]
+            least = off * off + weight * (x * x + y * y + z * z)
             for i in range(n):
-                off = plane[0, i] * x + plane[1, i] * y + plane[2, i] * z - plane[3, i]
-                away = (place[0, i] - x) ** 2 + (place[1, i] - y) ** 2 + (place[2, i] - z) ** 2
-                cost[i] = off * off + weight * away
-            best = 0
-            for i in range(1, n):
-                if cost[i] < cost[best]:
-                    best = i
-            chosen[p] = owner[best]
+                x, y, z = points[p, 0] - near[i, 0], points[p, 1] - near[i, 1], points[p, 2] - near[i, 2]
+                away = weight * (x * x + y * y + z * z)
+                if away < least:
+                    off = near[i, 3] * x + near[i, 4] * y + near[i, 5] * z - near[i, 6]
+                    if off * off + away < least:
+                        least, chosen[p] = off * off + away, owner[i]
             stay += chosen[p] == own
         if stay == 0:
             for at in range(starts[v], starts[v + 1]):

@@ -48,9 +48,10 @@ def local_planes(grid: VoxelGrid, viewpoints: NDArray[np.float64], reach: int) -
     -----
     A window is a voxel with two rings of its neighbours. Beside an edge the window around a voxel straddles both
     faces and its normal is a compromise; but some window further in lies on one face alone. So each voxel takes,
-    of the windows within `reach`, the one with the least mean squared distance of its own voxels plus
-    the squared distance of this voxel to its plane. On plane ground, where all windows are as good, the voxel's
-    own is preferred, and noise averages out. Source of the idea: Kuwahara et al. 1976, for images.
+    of the windows within `reach`, the one with the least mean squared distance of its own voxels plus the squared
+    distance of this voxel to its plane. Its own window counts 0.7 times its mean alone: so on plain and evenly
+    curved ground, where all windows are as good, it is preferred, and noise averages out. Source of the idea:
+    Kuwahara et al. 1976, for images.
     """
     n = grid.n_voxels
     lists = grid.indptr, grid.neighbours
@@ -60,10 +61,10 @@ def local_planes(grid: VoxelGrid, viewpoints: NDArray[np.float64], reach: int) -
     towards = viewpoints - grid.centroids
     normals, residuals = np.empty((n, 3)), np.empty(n)
     in_blocks(_fit, n, moments, towards, normals, residuals)
-    best = np.arange(n, dtype=np.int32)
+    best, costs = np.arange(n, dtype=np.int32), _OWN_BONUS * residuals
     for _ in range(reach):
-        better = np.empty_like(best)
-        in_blocks(_take_best, n, *lists, grid.centroids, moments, normals, residuals, best, better)
+        held, better = residuals[best], np.empty_like(best)
+        in_blocks(_take_best, n, *lists, grid.centroids, moments, normals, held, best, costs, better)
         best = better
     facing, origins = np.empty((n, 3)), np.empty((n, 3))
     in_blocks(_read_off, n, best, normals, moments, towards, facing, origins)
@@ -212,24 +213,31 @@ def _take_best(
     centroids: NDArray[np.float64],
     moments: NDArray[np.float64],
     normals: NDArray[np.float64],
-    residuals: NDArray[np.float64],
+    held: NDArray[np.float64],
     best: NDArray[np.int32],
+    costs: NDArray[np.float64],
     better: NDArray[np.int32],
 ) -> None:
-    """The best of the windows that a voxel and its neighbours hold so far, each as this voxel sees it."""
+    """The best of the windows that a voxel and its neighbours hold so far, each as this voxel sees it.
+
+    A window's cost is never below its residual (`held`), so on plain ground no plane need be looked at.
+    """
     for i in range(start, stop):
-        chosen, least = best[i], np.inf
-        for a in range(indptr[i] - 1, indptr[i + 1]):
-            w = best[i] if a < indptr[i] else best[neighbours[a]]
+        chosen, least = best[i], costs[i]
+        for a in range(indptr[i], indptr[i + 1]):
+            j = neighbours[a]
+            if held[j] >= least:
+                continue
+            w = best[j]
             away = (
                 normals[w, 0] * (centroids[i, 0] - moments[w, 1])
                 + normals[w, 1] * (centroids[i, 1] - moments[w, 2])
                 + normals[w, 2] * (centroids[i, 2] - moments[w, 3])
             )
-            cost = (residuals[w] + away * away) * (_OWN_BONUS if w == i else 1.0)
-            if cost < least or (cost == least and w < chosen):
+            cost = held[j] + away * away
+            if cost < least:
                 chosen, least = w, cost
-        better[i] = chosen
+        better[i], costs[i] = chosen, least
 
 
 @njit(cache=True, nogil=True)

@@ -122,3 +122,15 @@ def test_planes_go_through_their_surface(crease):
     planes = local_planes(grid, np.array([0.5, -3.0, 3.0]), 3)
     offset = np.abs(np.einsum("ij,ij->i", planes.normals, grid.centroids - planes.origins))
     assert np.percentile(offset[away > 0.03], 99) < 0.003
+
+
+def test_normals_on_a_ball_turn_smoothly():
+    rng = np.random.default_rng(3)
+    truth = rng.normal(size=(30_000, 3))
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    points = truth * (0.5 + rng.normal(0, 0.0005, (len(truth), 1)))
+    grid = voxel_grid(points, None, 0.03, Warp())
+    outward = grid.centroids / np.linalg.norm(grid.centroids, axis=1, keepdims=True)
+    normals = local_planes(grid, outward * 10.0, 3).normals
+    error = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normals, outward), -1.0, 1.0)))
+    assert np.percentile(error, 95) < 2.0  # facets as wide as the reach would be off by 5 degrees and more
