@@ -127,10 +127,12 @@ def bends(leaves: FlatLeaves, regions: NDArray[np.int32], n_regions: int) -> NDA
 
     The supervoxels' normals are fitted as a linear function of their place in the plane; what noise does to
     single normals cancels, what a ball or a cylinder does to them does not. A ball patch of radius a on a ball
-    of radius R turns by a / (2 R).
+    of radius R turns by a / (2 R). A surface that turns so also leaves its plane; where the distances show less than
+    half of that, the turn is one of the normals only, as slanted noise causes it, and counts as 0.
     """
     planes = moments_of_regions(leaves.moments, regions, n_regions)
-    frames = np.linalg.eigh(planes.covariances)[1]
+    variances, frames = np.linalg.eigh(planes.covariances)
+    residuals = np.sqrt(np.maximum(variances[:, 0], 0.0))
     result = np.zeros(n_regions)
     usable = (regions >= 0) & ~leaves.shapeless
     for i in range(n_regions):
@@ -143,7 +145,11 @@ def bends(leaves: FlatLeaves, regions: NDArray[np.int32], n_regions: int) -> NDA
         root = np.sqrt(leaves.moments.counts[member] / leaves.moments.counts[member].sum())[:, None]
         place, tilt = (place - (root**2 * place).sum(axis=0)) * root, (tilt - (root**2 * tilt).sum(axis=0)) * root
         slope = np.linalg.lstsq(place, tilt, rcond=1e-6)[0]
-        result[i] = np.linalg.norm(place @ slope, 2)
+        share = root[:, 0]
+        rise = 0.5 * ((place @ slope) * place).sum(axis=1) / share  # by which the surface would leave its plane
+        leaving = float(np.linalg.norm(rise - share * (share @ rise)))
+        if residuals[i] >= 0.5 * leaving:
+            result[i] = np.linalg.norm(place @ slope, 2)
     return result
 
 

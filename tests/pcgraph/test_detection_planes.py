@@ -11,6 +11,7 @@ from simulated_rooms import CLASSES, room
 
 import pcgraph
 from pcgraph.detection import find_planes, object_labels, objects_on
+from pcgraph.detection.coplanar import FlatLeaves, bends
 from pcgraph.detection.noise import surface_noise
 from pcgraph.detection.regions import moments_of_regions
 from pcgraph.features.moments import Moments, moments_of_groups
@@ -231,6 +232,21 @@ def test_wrong_arguments_are_refused(boxes):
         objects_on(result, planes, points=points[:-1])
     with pytest.raises(ValueError, match="margin"):
         objects_on(result, planes, margin=-1.0)
+
+
+@pytest.mark.parametrize(("shows", "turn"), [(True, 0.05), (False, 0.0)])
+def test_a_turn_that_distances_do_not_show_is_noise_of_the_normals(shows, turn):
+    radius, reach = 2.0, 0.2
+    place = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 2), axis=-1).reshape(-1, 2)
+    place = reach * place[np.linalg.norm(place, axis=1) <= 1]
+    height = -(place**2).sum(axis=1) / (2 * radius) if shows else np.zeros(len(place))
+    n = len(place)
+    moments = moments_of_groups(np.column_stack((place, height)), None, np.arange(n, dtype=np.int32), n)
+    normals = np.column_stack((place / radius, np.ones(n)))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    free = np.zeros(n, bool)
+    leaves = FlatLeaves(moments, normals, np.ones(n), free, 0.0, np.empty((0, 2), np.int32), np.empty(0, bool))
+    assert bends(leaves, np.zeros(n, np.int32), 1)[0] == pytest.approx(turn, rel=0.05)
 
 
 def test_order_of_points_does_not_matter():
