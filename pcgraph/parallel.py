@@ -4,10 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from threading import Thread
+from typing import TypeVar
 
 from numba import config
 
+_A = TypeVar("_A")
+_B = TypeVar("_B")
 _SMALLEST_BLOCK = 4096  # elements; starting a thread costs as much as some thousands of them
 
 
@@ -34,3 +38,12 @@ def in_blocks(kernel: Callable[..., None], n: int, *arguments: object) -> None:
     kernel(bounds[0], bounds[1], *arguments)
     for thread in others:
         thread.join()
+
+
+def side_by_side(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:
+    """What two calls return that spend their time in compiled code and do not need each other."""
+    if int(config.NUMBA_NUM_THREADS) < 2:
+        return first(), second()
+    with ThreadPoolExecutor(1) as other:
+        later = other.submit(second)
+        return first(), later.result()

@@ -14,6 +14,7 @@ from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import contacts
 from pcgraph.graph.relations import edge_features
 from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, fraction, non_negative, positive
+from pcgraph.parallel import side_by_side
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth
 from pcgraph.tree.growth import segmentation_tree
@@ -203,9 +204,10 @@ def _segmentation(
     supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.known)
     leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
     surface = Surface(grid, normals, supervoxels)
-    leaves = _leaves(cloud, surface, leaf_of_point, earlier)
+    leaves, touching = side_by_side(
+        lambda: _leaves(cloud, surface, leaf_of_point, earlier), lambda: contacts(grid, normals, supervoxels)
+    )
     nodes = node_features(leaves)
-    touching = contacts(grid, normals, supervoxels)
     graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes)
     tree = segmentation_tree(linkage.merges(graph, leaves), leaves)
     labels = cloud.spread(tree.cut(altitude=altitude)[leaf_of_point])

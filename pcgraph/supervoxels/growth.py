@@ -11,7 +11,7 @@ from pcgraph.parallel import in_blocks
 from pcgraph.supervoxels.distance import Metric, add_features, distance, set_means, sum_features
 from pcgraph.voxels.grid import VoxelGrid
 
-_SWEEPS = 3
+_SWEEPS = 2
 
 
 def grow(

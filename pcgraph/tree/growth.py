@@ -69,12 +69,12 @@ def _nearest_larger(
 ) -> NDArray[np.int64]:
     """For each part the larger one with a leaf nearest to its own; the largest part if none is near."""
     n_near = min(_GAP_CANDIDATES + 1, len(centroids))
-    distance, leaf = cKDTree(centroids).query(centroids, k=n_near)
-    larger = rank[part[leaf]] > rank[part][:, None]
-    source, column = np.nonzero(larger)
-    candidate = part[leaf[source, column]]
-    best = np.lexsort((candidate, distance[source, column], part[source]))
-    source_part = part[source][best]
+    seeking = np.flatnonzero(rank[part] < len(rank) - 1)  # the largest part looks for none
+    distance, leaf = cKDTree(centroids).query(centroids[seeking], k=n_near)
+    row, column = np.nonzero(rank[part[leaf]] > rank[part[seeking]][:, None])
+    source, candidate = part[seeking[row]], part[leaf[row, column]]
+    best = np.lexsort((candidate, distance[row, column], source))
+    source_part = source[best]
     first = np.flatnonzero(np.diff(source_part, prepend=-1))
     target = np.full(len(rank), int(np.argmax(rank)), np.int64)
     target[source_part[first]] = candidate[best][first]
