@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import heapq
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.tree.edge_queue import queued_edges, requeue, unqueue
 from pcgraph.tree.half_edges import NONE, drop, find, hang, hung_edges, unhang
 
 
@@ -52,49 +51,37 @@ def _merge(
     cost_sums: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Merges by a heap of edges; an entry counts only if its stamp is the edge's version."""
     ends, after, before, first, degree = hung_edges(n_nodes, edges)
-    version = np.zeros(len(edges), np.int64)
-    heap = [(0.0, np.int64(0), np.int64(0)) for _ in range(0)]  # empty, but typed for the compiler
-    for e in range(len(edges)):
-        heap.append((cost_sums[e] / weights[e], np.int64(e), np.int64(0)))
-    heapq.heapify(heap)
+    costs = cost_sums / weights
+    order, place, size = queued_edges(costs)
     name = np.arange(n_nodes)  # a cluster lives on under the slot of one of its leaves; this is its tree node
     pairs, altitudes = np.empty((max(n_nodes - 1, 0), 2), np.int32), np.empty(max(n_nodes - 1, 0))
     t = 0
-    while len(heap) > 0:
-        cost, cheapest, stamp = heapq.heappop(heap)
-        e = int(cheapest)
-        if version[e] != stamp:
-            continue
-        kept, gone = int(ends[2 * e]), int(ends[2 * e + 1])
+    while size[0] > 0:
+        e = order[0]
+        kept, gone = ends[2 * e], ends[2 * e + 1]
         pairs[t, 0], pairs[t, 1] = min(name[kept], name[gone]), max(name[kept], name[gone])
-        altitudes[t] = cost
+        altitudes[t] = costs[e]
         if degree[gone] > degree[kept]:
             kept, gone = gone, kept
         name[kept] = n_nodes + t
         t += 1
-        drop(e, ends, after, before, first, degree, version)
-        _absorb(kept, gone, ends, after, before, first, degree, version, cost_sums, weights, heap)
+        drop(e, ends, after, before, first, degree)
+        unqueue(e, costs, order, place, size)
+        half = first[gone]
+        while half != NONE:  # its edges go over; where both have one to the same third, the two become one
+            following, moved = after[half], half >> 1
+            twin = find(kept, ends[half ^ 1], ends, after, first, degree)
+            if twin == NONE:
+                unhang(half, ends, after, before, first, degree)
+                ends[half] = kept
+                hang(half, ends, after, before, first, degree)
+            else:
+                drop(moved, ends, after, before, first, degree)
+                unqueue(moved, costs, order, place, size)
+                cost_sums[twin] += cost_sums[moved]
+                weights[twin] += weights[moved]
+                costs[twin] = cost_sums[twin] / weights[twin]
+                requeue(twin, costs, order, place, size)
+            half = following
     return pairs[:t].copy(), altitudes[:t].copy()
-
-
-@njit(cache=True)
-def _absorb(kept, gone, ends, after, before, first, degree, version, cost_sums, weights, heap):  # type: ignore[no-untyped-def]
-    """Move the edges of one cluster to another; where both have one to the same third, the two become one."""
-    half = first[gone]
-    while half != NONE:
-        following = after[half]
-        twin = find(kept, ends[half ^ 1], ends, after, first, degree)
-        moved = half >> 1
-        if twin == NONE:
-            unhang(half, ends, after, before, first, degree)
-            ends[half] = kept
-            hang(half, ends, after, before, first, degree)
-        else:
-            cost_sums[twin] += cost_sums[moved]
-            weights[twin] += weights[moved]
-            drop(moved, ends, after, before, first, degree, version)
-            version[twin] += 1
-            heapq.heappush(heap, (cost_sums[twin] / weights[twin], np.int64(twin), version[twin]))
-        half = following

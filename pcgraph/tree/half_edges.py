@@ -47,11 +47,10 @@ def unhang(half, ends, after, before, first, degree):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def drop(e, ends, after, before, first, degree, version):  # type: ignore[no-untyped-def]
-    """Remove an edge from both lists and outdate its entries in the heap."""
+def drop(e, ends, after, before, first, degree):  # type: ignore[no-untyped-def]
+    """Remove an edge from both lists."""
     unhang(2 * e, ends, after, before, first, degree)
     unhang(2 * e + 1, ends, after, before, first, degree)
-    version[e] += 1
 
 
 @njit(cache=True)

@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.tree.edge_queue import queued_edges, requeue, unqueue
 from pcgraph.tree.half_edges import NONE, drop, find, hang, hung_edges, unhang
 from pcgraph.voxels.eigen import symmetric_eigen
-
-_MOST_OUTDATED = 4  # heap entries per edge before those that no longer count are swept out
 
 
 @dataclass(frozen=True)
@@ -87,63 +85,52 @@ def least_increase_linkage(
 def _merge(edges, lengths, per_length, masses, values, centroids, scatters, plane):  # type: ignore[no-untyped-def]
     n = len(masses)
     ends, after, before, first, degree = hung_edges(n, edges)
-    version = np.zeros(len(edges), np.int64)
     residuals = np.zeros(n)
     for a in range(n):
         if plane > 0.0:
             residuals[a] = _least_eigenvalue(scatters[a].copy())
-    heap = [(0.0, np.int64(0), np.int64(0)) for _ in range(0)]  # empty, but typed for the compiler
+    costs = np.empty(len(edges))
     for e in range(len(edges)):
         rise = _rise(edges[e, 0], edges[e, 1], masses, values, centroids, scatters, residuals, plane)
-        heap.append((rise / lengths[e], np.int64(e), np.int64(0)))
-    heapq.heapify(heap)
+        costs[e] = rise / lengths[e]
+    order, place, size = queued_edges(costs)
     name = np.arange(n)  # a region lives on under the slot of one of its leaves; this is its tree node
     pairs, altitudes = np.empty((max(n - 1, 0), 2), np.int32), np.empty(max(n - 1, 0))
     t = 0
-    while len(heap) > 0:
-        cost, cheapest, stamp = heapq.heappop(heap)
-        e = int(cheapest)
-        if version[e] != stamp:
-            continue
-        kept, gone = int(ends[2 * e]), int(ends[2 * e + 1])
+    while size[0] > 0:
+        e = order[0]
+        kept, gone = ends[2 * e], ends[2 * e + 1]
         pairs[t, 0], pairs[t, 1] = min(name[kept], name[gone]), max(name[kept], name[gone])
-        altitudes[t] = cost
+        altitudes[t] = costs[e]
         if degree[gone] > degree[kept]:
             kept, gone = gone, kept
         name[kept] = n + t
         t += 1
-        drop(e, ends, after, before, first, degree, version)
-        _take_edges(kept, gone, ends, after, before, first, degree, version, lengths, per_length)
+        drop(e, ends, after, before, first, degree)
+        unqueue(e, costs, order, place, size)
+        half = first[gone]
+        while half != NONE:  # its edges go over; where both have one to the same third, the two become one
+            following, moved = after[half], half >> 1
+            twin = find(kept, ends[half ^ 1], ends, after, first, degree)
+            if twin == NONE:
+                unhang(half, ends, after, before, first, degree)
+                ends[half] = kept
+                hang(half, ends, after, before, first, degree)
+            else:
+                if per_length:
+                    lengths[twin] += lengths[moved]
+                drop(moved, ends, after, before, first, degree)
+                unqueue(moved, costs, order, place, size)
+            half = following
         _unite(kept, gone, masses, values, centroids, scatters, residuals, plane)
         half = first[kept]
         while half != NONE:
             e = half >> 1
-            version[e] += 1
             rise = _rise(kept, ends[half ^ 1], masses, values, centroids, scatters, residuals, plane)
-            heapq.heappush(heap, (rise / lengths[e], np.int64(e), version[e]))
+            costs[e] = rise / lengths[e]
+            requeue(e, costs, order, place, size)
             half = after[half]
-        if len(heap) > _MOST_OUTDATED * len(edges):  # each of a hub's many merges outdates all its edges
-            heap = [entry for entry in heap if version[entry[1]] == entry[2]]
-            heapq.heapify(heap)
     return pairs[:t].copy(), altitudes[:t].copy()
-
-
-@njit(cache=True)
-def _take_edges(kept, gone, ends, after, before, first, degree, version, lengths, per_length):  # type: ignore[no-untyped-def]
-    """Move the edges of one region to another; where both have one to the same third, the two become one."""
-    half = first[gone]
-    while half != NONE:
-        following = after[half]
-        twin = find(kept, ends[half ^ 1], ends, after, first, degree)
-        if twin == NONE:
-            unhang(half, ends, after, before, first, degree)
-            ends[half] = kept
-            hang(half, ends, after, before, first, degree)
-        else:
-            if per_length:
-                lengths[twin] += lengths[half >> 1]
-            drop(half >> 1, ends, after, before, first, degree, version)
-        half = following
 
 
 @njit(cache=True)
