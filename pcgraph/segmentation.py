@@ -64,9 +64,9 @@ class Segmentation:
         """Moments of the supervoxels."""
         return self.tree.moments[: self.tree.n_leaves]
 
-    def cut(self, n: int | None = None, altitude: float | None = None) -> NDArray[np.int32]:
+    def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each point in the input's shape, -1 where not finite; see `SegmentationTree.cut`."""
-        return self.on_points(self.tree.cut(n, altitude))
+        return self.on_points(self.tree.cut(n, altitude, min_size))
 
     def on_points(self, values: NDArray[np.int32], missing: int = -1) -> NDArray[np.int32]:
         """Values of supervoxels, (k,) int32, on the points; `missing` where a point is not finite."""
