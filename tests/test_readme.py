@@ -22,11 +22,12 @@ def run(arguments: list[str], folder: Path) -> str:
 
 def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    ten_lines, more = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    ten_lines, *more = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len([line for line in ten_lines.splitlines() if line and not line.startswith("import")]) <= 10
-    printed = run([sys.executable, "-c", ten_lines + more], tmp_path)
+    printed = run([sys.executable, "-c", "".join((ten_lines, *more))], tmp_path)
     assert "| mirror |" in printed
     assert "mirrored_ghost" in printed
+    assert "ball [" in printed
     assert (tmp_path / "out" / "tabletop.ply").stat().st_size > 100_000
 
 
