@@ -125,7 +125,7 @@ def segment(cloud: PointCloud, path: Path) -> None:
     """Write supervoxels, objects and the tree of an organised cloud in the camera frame to a .npz file."""
     import pcgraph
 
-    result = pcgraph.segment(cloud.points, colors=cloud.colors, normals=cloud.normals, viewpoint=(0.0, 0.0, 0.0))
+    result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))
     np.savez_compressed(
         path,
         supervoxels=result.supervoxels,

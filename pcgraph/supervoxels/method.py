@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.inputs import non_negative
+from pcgraph.supervoxels.boundaries import settle_boundaries
 from pcgraph.supervoxels.connect import connect
 from pcgraph.supervoxels.distance import Metric, voxel_features
-from pcgraph.supervoxels.growth import grow, settle_boundaries
+from pcgraph.supervoxels.growth import grow
 from pcgraph.supervoxels.rims import settle_points
 from pcgraph.supervoxels.seeds import seed_voxels
 from pcgraph.voxels.grid import VoxelGrid

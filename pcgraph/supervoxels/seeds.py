@@ -7,7 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.voxels.grid import VoxelGrid, cell_keys, sorted_keys
+from pcgraph.voxels.cells import cell_keys, sorted_keys
+from pcgraph.voxels.grid import VoxelGrid
 
 
 def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, two_sided: bool) -> NDArray[np.int32]:

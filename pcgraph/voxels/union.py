@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.voxels.grid import VoxelGrid, cell_keys
+from pcgraph.voxels.cells import cell_keys
+from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.touching import touching
 
 
