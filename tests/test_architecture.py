@@ -42,6 +42,41 @@ def test_pcgraph_never_imports_rangesim_or_a_renderer(path: Path) -> None:
     assert not roots & ({"rangesim"} | RENDERER)
 
 
+STOREYS = [
+    "errors",
+    "atomic",
+    "cloud",
+    "parallel",
+    "voxels",
+    "inputs",
+    "features",
+    "supervoxels",
+    "graph",
+    "tree",
+    "segmentation",
+]
+"""Of pcgraph, from the ground up: nobody imports from above."""
+ON_TOP = {"pipeline", "warmup", "detection", "learning", "io", "cli"}
+"""What stands on these and may import all of them."""
+
+
+def storey(name: str) -> str:
+    return name.split(".")[1] if "." in name else ""
+
+
+@pytest.mark.parametrize("path", modules("pcgraph"), ids=relative)
+def test_nobody_in_pcgraph_imports_from_above(path: Path) -> None:
+    own = storey(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    above = {storey(name) for name in imports(path, top_level_only=True) if name.startswith("pcgraph.")} - {own}
+    if own == "metrics":
+        assert not above  # plain arrays in, numbers out
+    elif own in STOREYS:
+        assert above <= set(STOREYS[: STOREYS.index(own)])
+    else:
+        assert own in ON_TOP or own in ("", "__init__", "__main__")
+        assert "metrics" not in above
+
+
 @pytest.mark.parametrize("path", modules("rangesim"), ids=relative)
 def test_only_scenes_and_light_transport_import_the_renderer(path: Path) -> None:
     rendering = relative(path).startswith(RENDERING_PACKAGES)

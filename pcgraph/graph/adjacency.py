@@ -148,7 +148,7 @@ class AdjacencyGraph:
         CloudWriteError
             The place cannot be written.
         """
+        from pcgraph.atomic import write_bytes
         from pcgraph.graph.export import graphml
-        from pcgraph.io.atomic import write_bytes
 
         write_bytes(Path(path), graphml(self))

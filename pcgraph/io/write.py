@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.atomic import write_bytes
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
-from pcgraph.io.atomic import write_bytes
 from pcgraph.io.ply import encode_ply
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.atomic import write_bytes
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.relations import angle_between
-from pcgraph.io.atomic import write_bytes
 
 _FORMAT = "pcgraph edge model 1"
 
