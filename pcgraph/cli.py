@@ -117,14 +117,12 @@ def _segmentation(
     position = stored if viewpoint is None else viewpoint
     colors = cloud.colors if color else None
     chosen = SurfaceGrowth() if method is Method.SURFACE else Vccs()
-    camera = False if sizes["range_growth"] else None
     try:
         result = segment_points(
             cloud.points,
             colors,
             cloud.normals,
             position,
-            camera=camera,
             method=chosen,
             **sizes,  # type: ignore[arg-type]
         )

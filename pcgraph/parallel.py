@@ -24,20 +24,32 @@ def in_blocks(kernel: Callable[..., None], n: int, *arguments: object) -> None:
     Parameters
     ----------
     kernel : callable compiled with ``nogil=True``
-        Writes only what belongs to its own block, so that no result depends on the number of threads. An error in
-        it would be lost: it must not raise.
+        Writes only what belongs to its own block, so that no result depends on the number of threads.
     n : int
     arguments
         Handed on to every call.
     """
     blocks = max(1, min(int(config.NUMBA_NUM_THREADS), n // _SMALLEST_BLOCK))
     bounds = [n * block // blocks for block in range(blocks + 1)]
-    others = [Thread(target=kernel, args=(bounds[b], bounds[b + 1], *arguments)) for b in range(1, blocks)]
+    if blocks == 1:
+        kernel(0, n, *arguments)
+        return
+    errors: list[BaseException] = []
+
+    def run(block: int) -> None:
+        try:
+            kernel(bounds[block], bounds[block + 1], *arguments)
+        except BaseException as error:  # noqa: BLE001 -- handed on below, in the caller's thread
+            errors.append(error)
+
+    others = [Thread(target=run, args=(block,)) for block in range(1, blocks)]
     for thread in others:
         thread.start()
-    kernel(bounds[0], bounds[1], *arguments)
+    run(0)
     for thread in others:
         thread.join()
+    if errors:
+        raise errors[0]
 
 
 def side_by_side(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:

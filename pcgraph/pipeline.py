@@ -64,7 +64,8 @@ def segment(
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 6 times `voxel_size`.
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
-        depth, as a camera's pixels do. Default: organised clouds that lie in front of the viewpoint.
+        depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, unless
+        voxels grow with range. (A missing point stored as (0, 0, 0) lies at the viewpoint: make it NaN.)
     range_growth : float, 0..1, without 1
         Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
         scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece.
@@ -91,14 +92,17 @@ def segment(
     -----
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
+    settings = _Settings.of(method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
     voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
-    camera = _is_camera(cloud, position) if camera is None else bool(camera)
-    warp = choose_warp(cloud.points, position, camera, fraction("range_growth", range_growth))
+    growth = fraction("range_growth", range_growth)
+    warp = choose_warp(
+        cloud.points, position, _is_camera(cloud, position, growth) if camera is None else camera, growth
+    )
     grid = voxel_grid(cloud.points, cloud.colors, voxel_size, warp)
     scan = _Scan(cloud, position, grid, _outside(grid, position), np.full(grid.n_voxels, -1, np.int32), seed_size)
-    return _segmentation(scan, None, method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
+    return _segmentation(scan, None, settings)
 
 
 def update(
@@ -126,7 +130,7 @@ def update(
     points, colors, normals, viewpoint
         The new scan in the same frame; as for `pcgraph.segment`.
     method, linkage, object_altitude
-        As for `pcgraph.segment`.
+        As for `pcgraph.segment`; default: those of the earlier scan.
 
     Returns
     -------
@@ -146,6 +150,9 @@ def update(
     -----
     Nothing is ever taken away: what has moved between the scans is there twice.
     """
+    if object_altitude is None and linkage is None:
+        object_altitude = earlier.object_altitude
+    settings = _Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
     before = earlier.surface
@@ -158,7 +165,25 @@ def update(
     outside[union.second] = _outside(seen, position)
     outside[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
     scan = _Scan(cloud, position, union.grid, outside, known, earlier.seed_size)
-    return _segmentation(scan, earlier, method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
+    return _segmentation(scan, earlier, settings)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """How the scan is segmented, checked."""
+
+    method: SupervoxelMethod
+    linkage: Linkage
+    object_altitude: float
+
+    @classmethod
+    def of(cls, method: SupervoxelMethod, linkage: Linkage, object_altitude: float | None) -> _Settings:
+        if not isinstance(method, SupervoxelMethod):
+            raise ValueError(f"expected a method such as pcgraph.SurfaceGrowth() or pcgraph.Vccs(), got {method!r}")
+        if not isinstance(linkage, Linkage):
+            raise ValueError(f"expected a linkage such as pcgraph.ConvexityLinkage(), got {linkage!r}")
+        altitude = linkage.object_altitude if object_altitude is None else object_altitude
+        return cls(method, linkage, non_negative("object_altitude", altitude))
 
 
 @dataclass(frozen=True)
@@ -186,20 +211,13 @@ class _Scan:
     seed_size: float
 
 
-def _segmentation(
-    scan: _Scan,
-    earlier: Segmentation | None,
-    method: SupervoxelMethod,
-    linkage: Linkage,
-    object_altitude: float | None,
-) -> Segmentation:
+def _segmentation(scan: _Scan, earlier: Segmentation | None, settings: _Settings) -> Segmentation:
     """The algorithm from voxels on."""
-    altitude = linkage.object_altitude if object_altitude is None else object_altitude
-    altitude = non_negative("object_altitude", altitude)
-    cloud, grid = scan.cloud, scan.grid
+    cloud, grid, method, linkage = scan.cloud, scan.grid, settings.method, settings.linkage
     planes = method.planes(grid, scan.outside)
     normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
     if earlier is not None:
+        normals = normals.copy()  # the planes keep their own
         normals[scan.known >= 0] = earlier.surface.normals
     supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.known)
     leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
@@ -210,8 +228,18 @@ def _segmentation(
     nodes = node_features(leaves)
     graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes)
     tree = segmentation_tree(linkage.merges(graph, leaves), leaves)
-    labels = cloud.spread(tree.cut(altitude=altitude)[leaf_of_point])
-    return Segmentation(labels, cloud.spread(leaf_of_point), graph, tree, surface, scan.seed_size, scan.viewpoint)
+    objects = tree.cut(altitude=settings.object_altitude)
+    return Segmentation(
+        labels=cloud.spread(objects[leaf_of_point]),
+        supervoxels=cloud.spread(leaf_of_point),
+        objects=objects,
+        graph=graph,
+        tree=tree,
+        surface=surface,
+        seed_size=scan.seed_size,
+        viewpoint=scan.viewpoint,
+        **vars(settings),
+    )
 
 
 def _leaves(
@@ -248,8 +276,11 @@ def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None)
     return voxel, seed
 
 
-def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
-    return len(cloud.shape) == 2 and bool((cloud.points[:, 2] > viewpoint[2]).all())
+def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float) -> bool:
+    """Whether a camera at the viewpoint may have taken this as one image."""
+    if len(cloud.shape) != 2 or viewpoint.ndim != 1 or range_growth:
+        return False
+    return bool(cloud.points[:, 2].min() > viewpoint[2])
 
 
 def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.supervoxels.method import SupervoxelMethod
+from pcgraph.tree.linkage import Linkage
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.warp import CameraWarp
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.occlusion import Occlusions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segmentation:
     """A cloud from fine to coarse.
 
@@ -31,22 +33,32 @@ class Segmentation:
     supervoxels : (n,) or (h, w) int32
         Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where the point is not
         finite.
+    objects : (k,) int32
+        Object of each supervoxel, also of those that hold no point of the last scan.
     graph : AdjacencyGraph
     tree : SegmentationTree
     surface : Surface
         The voxels behind the points.
     seed_size : float, metres
         What was used, given or derived.
+    method : SupervoxelMethod
+    linkage : Linkage
+    object_altitude : float, the linkage's unit
+        What was used.
     viewpoint : (3,) or (n, 3) float64, metres, the points' frame
         What was used, given or derived; one per finite point if so given.
     """
 
     labels: NDArray[np.int32]
     supervoxels: NDArray[np.int32]
+    objects: NDArray[np.int32]
     graph: AdjacencyGraph
     tree: SegmentationTree
     surface: Surface
     seed_size: float
+    method: SupervoxelMethod
+    linkage: Linkage
+    object_altitude: float
     viewpoint: NDArray[np.float64]
 
     @property
@@ -68,9 +80,31 @@ class Segmentation:
         """Segment of each point in the input's shape, -1 where not finite; see `SegmentationTree.cut`."""
         return self.on_points(self.tree.cut(n, altitude, min_size))
 
-    def on_points(self, values: NDArray[np.int32], missing: int = -1) -> NDArray[np.int32]:
-        """Values of supervoxels, (k,) int32, on the points; `missing` where a point is not finite."""
-        return np.append(values, values.dtype.type(missing))[self.supervoxels]
+    def on_points(self, values: ArrayLike) -> NDArray[Any]:
+        """Values of supervoxels on the points, in the input's shape + s.
+
+        Parameters
+        ----------
+        values : (k,) + s numbers or truth values, one row per supervoxel
+
+        Returns
+        -------
+        Points that are not finite have NaN, or -1 where the values are whole numbers, or False.
+
+        Raises
+        ------
+        ValueError
+            There is not one row per supervoxel, or the values are neither numbers nor truth values.
+        """
+        rows = np.asarray(values)
+        if rows.ndim == 0 or len(rows) != self.tree.n_leaves:
+            raise ValueError(f"expected one row of values per supervoxel, {self.tree.n_leaves}, got {rows.shape}")
+        if rows.dtype.kind == "u":
+            rows = rows.astype(np.int64)
+        if rows.dtype.kind not in "fib":
+            raise ValueError(f"expected values as numbers or truth values, got {rows.dtype}")
+        missing = {"f": np.nan, "i": -1, "b": False}[rows.dtype.kind]
+        return np.concatenate((rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)))[self.supervoxels]
 
     def saliency(self) -> NDArray[np.float64]:
         """Boundary strength of each point in the input's shape, the altitudes' unit; NaN where not finite.

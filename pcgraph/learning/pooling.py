@@ -136,13 +136,7 @@ def down(segmentation: Segmentation, values: ArrayLike, nodes: ArrayLike | None 
         if len(array) != k:
             raise ValueError(f"expected one row of values per node ({k}) where nodes are given, got {len(array)}")
         array = array[chosen]
-    if array.dtype.kind == "u":
-        array = array.astype(np.int64)
-    missing = {"f": np.nan, "i": -1, "b": False}.get(array.dtype.kind)
-    if missing is None:
-        raise ValueError(f"expected values as numbers or booleans, got {array.dtype}")
-    filler = np.full((1, *array.shape[1:]), missing, array.dtype)
-    return np.concatenate((array, filler))[segmentation.supervoxels]
+    return segmentation.on_points(array)
 
 
 def _mean_up(tree: SegmentationTree, table: NDArray[Any], weights: NDArray[np.float64]) -> NDArray[np.float64]:

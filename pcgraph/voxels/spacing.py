@@ -38,23 +38,25 @@ def median_spacing(points: NDArray[np.float64]) -> float:
     crowd = points
     while len(crowd) > 2 * _CROWD and len(smaller := _some_blocks(crowd)) < len(crowd):
         crowd = smaller
-    distances = _nearest(crowd)
-    if not distances.all():
-        distances = _nearest(np.unique(crowd, axis=0))
+    hashes, first = np.unique(_hashes(crowd), return_index=True)
+    crowd = crowd[first]  # each place once
+    if len(crowd) == 1:
+        return _NO_SPACING_M
+    sample = np.arange(len(crowd))
+    if len(crowd) > _SAMPLE:  # the smallest hashes: as good as random, yet a property of the points
+        sample = np.argpartition(hashes, _SAMPLE)[:_SAMPLE]
+    tree = cKDTree(crowd, balanced_tree=False, compact_nodes=False)
+    distances = tree.query(crowd[sample], k=2)[0][:, 1]
     distances = distances[(distances > 0.0) & np.isfinite(distances)]
     return float(np.median(distances)) if len(distances) else _NO_SPACING_M
 
 
-def _nearest(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    sample = points
-    if len(points) > _SAMPLE:  # the smallest hashes: as good as random, yet a property of the points
-        bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
-        hashes = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)) >> 17
-        sample = points[
-            np.argpartition(_mixed((hashes[:, 0] ^ hashes[:, 1] ^ hashes[:, 2]).view(np.uint64)), _SAMPLE)[:_SAMPLE]
-        ]
-    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-    return tree.query(sample, k=2)[0][:, 1]
+def _hashes(points: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """A whole number per point that depends on its place alone, and differs between places."""
+    bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
+    odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    mixed = _mixed(bits * odd)
+    return _mixed(mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(1)) ^ (mixed[:, 2] >> np.uint64(2)))
 
 
 def _some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -157,6 +157,10 @@ def choose_warp(
     ValueError
         `camera` is true and a point does not lie in front of it, or voxels grow with range as well.
     """
+    if not isinstance(camera, (bool, np.bool_)):
+        raise ValueError(f"expected camera as True, False or None, got {camera!r}")
+    if (camera or range_growth) and viewpoint.ndim != 1:
+        raise ValueError("expected one viewpoint where voxels grow with depth or range, got one per point")
     if camera and range_growth:
         raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
     if range_growth:
