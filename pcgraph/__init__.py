@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
     from pcgraph.features.moments import Moments
     from pcgraph.features.nodes import NodeFeatures
-    from pcgraph.features.primitives import Primitives
+    from pcgraph.features.primitives import Primitive, Primitives
     from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
     from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
-    from pcgraph.graph.occlusion import Occlusions
+    from pcgraph.graph.occlusion import Continuations, Occlusions
     from pcgraph.io import read_cloud, write_segmentation
     from pcgraph.pipeline import segment, update
     from pcgraph.segmentation import Segmentation
     from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth, Vccs
-    from pcgraph.tree.energy import plane_energy, variance_energy
+    from pcgraph.tree.energy import Energy, plane_energy, variance_energy
     from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
     from pcgraph.tree.lccp import LccpLinkage
     from pcgraph.tree.learned import LearnedLinkage
-    from pcgraph.tree.linkage import ConvexityLinkage, Linkage
+    from pcgraph.tree.linkage import ConvexityLinkage, Linkage, Merges
     from pcgraph.tree.quasi_flat import QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree
     from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
@@ -40,17 +40,21 @@ __all__ = [
     "Cloud",
     "CloudReadError",
     "CloudWriteError",
+    "Continuations",
     "ConvexityLinkage",
     "EdgeFeatures",
+    "Energy",
     "FelzenszwalbLinkage",
     "LccpLinkage",
     "LearnedLinkage",
     "Linkage",
+    "Merges",
     "Moments",
     "MumfordShahLinkage",
     "NodeFeatures",
     "Occlusions",
     "PcgraphError",
+    "Primitive",
     "Primitives",
     "QuasiFlatLinkage",
     "Segmentation",
@@ -80,17 +84,21 @@ _HOMES = {
     "Cloud": "cloud",
     "CloudReadError": "errors",
     "CloudWriteError": "errors",
+    "Continuations": "graph.occlusion",
     "ConvexityLinkage": "tree.linkage",
     "EdgeFeatures": "graph.adjacency",
+    "Energy": "tree.energy",
     "FelzenszwalbLinkage": "tree.felzenszwalb",
     "LccpLinkage": "tree.lccp",
     "LearnedLinkage": "tree.learned",
     "Linkage": "tree.linkage",
+    "Merges": "tree.linkage",
     "Moments": "features.moments",
     "MumfordShahLinkage": "tree.ward",
     "NodeFeatures": "features.nodes",
     "Occlusions": "graph.occlusion",
     "PcgraphError": "errors",
+    "Primitive": "features.primitives",
     "Primitives": "features.primitives",
     "QuasiFlatLinkage": "tree.quasi_flat",
     "Segmentation": "segmentation",

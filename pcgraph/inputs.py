@@ -13,7 +13,7 @@ from pcgraph.voxels.bounds import bounding_box
 _LARGEST = 1e100  # metres; beyond it squares of distances overflow
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CleanCloud:
     """The finite points of a cloud.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.pooling import pool_means, pool_moments
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Moments:
     """Number, means and scatter of k groups of points.
 

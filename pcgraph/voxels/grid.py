@@ -20,7 +20,7 @@ _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VoxelGrid:
     """Occupied voxels of a cloud in ascending order of grid coordinates, whatever the points' order.
 

@@ -16,7 +16,7 @@ from pcgraph.voxels.windows import fitted_windows
 _OWN_BONUS = 0.7  # the window around the voxel itself wins unless another is better by this factor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LocalPlanes:
     """One plane per voxel.
 

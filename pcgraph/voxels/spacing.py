@@ -35,11 +35,10 @@ def median_spacing(points: NDArray[np.float64]) -> float:
     Source: Lin et al. 2018 start from the same median, their lambda_0. Of large clouds only some blocks of space
     are looked at, all points of each.
     """
-    crowd = points
-    while len(crowd) > 2 * _CROWD and len(smaller := _some_blocks(crowd)) < len(crowd):
-        crowd = smaller
-    hashes, first = np.unique(_hashes(crowd), return_index=True)
-    crowd = crowd[first]  # each place once
+    drawn = _some_places(points)
+    crowd, hashes = _each_place_once(drawn)
+    if 2 * len(crowd) < len(drawn) < len(points):  # duplicates took the room of others
+        crowd, hashes = _each_place_once(_some_places(_each_place_once(points)[0]))
     if len(crowd) == 1:
         return _NO_SPACING_M
     sample = np.arange(len(crowd))
@@ -51,12 +50,25 @@ def median_spacing(points: NDArray[np.float64]) -> float:
     return float(np.median(distances)) if len(distances) else _NO_SPACING_M
 
 
+def _each_place_once(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint64]]:
+    """One point per place, in the order of their hashes, and these."""
+    hashes, first = np.unique(_hashes(points), return_index=True)
+    return points[first], hashes
+
+
 def _hashes(points: NDArray[np.float64]) -> NDArray[np.uint64]:
     """A whole number per point that depends on its place alone, and differs between places."""
     bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
     odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
     mixed = _mixed(bits * odd)
     return _mixed(mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(1)) ^ (mixed[:, 2] >> np.uint64(2)))
+
+
+def _some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All points, or of large clouds those in some blocks of space."""
+    while len(points) > 2 * _CROWD and len(smaller := _some_blocks(points)) < len(points):
+        points = smaller
+    return points
 
 
 def _some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:

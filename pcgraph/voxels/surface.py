@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pcgraph.voxels.grid import VoxelGrid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """Occupied voxels with their normals and supervoxels.
 

@@ -13,7 +13,7 @@ from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.touching import touching
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GridUnion:
     """What two grids occupy together.
 

@@ -32,7 +32,7 @@ class Warp:
         return np.ones(len(points))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraWarp(Warp):
     """Voxels that grow in proportion to depth, as a camera's pixels do on what it sees.
 
@@ -78,7 +78,7 @@ class CameraWarp(Warp):
         return (points[:, 2] - self.viewpoint[2]) / self.reference_depth
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RangeWarp(Warp):
     """Voxels that grow with a power of the range, in all directions around a scanner.
 

@@ -38,6 +38,28 @@ def test_nodes_face_where_given_normals_point():
     assert (np.sign(nodes.normal[:, 1]) == np.sign(0.1 - nodes.centroid[:, 1])).all()
 
 
+def test_an_image_takes_a_viewpoint_per_pixel():
+    points, seen_from = (array[:5184].reshape(72, 72, 3) for array in plate())
+    result = pcgraph.segment(points, viewpoint=seen_from)
+    assert not result.camera
+    assert result.viewpoint.shape == (5184, 3)
+    alike = pcgraph.segment(points.reshape(-1, 3), viewpoint=seen_from.reshape(-1, 3))
+    assert np.array_equal(result.supervoxels.reshape(-1), alike.supervoxels)
+    for growing in ({"camera": True}, {"range_growth": 0.5}):
+        with pytest.raises(ValueError, match="one viewpoint where voxels grow"):
+            pcgraph.segment(points, viewpoint=seen_from, **growing)
+
+
+def test_an_image_may_grow_with_range():
+    rows, columns = np.mgrid[0:40, 0:50]
+    points = np.stack(((columns - 25) / 50, (rows - 20) / 50, np.ones((40, 50))), axis=-1) * (
+        1.0 + columns[..., None] / 25
+    )
+    result = pcgraph.segment(points, range_growth=0.5)
+    assert not result.camera
+    assert np.ptp(result.surface.grid.edge_lengths) > 0.1 * result.voxel_size
+
+
 def test_viewpoints_of_another_shape_are_refused():
     points, seen_from = plate()
     with pytest.raises(ValueError, match="viewpoint of three finite coordinates in metres, or one per point"):
@@ -140,3 +162,22 @@ def test_updates_that_do_not_fit_are_refused(halves):
     seen_by_camera = pcgraph.segment(image)
     with pytest.raises(ValueError, match="camera=False"):
         pcgraph.update(seen_by_camera, left - 9.0, viewpoint=viewpoint)
+
+
+def test_an_update_goes_on_with_the_settings(halves):
+    left, right, viewpoint, _, _ = halves
+    options = {"method": pcgraph.Vccs(), "linkage": pcgraph.QuasiFlatLinkage(), "object_altitude": 0.01}
+    first = pcgraph.segment(left, viewpoint=viewpoint, voxel_size=0.035, seed_size=0.2, **options)
+    second = pcgraph.update(first, right, viewpoint=viewpoint)
+    assert (second.method, second.linkage, second.object_altitude) == tuple(options.values())
+    assert np.array_equal(second.objects, second.tree.cut(altitude=0.01))
+    other = pcgraph.update(first, right, viewpoint=viewpoint, linkage=pcgraph.ConvexityLinkage())
+    assert other.object_altitude == pcgraph.ConvexityLinkage().object_altitude
+
+
+def test_an_update_leaves_the_planes_as_they_are_fitted(halves):
+    """With normals given for the new scan, and without, points on rims see the same planes."""
+    left, right, viewpoint, first, second = halves
+    given = np.zeros_like(right)  # zero means: none
+    again = pcgraph.update(first, right, None, given, viewpoint)
+    assert np.array_equal(again.supervoxels, second.supervoxels)

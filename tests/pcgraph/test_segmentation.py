@@ -80,3 +80,40 @@ def test_primitives_need_all_points():
         result.primitives(points[:-1])
     with pytest.raises(ValueError, match="all points of the scene in one scan"):
         pcgraph.update(result, points, viewpoint=viewpoint).primitives(points)
+
+
+def test_values_of_supervoxels_on_points():
+    points = patch((0, 0, 1), (0.5, 0, 0), (0, 0.5, 0))
+    points[7] = np.nan
+    result = pcgraph.segment(points)
+    n = result.tree.n_leaves
+    levels = result.on_points(np.stack((np.arange(n), np.zeros(n, int)), axis=1))
+    assert levels.shape == (len(points), 2)
+    assert levels[7].tolist() == [-1, -1]
+    assert np.array_equal(np.delete(levels[:, 0], 7), np.delete(result.supervoxels, 7))
+    assert result.on_points(np.arange(n, dtype=np.uint8))[7] == -1
+    assert np.isnan(result.on_points(np.ones(n))[7])
+    assert not result.on_points(np.ones(n, bool))[7]
+    for wrong in (np.ones(n + 1), np.ones(2 * n - 1), 3.0, ["a"] * n):
+        with pytest.raises(ValueError, match="expected"):
+            result.on_points(wrong)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "vccs"}, "expected a method such as"),
+        ({"method": pcgraph.Vccs}, "expected a method such as"),
+        ({"linkage": "ward"}, "expected a linkage such as"),
+        ({"linkage": pcgraph.WardLinkage}, "expected a linkage such as"),
+        ({"camera": "no"}, "expected camera as True, False or None"),
+    ],
+)
+def test_settings_of_another_kind_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        pcgraph.segment(patch((0, 0, 1), (0.2, 0, 0), (0, 0.2, 0)), **options)
+
+
+def test_segmentations_are_compared_by_identity(boxes):
+    assert boxes[2] == boxes[2]
+    assert len({boxes[2]}) == 1

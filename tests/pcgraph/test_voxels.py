@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from clouds import patch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pcgraph.parallel import in_blocks
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.planes import local_planes
@@ -139,3 +142,23 @@ def test_normals_on_a_ball_turn_smoothly():
         np.percentile(angles_to(local_planes(grid, outward * 10.0, reach).normals, outward), 95) for reach in (0, 3)
     )
     assert sharp < 1.3 * plain  # facets as wide as the reach would be off three times as much
+
+
+def test_a_million_points_in_one_place_cost_next_to_nothing():
+    rng = np.random.default_rng(1)
+    cloud = rng.random((20_000, 3)) * (1.0, 1.0, 0.0) + (0.0, 0.0, 1.0)
+    start = time.perf_counter()
+    with_zeros = median_spacing(np.vstack([cloud, np.zeros((1_000_000, 3))]))
+    assert time.perf_counter() - start < 2.0
+    assert with_zeros == pytest.approx(median_spacing(cloud), rel=0.05)
+    assert median_spacing(np.zeros((200_000, 3))) == 0.01
+
+
+def test_an_error_in_any_block_reaches_the_caller():
+    def kernel(start, stop, failing):
+        if start <= failing < stop:
+            raise MemoryError("no room")
+
+    for failing in (0, 99_999):
+        with pytest.raises(MemoryError, match="no room"):
+            in_blocks(kernel, 100_000, failing)
