@@ -119,7 +119,8 @@ class Segmentation:
     def occlusions(self) -> Occlusions:
         """Which supervoxels hide which from the viewpoint, and what may go on behind them.
 
-        Neighbours in an organised input's image, or in bearing where there is no image.
+        Neighbours in an organised input's image, or in bearing where there is no image. After an update the
+        viewpoint, and the image, are those of the last scan.
 
         Raises
         ------
@@ -133,12 +134,13 @@ class Segmentation:
         image = self._spread(self.surface.grid.voxel_of_point, -1) if self.supervoxels.ndim == 2 else None
         return occlusions(self.surface, self.graph.node_features, self.viewpoint, image)
 
-    def primitives(self, points: ArrayLike) -> Primitives:
+    def primitives(self, points: ArrayLike | None = None) -> Primitives:
         """Plane, sphere and cylinder fitted to every node of the tree, supervoxels first.
 
         Parameters
         ----------
-        points : as given to `pcgraph.segment`
+        points : as given to `pcgraph.segment`, optional
+            Default: the voxels' centroids, each as one point; a little less exact, but they hold all scans.
 
         Raises
         ------
@@ -148,15 +150,17 @@ class Segmentation:
         from pcgraph.features.primitive_moments import pool_up_tree, primitive_moments
         from pcgraph.features.primitives import fit_primitives
 
-        given = np.asarray(points)
-        inside = self.supervoxels >= 0
-        if given.shape != (*self.supervoxels.shape, 3):
-            raise ValueError(f"expected the points that were segmented, {(*inside.shape, 3)}, got {given.shape}")
-        if np.count_nonzero(inside) != self.tree.moments.counts[-1]:
-            raise ValueError("expected all points of the scene in one scan; primitives need the points of every scan")
-        normals = self.surface.normals[self.surface.grid.voxel_of_point]
-        groups = self.supervoxels[inside]
-        leaves = primitive_moments(given[inside].astype(np.float64), normals, groups, self.tree.n_leaves)
+        surface = self.surface
+        places, normals, groups = surface.grid.centroids, surface.normals, surface.supervoxels
+        if points is not None:
+            inside, given = self.supervoxels >= 0, np.asarray(points)
+            if given.shape != (*inside.shape, 3):
+                raise ValueError(f"expected the points that were segmented, {(*inside.shape, 3)}, got {given.shape}")
+            if np.count_nonzero(inside) != self.tree.moments.counts[-1]:
+                raise ValueError("expected the points of every scan, got one scan's; leave them out to use the voxels")
+            places, groups = given[inside].astype(np.float64), self.supervoxels[inside]
+            normals = normals[surface.grid.voxel_of_point]
+        leaves = primitive_moments(places, normals, groups, self.tree.n_leaves)
         return fit_primitives(pool_up_tree(leaves, self.tree.parents))
 
     def _spread(self, values: NDArray[Any], missing: float) -> NDArray[Any]:

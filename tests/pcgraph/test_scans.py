@@ -177,7 +177,7 @@ def test_an_update_goes_on_with_the_settings(halves):
 
 def test_an_update_leaves_the_planes_as_they_are_fitted(halves):
     """With normals given for the new scan, and without, points on rims see the same planes."""
-    left, right, viewpoint, first, second = halves
+    _, right, viewpoint, first, second = halves
     given = np.zeros_like(right)  # zero means: none
     again = pcgraph.update(first, right, None, given, viewpoint)
     assert np.array_equal(again.supervoxels, second.supervoxels)

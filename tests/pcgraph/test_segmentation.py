@@ -71,6 +71,7 @@ def test_primitives_of_a_ball_on_a_floor():
     assert primitives.sphere_radius[of_ball] == pytest.approx(0.2, rel=0.02)
     assert primitives.sphere_center[of_ball] == pytest.approx((0.5, 0.5, 0.2), abs=0.01)
     assert primitives.best[nodes[result.supervoxels[0]]] == Primitive.PLANE
+    assert result.primitives().sphere_radius[of_ball] == pytest.approx(0.2, rel=0.05)  # from voxels
 
 
 def test_primitives_need_all_points():
@@ -78,8 +79,10 @@ def test_primitives_need_all_points():
     result = pcgraph.segment(points, viewpoint=viewpoint)
     with pytest.raises(ValueError, match="the points that were segmented"):
         result.primitives(points[:-1])
-    with pytest.raises(ValueError, match="all points of the scene in one scan"):
-        pcgraph.update(result, points, viewpoint=viewpoint).primitives(points)
+    twice = pcgraph.update(result, points, viewpoint=viewpoint)
+    with pytest.raises(ValueError, match="points of every scan"):
+        twice.primitives(points)
+    assert twice.primitives().plane_residual == pytest.approx(result.primitives().plane_residual, abs=1e-9)
 
 
 def test_values_of_supervoxels_on_points():
