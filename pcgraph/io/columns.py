@@ -71,8 +71,9 @@ def _colors(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.uint8] | Non
     stored = [columns[name] for name in ("red", "green", "blue")]
     if all(channel.dtype == np.uint8 for channel in stored):
         return np.stack(stored, axis=-1).astype(np.uint8).reshape(*shape, 3)
-    values = np.stack(stored, axis=-1).astype(np.float64)
-    scaled = np.rint(values * (255.0 / _white(stored, values)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = np.stack(stored, axis=-1).astype(np.float64)
+        scaled = np.rint(values * (255.0 / _white(stored, values)))
     return np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8).reshape(*shape, 3)
 
 

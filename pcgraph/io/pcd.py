@@ -17,6 +17,7 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _REQUIRED = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
 _MAX_HEADER_BYTES = 1 << 16
+_MAX_NUMBER = 10**15  # no file holds as many points, and arrays of nothing may still be that wide
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
             raise CloudReadError(f"field {name!r}: TYPE {kind}, SIZE {size}, COUNT {count} is not a PCD number type")
         dtypes.append(np.dtype(f"<{_KINDS[kind]}{size}"))
     width, height = _integers(entries, "WIDTH")[0], _integers(entries, "HEIGHT")[0]
-    points = _integers(entries, "POINTS", default=[width * height])[0]
+    points = _integers(entries, "POINTS")[0] if entries.get("POINTS") else width * height
     if min(width, height) < 0 or points != width * height:
         raise CloudReadError(f"expected POINTS = WIDTH x HEIGHT, got {points} != {width} x {height}")
     viewpoint = _viewpoint(entries.get("VIEWPOINT", []))
@@ -116,9 +117,13 @@ def _integers(entries: dict[str, list[str]], key: str, default: list[int] | None
     if not words and default is not None:
         return default
     try:
-        return [int(word) for word in words or []]
+        numbers = [int(word) for word in words or []]
     except ValueError:
-        raise CloudReadError(f"expected whole numbers after {key} in the PCD header, got {words}") from None
+        numbers = [_MAX_NUMBER + 1]
+    if max(map(abs, numbers), default=0) > _MAX_NUMBER:
+        got = " ".join(words or [])[:80]
+        raise CloudReadError(f"expected whole numbers up to {_MAX_NUMBER} after {key} in the PCD header, got {got}")
+    return numbers
 
 
 def _viewpoint(words: list[str]) -> NDArray[np.float64]:

@@ -75,8 +75,8 @@ def encode_ply(columns: dict[str, NDArray[np.generic]]) -> bytes:
 
 
 def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
-    end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
-    newline = content.find(b"\n", end)
+    end = content.find(b"\nend_header", 0, _MAX_HEADER_BYTES)
+    newline = content.find(b"\n", end + 1)
     if not content.startswith(b"ply") or end < 0 or newline < 0:
         raise CloudReadError("expected a PLY header from 'ply' to 'end_header', but found none")
     code = ""

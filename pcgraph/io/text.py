@@ -29,6 +29,7 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.fl
     if len(words) < needed:
         raise CloudReadError(f"the header promises {n_rows} points ({needed} numbers), but {len(words)} follow")
     try:
-        return np.array(words, dtype="S").astype(np.float64).reshape(n_rows, n_columns)
+        # Not through an array of the words: each would take as many bytes as the longest.
+        return np.fromiter(map(float, words), np.float64, needed).reshape(n_rows, n_columns)
     except ValueError as error:
-        raise CloudReadError(f"expected numbers only in the ascii data: {error}") from None
+        raise CloudReadError(f"expected numbers only in the ascii data: {str(error)[:120]}") from None
