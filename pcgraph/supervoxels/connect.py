@@ -12,12 +12,12 @@ from pcgraph.voxels.grid import VoxelGrid
 
 
 def connect(
-    grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, owner: NDArray[np.int32], n_known: int
+    grid: VoxelGrid, features: NDArray[np.float64], metric: Metric, owner: NDArray[np.int32], known: NDArray[np.int32]
 ) -> NDArray[np.int32]:
     """Owners such that each one's voxels are connected, (v,) int32, renumbered in the order of their first voxel.
 
-    The largest piece of each supervoxel keeps it; voxels of other pieces go, ring by ring, to the nearest
-    supervoxel that touches them.
+    The known piece of each supervoxel, else its largest, keeps it; voxels of other pieces go, ring by ring, to the
+    nearest supervoxel that touches them.
 
     Parameters
     ----------
@@ -27,14 +27,14 @@ def connect(
     metric : Metric
     owner : (v,) int32, >= 0
         Supervoxels, perhaps in pieces.
-    n_known : int
-        The first so many are in one piece and keep their numbers.
+    known : (v,) int32
+        Supervoxels that exist already, each in one piece, and keep their numbers and voxels; -1 elsewhere.
     """
     n_supervoxels = int(owner.max()) + 1
     lists = grid.indptr, grid.neighbours
-    kept = np.where(_largest_pieces(*lists, owner, n_supervoxels), owner, np.int32(-1))
+    kept = np.where(_largest_pieces(*lists, owner, n_supervoxels, known >= 0), owner, np.int32(-1))
     _adopt(features, metric, *lists, kept, n_supervoxels)
-    return _renumber(kept, n_supervoxels, n_known)
+    return _renumber(kept, n_supervoxels, int(known.max()) + 1)
 
 
 @njit(cache=True, nogil=True)
@@ -54,9 +54,13 @@ def _renumber(owner: NDArray[np.int32], n_supervoxels: int, n_known: int) -> NDA
 
 @njit(cache=True, nogil=True)
 def _largest_pieces(
-    indptr: NDArray[np.int64], neighbours: NDArray[np.int32], owner: NDArray[np.int32], n_supervoxels: int
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    owner: NDArray[np.int32],
+    n_supervoxels: int,
+    known: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Whether each voxel lies in the largest piece of its owner (the first one, if several are as large)."""
+    """Whether each voxel lies in its owner's known piece, else in the largest (the first, if several are as large)."""
     n = len(owner)
     piece = np.full(n, -1, np.int32)
     stack = np.empty(n, np.int32)
@@ -72,7 +76,7 @@ def _largest_pieces(
         while depth > 0:
             depth -= 1
             i = stack[depth]
-            sizes[n_pieces] += 1
+            sizes[n_pieces] += n if known[i] else 1  # a known voxel outweighs all others
             for a in range(indptr[i], indptr[i + 1]):
                 j = neighbours[a]
                 if piece[j] < 0 and owner[j] == owner[i]:

@@ -98,7 +98,7 @@ class SurfaceGrowth(SupervoxelMethod):
         seeds = seed_voxels(grid, normals, seed_size, two_sided=False)
         owner = grow(grid, features, metric, seeds, seed_size, known)
         settle_boundaries(grid, features, metric, owner, known >= 0)
-        return connect(grid, features, metric, owner, int(known.max()) + 1)
+        return connect(grid, features, metric, owner, known)
 
     def supervoxel_of_point(
         self, points: NDArray[np.float64], grid: VoxelGrid, planes: LocalPlanes, supervoxels: NDArray[np.int32]
@@ -131,7 +131,7 @@ class Vccs(SupervoxelMethod):
         features = voxel_features(grid, normals)
         seeds = seed_voxels(grid, normals, seed_size, two_sided=True)
         owner = grow(grid, features, metric, seeds, seed_size, known)
-        return connect(grid, features, metric, owner, int(known.max()) + 1)
+        return connect(grid, features, metric, owner, known)
 
     def supervoxel_of_point(
         self, points: NDArray[np.float64], grid: VoxelGrid, planes: LocalPlanes, supervoxels: NDArray[np.int32]
