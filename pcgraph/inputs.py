@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.voxels.bounds import bounding_box
 
-_LARGEST = 1e100  # metres; beyond it squares of distances overflow
+_LARGEST = 1e100  # metres; far beyond it squares of distances overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,8 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     kept = np.flatnonzero(np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2]))
     if not len(kept):
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
-    places = flat.take(kept, axis=0).astype(np.float64)
+    with np.errstate(over="ignore"):  # long doubles
+        places = flat.take(kept, axis=0).astype(np.float64)
     largest = float(np.abs(bounding_box(places)).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
@@ -72,7 +73,7 @@ def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[n
         given = _numbers("viewpoint", viewpoint).astype(np.float64)
         per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
         position = given.reshape(-1, 3).take(cloud.kept, axis=0) if per_point else given
-        if position.shape not in ((3,), cloud.points.shape) or not np.isfinite(position).all():
+        if position.shape not in ((3,), cloud.points.shape) or not (np.abs(position) <= _LARGEST).all():
             raise ValueError(
                 f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
                 f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
@@ -91,10 +92,10 @@ def _excerpt(values: NDArray[np.float64]) -> str:
 
 
 def positive(name: str, value: float) -> float:
-    """The value as float, if it is a finite number of metres above zero; ValueError otherwise."""
+    """The value as float, if it is a finite number of metres above zero, at most 1e100; ValueError otherwise."""
     number = _number(value)
-    if not 0.0 < number < float("inf"):
-        raise ValueError(f"expected a finite {name} above 0 metres, got {value!r}")
+    if not 0.0 < number <= _LARGEST:
+        raise ValueError(f"expected a finite {name} above 0 metres, got {value!r}; at most {_LARGEST:g} works")
     return number
 
 
@@ -158,7 +159,8 @@ def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.i
 def _normals(normals: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
     if normals is None:
         return None
-    array = _same_shape("normals", normals, shape).take(kept, axis=0).astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # long doubles, signalling NaN
+        array = _same_shape("normals", normals, shape).take(kept, axis=0).astype(np.float64)
     array[~np.isfinite(array).all(axis=1)] = 0.0
     array /= np.maximum(np.abs(array).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
     return array / np.maximum(np.linalg.norm(array, axis=1, keepdims=True), 1e-300)

@@ -36,7 +36,7 @@ def grow(
     known : (v,) int32
         Supervoxels that exist already and keep their voxels, but may grow; -1 elsewhere.
     """
-    greedy_sweeps = max(1, int(1.8 * seed_size / grid.size) - 1)
+    greedy_sweeps = max(1, int(min(1.8 * seed_size / grid.size, 1e9)) - 1)
     seeds = seeds[known[seeds] < 0]
     owner, n_known = known.copy(), int(known.max()) + 1
     owner[seeds] = np.arange(n_known, n_known + len(seeds), dtype=np.int32)

@@ -36,7 +36,7 @@ def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float,
     ordered, order = sorted_keys(keys)
     starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
     ratio = seed_size / grid.size  # a cell counts if it holds a tenth of a plane, or half of a line
-    enough = min(0.1 * ratio**2, 0.5 * ratio)
+    enough = min(0.1 * ratio * ratio, 0.5 * ratio)
     return np.sort(_seeds_of_cells(grid.warped, normals, order, starts, enough, two_sided))
 
 

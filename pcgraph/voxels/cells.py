@@ -30,6 +30,8 @@ def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int6
     """
     cells = scaled
     low, high = np.floor(bounding_box(scaled))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
     if not _fits(high - low):
         cells = np.stack([_without_gaps(np.floor(scaled[:, axis])) for axis in range(3)], axis=1)
         low, high = bounding_box(cells)
@@ -74,7 +76,7 @@ def _number_cells(
 
 
 def _fits(span: NDArray[np.float64]) -> bool:
-    return bool(np.prod(span + 3.0) < _MAX_KEY) and bool(span.max() < _MAX_KEY)
+    return bool(span.max() < _MAX_KEY) and bool(np.prod(span + 3.0) < _MAX_KEY)
 
 
 def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -92,7 +92,8 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
     ValueError
         The cloud spans so many voxels that a grid coordinate cannot be written as a whole number.
     """
-    scaled = warp.forward(points) / size
+    with np.errstate(over="ignore"):
+        scaled = warp.forward(points) / size
     keys, pitch = cell_keys(scaled, size)
     ordered, order = sorted_keys(keys)
     starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
