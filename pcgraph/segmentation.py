@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.occlusion import Occlusions
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Segmentation:
     """A cloud from fine to coarse.
 
@@ -60,6 +60,14 @@ class Segmentation:
     linkage: Linkage
     object_altitude: float
     viewpoint: NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        """What there is, in one line."""
+        return (
+            f"Segmentation({np.count_nonzero(self.supervoxels >= 0)} points, {self.tree.n_leaves} supervoxels, "
+            f"{len(self.graph.edges)} edges, {int(self.objects.max()) + 1} objects, "
+            f"voxels of {self.voxel_size:.3g} m, seeds every {self.seed_size:.3g} m)"
+        )
 
     @property
     def voxel_size(self) -> float:

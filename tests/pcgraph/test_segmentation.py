@@ -120,3 +120,8 @@ def test_settings_of_another_kind_are_refused(options, message):
 def test_segmentations_are_compared_by_identity(boxes):
     assert boxes[2] == boxes[2]
     assert len({boxes[2]}) == 1
+
+
+def test_a_segmentation_shows_what_it_holds(boxes):
+    points, _, result = boxes
+    assert repr(result).startswith(f"Segmentation({len(points)} points, {result.graph.n_nodes} supervoxels, ")
