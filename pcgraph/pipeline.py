@@ -1,28 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From points to supervoxels, graph, tree and objects: the whole algorithm, for a first scan and for later ones."""
+"""From points to supervoxels, graph, tree and objects: a first scan, and those that follow."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
-from pcgraph.features.nodes import node_features
-from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.contacts import contacts
-from pcgraph.graph.relations import edge_features
-from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, fraction, non_negative, positive
-from pcgraph.parallel import side_by_side
+from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, fraction, positive
+from pcgraph.scan import Scan, Settings, segmentation
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth
-from pcgraph.tree.growth import segmentation_tree
 from pcgraph.tree.linkage import ConvexityLinkage, Linkage
 from pcgraph.voxels.bounds import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid, voxel_means
 from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.union import grid_union
 from pcgraph.voxels.warp import choose_warp
 
@@ -92,7 +83,7 @@ def segment(
     -----
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
-    settings = _Settings.of(method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
+    settings = Settings.of(method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
     voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
@@ -101,8 +92,8 @@ def segment(
         cloud.points, position, _is_camera(cloud, position, growth) if camera is None else camera, growth
     )
     grid = voxel_grid(cloud.points, cloud.colors, voxel_size, warp)
-    scan = _Scan(cloud, position, grid, _outside(grid, position), np.full(grid.n_voxels, -1, np.int32), seed_size)
-    return _segmentation(scan, None, settings)
+    scan = Scan(cloud, position, grid, _outside(grid, position), np.full(grid.n_voxels, -1, np.int32), seed_size)
+    return segmentation(scan, None, settings)
 
 
 def update(
@@ -152,7 +143,7 @@ def update(
     """
     if object_altitude is None and linkage is None:
         object_altitude = earlier.object_altitude
-    settings = _Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
+    settings = Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
     before = earlier.surface
@@ -164,96 +155,8 @@ def update(
     outside = np.empty((union.grid.n_voxels, 3))
     outside[union.second] = _outside(seen, position)
     outside[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
-    scan = _Scan(cloud, position, union.grid, outside, known, earlier.seed_size)
-    return _segmentation(scan, earlier, settings)
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """How the scan is segmented, checked."""
-
-    method: SupervoxelMethod
-    linkage: Linkage
-    object_altitude: float
-
-    @classmethod
-    def of(cls, method: SupervoxelMethod, linkage: Linkage, object_altitude: float | None) -> _Settings:
-        if not isinstance(method, SupervoxelMethod):
-            raise ValueError(f"expected a method such as pcgraph.SurfaceGrowth() or pcgraph.Vccs(), got {method!r}")
-        if not isinstance(linkage, Linkage):
-            raise ValueError(f"expected a linkage such as pcgraph.ConvexityLinkage(), got {linkage!r}")
-        altitude = linkage.object_altitude if object_altitude is None else object_altitude
-        return cls(method, linkage, non_negative("object_altitude", altitude))
-
-
-@dataclass(frozen=True)
-class _Scan:
-    """Points to be segmented, and what they lie in.
-
-    Attributes
-    ----------
-    cloud : CleanCloud of n points
-    viewpoint : (3,) or (n, 3) float64, metres
-    grid : VoxelGrid of v voxels
-        All that has been seen; its `voxel_of_point` speaks of these points.
-    outside : (3,) or (v, 3) float64, metres
-        A place on the outer side of each voxel's surface.
-    known : (v,) int32
-        Supervoxels of earlier scans, -1 elsewhere.
-    seed_size : float, metres
-    """
-
-    cloud: CleanCloud
-    viewpoint: NDArray[np.float64]
-    grid: VoxelGrid
-    outside: NDArray[np.float64]
-    known: NDArray[np.int32]
-    seed_size: float
-
-
-def _segmentation(scan: _Scan, earlier: Segmentation | None, settings: _Settings) -> Segmentation:
-    """The algorithm from voxels on."""
-    cloud, grid, method, linkage = scan.cloud, scan.grid, settings.method, settings.linkage
-    planes = method.planes(grid, scan.outside)
-    normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
-    if earlier is not None:
-        normals = normals.copy()  # the planes keep their own
-        normals[scan.known >= 0] = earlier.surface.normals
-    supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.known)
-    leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
-    surface = Surface(grid, normals, supervoxels)
-    leaves, touching = side_by_side(
-        lambda: _leaves(cloud, surface, leaf_of_point, earlier), lambda: contacts(grid, normals, supervoxels)
-    )
-    nodes = node_features(leaves)
-    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes)
-    tree = segmentation_tree(linkage.merges(graph, leaves), leaves)
-    objects = tree.cut(altitude=settings.object_altitude)
-    return Segmentation(
-        labels=cloud.spread(objects[leaf_of_point]),
-        supervoxels=cloud.spread(leaf_of_point),
-        objects=objects,
-        graph=graph,
-        tree=tree,
-        surface=surface,
-        seed_size=scan.seed_size,
-        viewpoint=scan.viewpoint,
-        **vars(settings),
-    )
-
-
-def _leaves(
-    cloud: CleanCloud, surface: Surface, leaf_of_point: NDArray[np.int32], earlier: Segmentation | None
-) -> Moments:
-    """Moments of the supervoxels' points, with those of earlier scans."""
-    n_leaves = int(surface.supervoxels.max()) + 1
-    if earlier is None:
-        leaves = moments_of_groups(cloud.points, cloud.colors, leaf_of_point, n_leaves)
-    else:
-        found, group = np.unique(leaf_of_point, return_inverse=True)
-        gained = moments_of_groups(cloud.points, cloud.colors, group.astype(np.int32), len(found))
-        leaves = joined_moments(replace(earlier.leaves, normals=None), gained, found, n_leaves)
-    return replace(leaves, normals=surface.mean_normals(n_leaves))
+    scan = Scan(cloud, position, union.grid, outside, known, earlier.seed_size)
+    return segmentation(scan, earlier, settings)
 
 
 def _outside(grid: VoxelGrid, position: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -281,11 +184,3 @@ def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: 
     if len(cloud.shape) != 2 or viewpoint.ndim != 1 or range_growth:
         return False
     return bool(cloud.points[:, 2].min() > viewpoint[2])
-
-
-def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of the given normals of each voxel's points; the estimate where there is none."""
-    means = voxel_means(given, grid)
-    length = np.linalg.norm(means, axis=1, keepdims=True)
-    usable = length > 1e-6
-    return np.where(usable, means / np.where(usable, length, 1.0), estimated)
