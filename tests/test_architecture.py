@@ -54,6 +54,7 @@ STOREYS = [
     "graph",
     "tree",
     "segmentation",
+    "scan",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
 ON_TOP = {"pipeline", "warmup", "detection", "learning", "io", "cli"}
