@@ -32,4 +32,4 @@ def write_bytes(path: Path, content: bytes) -> None:
     except OSError as error:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
-        raise CloudWriteError(f"cannot write {path}: {error.strerror or error}; choose another --out") from None
+        raise CloudWriteError(f"cannot write {path}: {error.strerror or error}; choose another path") from None

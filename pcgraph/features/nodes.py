@@ -15,7 +15,7 @@ from pcgraph.voxels.eigen import symmetric_eigen
 _NO_PLANE = 1e-5  # second over first standard deviation below which points lie on a line
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NodeFeatures:
     """One row per node, of a graph or of a tree.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pooling of moments from children to parents."""
+"""Pooling of moments, means and sums from children to parents."""
 
 from __future__ import annotations
 
@@ -72,3 +72,21 @@ def pool_means(
                 means[node, column] /= counts[node]
             if up != node:
                 means[up, column] += counts[node] * means[node, column]
+
+
+@njit(cache=True, nogil=True)
+def pool_sums(parents: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+    """Nothing; every node's row becomes the sum of the rows at and below it.
+
+    Parameters
+    ----------
+    parents : (k,) int32
+        Larger than the node's own number.
+    values : (k, c) numbers
+        Overwritten.
+    """
+    for node in range(len(parents)):
+        up = parents[node]
+        if up != node:
+            for column in range(values.shape[1]):
+                values[up, column] += values[node, column]

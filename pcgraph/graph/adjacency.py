@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EdgeFeatures:
     """One row per edge (i, j), i < j.
 
@@ -68,7 +68,7 @@ class EdgeFeatures:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AdjacencyGraph:
     """Supervoxels as nodes and their contacts as edges.
 

@@ -15,7 +15,7 @@ _MOST_CELLS = 4e6
 _MOST_CELLS_PER_VOXEL = 16  # to either side; only voxels that nearly touch the sensor are wider
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BearingImage:
     """A lattice of directions with the voxel seen in each.
 

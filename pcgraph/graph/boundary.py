@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pcgraph.inputs import non_negative
 
 if TYPE_CHECKING:
     from pcgraph.graph.adjacency import EdgeFeatures
@@ -26,12 +28,17 @@ class BoundaryCost:
     ----------
     contact : float, 0..1
         Share of the convexity at the contact; the rest is that of the whole supervoxels.
-    convex : float
+    convex : float, >= 0
         Cost of a convex radian: small, so that faces of a box merge late but before the box and its table.
-    step : float, radians per voxel
+    step : float, radians per voxel, >= 0
         Cost of an offset between the surfaces.
-    step_limit : float, voxels
+    step_limit : float, voxels, >= 0
         Offset above which the cost stays.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite or out of range.
 
     Notes
     -----
@@ -43,6 +50,11 @@ class BoundaryCost:
     convex: float = 0.05
     step: float = 0.1
     step_limit: float = 3.0
+
+    def __post_init__(self) -> None:
+        _check_fields(self)
+        if self.contact > 1.0:
+            raise ValueError(f"expected contact as a share of 0..1, got {self.contact!r}")
 
     def __call__(self, features: EdgeFeatures) -> NDArray[np.float64]:
         """Costs, (m,) float64, radians, in whole multiples of 2**-20 so that sums of them are exact.
@@ -70,11 +82,16 @@ class BoundaryStrength:
 
     Attributes
     ----------
-    concavity : float, per radian
-    step : float, per voxel
-    normal : float, per radian
-    color : float
+    concavity : float, per radian, >= 0
+    step : float, per voxel, >= 0
+    normal : float, per radian, >= 0
+    color : float, >= 0
         Per unit of contrast.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite or negative.
 
     Notes
     -----
@@ -86,6 +103,9 @@ class BoundaryStrength:
     step: float = 0.25
     normal: float = 0.1
     color: float = 0.05
+
+    def __post_init__(self) -> None:
+        _check_fields(self)
 
     def __call__(self, features: EdgeFeatures) -> NDArray[np.float64]:
         """Strengths, (m,) float64, 0..1.
@@ -99,3 +119,8 @@ class BoundaryStrength:
         evidence += self.normal * features.normal_angle + self.color * features.color_contrast
         strength: NDArray[np.float64] = -np.expm1(-np.log(2.0) * np.minimum(evidence, 100.0) ** 3)
         return strength
+
+
+def _check_fields(numbers: BoundaryCost | BoundaryStrength) -> None:
+    for field in fields(numbers):
+        non_negative(field.name, getattr(numbers, field.name))

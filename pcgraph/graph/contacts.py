@@ -14,7 +14,7 @@ from pcgraph.voxels.grid import VoxelGrid
 _MOST_OWNERS = 26
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contacts:
     """Pairs of touching supervoxels and what their rims look like; m pairs, side 0 is the smaller number.
 

@@ -18,7 +18,7 @@ _FLUSH_RAD = 0.2
 _FLUSH_VOXELS = 2.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Continuations:
     """Pairs of supervoxels that vanish behind something on one side and appear from behind it on the other.
 
@@ -50,7 +50,7 @@ class Continuations:
     coplanar: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Occlusions:
     """Pairs of supervoxels next to each other as the sensor sees them, but apart in depth.
 

@@ -14,7 +14,7 @@ from pcgraph.metrics.levels import LevelCurve
 from pcgraph.metrics.neighbours import NeighbourGraph
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BoundaryCurve:
     """Boundary recall and precision of every distinct cut of a tree, from the leaves to the root.
 

@@ -14,7 +14,7 @@ from pcgraph.metrics.hierarchy import children
 from pcgraph.metrics.node_table import NodeTable
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FragmentationCurve:
     """Least error against the number of regions of optimal cuts.
 

@@ -23,7 +23,7 @@ Score = Literal[
 ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LevelCurve:
     """One score of every distinct cut of a tree, from the leaves to the root.
 

@@ -13,7 +13,7 @@ from pcgraph.metrics.hierarchy import checked_parents, children, count_leaves
 from pcgraph.metrics.table import count_pairs, labelled, ranked
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NodeTable:
     """Points that each node of a tree shares with each true segment it meets: p cells, in the nodes' order.
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.metrics.table import count_pairs, labelled, overlaps, ranked
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PanopticQuality:
     """Matches of segments and true segments, per class; the numbers for all are means over the classes.
 

@@ -14,7 +14,7 @@ from pcgraph.metrics.levels import LevelCurve
 _LOWER_IS_BETTER = ("undersegmentation_error", "variation_of_information")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BestScales:
     """The best score with one altitude for all clouds (ODS) and with the best altitude for each (OIS).
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.tree.segments import children_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AncestorIndex:
     """Leaves linked by size: at each merge the larger side keeps its representative, the other one links to it.
 
@@ -29,14 +29,26 @@ class AncestorIndex:
     links: NDArray[np.int32]
     merges: NDArray[np.int32]
 
-    def of_pairs(self, pairs: NDArray[np.int32]) -> NDArray[np.int32]:
+    def of_pairs(self, pairs: ArrayLike) -> NDArray[np.int32]:
         """Lowest common ancestor of each pair of leaves, (m,) int32; the leaf itself where the two are one.
 
         Parameters
         ----------
-        pairs : (m, 2) int32
+        pairs : (m, 2) int, 0..n_leaves - 1
+
+        Raises
+        ------
+        ValueError
+            Pairs are not (m, 2) whole numbers, or not leaves of the tree.
         """
-        return _common_ancestors(self.links, self.merges, pairs)
+        leaves, last = np.asarray(pairs), len(self.links) - 1
+        if leaves.ndim != 2 or leaves.shape[1] != 2 or (leaves.size and leaves.dtype.kind not in "iu"):
+            raise ValueError(
+                f"expected pairs (m, 2) of leaves, whole numbers, got {leaves.dtype} of shape {leaves.shape}"
+            )
+        if leaves.size and not 0 <= leaves.min() <= leaves.max() <= last:
+            raise ValueError(f"expected pairs of this tree's leaves 0..{last}, got {leaves.min()}..{leaves.max()}")
+        return _common_ancestors(self.links, self.merges, np.ascontiguousarray(leaves, np.int32))
 
 
 def ancestor_index(parents: NDArray[np.int32]) -> AncestorIndex:

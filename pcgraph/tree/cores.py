@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.tree.segments import children_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SizeCores:
     """What remains of a tree when no segment may have fewer than some number of points.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.atomic import write_bytes
+from pcgraph.errors import CloudReadError
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.relations import angle_between
 
@@ -108,13 +109,19 @@ class EdgeModel:
 
         Raises
         ------
-        OSError
-            There is no such file.
+        CloudReadError
+            The file cannot be read.
         ValueError
             The file holds no such model.
         """
         try:
-            content = json.loads(Path(path).read_bytes())
+            text = Path(path).read_bytes()
+        except OSError as error:
+            raise CloudReadError(
+                f"cannot read {path}: {error.strerror or error}; give a file of EdgeModel.save"
+            ) from None
+        try:
+            content = json.loads(text)
         except ValueError as error:
             raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}: {error}") from None
         if not isinstance(content, dict) or content.pop("format", None) != _FORMAT:

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.features.pooling import pool_sums
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.tree.ancestors import ancestor_index
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from pcgraph.tree.tree import SegmentationTree
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Energy:
     """Energy of a segmentation at a scale: sum over its segments of data + scale x complexity.
 
@@ -31,13 +32,16 @@ class Energy:
     Raises
     ------
     ValueError
-        The two are not one-dimensional and of one length, a value is NaN, or a complexity infinite.
+        The two are not arrays of one dimension and one length, a value is NaN, or a complexity infinite.
     """
 
     data: NDArray[np.float64]
     complexity: NDArray[np.float64]
 
     def __post_init__(self) -> None:
+        for name, values in (("data", self.data), ("complexity", self.complexity)):
+            if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+                raise ValueError(f"expected {name} as an array of numbers, got {_kind(values)}; use np.asarray")
         if self.data.ndim != 1 or self.data.shape != self.complexity.shape:
             raise ValueError(
                 f"expected data and complexity (k,) of one length, got {self.data.shape} and {self.complexity.shape}"
@@ -56,6 +60,11 @@ def plane_energy(tree: SegmentationTree, graph: AdjacencyGraph | None = None) ->
         Of the tree's leaves. With it complexity is the length of contact with other segments in metres, and the
         scale has square metres x points per metre. Without it complexity counts segments, and the scale has
         square metres x points.
+
+    Raises
+    ------
+    ValueError
+        The graph is not of the tree's leaves.
     """
     residual = np.linalg.eigvalsh(tree.moments.scatters)[:, 0]
     return Energy(np.maximum(residual, 0.0), _complexity(tree, graph))
@@ -75,7 +84,7 @@ def variance_energy(tree: SegmentationTree, values: ArrayLike, graph: AdjacencyG
     Raises
     ------
     ValueError
-        Values are not (n_leaves, d), or not finite.
+        Values are not (n_leaves, d), or not finite; or the graph is not of the tree's leaves.
     """
     rows = np.asarray(values, np.float64)
     if rows.ndim != 2 or len(rows) != tree.n_leaves or not np.isfinite(rows).all():
@@ -91,24 +100,29 @@ def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[n
     tree : SegmentationTree
     graph : AdjacencyGraph
         Of the tree's leaves.
+
+    Raises
+    ------
+    ValueError
+        The graph has another number of nodes than the tree has leaves.
     """
+    if graph.n_nodes != tree.n_leaves:
+        raise ValueError(f"expected a graph of the tree's {tree.n_leaves} leaves, got one of {graph.n_nodes} nodes")
     k, lengths = len(tree.parents), graph.edge_features.contact_length
     outlines = np.bincount(graph.edges.ravel(), np.repeat(lengths, 2), k).astype(np.float64)
     # An edge is inside from the lowest common ancestor of its ends upwards: there both its sides leave the outline.
     meeting = ancestor_index(tree.parents).of_pairs(graph.edges)
     outlines -= 2.0 * np.bincount(meeting, lengths, k)
-    _sum_up(tree.parents, outlines)
+    pool_sums(tree.parents, outlines[:, None])
     return np.maximum(outlines, 0.0)
+
+
+def _kind(values: object) -> object:
+    return values.dtype if isinstance(values, np.ndarray) else type(values).__name__
 
 
 def _complexity(tree: SegmentationTree, graph: AdjacencyGraph | None) -> NDArray[np.float64]:
     return np.ones(len(tree.parents)) if graph is None else boundary_lengths(tree, graph)
-
-
-@njit(cache=True)
-def _sum_up(parents: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-    for node in range(len(parents) - 1):
-        values[parents[node]] += values[node]
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
-from pcgraph.tree.linkage import Linkage, Merges
+from pcgraph.tree.linkage import Linkage, Merges, check_numbers
 from pcgraph.tree.scales import scale_linkage
 
 
@@ -31,6 +31,9 @@ class FelzenszwalbLinkage(Linkage):
 
     object_altitude: float = 20.0
     part_altitude: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest scale first."""

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.relations import angle_between
+from pcgraph.inputs import positive
 from pcgraph.tree.average import average_linkage
-from pcgraph.tree.linkage import Linkage, Merges
+from pcgraph.tree.linkage import Linkage, Merges, check_numbers
 from pcgraph.tree.segments import tops_below
 from pcgraph.tree.single import single_linkage
 
@@ -29,16 +30,16 @@ class LccpLinkage(Linkage):
 
     Attributes
     ----------
-    concavity_tolerance : float, radians
+    concavity_tolerance : float, radians, >= 0
         Concave edges of a smaller angle count as convex. Its default is LCCP's, 10 degrees.
     smoothness : bool
         Whether an edge over a step is not convex: both distances to the other one's plane exceed
         sin(angle) seed_size + 0.1 voxel.
     sanity : bool
         Whether an edge is not convex where the patches' planes meet along the line that joins them.
-    common_neighbours : int
+    common_neighbours : int, >= 0
         Their k: number of common neighbours with convex edges to both that an edge needs.
-    seed_size : float, metres, optional
+    seed_size : float, metres, > 0, optional
         Spacing of the supervoxels; default: the median distance between the centroids of those that touch.
     object_altitude : float
         1 for their segmentation.
@@ -57,6 +58,11 @@ class LccpLinkage(Linkage):
     seed_size: float | None = None
     object_altitude: float = 1.0
     part_altitude: float = 1.0 / 9.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "concavity_tolerance", "common_neighbours")
+        if self.seed_size is not None:
+            positive("seed_size", self.seed_size)
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges inside objects, then merges of objects."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LeafTruth:
     """Points per pair of leaf and true segment; r pairs.
 
@@ -69,11 +69,13 @@ def leaf_truth(supervoxels: NDArray[np.int32], truth: ArrayLike, n_leaves: int) 
     Raises
     ------
     ValueError
-        The shapes differ.
+        The shapes differ, or the truth is not whole numbers.
     """
     true = np.asarray(truth)
     if true.shape != supervoxels.shape:
         raise ValueError(f"expected a truth of shape {supervoxels.shape}, got {true.shape}")
+    if true.dtype.kind not in "iub":
+        raise ValueError(f"expected a truth of whole numbers, got {true.dtype}; convert it first")
     both = (true >= 0) & (supervoxels >= 0)
     names, column = np.unique(true[both], return_inverse=True)
     n_true = np.int64(max(len(names), 1))

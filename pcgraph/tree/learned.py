@@ -45,6 +45,10 @@ class LearnedLinkage(Linkage):
 
     model: EdgeModel
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.model, EdgeModel):
+            raise ValueError(f"expected an EdgeModel, got {type(self.model).__name__}; fit one or load it")
+
     @property
     def object_altitude(self) -> float:  # type: ignore[override]
         """Probability of a boundary above which two parts are two objects: the model's."""
@@ -77,8 +81,11 @@ class LearnedLinkage(Linkage):
         ImportError
             scikit-learn is not installed.
         ValueError
-            Numbers or shapes do not fit, or the edges are not of both kinds.
+            These are not sequences of one length, shapes do not fit, or the edges are not of both kinds.
         """
+        if not isinstance(segmentations, Sequence) or not isinstance(truths, (Sequence, np.ndarray)):
+            kinds = f"{type(segmentations).__name__} and {type(truths).__name__}"
+            raise ValueError(f"expected a list of segmentations and a list of truths, got {kinds}")
         if len(segmentations) != len(truths) or not len(truths):
             raise ValueError(f"expected a truth for each segmentation, got {len(segmentations)} and {len(truths)}")
         pairs = zip(segmentations, truths, strict=True)

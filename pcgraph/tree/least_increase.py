@@ -14,7 +14,7 @@ from pcgraph.tree.half_edges import NONE, drop, find, hang, hung_edges, unhang
 from pcgraph.voxels.eigen import symmetric_eigen
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Regions:
     """What the energy of n regions is made of.
 
@@ -91,8 +91,8 @@ def _merge(edges, lengths, per_length, masses, values, centroids, scatters, plan
             residuals[a] = _least_eigenvalue(scatters[a].copy())
     costs = np.empty(len(edges))
     for e in range(len(edges)):
-        rise = _rise(edges[e, 0], edges[e, 1], masses, values, centroids, scatters, residuals, plane)
-        costs[e] = rise / lengths[e]
+        increase = _increase(edges[e, 0], edges[e, 1], masses, values, centroids, scatters, residuals, plane)
+        costs[e] = increase / lengths[e]
     order, place, size = queued_edges(costs)
     name = np.arange(n)  # a region lives on under the slot of one of its leaves; this is its tree node
     pairs, altitudes = np.empty((max(n - 1, 0), 2), np.int32), np.empty(max(n - 1, 0))
@@ -126,25 +126,25 @@ def _merge(edges, lengths, per_length, masses, values, centroids, scatters, plan
         half = first[kept]
         while half != NONE:
             e = half >> 1
-            rise = _rise(kept, ends[half ^ 1], masses, values, centroids, scatters, residuals, plane)
-            costs[e] = rise / lengths[e]
+            increase = _increase(kept, ends[half ^ 1], masses, values, centroids, scatters, residuals, plane)
+            costs[e] = increase / lengths[e]
             requeue(e, costs, order, place, size)
             half = after[half]
     return pairs[:t].copy(), altitudes[:t].copy()
 
 
 @njit(cache=True)
-def _rise(a, b, masses, values, centroids, scatters, residuals, plane):  # type: ignore[no-untyped-def]
+def _increase(a, b, masses, values, centroids, scatters, residuals, plane):  # type: ignore[no-untyped-def]
     """Energy of the union of two regions less the sum of theirs."""
     reduced = masses[a] * masses[b] / (masses[a] + masses[b])
-    rise = 0.0
+    increase = 0.0
     for i in range(values.shape[1]):
         gap = values[a, i] - values[b, i]
-        rise += reduced * gap * gap
+        increase += reduced * gap * gap
     if plane > 0.0:
         union = _scatter_of_union(a, b, reduced, centroids, scatters)
-        rise += plane * (_least_eigenvalue(union) - residuals[a] - residuals[b])
-    return rise
+        increase += plane * (_least_eigenvalue(union) - residuals[a] - residuals[b])
+    return increase
 
 
 @njit(cache=True)

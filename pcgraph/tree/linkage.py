@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.inputs import non_negative
 from pcgraph.tree.average import average_linkage
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Merges:
     """Binary merges along the edges of a graph, until every connected component is one node.
 
@@ -50,6 +51,18 @@ class Linkage(ABC):
         """Merges of the graph's nodes, whose points have these moments."""
 
 
+def check_numbers(linkage: Linkage, *names: str) -> None:
+    """Nothing; raises ValueError unless these attributes and both altitudes are finite numbers, not negative."""
+    for name in (*names, "object_altitude", "part_altitude"):
+        non_negative(name, getattr(linkage, name))
+
+
+def check_cost(cost: BoundaryCost) -> None:
+    """Nothing; raises ValueError unless this is a `BoundaryCost`."""
+    if not isinstance(cost, BoundaryCost):
+        raise ValueError(f"expected cost as a BoundaryCost, got {cost!r}")
+
+
 @dataclass(frozen=True)
 class ConvexityLinkage(Linkage):
     """Average linkage of an edge's concavity, weighted by contact; altitudes in radians.
@@ -72,6 +85,10 @@ class ConvexityLinkage(Linkage):
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     object_altitude: float = 0.4
     part_altitude: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_cost(self.cost)
+        check_numbers(self)
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least concave contact first."""

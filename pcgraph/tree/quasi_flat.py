@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
-from pcgraph.tree.linkage import Linkage, Merges
+from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
 from pcgraph.tree.single import single_linkage
 
 
@@ -31,6 +31,10 @@ class QuasiFlatLinkage(Linkage):
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     object_altitude: float = 0.12
     part_altitude: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_cost(self.cost)
+        check_numbers(self)
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the cheapest edge first."""

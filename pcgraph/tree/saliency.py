@@ -25,19 +25,29 @@ def voxel_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float
         Whose leaves are the surface's supervoxels.
     surface : Surface of v voxels
 
+    Raises
+    ------
+    ValueError
+        The surface has a supervoxel that is no leaf of the tree.
+
     Notes
     -----
     Source: Arbelaez et al. 2011, ultrametric contour maps.
     """
+    last, grid = int(surface.supervoxels.max(initial=0)), surface.grid
+    if last >= tree.n_leaves:
+        raise ValueError(f"expected a surface of the tree's {tree.n_leaves} leaves, got one with supervoxel {last}")
     index = ancestor_index(tree.parents)
-    grid = surface.grid
     return _strongest_contacts(
         index.links, index.merges, tree.altitudes, grid.indptr, grid.neighbours, surface.supervoxels
     )
 
 
 def point_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float64]:
-    """Boundary strength of each finite point, (n,) float64, the altitudes' unit: that of its voxel."""
+    """Boundary strength of each finite point, (n,) float64, the altitudes' unit: that of its voxel.
+
+    Raises as `voxel_saliency`.
+    """
     return voxel_saliency(tree, surface)[surface.grid.voxel_of_point]
 
 

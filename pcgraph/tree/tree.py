@@ -12,18 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.columns import rows
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import NodeFeatures, node_features
+from pcgraph.inputs import non_negative
 from pcgraph.tree.ancestors import ancestor_index
-from pcgraph.tree.cores import core_of_leaf, size_cores
+from pcgraph.tree.cuts import horizontal_cut, stable_cut
 from pcgraph.tree.energy import Energy
 from pcgraph.tree.optimal import appearance_scales
-from pcgraph.tree.segments import children_of, numbered_segments, tops_below
-from pcgraph.tree.stability import persistences, stable_nodes
+from pcgraph.tree.segments import numbered_segments
+from pcgraph.tree.stability import persistences
 
 if TYPE_CHECKING:
     import networkx
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SegmentationTree:
     """Binary merge tree; every cut of it is a segmentation, and all cuts at altitudes nest.
 
@@ -85,16 +86,7 @@ class SegmentationTree:
 
         The node is above the leaf, except for leaves that went to another segment because of `min_size`.
         """
-        if _whole("min_size", min_size) == 1:
-            last = self.n_leaves + self._merges(n, altitude, self.n_leaves)
-            return tops_below(self.parents, last)[: self.n_leaves].copy()
-        cores = size_cores(self.parents, self.moments.counts, min_size)
-        n_cores = len(cores.joins) + 1
-        merges = self._merges(n, altitude, n_cores)
-        last = self.n_leaves + merges
-        if n is not None:  # so many of the merges that join cores
-            last = int(cores.joins[merges - 1]) + 1 if merges > 0 else 0
-        return tops_below(self.parents, last)[cores.of_leaf]
+        return horizontal_cut(self.parents, self.altitudes, self.moments.counts, n, altitude, min_size)
 
     def levels(self, altitudes: ArrayLike) -> NDArray[np.int32]:
         """Segment of each leaf at several altitudes, (n_leaves, l) int32: supervoxel, part, object, scene.
@@ -111,7 +103,7 @@ class SegmentationTree:
         ValueError
             An altitude is not a number.
         """
-        columns = [self.cut(altitude=level) for level in np.asarray(altitudes, np.float64).ravel().tolist()]
+        columns = [self.cut(altitude=level) for level in np.ravel(altitudes).tolist()]
         return np.stack(columns, axis=1) if columns else np.empty((self.n_leaves, 0), np.int32)
 
     def cut_stable(self, min_size: int = 1) -> NDArray[np.int32]:
@@ -135,12 +127,7 @@ class SegmentationTree:
 
     def cut_stable_nodes(self, min_size: int = 1) -> NDArray[np.int32]:
         """Node of the tree for each leaf, (n_leaves,) int32; as `cut_stable`."""
-        counts = self.moments.counts
-        least = min(_whole("min_size", min_size), int(counts[-1]))
-        chosen = stable_nodes(self.parents, self.altitudes, counts, least)
-        if not chosen.any():  # only parts that do not touch, each too small
-            chosen[-1] = True
-        return core_of_leaf(self.parents, children_of(self.parents), counts, chosen)
+        return stable_cut(self.parents, self.altitudes, self.moments.counts, min_size)
 
     def cut_optimal(self, energy: Energy, scale: float) -> NDArray[np.int32]:
         """Segment of each leaf in the cut of least energy, (n_leaves,) int32, numbered as in `cut`.
@@ -158,9 +145,9 @@ class SegmentationTree:
         Raises
         ------
         ValueError
-            The energy has another number of rows, or scale is not a finite number >= 0.
+            `energy` is none or has another number of rows, or scale is not a finite number >= 0.
         """
-        return self.by_energy(energy).cut(altitude=_scale(scale))
+        return self.by_energy(energy).cut(altitude=non_negative("scale", scale))
 
     def by_energy(self, energy: Energy) -> SegmentationTree:
         """The same merges with the scale as altitude: the persistent hierarchy of optimal cuts.
@@ -171,15 +158,17 @@ class SegmentationTree:
         Raises
         ------
         ValueError
-            The energy has another number of rows than the tree has nodes, or leaves with infinite data.
+            `energy` is none, has another number of rows than the tree has nodes, or leaves with infinite data.
         """
+        if not isinstance(energy, Energy):
+            raise ValueError(f"expected an Energy, got {type(energy).__name__}; make it with plane_energy(tree)")
         if len(energy.data) != len(self.parents) or np.isinf(energy.data[: self.n_leaves]).any():
             raise ValueError(
                 f"expected an energy with {len(self.parents)} rows, finite for leaves, got {len(energy.data)}; "
                 "make it from this tree"
             )
         data = np.where(np.isinf(self.altitudes), np.inf, energy.data)
-        return self.with_altitudes(appearance_scales(self.parents, data, energy.complexity))
+        return self.with_altitudes(appearance_scales(self.parents, data, energy.complexity.astype(np.float64)))
 
     def with_altitudes(self, altitudes: ArrayLike) -> SegmentationTree:
         """The same merges at other altitudes; inner nodes are renumbered so that these do not decrease.
@@ -207,7 +196,7 @@ class SegmentationTree:
         rank[order] = np.arange(len(order), dtype=np.int32)
         return SegmentationTree(rank[self.parents[order]], levels[order], self.moments[order])
 
-    def edge_saliency(self, pairs: NDArray[np.int32]) -> NDArray[np.float64]:
+    def edge_saliency(self, pairs: ArrayLike) -> NDArray[np.float64]:
         """Altitude at which the two leaves of each pair become one segment, (m,) float64, the linkage's unit.
 
         On the edges of the graph this is the ultrametric contour map: edges above a level are the boundaries of
@@ -215,20 +204,15 @@ class SegmentationTree:
 
         Parameters
         ----------
-        pairs : (m, 2) int32, 0..n_leaves - 1
+        pairs : (m, 2) int, 0..n_leaves - 1
             For example ``graph.edges``.
 
         Raises
         ------
         ValueError
-            Pairs are not (m, 2), or not leaves.
+            Pairs are not (m, 2) whole numbers, or not leaves.
         """
-        leaves = np.asarray(pairs)
-        if leaves.ndim != 2 or leaves.shape[1] != 2 or (leaves.size and not 0 <= leaves.min() <= leaves.max()):
-            raise ValueError(f"expected pairs (m, 2) of leaves, got shape {leaves.shape}")
-        if leaves.size and leaves.max() >= self.n_leaves:
-            raise ValueError(f"expected leaves below {self.n_leaves}, got {leaves.max()}")
-        return self.altitudes[ancestor_index(self.parents).of_pairs(leaves.astype(np.int32))]
+        return self.altitudes[ancestor_index(self.parents).of_pairs(pairs)]
 
     def features(self) -> NodeFeatures:
         """Features of all k nodes, from their moments."""
@@ -246,27 +230,3 @@ class SegmentationTree:
 
     def _segments(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
         return numbered_segments(nodes, len(self.parents))
-
-    def _merges(self, n: int | None, altitude: float | None, most: int) -> int:
-        """Number of merges that a cut does; of a tree with `most` segments at its finest."""
-        if n is not None and altitude is None:
-            if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 1 <= n <= most:
-                raise ValueError(f"expected a whole number n of 1..{most} segments, got {n!r}")
-            return most - int(n)
-        if altitude is None or n is not None:
-            raise ValueError(f"expected either n or altitude, got n={n} and altitude={altitude}")
-        if np.isnan(altitude):
-            raise ValueError("expected an altitude in the linkage's unit, got NaN")
-        return int(np.searchsorted(self.altitudes[self.n_leaves :], altitude, side="right"))
-
-
-def _whole(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"expected {name} as a whole number of at least 1, got {value!r}")
-    return int(value)
-
-
-def _scale(value: float) -> float:
-    if not 0.0 <= value < np.inf:
-        raise ValueError(f"expected a finite scale of at least 0, got {value!r}")
-    return float(value)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.tree.least_increase import Regions, least_increase_linkage
-from pcgraph.tree.linkage import Linkage, Merges
+from pcgraph.tree.linkage import Linkage, Merges, check_numbers
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class WardLinkage(Linkage):
 
     Attributes
     ----------
-    position : float, per voxel
+    position : float, per voxel, >= 0
         Weight of places, in voxel edges.
-    normal : float
+    normal : float, >= 0
         Weight of unit normals.
-    color : float
+    color : float, >= 0
         Weight of colours, 0..1.
     object_altitude, part_altitude : float
         Increase of the sum of squares above which two pieces are two objects, or two parts.
@@ -42,6 +42,9 @@ class WardLinkage(Linkage):
     object_altitude: float = 6.0
     part_altitude: float = 0.5
 
+    def __post_init__(self) -> None:
+        check_numbers(self, "position", "normal", "color")
+
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest increase first."""
         regions = _regions(graph, leaves, self.position, self.normal, self.color, 0.0)
@@ -54,9 +57,9 @@ class MumfordShahLinkage(Linkage):
 
     Attributes
     ----------
-    plane : float, per voxel
+    plane : float, per voxel, >= 0
         Weight of distances to a region's least-squares plane, in voxel edges.
-    normal, color : float
+    normal, color : float, >= 0
         Weights of unit normals and of colours, 0..1, as piecewise constant data.
     object_altitude, part_altitude : float
         Scale at which objects, or parts, are read off.
@@ -73,6 +76,9 @@ class MumfordShahLinkage(Linkage):
     color: float = 0.0
     object_altitude: float = 10.0
     part_altitude: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "plane", "normal", "color")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest scale first."""
