@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
 from pcgraph.detection.hulls import FLAT, smallest_rectangle
+from pcgraph.features.nodes import unit_vector
+from pcgraph.features.primitive_moments import finite_vectors
 
 _SAME_NORMAL = 1e6  # steps per unit in which normals of facets are told apart
 _MOST_FACETS = 64  # the largest ones; noise makes hundreds of small ones
@@ -57,15 +59,15 @@ class OrientedBox:
         return np.where((outside <= 0.0).all(axis=-1), -outside.max(axis=-1), beyond)
 
 
-def standing_box(points: NDArray[np.float64], up: NDArray[np.float64], bottom: float | None = None) -> OrientedBox:
+def standing_box(points: ArrayLike, up: ArrayLike, bottom: float | None = None) -> OrientedBox:
     """Box on a plane: the smallest rectangle around the points' footprint, times their height.
 
     Parameters
     ----------
-    points : (n, 3) float64, metres
-        n >= 1.
-    up : (3,) float64
-        Unit normal of the plane; the third axis of the box.
+    points : (n, 3) float, metres
+        n >= 1, finite.
+    up : (3,) float, any length but zero
+        Normal of the plane; the third axis of the box.
     bottom : float, metres, optional
         Position of the box's underside along `up`; default: that of the lowest point.
 
@@ -73,9 +75,18 @@ def standing_box(points: NDArray[np.float64], up: NDArray[np.float64], bottom: f
     -------
     OrientedBox
         Its first axis is the longer side of the footprint.
+
+    Raises
+    ------
+    ValueError
+        Points or `up` are not as above.
     """
+    return _standing(some_points(points), unit_vector("up", up), bottom)
+
+
+def _standing(places: NDArray[np.float64], up: NDArray[np.float64], bottom: float | None = None) -> OrientedBox:
     basis = plane_basis(up)
-    flat, heights = points @ basis.T, points @ up
+    flat, heights = places @ basis.T, places @ up
     rectangle = smallest_rectangle(flat)
     low = float(heights.min()) if bottom is None else bottom
     high = max(float(heights.max()), low)
@@ -84,32 +95,46 @@ def standing_box(points: NDArray[np.float64], up: NDArray[np.float64], bottom: f
     return OrientedBox(center, axes, np.append(rectangle.size, high - low))
 
 
-def tight_box(points: NDArray[np.float64]) -> OrientedBox:
-    """Free box around points, (n, 3) float64, n >= 1: the smallest of those flush with a large facet of their hull.
+def tight_box(points: ArrayLike) -> OrientedBox:
+    """Free box around points, (n, 3) float, n >= 1: the smallest of those flush with a large facet of their hull.
 
     Returns
     -------
     OrientedBox
         Axes in descending order of length.
 
+    Raises
+    ------
+    ValueError
+        There is no point, or not all are finite.
+
     Notes
     -----
     The smallest box of all need not be flush with a facet (O'Rourke 1985), but is rarely smaller by much.
     """
-    middle = points.mean(axis=0)
-    local = points - middle
+    places = some_points(points)
+    middle = places.mean(axis=0)
+    local = places - middle
     _, principal = np.linalg.eigh(local.T @ local)
     spans = np.ptp(local @ principal, axis=0)
     if spans.min() <= FLAT * spans.max():
-        best = standing_box(local, principal[:, 0])
+        best = _standing(local, principal[:, 0])
     else:
         hull = ConvexHull(local)
         corners = local[hull.vertices]
-        best = min((standing_box(corners, normal) for normal in _facets(hull)), key=lambda box: box.volume)
+        best = min((_standing(corners, normal) for normal in _facets(hull)), key=lambda box: box.volume)
     order = np.argsort(-best.size, kind="stable")
     axes = best.axes[order]
     axes[2] *= np.sign(np.linalg.det(axes))
     return OrientedBox(best.center + middle, axes, best.size[order])
+
+
+def some_points(points: ArrayLike) -> NDArray[np.float64]:
+    """The points as (n, 3) float64; ValueError if there is none, or if they are not three finite numbers each."""
+    places = finite_vectors("points", points)
+    if not len(places):
+        raise ValueError("expected at least one point, got none")
+    return places
 
 
 def plane_basis(normal: NDArray[np.float64]) -> NDArray[np.float64]:

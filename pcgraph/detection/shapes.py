@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.detection.boxes import OrientedBox, plane_basis, standing_box, tight_box
-from pcgraph.features.primitive_moments import primitive_moments
+from pcgraph.detection.boxes import OrientedBox, plane_basis, some_points, standing_box, tight_box
+from pcgraph.features.nodes import unit_vector
+from pcgraph.features.primitive_moments import finite_vectors, primitive_moments
 from pcgraph.features.primitives import fit_primitives
 
 Kind = Literal["plane", "box", "ball", "cylinder"]
@@ -52,40 +53,45 @@ class Shape:
     box: OrientedBox | None
 
 
-def fit_shape(
-    points: NDArray[np.float64], normals: NDArray[np.float64], up: NDArray[np.float64] | None = None
-) -> Shape:
+def fit_shape(points: ArrayLike, normals: ArrayLike, up: ArrayLike | None = None) -> Shape:
     """Shape whose surface lies nearest to points, by root mean square distance.
 
     Parameters
     ----------
-    points : (n, 3) float64, metres
-        n >= 1; parts of the surface may be missing.
-    normals : (n, 3) float64
+    points : (n, 3) float, metres
+        n >= 1, finite; parts of the surface may be missing.
+    normals : (n, 3) float
         Unit normals at the points.
-    up : (3,) float64, optional
-        Unit vector along which boxes and cylinders are likely to stand: tried besides other poses.
+    up : (3,) float, any length but zero, optional
+        Along which boxes and cylinders are likely to stand: tried besides other poses.
+
+    Raises
+    ------
+    ValueError
+        An argument is not as above.
     """
-    moments = primitive_moments(points, normals, np.zeros(len(points), np.int32), 1)
-    round_shapes = fit_primitives(moments)
+    places, directions = some_points(points), finite_vectors("normals", normals)
+    upwards = None if up is None else unit_vector("up", up)
+    round_shapes = fit_primitives(primitive_moments(places, directions, np.zeros(len(places), np.int32), 1))
     flat = Shape(
         "plane",
         float(round_shapes.plane_residual[0]),
         {},
-        points.mean(axis=0),
+        places.mean(axis=0),
         round_shapes.plane_normal[0],
         float("nan"),
         None,
     )
     # A flat patch has room for a flat box in its noise.
-    found = [flat, *(b for b in _boxes(points, up) if b.box is not None and b.box.size.min() > THICK * flat.residual)]
+    boxes = _boxes(places, upwards)
+    found = [flat, *(b for b in boxes if b.box is not None and b.box.size.min() > THICK * flat.residual)]
     center, radius = round_shapes.sphere_center[0], float(round_shapes.sphere_radius[0])
     if np.isfinite(radius):
-        distance = np.linalg.norm(points - center, axis=1) - radius
+        distance = np.linalg.norm(places - center, axis=1) - radius
         found.append(Shape("ball", _rms(distance), {}, center, np.zeros(3), radius, None))
-    axes = [round_shapes.cylinder_axis[0]] + ([] if up is None else [up])
+    axes = [round_shapes.cylinder_axis[0]] + ([] if upwards is None else [upwards])
     for axis in axes:
-        found += _cylinder(points, normals, axis)
+        found += _cylinder(places, directions, axis)
     residuals: dict[Kind, float] = {}
     for shape in found:
         residuals[shape.kind] = min(shape.residual, residuals.get(shape.kind, np.inf))

@@ -71,11 +71,19 @@ class NodeFeatures:
         -----
         Source: Hackel et al. 2016. It is no moment, but follows from one, so merged nodes have it too.
         """
-        direction = np.asarray(up, dtype=np.float64)
-        if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
-            raise ValueError(f"expected up as three finite numbers, not all zero, got {up!r}")
-        direction = direction / np.abs(direction).max()  # so that its square neither overflows nor vanishes
-        return np.maximum(1.0 - np.abs(self.normal @ (direction / np.linalg.norm(direction))), 0.0)
+        return np.maximum(1.0 - np.abs(self.normal @ unit_vector("up", up)), 0.0)
+
+
+def unit_vector(name: str, vector: ArrayLike) -> NDArray[np.float64]:
+    """The direction of a vector, (3,) float64 of length 1; ValueError if it is not three finite numbers or all zero."""
+    try:
+        direction = np.asarray(vector, dtype=np.float64)
+    except (TypeError, ValueError):
+        direction = np.empty(0)
+    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+        raise ValueError(f"expected {name} as three finite numbers, not all zero, got {vector!r}")
+    direction = direction / np.abs(direction).max()  # so that its square neither overflows nor vanishes
+    return direction / np.linalg.norm(direction)
 
 
 def node_features(moments: Moments) -> NodeFeatures:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.pooling import pool_moments
@@ -53,7 +53,7 @@ class PrimitiveMoments:
 
 
 def primitive_moments(
-    points: NDArray[np.float64], normals: NDArray[np.float64], groups: NDArray[np.int32], n_groups: int
+    points: ArrayLike, normals: ArrayLike, groups: NDArray[np.int32], n_groups: int
 ) -> PrimitiveMoments:
     """Moments of points by group.
 
@@ -65,12 +65,35 @@ def primitive_moments(
     groups : (n,) int32, 0..n_groups - 1
         Every group has a point at least.
     n_groups : int
+
+    Raises
+    ------
+    ValueError
+        A shape is not as above, a number is not finite, or a group is out of range or has no point.
     """
-    low = moments_of_groups(points, None, groups, n_groups)
+    places, directions = finite_vectors("points", points), finite_vectors("normals", normals)
+    if not len(places) == len(directions) == len(groups):
+        raise ValueError(
+            f"expected one normal and one group per point, got {len(places)} points, {len(directions)} normals, "
+            f"{len(groups)} groups"
+        )
+    if groups.min(initial=0) < 0 or groups.max(initial=-1) != n_groups - 1 or not np.bincount(groups).all():
+        raise ValueError(f"expected all of the groups 0..{n_groups - 1}, with a point each, and no others")
+    low = moments_of_groups(places, None, groups, n_groups)
     scales = _scales(low.counts, low.scatters)
-    powers = sums_of_powers(points, groups, low.centroids, scales)
-    sums, scatters = _normal_moments(normals, groups, n_groups)
+    powers = sums_of_powers(places, groups, low.centroids, scales)
+    sums, scatters = _normal_moments(directions, groups, n_groups)
     return PrimitiveMoments(low.counts, low.centroids, scales, powers, sums, scatters)
+
+
+def finite_vectors(name: str, vectors: ArrayLike) -> NDArray[np.float64]:
+    """The vectors as (n, 3) float64; ValueError if they have another shape or are not all finite numbers."""
+    array = np.asarray(vectors)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        raise ValueError(f"expected {name} as numbers of shape (n, 3), got {array.shape} {array.dtype}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"expected {name} as finite numbers; leave out points that have NaN or infinite ones")
+    return array.astype(np.float64, copy=False)
 
 
 def pool_up_tree(leaves: PrimitiveMoments, parents: NDArray[np.int32]) -> PrimitiveMoments:

@@ -89,6 +89,33 @@ def test_few_points_and_points_on_a_line_or_plane_have_boxes(n):
     assert tight_box(flat).size[2] == pytest.approx(0, abs=1e-9)
 
 
+def test_only_the_direction_of_up_counts():
+    points = np.random.default_rng(3).normal(size=(60, 3))
+    unit, longer = standing_box(points, TURN[0]), standing_box(points.tolist(), 10 * TURN[0])
+    assert longer.size == pytest.approx(unit.size)
+    assert longer.center == pytest.approx(unit.center)
+    assert fit_shape(points, points, 10 * TURN[0]).residuals == pytest.approx(
+        fit_shape(points, points, TURN[0]).residuals
+    )
+
+
+@pytest.mark.parametrize("points", [np.empty((0, 3)), np.full((5, 3), np.nan), np.ones((5, 2)), np.ones(3)])
+def test_boxes_and_shapes_need_finite_points(points):
+    for call in (lambda: standing_box(points, UP), lambda: tight_box(points), lambda: fit_shape(points, points)):
+        with pytest.raises(ValueError, match=r"expected .*point"):
+            call()
+
+
+def test_shapes_need_a_normal_per_point_and_boxes_a_direction():
+    points = np.random.default_rng(4).random((200_000, 3))
+    for normals in (points[:3], np.full((200_000, 3), np.nan)):
+        with pytest.raises(ValueError, match="normal"):
+            fit_shape(points, normals)
+    for up in (np.zeros(3), (0, 1), "z"):
+        with pytest.raises(ValueError, match="up"):
+            standing_box(points, up)
+
+
 def test_no_turned_rectangle_is_smaller():
     rng = np.random.default_rng(2)
     for _ in range(20):

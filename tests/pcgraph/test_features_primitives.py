@@ -156,6 +156,18 @@ def test_noise_speaks_for_the_simpler_shape():
     assert fit_primitives(moments(points, normals), noise=0.01).best[0] == Primitive.PLANE
 
 
+def test_wrong_input_is_refused_before_it_is_summed():
+    points, one = np.random.default_rng(0).random((1000, 3)), np.zeros(1000, np.int32)
+    for normals in (points[:3], points[:, :2], points[0], np.full((1000, 3), np.nan)):
+        with pytest.raises(ValueError, match="normal"):
+            primitive_moments(points, normals, one, 1)
+    with pytest.raises(ValueError, match="points as finite"):
+        primitive_moments(np.full((1000, 3), np.inf), points, one, 1)
+    for groups, n in ((one + 1, 1), (one - 1, 1), (one, 2), (one + 1, 2)):
+        with pytest.raises(ValueError, match="groups"):
+            primitive_moments(points, points, groups, n)
+
+
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_few_or_coincident_points_break_nothing(n):
     rng = np.random.default_rng(8)
