@@ -13,6 +13,7 @@ from pcgraph.segmentation import Segmentation
 from pcgraph.tree.tree import SegmentationTree
 
 REDUCTIONS = ("sum", "mean", "max", "min")
+_LARGEST_SUM = 2.0**62  # half of what int64 holds, so that rounding decides nothing
 
 
 def pool_up(
@@ -38,7 +39,8 @@ def pool_up(
     Raises
     ------
     ValueError
-        A shape does not fit the tree, a weight is negative, or `reduce` is unknown.
+        A shape does not fit the tree, a weight is negative, `reduce` is unknown, or whole numbers are too large to be
+        summed: their sizes may add up to 2**62.
     """
     table, flat = _table(values, tree.n_leaves, "values", "leaves")
     if reduce not in REDUCTIONS:
@@ -51,10 +53,11 @@ def pool_up(
         pooled = _sum_up(tree, table)
     else:
         sign = 1.0 if reduce == "max" else -1.0
+        known = ~np.isnan(table)
         highest = np.full((len(tree.parents), table.shape[1]), -np.inf)
-        highest[: tree.n_leaves] = np.where(np.isnan(table), -np.inf, sign * table)
+        highest[: tree.n_leaves] = np.where(known, sign * table, -np.inf)
         _max_to_parents(tree.parents, highest)
-        pooled = np.where(np.isneginf(highest), np.nan, sign * highest)
+        pooled = np.where(_sum_up(tree, known) > 0, sign * highest, np.nan)
     return pooled[:, 0] if flat else pooled
 
 
@@ -77,27 +80,22 @@ def pool_points(segmentation: Segmentation, values: ArrayLike, reduce: str = "me
     Raises
     ------
     ValueError
-        The shape is not that of the points, or `reduce` is unknown.
+        The shape is not that of the points, `reduce` is unknown, or whole numbers are too large to be summed.
     """
+    if reduce not in REDUCTIONS:
+        raise ValueError(f"expected reduce as one of {', '.join(REDUCTIONS)}, got {reduce!r}")
     leaf, table, flat = _on_finite_points(segmentation, values)
-    tree, columns = segmentation.tree, range(table.shape[1])
-    n = tree.n_leaves
+    tree, known = segmentation.tree, ~np.isnan(table)
     if reduce in ("max", "min"):
-        extreme = np.full((n, table.shape[1]), np.nan)
+        extreme = np.full((tree.n_leaves, table.shape[1]), np.nan)
         (np.fmax if reduce == "max" else np.fmin).at(extreme, leaf, table.astype(np.float64))
         pooled = pool_up(tree, extreme, reduce=reduce)
     else:
-        known = ~np.isnan(table)
-        sums = np.stack([np.bincount(leaf, np.where(known, table, 0)[:, c], n) for c in columns], axis=1)
-        if reduce == "sum":
-            whole = table.dtype.kind in "bui"
-            pooled = pool_up(tree, np.rint(sums).astype(np.int64) if whole else sums, reduce="sum")
-        elif reduce == "mean":
-            counts = np.stack([np.bincount(leaf, known[:, c], n) for c in columns], axis=1)
+        values = _summable(np.where(known, table, 0)) if reduce == "sum" else np.where(known, table, 0.0)
+        pooled = _sum_up(tree, _sums(leaf, values, tree.n_leaves))
+        if reduce == "mean":
             with np.errstate(invalid="ignore"):
-                pooled = pool_up(tree, sums, reduce="sum") / pool_up(tree, counts, reduce="sum")
-        else:
-            raise ValueError(f"expected reduce as one of {', '.join(REDUCTIONS)}, got {reduce!r}")
+                pooled = pooled / _sum_up(tree, _sums(leaf, known.astype(np.int64), tree.n_leaves))
     return pooled[:, 0] if flat else pooled
 
 
@@ -140,7 +138,7 @@ def down(segmentation: Segmentation, values: ArrayLike, nodes: ArrayLike | None 
 
 
 def _mean_up(tree: SegmentationTree, table: NDArray[Any], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    known = ~np.isnan(table)
+    known = ~np.isnan(table) & (weights > 0.0)[:, None]
     sums = _sum_up(tree, np.where(known, table, 0) * weights[:, None])
     totals = _sum_up(tree, known * weights[:, None])
     means = np.full(sums.shape, np.nan)
@@ -150,11 +148,29 @@ def _mean_up(tree: SegmentationTree, table: NDArray[Any], weights: NDArray[np.fl
 
 
 def _sum_up(tree: SegmentationTree, table: NDArray[Any]) -> NDArray[Any]:
-    dtype = np.int64 if table.dtype.kind in "bui" else np.float64
-    sums = np.zeros((len(tree.parents), table.shape[1]), dtype)
-    sums[: tree.n_leaves] = np.where(np.isnan(table), 0, table)
+    values = _summable(np.where(np.isnan(table), 0, table))
+    sums = np.zeros((len(tree.parents), table.shape[1]), values.dtype)
+    sums[: tree.n_leaves] = values
     _add_to_parents(tree.parents, sums)
     return sums
+
+
+def _sums(leaf: NDArray[np.int32], table: NDArray[Any], n: int) -> NDArray[Any]:
+    """Sums of the points' rows by leaf, (n, c), of the table's dtype."""
+    sums = np.zeros((n, table.shape[1]), table.dtype)
+    np.add.at(sums, leaf, table)
+    return sums
+
+
+def _summable(table: NDArray[Any]) -> NDArray[Any]:
+    """The table as int64 if it holds whole numbers, as float64 otherwise."""
+    if table.dtype.kind == "f":
+        return table.astype(np.float64)
+    if (np.abs(table.astype(np.float64)).sum(axis=0) > _LARGEST_SUM).any():
+        raise ValueError(
+            "expected whole numbers whose sizes add up to 2**62 at most, got larger ones; pass them as float"
+        )
+    return table.astype(np.int64)
 
 
 @njit(cache=True)

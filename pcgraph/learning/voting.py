@@ -42,16 +42,24 @@ def votes(segmentation: Segmentation, labels: ArrayLike, n_classes: int | None =
     return pool_up(tree, flat.reshape(tree.n_leaves, classes), reduce="sum")
 
 
-def majority(votes: NDArray[np.int64]) -> NDArray[np.int32]:
+def majority(votes: ArrayLike) -> NDArray[np.int32]:
     """Class with most votes, (k,) int32; of equals the smallest; -1 without any vote.
 
     Parameters
     ----------
-    votes : (k, c) int64
+    votes : (k, c) int, not negative
+
+    Raises
+    ------
+    ValueError
+        The shape or the type is another.
     """
-    if votes.shape[1] == 0:
-        return np.full(len(votes), -1, np.int32)
-    return np.where(votes.any(axis=1), votes.argmax(axis=1), -1).astype(np.int32)
+    counts = np.asarray(votes)
+    if counts.ndim != 2 or counts.dtype.kind not in "iu":
+        raise ValueError(f"expected votes as whole numbers of shape (k, c), got {counts.shape} {counts.dtype}")
+    if counts.shape[1] == 0:
+        return np.full(len(counts), -1, np.int32)
+    return np.where(counts.any(axis=1), counts.argmax(axis=1), -1).astype(np.int32)
 
 
 def pure_ancestors(

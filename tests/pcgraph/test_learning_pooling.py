@@ -49,6 +49,29 @@ def test_missing_values_are_left_out():
     assert pool_up(tree, values, reduce="sum")[3:].tolist() == [[3, 0], [3, 5]]
 
 
+def test_infinity_is_a_value_and_not_a_missing_one():
+    tree = hand_drawn()
+    for reduce, sign in (("min", 1.0), ("max", -1.0)):
+        values = sign * np.array([np.inf, 2.0, 3.0])
+        assert pool_up(tree, values, reduce=reduce).tolist() == (sign * np.array([np.inf, 2, 3, 2, 2])).tolist()
+        assert pool_up(tree, [sign * np.inf] * 3, reduce=reduce).tolist() == [sign * np.inf] * 5
+    assert pool_up(tree, [np.inf, 2.0, 3.0], weights=[0, 1, 1]).tolist() == [np.inf, 2, 3, 2, 2.5]
+
+
+def test_sums_of_whole_numbers_are_exact_or_refused(boxes):
+    _, truth, result = boxes
+    values = np.zeros(truth.shape, np.int64)
+    values[0] = 2**53 + 1
+    assert pool_points(result, values, "sum")[-1] == 2**53 + 1
+    assert pool_points(result, np.full(truth.shape, 200, np.uint8), "sum")[-1] == 200 * len(truth)
+    assert pool_up(hand_drawn(), [2**53 + 1, 0, 0], reduce="sum")[-1] == 2**53 + 1
+    for big in (np.uint64(2**63), np.int64(-(2**63))):
+        with pytest.raises(ValueError, match="add up to"):
+            pool_points(result, np.full(truth.shape, big), "sum")
+        with pytest.raises(ValueError, match="add up to"):
+            pool_up(hand_drawn(), np.array([big, 0, 0], big.dtype), reduce="sum")
+
+
 @pytest.mark.parametrize("reduce", ["sum", "mean", "max", "min"])
 def test_nodes_hold_what_their_points_do(boxes, reduce):
     points, _, result = boxes
@@ -139,6 +162,10 @@ def test_wrong_input_is_refused(boxes):
         down(result, np.zeros(3))
     with pytest.raises(ValueError, match="per node"):
         down(result, np.zeros(tree.n_leaves), tree.cut_nodes(n=2))
+    assert majority([[1, 2]]).tolist() == [1]
+    for votes_ in (np.ones(3), [1, 2], [[0.5, 1.0]]):
+        with pytest.raises(ValueError, match="votes as whole numbers"):
+            majority(votes_)
     with pytest.raises(ValueError, match="share"):
         pure_ancestors(tree, votes(result, truth), 1.5)
 
