@@ -95,15 +95,20 @@ def objects_on(
     Raises
     ------
     ValueError
-        An argument is not as above, or there is no plane of that index.
+        An argument is not as above, the planes are another segmentation's, or there is none of that index.
 
     Notes
     -----
-    An object is a connected part of one segment (`Segmentation.labels`) that does not belong to the support and
+    An object is a connected part of one segment (`Segmentation.objects`) that does not belong to the support and
     lies above it. A piece that lies mostly within the box of a larger one goes to it, and so does one that hangs
     beside another without reaching the support, such as the inside of a cup (`fragments.joined_fragments`).
     """
     planes = find_planes(segmentation) if planes is None else planes
+    if len(planes.plane_of_supervoxel) != segmentation.tree.n_leaves:
+        raise ValueError(
+            f"expected planes of this segmentation, of {segmentation.tree.n_leaves} supervoxels, got planes of "
+            f"{len(planes.plane_of_supervoxel)}; call find_planes again"
+        )
     index = _support(planes, support)
     if index is None:
         return []
@@ -111,7 +116,9 @@ def objects_on(
     sizes = segmentation.graph.node_features.size
     reach = edge if margin is None else non_negative("margin", margin)
     lowest = LEAST_HEIGHT * edge if min_height is None else non_negative("min_height", min_height)
-    fewest = LEAST_SUPERVOXELS * float(np.median(sizes)) if min_points is None else min_points
+    fewest = (
+        LEAST_SUPERVOXELS * float(np.median(sizes)) if min_points is None else (non_negative("min_points", min_points))
+    )
     up = planes.normals[index] * (-1.0 if planes.normals[index] @ planes.up < -0.5 else 1.0)
     bottom = float(up @ planes.centroids[index])
     above = _above(segmentation, planes, index, up, bottom, reach)
@@ -141,8 +148,8 @@ def _shape(segmentation: Segmentation, leaves: NDArray[np.int32], up: NDArray[np
 
 def _support(planes: Planes, support: int | None) -> int | None:
     if support is not None:
-        if not 0 <= support < len(planes):
-            raise ValueError(f"expected a support of 0..{len(planes) - 1}, got {support!r}")
+        if not isinstance(support, int | np.integer) or not 0 <= support < len(planes):
+            raise ValueError(f"expected support as one of the {len(planes)} planes, a whole number, got {support!r}")
         return int(support)
     level = np.flatnonzero(planes.roles == "horizontal")
     return int(level[0]) if len(level) else None
@@ -162,10 +169,7 @@ def _above(
 
 def _pieces(segmentation: Segmentation, above: NDArray[np.bool_]) -> list[NDArray[np.int32]]:
     """Connected parts of segments among the chosen supervoxels, most points first."""
-    n, labels = segmentation.tree.n_leaves, segmentation.labels.ravel()
-    segment = np.zeros(n, np.int32)
-    seen = labels >= 0
-    segment[segmentation.supervoxels.ravel()[seen]] = labels[seen]
+    n, segment = segmentation.tree.n_leaves, segmentation.objects
     i, j = segmentation.graph.edges.T
     kept = above[i] & above[j] & (segment[i] == segment[j])
     links = csr_array((np.ones(int(kept.sum()), np.int8), (i[kept], j[kept])), shape=(n, n))

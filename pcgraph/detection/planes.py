@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +16,7 @@ from pcgraph.detection.hulls import outline, smallest_rectangle
 from pcgraph.detection.noise import surface_noise
 from pcgraph.detection.regions import grow_planes, moments_of_regions
 from pcgraph.features.moments import Moments
-from pcgraph.features.nodes import node_features
+from pcgraph.features.nodes import node_features, unit_vector
 from pcgraph.inputs import positive
 from pcgraph.segmentation import Segmentation
 
@@ -123,12 +124,14 @@ def find_planes(
     -----
     Regions grow over the graph as in Vo et al. 2015, here from supervoxel to supervoxel by exact moments.
     """
-    if not 0.0 < angle <= np.pi / 2:
+    if not isinstance(angle, Real) or not 0.0 < angle <= np.pi / 2:
         raise ValueError(f"expected an angle above 0 and up to pi/2 radians, got {angle!r}")
-    upwards = None if up is None else _unit(up)
+    if min_area is not None and not (isinstance(min_area, Real) and 0.0 < min_area < np.inf):
+        raise ValueError(f"expected a finite min_area above 0 square metres, got {min_area!r}")
+    upwards = None if up is None else unit_vector("up", up)
     leaves = _flat_leaves(segmentation, tolerance, angle)
     leaf_areas = _areas(leaves.moments)
-    least = LEAST_SUPERVOXELS * float(np.median(leaf_areas)) if min_area is None else positive("min_area", min_area)
+    least = LEAST_SUPERVOXELS * float(np.median(leaf_areas)) if min_area is None else min_area
     regions = _without_bends(leaves, _grown(leaves))
     regions = join_planes(leaves, regions, apart=False)
     if join:
@@ -142,11 +145,8 @@ def find_planes(
 def voxel_edges(segmentation: Segmentation) -> NDArray[np.float64]:
     """Mean edge of each supervoxel's voxels, (n_leaves,) float64, metres."""
     surface, n = segmentation.surface, segmentation.tree.n_leaves
-    lengths = surface.grid.edge_lengths
-    voxels = np.bincount(surface.supervoxels, minlength=n)
-    sums = np.bincount(surface.supervoxels, lengths, n)
-    # Points may settle on another supervoxel than their voxel's, which may so be left without voxels.
-    return np.where(voxels > 0, sums / np.maximum(voxels, 1), np.median(lengths))
+    sums = np.bincount(surface.supervoxels, surface.grid.edge_lengths, n)
+    return sums / np.bincount(surface.supervoxels, minlength=n)
 
 
 def _flat_leaves(segmentation: Segmentation, tolerance: float | None, angle: float) -> FlatLeaves:
@@ -262,11 +262,3 @@ def _describe(
         up=up,
         plane_of_supervoxel=regions,
     )
-
-
-def _unit(vector: ArrayLike) -> NDArray[np.float64]:
-    array = np.asarray(vector, np.float64)
-    length = float(np.linalg.norm(array)) if array.shape == (3,) else 0.0
-    if not 0.0 < length < np.inf:
-        raise ValueError(f"expected a direction of three finite numbers, not all zero, got {vector!r}")
-    return array / length

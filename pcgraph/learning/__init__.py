@@ -10,32 +10,32 @@ if TYPE_CHECKING:
     from pcgraph.learning.classifier import NodeClassifier
     from pcgraph.learning.descriptors import leaf_descriptors
     from pcgraph.learning.pooling import down, pool_points, pool_up
-    from pcgraph.learning.transfer import labels_at
+    from pcgraph.learning.transfer import supervoxels_at
     from pcgraph.learning.voting import majority, pure_ancestors, spread_votes, votes
 
 __all__ = [
     "NodeClassifier",
     "down",
-    "labels_at",
     "leaf_descriptors",
     "majority",
     "pool_points",
     "pool_up",
     "pure_ancestors",
     "spread_votes",
+    "supervoxels_at",
     "votes",
 ]
 
 _HOMES = {
     "NodeClassifier": "classifier",
     "down": "pooling",
-    "labels_at": "transfer",
     "leaf_descriptors": "descriptors",
     "majority": "voting",
     "pool_points": "pooling",
     "pool_up": "pooling",
     "pure_ancestors": "voting",
     "spread_votes": "voting",
+    "supervoxels_at": "transfer",
     "votes": "voting",
 }
 

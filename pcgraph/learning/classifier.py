@@ -161,7 +161,7 @@ class NodeClassifier:
         Raises
         ------
         ValueError
-            There is no parameter of that name.
+            There is no parameter of that name, or no estimator to have it.
         """
         known = self.get_params(deep=False)
         inner = {}
@@ -172,6 +172,10 @@ class NodeClassifier:
                 setattr(self, name, value)
             else:
                 raise ValueError(f"expected one of the parameters {', '.join(known)}, got {name!r}")
+        if inner and not hasattr(self.estimator, "set_params"):
+            raise ValueError(
+                f"expected an estimator to set {', '.join(inner)} of, got {self.estimator!r}; give one first"
+            )
         if inner:
             self.estimator.set_params(**inner)
         return self

@@ -41,8 +41,16 @@ def leaf_descriptors(
         also mean, smallest and largest of its edges' features.
     ancestors : int, >= 0
         Nodes of the tree of which it learns all that it knows of itself: with 4, 16, 64, ... times the points of
-        the median supervoxel; with the first also its segment in `Segmentation.labels`.
+        the median supervoxel; with the first also its segment in `Segmentation.objects`.
+
+    Raises
+    ------
+    ValueError
+        An argument is not as above.
     """
+    for name, rings in (("neighbours", neighbours), ("ancestors", ancestors)):
+        if not isinstance(rings, int | np.integer) or rings < 0:
+            raise ValueError(f"expected {name} as a whole number of at least 0, got {rings!r}")
     tree = segmentation.tree
     direction, ground = _upright(segmentation, up) if pose else (None, 0.0)
     nodes, names = _node_descriptors(segmentation, direction, ground)
@@ -170,11 +178,10 @@ def _edge_summary(segmentation: Segmentation) -> tuple[NDArray[np.float64], list
 
 
 def _segments(segmentation: Segmentation) -> NDArray[np.int32]:
-    """Highest node above each node whose points all have one label in `Segmentation.labels`, (k,) int32."""
-    tree, seen = segmentation.tree, segmentation.labels.ravel() >= 0
+    """Highest node above each node whose supervoxels are all of one object (`Segmentation.objects`), (k,) int32."""
+    tree = segmentation.tree
     low, high = np.full(len(tree.parents), np.iinfo(np.int32).max, np.int32), np.full(len(tree.parents), -1, np.int32)
-    leaf, label = segmentation.supervoxels.ravel()[seen], segmentation.labels.ravel()[seen]
-    low[leaf] = high[leaf] = label
+    low[: tree.n_leaves] = high[: tree.n_leaves] = segmentation.objects
     return _uniform_tops(tree.parents, low, high)
 
 

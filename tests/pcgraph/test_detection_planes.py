@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import VIEWPOINT, patch, two_boxes_on_a_plane
+from clouds import VIEWPOINT, box, patch, two_boxes_on_a_plane
 from scipy.spatial.transform import Rotation
 from simulated_rooms import CLASSES, room
 
@@ -15,6 +15,7 @@ from pcgraph.detection.coplanar import FlatLeaves, bends
 from pcgraph.detection.noise import surface_noise
 from pcgraph.detection.regions import moments_of_regions
 from pcgraph.features.moments import Moments, moments_of_groups
+from pcgraph.learning import leaf_descriptors
 
 
 def sphere(radius, n):
@@ -78,6 +79,23 @@ def test_objects_on_the_ground_stand_in_their_boxes(boxes):
     for k, number in ((0, 1), (1, 2)):
         both = ((labels == k) & (truth == number)).sum()
         assert both / ((labels == k) | (truth == number)).sum() > 0.9
+
+
+def test_a_scan_of_bare_table_takes_no_object_away():
+    """Two boxes that touch, of different height; only `Segmentation.objects` knows them after a scan without them."""
+    low, high = box(0.4, 0.3, 0.2), box(0.6, 0.3, 0.2) * [1, 1, 1.5]
+    table = patch((0, 0, 0), (1.2, 0, 0), (0, 0.8, 0))
+    table = table[~((table[:, 0] > 0.39) & (table[:, 0] < 0.81) & (table[:, 1] > 0.29))]
+    first = pcgraph.segment(np.vstack((table, low, high)), viewpoint=VIEWPOINT)
+    before = objects_on(first)
+    assert len(before) == 2
+    second = pcgraph.update(first, table[table[:, 0] < 0.2], viewpoint=VIEWPOINT)
+    after = objects_on(second)
+    assert [thing.count for thing in after] == [thing.count for thing in before]
+    whole, one_scan = leaf_descriptors(second), leaf_descriptors(first)
+    at = [i for i, name in enumerate(whole[1]) if name == "segment: length"]
+    things = np.concatenate([thing.supervoxels for thing in after])
+    assert whole[0][things][:, at] == pytest.approx(one_scan[0][things][:, at])
 
 
 def test_rigid_motion_moves_the_answer_along(boxes):
@@ -223,11 +241,19 @@ def test_noise_is_read_off_flat_parts_at_its_distance():
 def test_wrong_arguments_are_refused(boxes):
     points, _, result = boxes
     planes = find_planes(result)
-    for arguments in ({"up": (0, 0, 0)}, {"up": (1, 2)}, {"tolerance": -1.0}, {"angle": 0.0}, {"min_area": np.nan}):
+    for arguments in ({"up": (0, 0, 0)}, {"up": (1, 2)}, {"tolerance": -1.0}, {"angle": 0.0}, {"angle": "a"}):
         with pytest.raises(ValueError, match="expected"):
             find_planes(result, **arguments)
-    with pytest.raises(ValueError, match="support"):
-        objects_on(result, planes, len(planes))
+    for area in (0, np.nan, "a"):
+        with pytest.raises(ValueError, match="square metres"):
+            find_planes(result, min_area=area)
+    for support in (len(planes), -1, "table", 0.5):
+        with pytest.raises(ValueError, match="support"):
+            objects_on(result, planes, support)
+    with pytest.raises(ValueError, match="call find_planes again"):
+        objects_on(pcgraph.segment(points[:200], voxel_size=0.05), planes)
+    with pytest.raises(ValueError, match="min_points"):
+        objects_on(result, planes, min_points="a")
     with pytest.raises(ValueError, match="points of shape"):
         objects_on(result, planes, points=points[:-1])
     with pytest.raises(ValueError, match="margin"):

@@ -87,6 +87,8 @@ def test_params_and_clones():
     assert (twin.ancestors, twin.estimator.max_depth, inner.max_depth) == (0, 5, 3)
     with pytest.raises(ValueError, match="neighbours"):
         twin.set_params(neighbors=1)
+    with pytest.raises(ValueError, match="estimator"):
+        NodeClassifier().set_params(estimator__n=1)
 
 
 def test_columns_are_named_finite_and_nested(rooms):
@@ -156,6 +158,9 @@ def test_scikit_learn_is_loaded_only_when_it_fits():
 
 def test_wrong_input_is_refused(rooms):
     results, classes, _ = rooms
+    for arguments in ({"neighbours": -1}, {"ancestors": -1}, {"ancestors": "a"}):
+        with pytest.raises(ValueError, match="at least 0"):
+            leaf_descriptors(results[0], **arguments)
     with pytest.raises(ValueError, match="call fit"):
         NodeClassifier().predict(results[0])
     with pytest.raises(ValueError, match="labelled point"):
