@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from pcgraph.metrics.neighbours import NeighbourGraph
+from pcgraph.metrics.table import whole_numbers
 
 
 def boundary_recall(
@@ -44,7 +44,8 @@ def boundary_recall(
     Raises
     ------
     ValueError
-        Shapes differ, nothing is labelled in both, a labelled point is not finite, or a number is out of range.
+        Shapes differ, labels are not whole numbers, nothing is labelled in both, a labelled point is not finite, or a
+        number is out of range.
     """
     return _graph_of_labelled(points, labels, truth, k).recall(labels, truth, hops=hops, tolerance=tolerance)
 
@@ -67,7 +68,7 @@ def boundary_precision(
 
 
 def _graph_of_labelled(points: ArrayLike, labels: ArrayLike, truth: ArrayLike, k: int) -> NeighbourGraph:
-    found, true = np.asarray(labels), np.asarray(truth)
+    found, true = whole_numbers(labels), whole_numbers(truth)
     if found.shape != true.shape:
         raise ValueError(f"expected labels and truth of one shape, got {found.shape} and {true.shape}")
     return NeighbourGraph.of(points, (found >= 0) & (true >= 0), k)

@@ -6,12 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.metrics.hierarchy import Cuts, checked_parents, count_leaves
 from pcgraph.metrics.levels import LevelCurve
-from pcgraph.metrics.neighbours import NeighbourGraph
+from pcgraph.metrics.meeting import lowest_common
+from pcgraph.metrics.neighbours import NeighbourGraph, check_reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +69,9 @@ def boundary_curve(
     Raises
     ------
     ValueError
-        As `level_curve` and `NeighbourGraph.boundary`; or hops is negative.
+        As `level_curve` and `NeighbourGraph.boundary`; or hops is not a whole number of at least 0.
     """
+    check_reach(hops)
     up = checked_parents(parents)
     cuts = Cuts.of(up, altitudes)
     leaf = graph.of_members(leaves)
@@ -96,24 +97,9 @@ def _saliency(
     saliency = np.full(len(leaf), -np.inf)
     point, side = np.nonzero(leaf[neighbours] != leaf[:, None])
     pairs, which = np.unique(leaf[point] * n_leaves + leaf[neighbours[point, side]], return_inverse=True)
-    meeting = _lowest_common(parents, pairs // n_leaves, pairs % n_leaves)
+    meeting = lowest_common(parents, n_leaves, pairs // n_leaves, pairs % n_leaves)
     np.maximum.at(saliency, point, altitudes[meeting][which])
     return saliency
-
-
-@njit(cache=True)
-def _lowest_common(parents: NDArray[np.int64], left: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Lowest common ancestor of each pair of nodes: the lower number of the two climbs until they meet."""
-    meeting = np.empty(len(left), np.int64)
-    for i in range(len(left)):
-        a, b = left[i], right[i]
-        while a != b:
-            if a < b:
-                a = parents[a]
-            else:
-                b = parents[b]
-        meeting[i] = a
-    return meeting
 
 
 def _above(values: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.int64]:

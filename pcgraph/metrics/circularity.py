@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.metrics.neighbours import NeighbourGraph
-from pcgraph.metrics.table import ranked
+from pcgraph.metrics.table import ranked, whole_numbers
 
 
 def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int = 24) -> float:
@@ -31,9 +31,9 @@ def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int
     Raises
     ------
     ValueError
-        The shapes differ, a point that takes part is not finite, or none takes part.
+        The shapes differ, labels are not whole numbers, a point that takes part is not finite, or none takes part.
     """
-    graph = points if isinstance(points, NeighbourGraph) else NeighbourGraph.of(points, np.asarray(labels) >= 0, k)
+    graph = points if isinstance(points, NeighbourGraph) else NeighbourGraph.of(points, whole_numbers(labels) >= 0, k)
     segment, n = ranked(graph.of_members(labels))
     counts = np.bincount(segment, minlength=n)
     return float(counts @ _circularity(graph.points, graph.areas(), segment, n) / counts.sum())

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pcgraph.metrics.table import ranked
+from pcgraph.metrics.table import decimals, ranked, whole_numbers
 
 
 def explained_variation(labels: ArrayLike, values: ArrayLike) -> float:
@@ -27,9 +27,9 @@ def explained_variation(labels: ArrayLike, values: ArrayLike) -> float:
     Raises
     ------
     ValueError
-        The shapes do not fit, no point has a label, or a labelled point's value is not finite.
+        Shapes do not fit, labels are not whole numbers, no point has one, or a labelled point's value is not finite.
     """
-    segments, given = np.asarray(labels), np.asarray(values, np.float64)
+    segments, given = whole_numbers(labels), decimals(values)
     if given.shape[: segments.ndim] != segments.shape or given.ndim > segments.ndim + 1:
         raise ValueError(f"expected values for labels {segments.shape}, got {given.shape}")
     inside = segments >= 0
@@ -39,7 +39,7 @@ def explained_variation(labels: ArrayLike, values: ArrayLike) -> float:
     if not np.isfinite(chosen).all():
         raise ValueError("expected finite values, got NaN or infinity at a labelled point; give it the label -1")
     chosen = chosen - chosen.mean(axis=0)
-    segment, n = ranked(segments[inside].astype(np.int64))
+    segment, n = ranked(segments[inside])
     counts = np.bincount(segment, minlength=n)
     sums = np.stack([np.bincount(segment, channel, n) for channel in chosen.T])
     total = float((chosen**2).sum())

@@ -57,8 +57,8 @@ def fragmentation_curve(
     ValueError
         The tree is not one, max_regions or the measure is out of range, or as `contingency`.
     """
-    if max_regions < 1:
-        raise ValueError(f"expected max_regions of at least 1, got {max_regions}")
+    if isinstance(max_regions, bool) or not isinstance(max_regions, (int, np.integer)) or max_regions < 1:
+        raise ValueError(f"expected max_regions as a whole number of at least 1, got {max_regions!r}")
     table = NodeTable.of(parents, leaves, truth)
     best = _optimal_cuts(_scores(table, measure), *children(table.parents), table.n_leaves, int(max_regions))
     regions = np.flatnonzero(np.isfinite(best))

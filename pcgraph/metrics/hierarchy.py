@@ -60,9 +60,13 @@ def checked_parents(parents: ArrayLike) -> NDArray[np.int64]:
     Raises
     ------
     ValueError
-        A parent does not come after its node, the root is not last, or a leaf comes after another node.
+        Parents are not whole numbers, a parent does not come after its node, the root is not last, or a leaf comes
+        after another node.
     """
-    up = np.asarray(parents).astype(np.int64)
+    up = np.asarray(parents)
+    if up.dtype.kind not in "iu":
+        raise ValueError(f"expected parents that are whole numbers, got {up.dtype}; convert them first")
+    up = up.astype(np.int64)
     k = len(up) if up.ndim == 1 else 0
     if k == 0 or up[-1] != k - 1 or (up[:-1] <= np.arange(k - 1)).any() or (up >= k).any():
         raise ValueError("expected parents (k,) each larger than its node, the last node its own parent")

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from pcgraph.metrics.table import decimals, whole_numbers
+
 
 @dataclass(frozen=True, eq=False)
 class NeighbourGraph:
@@ -51,13 +53,13 @@ class NeighbourGraph:
         ValueError
             The shapes differ, k is below 1, no point is valid, or a valid point is not finite.
         """
-        positions = np.asarray(points, np.float64)
+        positions = decimals(points)
         if positions.ndim not in (2, 3) or positions.shape[-1] != 3:
             raise ValueError(f"expected points (n, 3) or (h, w, 3), got {positions.shape}")
-        if k < 1:
-            raise ValueError(f"expected k of at least 1 neighbour, got {k}")
+        if not _is_whole(k) or k < 1:
+            raise ValueError(f"expected k as a whole number of at least 1 neighbour, got {k!r}")
         finite = np.isfinite(positions).all(axis=-1)
-        chosen = finite if valid is None else np.asarray(valid, bool)
+        chosen = finite if valid is None else np.asarray(np.ma.filled(valid, False), bool)
         if chosen.shape != finite.shape:
             raise ValueError(f"expected one value of valid per point, {finite.shape}, got {chosen.shape}")
         if not chosen.any():
@@ -73,7 +75,7 @@ class NeighbourGraph:
         Raises
         ------
         ValueError
-            The shape is not the graph's, or a point of the graph has a negative label.
+            The shape is not the graph's, labels are not whole numbers, or a point of the graph has a negative label.
         """
         marked = np.zeros(self.shape, bool)
         marked.flat[self.members] = self.rim(labels)
@@ -105,13 +107,13 @@ class NeighbourGraph:
 
     def of_members(self, labels: ArrayLike) -> NDArray[np.int64]:
         """Labels of the points in the graph, (m,) int64; raises as `boundary` does."""
-        given = np.asarray(labels)
+        given = whole_numbers(labels)
         if given.shape != self.shape:
             raise ValueError(f"expected labels of the points' shape {self.shape}, got {given.shape}")
         own = given.reshape(-1)[self.members]
         if (own < 0).any():
             raise ValueError("expected labels >= 0 for all points of the graph; build it with valid=labels >= 0")
-        return own.astype(np.int64)
+        return own
 
     def rim(self, labels: ArrayLike) -> NDArray[np.bool_]:
         """As `boundary`, but (m,) and of the points in the graph only."""
@@ -120,27 +122,37 @@ class NeighbourGraph:
 
     def within_hops(self, marked: NDArray[np.bool_], hops: int) -> NDArray[np.bool_]:
         """Points of the graph that reach a marked one, (m,) bool both, in so many steps to a neighbour."""
-        if hops < 0:
-            raise ValueError(f"expected hops of at least 0, got {hops}")
+        check_reach(hops)
         for _ in range(hops):
             marked = marked | marked[self.neighbours].any(axis=1)
         return marked
 
     def _share_near(self, of: NDArray[np.bool_], to: NDArray[np.bool_], hops: int, tolerance: float | None) -> float:
         """Share of the points `of` near a point of `to`; 1 if there are none, as then none is missed."""
+        check_reach(hops, tolerance)
         if not of.any():
             return 1.0
         near = self.within_hops(to, hops)[of] if tolerance is None else self._within_reach(of, to, tolerance)
         return float(near.mean())
 
     def _within_reach(self, of: NDArray[np.bool_], to: NDArray[np.bool_], tolerance: float) -> NDArray[np.bool_]:
-        if not tolerance >= 0:
-            raise ValueError(f"expected a tolerance of at least 0 in the points' unit, got {tolerance}")
         if not to.any():
             return np.zeros(np.count_nonzero(of), bool)
         reach = np.nextafter(tolerance, np.inf)  # the tree finds what is nearer than the bound, not at it
         distances, _ = cKDTree(self.points[to]).query(self.points[of], distance_upper_bound=reach, workers=2)
         return np.isfinite(distances)
+
+
+def check_reach(hops: int, tolerance: float | None = None) -> None:
+    """Nothing; raises ValueError unless hops is a whole number, and tolerance a number if any, of at least 0."""
+    if not _is_whole(hops) or hops < 0:
+        raise ValueError(f"expected hops as a whole number of at least 0, got {hops!r}")
+    if tolerance is not None and not (isinstance(tolerance, (float, int, np.number)) and tolerance >= 0):
+        raise ValueError(f"expected a tolerance of at least 0 in the points' unit, got {tolerance!r}")
+
+
+def _is_whole(number: object) -> bool:
+    return isinstance(number, (int, np.integer)) and not isinstance(number, bool)
 
 
 def _nearest(points: NDArray[np.float64], k: int) -> NDArray[np.int32]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.metrics.table import count_pairs, labelled, overlaps, ranked
+from pcgraph.metrics.table import count_pairs, labelled, overlaps, ranked, whole_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def panoptic_quality(
     if classes is None or true_classes is None:
         found_class, true_class = np.zeros_like(found), np.zeros_like(true)
     else:
-        inside = (np.asarray(labels) >= 0) & (np.asarray(truth) >= 0)
+        inside = (whole_numbers(labels) >= 0) & (whole_numbers(truth) >= 0)
         found_class, true_class = _class_of(classes, inside), _class_of(true_classes, inside)
     row, row_class = _things(found, found_class)
     column, column_class = _things(true, true_class)
@@ -100,10 +100,10 @@ def panoptic_quality(
 
 
 def _class_of(classes: ArrayLike, inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    given = np.asarray(classes)
+    given = whole_numbers(classes)
     if given.shape != inside.shape:
         raise ValueError(f"expected classes of the labels' shape {inside.shape}, got {given.shape}")
-    chosen = given[inside].astype(np.int64)
+    chosen = given[inside]
     if (chosen < 0).any():
         raise ValueError("expected a class >= 0 for every labelled point; give the others the label -1")
     return chosen

@@ -29,16 +29,37 @@ def contingency(labels: ArrayLike, truth: ArrayLike) -> coo_array:
 
 def labelled(labels: ArrayLike, truth: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Label and true label, (m,) int64 each, of the points that have both; raises as `contingency` does."""
-    found, true = np.asarray(labels), np.asarray(truth)
+    found, true = whole_numbers(labels), whole_numbers(truth)
     if found.shape != true.shape:
         raise ValueError(f"expected labels and truth of one shape, got {found.shape} and {true.shape}")
-    for array in (found, true):
-        if array.dtype.kind not in "iub":
-            raise ValueError(f"expected labels that are whole numbers, got {array.dtype}; convert them first")
     both = (found >= 0) & (true >= 0)
     if not both.any():
         raise ValueError("expected at least one point with a label and a true label, got none")
-    return found[both].astype(np.int64), true[both].astype(np.int64)
+    return found[both], true[both]
+
+
+def whole_numbers(labels: ArrayLike) -> NDArray[np.int64]:
+    """The labels as int64, -1 where they are masked.
+
+    Raises
+    ------
+    ValueError
+        Labels are not whole numbers, or one is 2**63 or more.
+    """
+    array = labels if isinstance(labels, np.ma.MaskedArray) else np.asarray(labels)
+    if array.dtype.kind not in "iub":
+        raise ValueError(f"expected labels that are whole numbers, got {array.dtype}; convert them first")
+    if array.dtype == np.uint64 and array.size and array.max() > np.iinfo(np.int64).max:
+        raise ValueError(f"expected labels below 2**63, got {array.max()}; number them from 0")
+    numbers = array.astype(np.int64, copy=False)
+    return np.ma.filled(numbers, -1) if isinstance(numbers, np.ma.MaskedArray) else numbers
+
+
+def decimals(values: ArrayLike) -> NDArray[np.float64]:
+    """The values as float64, NaN where they are masked."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.float64), np.nan)
+    return np.asarray(values, np.float64)
 
 
 def ranked(labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:

@@ -109,7 +109,7 @@ def test_bad_arguments():
         boundary_recall(np.full((12, 3), np.nan), TRUTH, TRUTH)
     with pytest.raises(ValueError, match="at least 1 neighbour"):
         boundary_recall(ROW, TRUTH, TRUTH, k=0)
-    with pytest.raises(ValueError, match="hops of at least 0"):
+    with pytest.raises(ValueError, match="whole number of at least 0"):
         boundary_recall(ROW, TRUTH, TRUTH, hops=-1)
     with pytest.raises(ValueError, match="tolerance of at least 0"):
         boundary_recall(ROW, TRUTH, TRUTH, tolerance=float("nan"))

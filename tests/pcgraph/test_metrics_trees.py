@@ -219,7 +219,7 @@ def test_bad_arguments():
     graph = metrics.NeighbourGraph.of(np.random.default_rng(0).normal(size=(8, 3)))
     with pytest.raises(ValueError, match=r"leaves 0\.\.2"):
         metrics.boundary_curve(graph, PARENTS, ALTITUDES, LEAVES + 1, TRUTH)
-    with pytest.raises(ValueError, match="hops of at least 0"):
+    with pytest.raises(ValueError, match="whole number of at least 0"):
         metrics.boundary_curve(graph, PARENTS, ALTITUDES, LEAVES, TRUTH, hops=-1)
     with pytest.raises(ValueError, match="one altitude per node"):
         metrics.level_curve(PARENTS, ALTITUDES[:3], LEAVES, TRUTH)

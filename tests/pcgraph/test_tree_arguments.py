@@ -122,7 +122,7 @@ def test_other_settings():
     ],
 )
 def test_words_and_lists_are_refused_in_one_sentence(tree, wrong):
-    with pytest.raises(ValueError, match="^expected "):
+    with pytest.raises(ValueError, match=r"^expected "):
         wrong(tree)
 
 
