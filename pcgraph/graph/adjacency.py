@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     import networkx
     from scipy.sparse import csr_array
 
+    from pcgraph.graph.occlusion import Occlusions
+
 
 @dataclass(frozen=True, eq=False)
 class EdgeFeatures:
@@ -91,11 +93,23 @@ class AdjacencyGraph:
         """Number of supervoxels."""
         return len(self.node_features.size)
 
-    def to_networkx(self) -> networkx.Graph:
-        """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names."""
-        from pcgraph.graph.export import edge_columns, network
+    def to_networkx(self, occlusions: Occlusions | None = None) -> networkx.Graph:
+        """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names.
 
-        return network(self, self.node_features.columns(), edge_columns(self))
+        Parameters
+        ----------
+        occlusions : Occlusions, optional
+            `Segmentation.occlusions()`. With them it is a ``MultiGraph``: edges of the kind (an attribute) "contact",
+            and edges of the kind "occlusion" with their features and the supervoxel in `front`.
+
+        Raises
+        ------
+        ValueError
+            The occlusions are those of other supervoxels.
+        """
+        from pcgraph.graph.export import network
+
+        return network(self, occlusions, split=False)
 
     def to_csr(self, weights: str | ArrayLike | None = None) -> csr_array:
         """The graph as a symmetric SciPy matrix, (k, k) float64, 2 m stored entries, columns ascending.
@@ -120,7 +134,7 @@ class AdjacencyGraph:
 
         return csr(self, weights)
 
-    def to_pyg(self, up: ArrayLike | None = None) -> dict[str, object]:
+    def to_pyg(self, up: ArrayLike | None = None, occlusions: Occlusions | None = None) -> dict[str, object]:
         """Arrays named as PyTorch Geometric names them; every edge occurs in both directions.
 
         ``x`` (k, f) float32: size, normal, covariance, linearity, planarity, scattering, residual, and, if known,
@@ -133,22 +147,38 @@ class AdjacencyGraph:
         ----------
         up : (3,) float, the points' frame, optional
             Against gravity; for verticality, which is left out without it.
+        occlusions : Occlusions, optional
+            Adds ``occlusion_index`` (2, q) int64, from front to behind, ``occlusion_attr`` (q, c) float32 and
+            ``occlusion_attr_names``.
+
+        Raises
+        ------
+        ValueError
+            `up` is no direction, or the occlusions are those of other supervoxels.
         """
         from pcgraph.graph.export import pyg
 
-        return pyg(self, up)
+        return pyg(self, up, occlusions)
 
-    def write_graphml(self, path: str | PathLike[str]) -> None:
+    def write_graphml(self, path: str | PathLike[str], occlusions: Occlusions | None = None) -> None:
         """Nothing; writes the graph with all features, vectors as scalars (``normal_x``), whole or not at all.
 
         ``networkx.read_graphml(path, node_type=int)`` reads it back.
+
+        Parameters
+        ----------
+        path : path of a file
+        occlusions : Occlusions, optional
+            As for `to_networkx`.
 
         Raises
         ------
         CloudWriteError
             The place cannot be written.
+        ValueError
+            The occlusions are those of other supervoxels.
         """
         from pcgraph.atomic import write_bytes
         from pcgraph.graph.export import graphml
 
-        write_bytes(Path(path), graphml(self))
+        write_bytes(Path(path), graphml(self, occlusions))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from pcgraph.graph.adjacency import AdjacencyGraph
+    from pcgraph.graph.occlusion import Occlusions
 
 
 def edge_columns(graph: AdjacencyGraph) -> dict[str, NDArray[np.generic]]:
@@ -23,16 +24,22 @@ def edge_columns(graph: AdjacencyGraph) -> dict[str, NDArray[np.generic]]:
     return {**graph.edge_features.columns(), "boundary_strength": graph.edge_features.boundary_strength}
 
 
-def network(
-    graph: AdjacencyGraph, nodes: dict[str, NDArray[np.generic]], edges: dict[str, NDArray[np.generic]]
-) -> networkx.Graph:
-    """The graph with these columns as attributes of nodes and edges."""
-    from networkx import Graph
+def network(graph: AdjacencyGraph, occlusions: Occlusions | None, split: bool) -> networkx.Graph:
+    """The graph with columns as attributes, vectors split into scalars or not; see `AdjacencyGraph.to_networkx`."""
+    from networkx import Graph, MultiGraph
 
-    result = Graph()
-    result.add_nodes_from(enumerate(rows(nodes, graph.n_nodes)))
-    features = rows(edges, len(graph.edges))
-    result.add_edges_from((i, j, row) for (i, j), row in zip(graph.edges.tolist(), features, strict=True))
+    nodes, edges = graph.node_features.columns(), edge_columns(graph)
+    result = Graph() if occlusions is None else MultiGraph()
+    result.add_nodes_from(enumerate(rows(scalar_columns(nodes) if split else nodes, graph.n_nodes)))
+    contacts = _joined(graph.edges, scalar_columns(edges) if split else edges)
+    if occlusions is None:
+        result.add_edges_from(contacts)
+        return result
+    columns = {"front": _checked(graph, occlusions)[:, 0], **occlusions.columns()}
+    hidden = _joined(occlusions.pairs, scalar_columns(columns) if split else columns)
+    both = [("contact", edge) for edge in contacts] + [("occlusion", edge) for edge in hidden]
+    # One key per edge: they are the edges' ids in GraphML, where programs take two of one id for one edge.
+    result.add_edges_from((i, j, key, {"kind": kind, **row}) for key, (kind, (i, j, row)) in enumerate(both))
     return result
 
 
@@ -48,7 +55,7 @@ def csr(graph: AdjacencyGraph, weights: str | ArrayLike | None) -> csr_array:
     return csr_array((both[order], columns, indptr), shape=(graph.n_nodes, graph.n_nodes))
 
 
-def pyg(graph: AdjacencyGraph, up: ArrayLike | None) -> dict[str, object]:
+def pyg(graph: AdjacencyGraph, up: ArrayLike | None, occlusions: Occlusions | None) -> dict[str, object]:
     """Arrays and names of columns; see `AdjacencyGraph.to_pyg`."""
     nodes = graph.node_features.columns()
     centroids = graph.node_features.centroid
@@ -59,7 +66,7 @@ def pyg(graph: AdjacencyGraph, up: ArrayLike | None) -> dict[str, object]:
     edges = scalar_columns(edge_columns(graph))
     origin = centroids.mean(axis=0)
     attributes = _table(edges, len(graph.edges))
-    return {
+    arrays: dict[str, object] = {
         "x": _table(nodes, graph.n_nodes),
         "x_names": list(nodes),
         "pos": (centroids - origin).astype(np.float32),
@@ -68,16 +75,36 @@ def pyg(graph: AdjacencyGraph, up: ArrayLike | None) -> dict[str, object]:
         "edge_attr": np.concatenate((attributes, attributes)),
         "edge_attr_names": list(edges),
     }
+    if occlusions is not None:
+        hidden = scalar_columns(occlusions.columns())
+        arrays["occlusion_index"] = _checked(graph, occlusions).T.astype(np.int64)
+        arrays["occlusion_attr"] = _table(hidden, len(occlusions.pairs))
+        arrays["occlusion_attr_names"] = list(hidden)
+    return arrays
 
 
-def graphml(graph: AdjacencyGraph) -> bytes:
+def graphml(graph: AdjacencyGraph, occlusions: Occlusions | None) -> bytes:
     """A GraphML document; see `AdjacencyGraph.write_graphml`."""
     from networkx.readwrite.graphml import write_graphml_xml
 
     stream = io.BytesIO()
-    nodes, edges = scalar_columns(graph.node_features.columns()), scalar_columns(edge_columns(graph))
-    write_graphml_xml(network(graph, nodes, edges), stream)
+    write_graphml_xml(network(graph, occlusions, split=True), stream)
     return stream.getvalue()
+
+
+def _joined(
+    pairs: NDArray[np.int32], columns: dict[str, NDArray[np.generic]]
+) -> list[tuple[int, int, dict[str, object]]]:
+    """Each pair with its row of the columns."""
+    return [(i, j, row) for (i, j), row in zip(pairs.tolist(), rows(columns, len(pairs)), strict=True)]
+
+
+def _checked(graph: AdjacencyGraph, occlusions: Occlusions) -> NDArray[np.int32]:
+    """The pairs of the occlusions; raises ValueError if one is none of the graph's nodes."""
+    last = int(occlusions.pairs.max(initial=0))
+    if last >= graph.n_nodes:
+        raise ValueError(f"expected occlusions between the graph's {graph.n_nodes} nodes, got one of node {last}")
+    return occlusions.pairs
 
 
 def _weights(graph: AdjacencyGraph, weights: str | ArrayLike | None) -> NDArray[np.float64]:

@@ -12,9 +12,11 @@ import networkx as nx
 import numpy as np
 import pytest
 from clouds import two_boxes_on_a_plane
+from graphs import hand_graph
 from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 
 import pcgraph
+from pcgraph.graph.occlusion import Continuations, Occlusions
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -157,6 +159,77 @@ def test_graphs_without_edges(name, request, tmp_path):
     assert graph.to_networkx().number_of_edges() == 0
     graph.write_graphml(tmp_path / "graph.graphml")
     assert sorted(nx.read_graphml(tmp_path / "graph.graphml", node_type=int).nodes) == list(range(k))
+
+
+@pytest.fixture(scope="module")
+def plate():
+    """A plate before a wall, as a camera sees it: segmentation and occlusions."""
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 64), np.linspace(-0.4, 0.4, 48))
+    depth = np.where((abs(x) < 0.15) & (abs(y) < 0.15), 0.8, 1.2)
+    result = pcgraph.segment(np.stack((x * depth, y * depth, depth), axis=-1))
+    return result.graph, result.occlusions()
+
+
+def test_networkx_has_occlusions_beside_contacts(plate, tmp_path):
+    graph, hidden = plate
+    network = graph.to_networkx(hidden)
+    graph.write_graphml(tmp_path / "graph.graphml", hidden)
+    read = nx.read_graphml(tmp_path / "graph.graphml", node_type=int, force_multigraph=True)
+    assert len(hidden.pairs) >= 4
+    for multi in (network, read):
+        assert multi.is_multigraph()
+        edges = sorted(multi.edges(data=True, keys=True), key=lambda edge: edge[2])
+        assert len({key for _, _, key, _ in edges}) == len(edges) == len(graph.edges) + len(hidden.pairs)
+        contacts, across = edges[: len(graph.edges)], edges[len(graph.edges) :]
+        assert {row["kind"] for *_, row in contacts} == {"contact"}
+        assert [sorted(edge[:2]) for edge in contacts] == graph.edges.tolist()
+        assert [row["step"] for *_, row in contacts] == graph.edge_features.step.tolist()
+        assert {row["kind"] for *_, row in across} == {"occlusion"}
+        assert [row["front"] for *_, row in across] == hidden.pairs[:, 0].tolist()
+        assert [sum(edge[:2]) for edge in across] == hidden.pairs.sum(axis=1).tolist()
+        assert [row["gap"] for *_, row in across] == hidden.gap.tolist()
+    along = [row["direction_y"] for *_, row in sorted(read.edges(data=True, keys=True), key=lambda edge: edge[2])[-3:]]
+    assert along == hidden.direction[-3:, 1].tolist()
+
+
+def test_pyg_has_occlusions_from_front_to_behind(plate):
+    graph, hidden = plate
+    data, plain = graph.to_pyg(occlusions=hidden), graph.to_pyg()
+    assert [*data] == [*plain, "occlusion_index", "occlusion_attr", "occlusion_attr_names"]
+    assert data["occlusion_attr_names"] == ["gap", "length", "direction_x", "direction_y", "direction_z"]
+    assert data["occlusion_index"].dtype == np.int64
+    assert np.array_equal(data["occlusion_index"], hidden.pairs.T)
+    assert data["occlusion_attr"].dtype == np.float32
+    assert np.array_equal(data["occlusion_attr"][:, 0], hidden.gap.astype(np.float32))
+    assert np.array_equal(data["occlusion_attr"][:, 2:], hidden.direction.astype(np.float32))
+
+
+def test_pairs_that_hide_each_other_and_touch_keep_all_edges(tmp_path):
+    graph = hand_graph([[0, 1]], n=2)
+    nothing = Continuations(np.empty((0, 2), np.int32), *([np.empty(0)] * 6))
+    hidden = Occlusions(np.array([[0, 1], [1, 0]], np.int32), np.ones(2), np.ones(2), np.zeros((2, 3)), nothing)
+    assert graph.to_networkx(hidden).number_of_edges(0, 1) == 3
+    graph.write_graphml(tmp_path / "graph.graphml", hidden)
+    read = nx.read_graphml(tmp_path / "graph.graphml", node_type=int)
+    assert sorted(str(row.get("front")) for row in read.get_edge_data(0, 1).values()) == ["0", "1", "None"]
+
+
+def test_without_occlusions_there_are_contacts_only(lone):
+    empty = np.empty(0)
+    hidden = Occlusions(np.empty((0, 2), np.int32), empty, empty, np.empty((0, 3)), None)
+    assert lone.to_networkx(hidden).number_of_edges() == 0
+    assert lone.to_pyg(occlusions=hidden)["occlusion_attr"].shape == (0, 5)
+
+
+def test_occlusions_of_other_supervoxels_are_refused(plate, pair, tmp_path):
+    for export in (
+        lambda: pair.to_networkx(plate[1]),
+        lambda: pair.to_pyg(occlusions=plate[1]),
+        lambda: pair.write_graphml(tmp_path / "graph.graphml", plate[1]),
+    ):
+        with pytest.raises(ValueError, match="graph's 2 nodes"):
+            export()
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_snippets_of_the_docs_run(tmp_path):
