@@ -47,8 +47,8 @@ class BoundaryCost:
     """
 
     contact: float = 0.5
-    convex: float = 0.05
-    step: float = 0.1
+    convex: float = 0.03
+    step: float = 0.05
     step_limit: float = 3.0
 
     def __post_init__(self) -> None:

@@ -83,7 +83,7 @@ class ConvexityLinkage(Linkage):
     """
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
-    object_altitude: float = 0.4
+    object_altitude: float = 0.5
     part_altitude: float = 0.1
 
     def __post_init__(self) -> None:

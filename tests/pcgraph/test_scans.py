@@ -138,7 +138,7 @@ def test_an_update_keeps_supervoxels_and_adds_to_them(halves):
 
 def test_objects_of_an_update_are_those_of_the_whole(halves):
     left, right, viewpoint, first, second = halves
-    objects = second.tree.cut(altitude=0.4)
+    objects = second.tree.cut(altitude=0.5)
     labels = np.concatenate((objects[first.supervoxels], objects[second.supervoxels]))
     whole = pcgraph.segment(np.vstack([left, right]), viewpoint=viewpoint, voxel_size=0.035, seed_size=0.2)
     assert np.array_equal(objects[second.supervoxels], second.labels)
@@ -151,7 +151,7 @@ def test_scanning_the_same_again_adds_no_supervoxel(halves):
     assert again.graph.n_nodes == first.graph.n_nodes
     assert np.array_equal(again.surface.supervoxels, first.surface.supervoxels)
     assert again.leaves.counts.tolist() == (2 * first.leaves.counts).tolist()
-    assert same_partition(again.tree.cut(altitude=0.4), first.tree.cut(altitude=0.4))
+    assert same_partition(again.tree.cut(altitude=0.5), first.tree.cut(altitude=0.5))
 
 
 def test_updates_that_do_not_fit_are_refused(halves):
