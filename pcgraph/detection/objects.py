@@ -11,9 +11,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from pcgraph.detection.boxes import OrientedBox, plane_basis, standing_box, tight_box
+from pcgraph.detection.flat_leaves import voxel_edges
 from pcgraph.detection.fragments import joined_fragments
 from pcgraph.detection.hulls import inside_outline, outline
-from pcgraph.detection.planes import Planes, find_planes, voxel_edges
+from pcgraph.detection.planes import Planes, find_planes
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.inputs import non_negative
 from pcgraph.segmentation import Segmentation

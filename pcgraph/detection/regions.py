@@ -26,7 +26,18 @@ def moments_of_regions(leaves: Moments, regions: NDArray[np.int32], n_regions: i
     return grouped_moments(leaves[members], regions[members], n_regions)
 
 
-@njit(cache=True)
+def plane_normals(moments: Moments) -> NDArray[np.float64]:
+    """Unit directions of least spread, (k, 3), of either sign."""
+    return np.linalg.eigh(moments.covariances)[1][:, :, 0]
+
+
+def numbered(regions: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The same regions numbered from 0 without gaps, in the order of their numbers; -1 stays."""
+    kept, inverse = np.unique(regions, return_inverse=True)
+    return (inverse - int(kept[0] < 0)).astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
 def grow_planes(
     indptr: NDArray[np.int32],
     neighbours: NDArray[np.int32],
@@ -88,52 +99,62 @@ def grow_planes(
                 if region[j] >= 0:
                     continue
                 limit = SLACK * tolerances[j] if flush[a] else tolerances[j]
-                if not _fits(j, counts, centroids, scatters, normals, limit, shapeless, cos_angle, mean, normal):
+                if mean_square_distance(counts[j], centroids[j], scatters[j], mean, normal) > limit**2:
+                    continue
+                if not shapeless[j] and cosine(normals[j], normal) < cos_angle:
                     continue
                 region[j] = n_regions
                 queue[tail] = j
                 tail += 1
-                total = _add(j, total, counts, centroids, scatters, mean, scatter)
-                work[:] = scatter
-                symmetric_eigen(work, vectors)
-                _least(work, vectors, normal)
+                total = take_in(total, mean, scatter, counts[j], centroids[j], scatters[j])
+                least_axis(scatter, work, vectors, normal)
         n_regions += 1
     return region
 
 
-@njit(cache=True)
-def _fits(j, counts, centroids, scatters, normals, limit, shapeless, cos_angle, mean, normal):  # type: ignore[no-untyped-def]
-    """Whether a supervoxel lies along the plane through `mean` across `normal`."""
-    offset = facing = spread = 0.0
-    for a in range(3):
-        offset += normal[a] * (centroids[j, a] - mean[a])
-        facing += normal[a] * normals[j, a]
-        for b in range(3):
-            spread += normal[a] * scatters[j, a, b] * normal[b]
-    near = offset * offset + spread / counts[j] <= limit**2
-    return near and (shapeless[j] or abs(facing) >= cos_angle)
+@njit(cache=True, nogil=True)
+def take_in(count, mean, scatter, more, its_mean, its_scatter):  # type: ignore[no-untyped-def]
+    """Number of points of two groups together; `mean` and `scatter` of the first become those of both.
 
-
-@njit(cache=True)
-def _add(j, total, counts, centroids, scatters, mean, scatter):  # type: ignore[no-untyped-def]
-    """New number of points; mean and scatter of the region take in one more supervoxel."""
-    together = total + counts[j]
-    share = counts[j] / together
+    Source: Chan, Golub and LeVeque 1979. `pcgraph.features.pooling` has it written out, as rows handed on as views cost
+    it six times the time.
+    """
+    total = count + more
+    share = more / total
     for a in range(3):
         for b in range(3):
-            shift = (centroids[j, a] - mean[a]) * (centroids[j, b] - mean[b])
-            scatter[a, b] += scatters[j, a, b] + total * share * shift
+            shift = (its_mean[a] - mean[a]) * (its_mean[b] - mean[b])
+            scatter[a, b] += its_scatter[a, b] + count * share * shift
     for a in range(3):
-        mean[a] += share * (centroids[j, a] - mean[a])
-    return together
+        mean[a] += share * (its_mean[a] - mean[a])
+    return total
 
 
-@njit(cache=True)
-def _least(diagonal, vectors, normal):  # type: ignore[no-untyped-def]
-    """Eigenvector of the smallest eigenvalue, on the side where the normal was."""
+@njit(cache=True, nogil=True)
+def mean_square_distance(count, centroid, scatter, mean, normal):  # type: ignore[no-untyped-def]
+    """Mean square distance of a group's points to the plane through `mean` across the unit `normal`."""
+    offset = spread = 0.0
+    for a in range(3):
+        offset += normal[a] * (centroid[a] - mean[a])
+        for b in range(3):
+            spread += normal[a] * scatter[a, b] * normal[b]
+    return offset * offset + max(spread, 0.0) / count
+
+
+@njit(cache=True, nogil=True)
+def cosine(first, second):  # type: ignore[no-untyped-def]
+    """|first . second| of two unit vectors."""
+    return abs(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+
+
+@njit(cache=True, nogil=True)
+def least_axis(scatter, work, vectors, normal):  # type: ignore[no-untyped-def]
+    """Nothing; `normal` becomes the direction of least scatter, on the side where it was."""
+    work[:] = scatter
+    symmetric_eigen(work, vectors)
     low = 0
     for axis in range(1, 3):
-        if diagonal[axis, axis] < diagonal[low, low]:
+        if work[axis, axis] < work[low, low]:
             low = axis
     side = 0.0
     for a in range(3):

@@ -11,7 +11,8 @@ from simulated_rooms import CLASSES, room
 
 import pcgraph
 from pcgraph.detection import find_planes, object_labels, objects_on
-from pcgraph.detection.coplanar import FlatLeaves, bends
+from pcgraph.detection.bends import bends
+from pcgraph.detection.flat_leaves import FlatLeaves
 from pcgraph.detection.noise import surface_noise
 from pcgraph.detection.regions import moments_of_regions
 from pcgraph.features.moments import Moments, moments_of_groups
@@ -272,7 +273,7 @@ def test_a_turn_that_distances_do_not_show_is_noise_of_the_normals(shows, turn):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     free = np.zeros(n, bool)
     leaves = FlatLeaves(moments, normals, np.ones(n), free, 0.0, np.empty((0, 2), np.int32), np.empty(0, bool))
-    assert bends(leaves, np.zeros(n, np.int32), 1)[0] == pytest.approx(turn, rel=0.05)
+    assert bends(leaves, np.zeros(n, np.int32))[0] == pytest.approx(turn, rel=0.05)
 
 
 def test_order_of_points_does_not_matter():
