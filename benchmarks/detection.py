@@ -123,7 +123,7 @@ def rooms(seeds: range) -> dict[str, float]:
                 mine = object_labels(result, found) == k
                 kind = CLASSES[np.bincount(view.classes[mine & (view.classes >= 0)]).argmax()]
                 shapes.append(thing.shape.kind == kind)
-                if kind in ("ball", "cylinder"):
+                if kind in ("sphere", "cylinder"):
                     number = np.bincount(view.things[mine & (view.things >= 0)]).argmax()
                     radii.append(abs(thing.shape.radius / view.radii[number] - 1.0))
     return {

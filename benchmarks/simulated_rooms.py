@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-CLASSES = ("floor", "wall", "table", "box", "ball", "cylinder")
+CLASSES = ("floor", "wall", "table", "box", "sphere", "cylinder")
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Room:
     floor, table : float, metres
         Position of the floor and of the table's top along `up`.
     radii : (t,) float64, metres
-        Of each thing, if it is a ball or a cylinder; NaN otherwise.
+        Of each thing, if it is a sphere or a cylinder; NaN otherwise.
     """
 
     points: NDArray[np.float64]
@@ -42,7 +42,7 @@ class Room:
 
 
 def room(seed: int, noise: float = 0.0015, shape: tuple[int, int] = (240, 320)) -> Room:
-    """A room with two walls, a table, and six to ten boxes, balls and cylinders on table and floor.
+    """A room with two walls, a table, and six to ten boxes, spheres and cylinders on table and floor.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def room(seed: int, noise: float = 0.0015, shape: tuple[int, int] = (240, 320)) 
     colors = np.clip(shades[thing] + 0.03 * rng.standard_normal((*shape, 3)), 0.0, 1.0)
     classes = np.array([CLASSES.index(entry[0]) for entry in things] + [-1], np.int32)[thing]
     up = axes[:, 2].copy()
-    radii = np.array([size[0] if kind in ("ball", "cylinder") else np.nan for _, kind, _, size, _ in things])
+    radii = np.array([size[0] if kind in ("sphere", "cylinder") else np.nan for _, kind, _, size, _ in things])
     return Room(points, colors, classes, thing, up, float(-eye[2]), float(height - eye[2]), radii)
 
 
@@ -98,12 +98,12 @@ def _things(
     ]
     taken: list[tuple[NDArray[np.float64], float, float]] = []
     for _ in range(int(rng.integers(6, 11))):
-        kind = str(rng.choice(("box", "ball", "cylinder")))
+        kind = str(rng.choice(("box", "sphere", "cylinder")))
         on_table = bool(rng.random() < 0.75)
         scale = 1.0 if on_table else 1.6
         for _ in range(30):
             size = scale * rng.uniform(0.04, 0.11, 3)
-            if kind == "ball":
+            if kind == "sphere":
                 size[:] = size[0]
             if kind == "cylinder":
                 size[1] = size[0]
@@ -134,7 +134,7 @@ def _cast_box(eye, directions, place, size, turn):  # type: ignore[no-untyped-de
     return np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
 
 
-def _cast_ball(eye, directions, place, size, turn):  # type: ignore[no-untyped-def]
+def _cast_sphere(eye, directions, place, size, turn):  # type: ignore[no-untyped-def]
     return _quadric(eye - place, directions, size[0], 3)[0]
 
 
@@ -151,7 +151,7 @@ def _cast_cylinder(eye, directions, place, size, turn):  # type: ignore[no-untyp
 
 
 def _quadric(origin, directions, radius, dimensions):  # type: ignore[no-untyped-def]
-    """Where rays first meet a ball (3 dimensions) or an endless upright cylinder (2), and their discriminant."""
+    """Where rays first meet a sphere (3 dimensions) or an endless upright cylinder (2), and their discriminant."""
     o, d = origin[:dimensions], directions[..., :dimensions]
     a, b, c = (d**2).sum(axis=-1), d @ o, o @ o - radius**2
     inside = b**2 - a * c
@@ -159,4 +159,4 @@ def _quadric(origin, directions, radius, dimensions):  # type: ignore[no-untyped
     return np.where((inside >= 0.0) & (first > 0.0), first, np.inf), inside
 
 
-_CAST = {"box": _cast_box, "ball": _cast_ball, "cylinder": _cast_cylinder}
+_CAST = {"box": _cast_box, "sphere": _cast_sphere, "cylinder": _cast_cylinder}

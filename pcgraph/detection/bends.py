@@ -14,7 +14,7 @@ def bends(leaves: FlatLeaves, regions: NDArray[np.int32]) -> NDArray[np.float64]
     """How far each region's surface turns, radians, (p,): curvature times extent, 0 for a plane.
 
     The supervoxels' normals are fitted as a linear function of their place in the plane; what noise does to
-    single normals cancels, what a ball or a cylinder does to them does not. A ball patch of radius a on a ball
+    single normals cancels, what a sphere or a cylinder does to them does not. A round patch of radius a on a sphere
     of radius R turns by a / (2 R). A surface that turns so also leaves its plane; where the distances show less than
     half of that, the turn is one of the normals only, as slanted noise causes it, and counts as 0.
     """

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-OPEN = 0.05  # below which a piece is not convex: about 0.5 for a ball or a box, 0 for a plane, negative if hollow
+OPEN = 0.05  # below which a piece is not convex: about 0.5 for a sphere or a box, 0 for a plane, negative if hollow
 WITHIN = 0.5  # share of a piece inside another's box
 
 

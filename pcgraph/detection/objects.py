@@ -43,7 +43,7 @@ class DetectedObject:
     free_box : OrientedBox
         Small box in any pose, longest axis first.
     shape : Shape
-        Which of plane, box, ball and cylinder fits its voxels.
+        Which of plane, box, sphere and cylinder fits its voxels.
     """
 
     supervoxels: NDArray[np.int32]

@@ -103,7 +103,7 @@ def find_planes(
     Returns
     -------
     Planes
-        None of them on a ball or a cylinder: pieces whose normals turn steadily are left out. Without any
+        None of them on a sphere or a cylinder: pieces whose normals turn steadily are left out. Without any
         plane the arrays are empty.
 
     Raises

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of objects: which of plane, box, ball and closed cylinder fits what was seen."""
+"""Shapes of objects: which of plane, box, sphere and closed cylinder fits what was seen."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitive_moments import finite_vectors, primitive_moments
 from pcgraph.features.primitives import fit_primitives
 
-Kind = Literal["plane", "box", "ball", "cylinder"]
+Kind = Literal["plane", "box", "sphere", "cylinder"]
 
 ROUNDS = 6
 FEWEST = 0.05  # share of the points that a side of a box needs to be moved to them
 SIDEWAYS = 0.5  # |normal . axis| above which a point counts to the ends of a cylinder, not to its wall
 THICK = 2.0  # thickness of a box over the residual of its plane, at least
-GAIN = 0.7  # a plane has to be beaten by this factor: boxes, balls and cylinders contain planes as limits
+GAIN = 0.7  # a plane has to be beaten by this factor: boxes, spheres and cylinders contain planes as limits
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,17 @@ class Shape:
 
     Attributes
     ----------
-    kind : "plane", "box", "ball" or "cylinder"
+    kind : "plane", "box", "sphere" or "cylinder"
     residual : float, metres
         Root mean square distance of the points to its surface.
     residuals : dict from kind to float, metres
         The same for all kinds tried.
     center : (3,) float64, metres, the points' frame
-        Of box, ball and cylinder (halfway between its ends as seen); of a plane, the points' mean.
+        Of box, sphere and cylinder (halfway between its ends as seen); of a plane, the points' mean.
     axis : (3,) float64
-        Unit: the cylinder's axis, the plane's normal, the box's longest side; zero for a ball.
+        Unit: the cylinder's axis, the plane's normal, the box's longest side; zero for a sphere.
     radius : float, metres
-        Of ball and cylinder; NaN otherwise.
+        Of sphere and cylinder; NaN otherwise.
     box : OrientedBox or None
         The fitted box, if that is the kind.
     """
@@ -88,7 +88,7 @@ def fit_shape(points: ArrayLike, normals: ArrayLike, up: ArrayLike | None = None
     center, radius = round_shapes.sphere_center[0], float(round_shapes.sphere_radius[0])
     if np.isfinite(radius):
         distance = np.linalg.norm(places - center, axis=1) - radius
-        found.append(Shape("ball", _rms(distance), {}, center, np.zeros(3), radius, None))
+        found.append(Shape("sphere", _rms(distance), {}, center, np.zeros(3), radius, None))
     axes = [round_shapes.cylinder_axis[0]] + ([] if upwards is None else [upwards])
     for axis in axes:
         found += _cylinder(places, directions, axis)

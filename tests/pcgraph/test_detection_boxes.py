@@ -27,8 +27,8 @@ def surface_of_a_box(size, n=4000, seed=0):
     return points * size, normals
 
 
-def ball(radius, n=2000):
-    """Points evenly on the upper half of a ball, and their normals."""
+def sphere(radius, n=2000):
+    """Points evenly on the upper half of a sphere, and their normals."""
     height = np.linspace(0.0, 1.0, n)
     turn = np.arange(n) * np.pi * (3 - np.sqrt(5))
     normals = np.column_stack((np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height))
@@ -151,11 +151,11 @@ def test_plane_basis_is_right_handed():
         assert np.linalg.det(frame) == pytest.approx(1.0)
 
 
-def test_a_ball_is_a_ball():
-    points, normals = ball(0.12)
+def test_a_sphere_is_a_sphere():
+    points, normals = sphere(0.12)
     noise = 0.001 * np.random.default_rng(0).normal(size=(len(points), 1))
     shape = fit_shape((points + noise * normals) @ TURN.T + AWAY, normals @ TURN.T)
-    assert shape.kind == "ball"
+    assert shape.kind == "sphere"
     assert shape.radius == pytest.approx(0.12, abs=2e-4)
     assert shape.center == pytest.approx(AWAY, abs=5e-4)
     assert shape.residual == pytest.approx(0.001, rel=0.1)

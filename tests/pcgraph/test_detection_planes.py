@@ -117,7 +117,7 @@ def test_rigid_motion_moves_the_answer_along(boxes):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
-def test_there_is_no_plane_on_a_ball(noise):
+def test_there_is_no_plane_on_a_sphere(noise):
     points = sphere(0.3, 20000)
     points = points * (1 + noise * np.random.default_rng(0).normal(size=(len(points), 1)))
     result = pcgraph.segment(points, viewpoint=(0, 0, 3), voxel_size=0.012)
@@ -133,17 +133,17 @@ def test_there_is_no_plane_on_a_ball(noise):
     assert np.all(object_labels(result, []) == -1)
 
 
-def test_a_ball_on_the_table_is_found_with_its_radius():
+def test_a_sphere_on_the_table_is_found_with_its_radius():
     table = patch((0, 0, 0), (1, 0, 0), (0, 1, 0))
     table = table[np.linalg.norm(table[:, :2] - 0.5, axis=1) > 0.12]
-    ball = sphere(0.12, 6000)
-    seen = (ball * (np.array([0.0, -1.5, 1.88]) - ball)).sum(axis=1) > 0  # the side that faces the viewpoint
-    ball = ball[seen & (ball[:, 2] > -0.1)] + [0.5, 0.5, 0.12]
-    noise = 0.0005 * np.random.default_rng(0).normal(size=(len(table) + len(ball), 3))
-    result = pcgraph.segment(np.vstack((table, ball)) + noise, viewpoint=(0.5, -1, 2), voxel_size=0.015)
+    cap = sphere(0.12, 6000)
+    seen = (cap * (np.array([0.0, -1.5, 1.88]) - cap)).sum(axis=1) > 0  # the side that faces the viewpoint
+    cap = cap[seen & (cap[:, 2] > -0.1)] + [0.5, 0.5, 0.12]
+    noise = 0.0005 * np.random.default_rng(0).normal(size=(len(table) + len(cap), 3))
+    result = pcgraph.segment(np.vstack((table, cap)) + noise, viewpoint=(0.5, -1, 2), voxel_size=0.015)
     found = objects_on(result)
     assert len(found) == 1
-    assert found[0].shape.kind == "ball"
+    assert found[0].shape.kind == "sphere"
     assert found[0].shape.radius == pytest.approx(0.12, rel=0.03)
     assert found[0].shape.center == pytest.approx([0.5, 0.5, 0.12], abs=0.005)
     assert found[0].height == pytest.approx(0.24, abs=0.01)
