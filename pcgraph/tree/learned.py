@@ -39,7 +39,7 @@ class LearnedLinkage(Linkage):
 
     Notes
     -----
-    Few edges are boundaries (0.6 % on tables with things), so both classes weigh the same in the fit. On twelve
+    Few edges are boundaries (1.2 % on tables with things), so both classes weigh the same in the fit. On twelve
     such clouds boosted trees on the same columns did much worse than this linear model (docs/tree.md).
     """
 
