@@ -71,6 +71,8 @@ def fit_shape(points: ArrayLike, normals: ArrayLike, up: ArrayLike | None = None
         An argument is not as above.
     """
     places, directions = some_points(points), finite_vectors("normals", normals)
+    if len(places) != len(directions):
+        raise ValueError(f"expected one normal per point, got {len(places)} points and {len(directions)} normals")
     upwards = None if up is None else unit_vector("up", up)
     round_shapes = fit_primitives(primitive_moments(places, directions, np.zeros(len(places), np.int32), 1))
     flat = Shape(

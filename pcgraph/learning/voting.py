@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from numbers import Real
+
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +36,8 @@ def votes(segmentation: Segmentation, labels: ArrayLike, n_classes: int | None =
     voting = (leaf >= 0) & (array >= 0)
     chosen = array[voting].astype(np.int64)
     highest = int(chosen.max(initial=-1))
+    if n_classes is not None and (not isinstance(n_classes, int | np.integer) or n_classes < 0):
+        raise ValueError(f"expected n_classes as a whole number of at least 0, got {n_classes!r}")
     classes = highest + 1 if n_classes is None else int(n_classes)
     if highest >= classes:
         raise ValueError(f"expected labels below n_classes={classes}, got {highest}")
@@ -80,12 +84,14 @@ def pure_ancestors(
     Raises
     ------
     ValueError
-        There is not one row of votes per node, or `share` is not within 0..1.
+        There is not one row of votes per node, `share` is not within 0..1, or `altitude` is NaN.
     """
     if votes.ndim != 2 or len(votes) != len(tree.parents):
         raise ValueError(f"expected votes of all {len(tree.parents)} nodes, one row each, got {votes.shape}")
     if not 0.0 <= share <= 1.0:
         raise ValueError(f"expected a share within 0..1, got {share!r}")
+    if not isinstance(altitude, Real) or altitude != altitude:
+        raise ValueError(f"expected altitude as a number, infinity for no limit, got {altitude!r}")
     total = votes.sum(axis=1)
     pure = (total > 0) & (votes.max(axis=1, initial=0) >= share * total) & (tree.altitudes <= altitude)
     return _highest(tree.parents, pure)[: tree.n_leaves]

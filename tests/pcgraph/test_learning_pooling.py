@@ -168,6 +168,12 @@ def test_wrong_input_is_refused(boxes):
             majority(votes_)
     with pytest.raises(ValueError, match="share"):
         pure_ancestors(tree, votes(result, truth), 1.5)
+    for altitude in (np.nan, "a"):
+        with pytest.raises(ValueError, match="altitude"):
+            pure_ancestors(tree, votes(result, truth), altitude=altitude)
+    for n_classes in (-1, "a", 2.5):
+        with pytest.raises(ValueError, match="n_classes as a whole"):
+            votes(result, truth, n_classes)
 
 
 @pytest.mark.parametrize("package", ["learning", "detection"])
