@@ -7,24 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
-from pcgraph.detection.boxes import OrientedBox, plane_basis, standing_box, tight_box
-from pcgraph.detection.flat_leaves import voxel_edges
-from pcgraph.detection.fragments import joined_fragments
-from pcgraph.detection.hulls import inside_outline, outline
+from pcgraph.detection.boxes import OrientedBox, standing_box, tight_box
+from pcgraph.detection.pieces import connected_pieces, gathered, supervoxels_above
 from pcgraph.detection.planes import Planes, find_planes
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.inputs import non_negative
 from pcgraph.segmentation import Segmentation
 
-LEAST_CLEARANCE = 0.5  # voxel edges between the support and the centroid of a supervoxel above it
 LEAST_HEIGHT = 3.0  # voxel edges
 LEAST_SUPERVOXELS = 0.5  # median supervoxels, in points
-GAP = 8.0  # voxel edges, across which the inside of a cup may belong to its outside
-NARROW = 0.5  # the same, in lengths of the larger one's footprint
-LEVEL = 2.0  # voxel edges by which their tops may differ
 
 
 @dataclass(frozen=True)
@@ -122,10 +114,10 @@ def objects_on(
     )
     up = planes.normals[index] * (-1.0 if planes.normals[index] @ planes.up < -0.5 else 1.0)
     bottom = float(up @ planes.centroids[index])
-    above = _above(segmentation, planes, index, up, bottom, reach)
+    above = supervoxels_above(segmentation, planes, index, up, bottom, reach)
     places, leaf_of_place = _places(segmentation, points)
     found = []
-    for leaves in _gathered(segmentation, planes, index, _pieces(segmentation, above), up, bottom, edge):
+    for leaves in gathered(segmentation, planes, index, connected_pieces(segmentation, above), up, bottom, edge):
         member, count = places[np.isin(leaf_of_place, leaves)], int(sizes[leaves].sum())
         box = standing_box(member, up, bottom)
         if box.size[2] >= lowest and count >= fewest:
@@ -156,31 +148,6 @@ def _support(planes: Planes, support: int | None) -> int | None:
     return int(level[0]) if len(level) else None
 
 
-def _above(
-    segmentation: Segmentation, planes: Planes, index: int, up: NDArray[np.float64], bottom: float, margin: float
-) -> NDArray[np.bool_]:
-    """Which supervoxels lie above the plane within its outline, without being part of it."""
-    basis = plane_basis(up)
-    edges = voxel_edges(segmentation)
-    centroids = segmentation.graph.node_features.centroid
-    inside = inside_outline(centroids @ basis.T, outline(planes.outlines[index] @ basis.T), margin)
-    clear = centroids @ up - bottom > LEAST_CLEARANCE * edges
-    return inside & clear & (planes.plane_of_supervoxel != index)
-
-
-def _pieces(segmentation: Segmentation, above: NDArray[np.bool_]) -> list[NDArray[np.int32]]:
-    """Connected parts of segments among the chosen supervoxels, most points first."""
-    n, segment = segmentation.tree.n_leaves, segmentation.objects
-    i, j = segmentation.graph.edges.T
-    kept = above[i] & above[j] & (segment[i] == segment[j])
-    links = csr_array((np.ones(int(kept.sum()), np.int8), (i[kept], j[kept])), shape=(n, n))
-    _, part = connected_components(links, directed=False)
-    leaves = np.flatnonzero(above).astype(np.int32)
-    parts = [leaves[part[leaves] == p] for p in np.unique(part[leaves])]
-    sizes = segmentation.graph.node_features.size
-    return sorted(parts, key=lambda part: (-int(sizes[part].sum()), int(part[0])))
-
-
 def _places(segmentation: Segmentation, points: ArrayLike | None) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Points, or centroids of voxels, (q, 3), with their supervoxels."""
     if points is None:
@@ -190,32 +157,3 @@ def _places(segmentation: Segmentation, points: ArrayLike | None) -> tuple[NDArr
         raise ValueError(f"expected points of shape {(*segmentation.supervoxels.shape, 3)}, got {array.shape}")
     finite = segmentation.supervoxels >= 0
     return array[finite].astype(np.float64), segmentation.supervoxels[finite]
-
-
-def _gathered(
-    segmentation: Segmentation,
-    planes: Planes,
-    index: int,
-    pieces: list[NDArray[np.int32]],
-    up: NDArray[np.float64],
-    bottom: float,
-    edge: float,
-) -> list[NDArray[np.int32]]:
-    """Supervoxels of objects, from those of their pieces."""
-    if not pieces:
-        return []
-    surface, (i, j) = segmentation.surface, segmentation.graph.edges.T
-    support = planes.plane_of_supervoxel == index
-    at_support = np.zeros(segmentation.tree.n_leaves, bool)
-    at_support[i[support[j]]] = at_support[j[support[i]]] = True
-    members = [np.isin(surface.supervoxels, leaves) for leaves in pieces]
-    places, normals = [surface.grid.centroids[m] for m in members], [surface.normals[m] for m in members]
-    boxes = [standing_box(place, up, bottom) for place in places]
-    inside = np.array([[box.contains(place, edge).mean() for place in places] for box in boxes])
-    floating = np.array([not at_support[leaves].any() for leaves in pieces])
-    reach = np.minimum(GAP * edge, NARROW * np.array([box.size[0] for box in boxes]))
-    part = joined_fragments(places, normals, [place @ up for place in places], floating, inside, reach, LEVEL * edge)
-    return [
-        np.sort(np.concatenate([leaves for leaves, its in zip(pieces, part, strict=True) if its == p]))
-        for p in range(int(part.max()) + 1)
-    ]
