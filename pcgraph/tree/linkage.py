@@ -74,8 +74,8 @@ class ConvexityLinkage(Linkage):
     object_altitude : float, radians
         Mean concavity above which two parts are two objects.
     part_altitude : float, radians
-        Right-angled convex edges cost about 0.08 (0.05 per radian) and up to 0.15 where voxels round them off;
-        noise on a flat table costs less than 0.1.
+        Right-angled convex edges cost about 0.05 (0.03 per radian) and up to 0.08 where voxels round them off;
+        noise on a flat table costs as much: of a real one pieces remain at this altitude.
 
     Notes
     -----

@@ -29,8 +29,8 @@ class QuasiFlatLinkage(Linkage):
     """
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
-    object_altitude: float = 0.12
-    part_altitude: float = 0.05
+    object_altitude: float = 0.07
+    part_altitude: float = 0.04
 
     def __post_init__(self) -> None:
         check_cost(self.cost)

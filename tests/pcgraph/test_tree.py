@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import re
 from itertools import pairwise
-from pathlib import Path
 
 import networkx
 import numpy as np
 import pytest
-from clouds import refines, two_boxes_on_a_plane
+from clouds import refines
 
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
@@ -146,13 +144,3 @@ def test_networkx_export(boxes):
     assert networkx.is_arborescence(exported)
     assert exported.number_of_nodes() == len(tree.parents)
     assert exported.nodes[len(tree.parents) - 1]["size"] == len(boxes[0])
-
-
-def test_the_snippets_of_the_docs_run():
-    text = (Path(__file__).resolve().parents[2] / "docs" / "tree.md").read_text(encoding="utf-8")
-    snippets = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len(snippets) >= 2
-    points, _, _ = two_boxes_on_a_plane()
-    names = {"points": points, "colors": np.full(points.shape, 0.5), "__name__": __name__}
-    exec("".join(snippets), names)
-    assert names["result"].linkage == names["NormalLinkage"]()
