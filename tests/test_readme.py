@@ -27,7 +27,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
     printed = run([sys.executable, "-c", "".join((ten_lines, *more))], tmp_path)
     assert "| mirror |" in printed
     assert "mirrored_ghost" in printed
-    assert "ball [" in printed
+    assert "sphere [" in printed
     assert (tmp_path / "out" / "tabletop.ply").stat().st_size > 100_000
 
 
