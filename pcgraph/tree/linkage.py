@@ -84,7 +84,7 @@ class ConvexityLinkage(Linkage):
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     object_altitude: float = 0.5
-    part_altitude: float = 0.05
+    part_altitude: float = 0.06
 
     def __post_init__(self) -> None:
         check_cost(self.cost)
