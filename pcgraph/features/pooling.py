@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -75,7 +77,7 @@ def pool_means(
 
 
 @njit(cache=True, nogil=True)
-def pool_sums(parents: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+def pool_sums(parents: NDArray[np.int32], values: NDArray[Any]) -> None:
     """Nothing; every node's row becomes the sum of the rows at and below it.
 
     Parameters

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.features.pooling import pool_sums
 from pcgraph.segmentation import Segmentation
 from pcgraph.tree.tree import SegmentationTree
 
@@ -151,7 +152,7 @@ def _sum_up(tree: SegmentationTree, table: NDArray[Any]) -> NDArray[Any]:
     values = _summable(np.where(np.isnan(table), 0, table))
     sums = np.zeros((len(tree.parents), table.shape[1]), values.dtype)
     sums[: tree.n_leaves] = values
-    _add_to_parents(tree.parents, sums)
+    pool_sums(tree.parents, sums)
     return sums
 
 
@@ -171,16 +172,6 @@ def _summable(table: NDArray[Any]) -> NDArray[Any]:
             "expected whole numbers whose sizes add up to 2**62 at most, got larger ones; pass them as float"
         )
     return table.astype(np.int64)
-
-
-@njit(cache=True)
-def _add_to_parents(parents: NDArray[np.int32], values: NDArray[Any]) -> None:
-    """Parents have larger numbers than their children, so one pass in ascending order is enough."""
-    for node in range(len(parents)):
-        up = parents[node]
-        if up != node:
-            for c in range(values.shape[1]):
-                values[up, c] += values[node, c]
 
 
 @njit(cache=True)
