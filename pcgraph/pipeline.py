@@ -70,9 +70,9 @@ def segment(
     Returns
     -------
     Segmentation
-        Every finite point has a supervoxel, every supervoxel is connected (26-neighbourhood of occupied
-        voxels), the same points give the same result in any order (up to the rounding of sums) and at any
-        number of threads.
+        Every finite point has a supervoxel; the voxels that hold points of a supervoxel are connected
+        (26-neighbourhood). The same points give the same supervoxels in any order, and node features up to the
+        rounding of sums; the number of threads changes nothing.
 
     Raises
     ------
