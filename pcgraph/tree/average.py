@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.tree.edge_queue import queued_edges, requeue, unqueue
-from pcgraph.tree.half_edges import NONE, drop, find, hang, hung_edges, unhang
+from pcgraph.tree.half_edges import drop, hand_over, hung_edges
 
 
 def average_linkage(
@@ -39,7 +39,7 @@ def average_linkage(
     A mean of two costs is never below the smaller one, so merging in ascending order yields ascending
     altitudes.
     """
-    pairs, altitudes = _merge(n_nodes, edges, costs * weights, weights.astype(np.float64))
+    pairs, altitudes = _merge(n_nodes, edges, np.stack((costs * weights, weights)))
     # A mean may still round down by one unit in the last place.
     return pairs, np.maximum.accumulate(altitudes)
 
@@ -48,11 +48,11 @@ def average_linkage(
 def _merge(
     n_nodes: int,
     edges: NDArray[np.int32],
-    cost_sums: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    sums: NDArray[np.float64],
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     ends, after, before, first, degree = hung_edges(n_nodes, edges)
-    costs = cost_sums / weights
+    costs = sums[0] / sums[1]
+    twins, moved = np.empty(len(edges), np.int64), np.empty(len(edges), np.int64)
     order, place, size = queued_edges(costs)
     name = np.arange(n_nodes)  # a cluster lives on under the slot of one of its leaves; this is its tree node
     pairs, altitudes = np.empty((max(n_nodes - 1, 0), 2), np.int32), np.empty(max(n_nodes - 1, 0))
@@ -68,20 +68,9 @@ def _merge(
         t += 1
         drop(e, ends, after, before, first, degree)
         unqueue(e, costs, order, place, size)
-        half = first[gone]
-        while half != NONE:  # its edges go over; where both have one to the same third, the two become one
-            following, moved = after[half], half >> 1
-            twin = find(kept, ends[half ^ 1], ends, after, first, degree)
-            if twin == NONE:
-                unhang(half, ends, after, before, first, degree)
-                ends[half] = kept
-                hang(half, ends, after, before, first, degree)
-            else:
-                drop(moved, ends, after, before, first, degree)
-                unqueue(moved, costs, order, place, size)
-                cost_sums[twin] += cost_sums[moved]
-                weights[twin] += weights[moved]
-                costs[twin] = cost_sums[twin] / weights[twin]
-                requeue(twin, costs, order, place, size)
-            half = following
+        for pair in range(hand_over(kept, gone, ends, after, before, first, degree, sums, twins, moved)):
+            unqueue(moved[pair], costs, order, place, size)
+            twin = twins[pair]
+            costs[twin] = sums[0, twin] / sums[1, twin]
+            requeue(twin, costs, order, place, size)
     return pairs[:t].copy(), altitudes[:t].copy()

@@ -64,3 +64,29 @@ def find(a, b, ends, after, first, degree):  # type: ignore[no-untyped-def]
             return half >> 1
         half = after[half]
     return NONE
+
+
+@njit(cache=True)
+def hand_over(kept, gone, ends, after, before, first, degree, sums, twins, moved):  # type: ignore[no-untyped-def]
+    """Number of edges of `gone` that fell together with one of `kept`, to the same third cluster.
+
+    The others now hang at `kept`. Of each pair that fell together, `twins` names the edge that stays, with its
+    `sums` (one column per edge) the sums of both, and `moved` the one that was dropped.
+    """
+    pairs = 0
+    half = first[gone]
+    while half != NONE:
+        following = after[half]
+        twin = find(kept, ends[half ^ 1], ends, after, first, degree)
+        if twin == NONE:
+            unhang(half, ends, after, before, first, degree)
+            ends[half] = kept
+            hang(half, ends, after, before, first, degree)
+        else:
+            twins[pairs], moved[pairs] = twin, half >> 1
+            pairs += 1
+            for row in range(len(sums)):
+                sums[row, twin] += sums[row, half >> 1]
+            drop(half >> 1, ends, after, before, first, degree)
+        half = following
+    return pairs

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.tree.edge_queue import queued_edges, requeue, unqueue
-from pcgraph.tree.half_edges import NONE, drop, find, hang, hung_edges, unhang
+from pcgraph.tree.half_edges import NONE, drop, hand_over, hung_edges
 from pcgraph.voxels.eigen import symmetric_eigen
 
 
@@ -90,6 +90,8 @@ def _merge(edges, lengths, per_length, masses, values, centroids, scatters, plan
         if plane > 0.0:
             residuals[a] = _least_eigenvalue(scatters[a].copy())
     costs = np.empty(len(edges))
+    sums = lengths.reshape(1, -1) if per_length else np.empty((0, len(edges)))  # the same memory
+    twins, moved = np.empty(len(edges), np.int64), np.empty(len(edges), np.int64)
     for e in range(len(edges)):
         increase = _increase(edges[e, 0], edges[e, 1], masses, values, centroids, scatters, residuals, plane)
         costs[e] = increase / lengths[e]
@@ -108,20 +110,8 @@ def _merge(edges, lengths, per_length, masses, values, centroids, scatters, plan
         t += 1
         drop(e, ends, after, before, first, degree)
         unqueue(e, costs, order, place, size)
-        half = first[gone]
-        while half != NONE:  # its edges go over; where both have one to the same third, the two become one
-            following, moved = after[half], half >> 1
-            twin = find(kept, ends[half ^ 1], ends, after, first, degree)
-            if twin == NONE:
-                unhang(half, ends, after, before, first, degree)
-                ends[half] = kept
-                hang(half, ends, after, before, first, degree)
-            else:
-                if per_length:
-                    lengths[twin] += lengths[moved]
-                drop(moved, ends, after, before, first, degree)
-                unqueue(moved, costs, order, place, size)
-            half = following
+        for pair in range(hand_over(kept, gone, ends, after, before, first, degree, sums, twins, moved)):
+            unqueue(moved[pair], costs, order, place, size)
         _unite(kept, gone, masses, values, centroids, scatters, residuals, plane)
         half = first[kept]
         while half != NONE:
