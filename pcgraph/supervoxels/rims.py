@@ -58,15 +58,7 @@ def _settle(
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
     near, owner = np.empty((_MOST, 8)), np.empty(_MOST, np.int32)
     for v in range(start, stop):
-        own = supervoxels[v]
-        rim = False
-        for a in range(indptr[v], indptr[v + 1]):
-            rim |= supervoxels[neighbours[a]] != own
-        for at in range(starts[v], starts[v + 1]):
-            chosen[order[at]] = own
-        if not rim:
-            continue
-        n = 0
+        own, n = supervoxels[v], 0
         for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around
             i = neighbours[a]
             if supervoxels[i] != own:
@@ -74,10 +66,13 @@ def _settle(
                     near[n, column] = surface[i, column]
                 owner[n] = supervoxels[i]
                 n += 1
+        for at in range(starts[v], starts[v + 1]):
+            chosen[order[at]] = own
+        if n == 0:
+            continue
         stay = 0
         for at in range(starts[v], starts[v + 1]):
             p = order[at]
-            chosen[p] = own
             x, y, z = points[p, 0] - surface[v, 0], points[p, 1] - surface[v, 1], points[p, 2] - surface[v, 2]
             off = surface[v, 3] * x + surface[v, 4] * y + surface[v, 5] * z - surface[v, 6]
             least = off * off + weight * (x * x + y * y + z * z)
