@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from threading import Thread
 from typing import TypeVar
 
 from numba import config
@@ -34,22 +33,11 @@ def in_blocks(kernel: Callable[..., None], n: int, *arguments: object) -> None:
     if blocks == 1:
         kernel(0, n, *arguments)
         return
-    errors: list[BaseException] = []
-
-    def run(block: int) -> None:
-        try:
-            kernel(bounds[block], bounds[block + 1], *arguments)
-        except BaseException as error:  # noqa: BLE001 -- handed on below, in the caller's thread
-            errors.append(error)
-
-    others = [Thread(target=run, args=(block,)) for block in range(1, blocks)]
-    for thread in others:
-        thread.start()
-    run(0)
-    for thread in others:
-        thread.join()
-    if errors:
-        raise errors[0]
+    with ThreadPoolExecutor(blocks - 1) as pool:
+        others = [pool.submit(kernel, bounds[b], bounds[b + 1], *arguments) for b in range(1, blocks)]
+        kernel(bounds[0], bounds[1], *arguments)
+    for other in others:
+        other.result()  # raises what the kernel raised
 
 
 def side_by_side(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:
