@@ -128,7 +128,7 @@ def update(
     Segmentation
         `labels` and `supervoxels` are those of the new points; `graph`, `tree` and `surface` those of the whole
         scene. Points of an earlier scan keep their supervoxels, so their objects are now
-        ``result.tree.cut(altitude=...)[earlier.supervoxels]``.
+        ``result.objects[earlier.supervoxels]``.
 
     Raises
     ------
