@@ -547,13 +547,20 @@ def _why(problem: OSError) -> str:
 
 @contextmanager
 def _one_sentence(named: Path, target: Path, kind: DirectoryKind) -> Iterator[None]:
-    """Turn an OSError of the directory that is written to, or of those around it, into a sentence."""
+    """Turn an OSError of the directory that is written to, or of those around it, into a sentence that names it."""
     try:
         yield
-    except OSError as problem:
+    except (OSError, kind.error) as error:
+        problem = error if isinstance(error, OSError) else error.__cause__
+        if not isinstance(problem, OSError):
+            raise
         where = None if problem.filename is None else Path(os.path.abspath(os.fsdecode(problem.filename)))
         ours = where is not None and (where == target or where in target.parents or target in where.parents)
-        if not ours and (where is not None or problem.errno not in _DISK):
+        if problem.errno in _DISK and (ours or where is None):
+            raise kind.error(
+                f"cannot write {named}: {_why(problem)}; nothing was written, make room or name another place."
+            ) from problem
+        if not ours:
             raise
         in_the_way = isinstance(problem, (FileExistsError, NotADirectoryError))
         reason = "a file is in the way" if in_the_way else _why(problem)
