@@ -12,6 +12,7 @@ from typing import Annotated, Any
 from rangesim import limits
 from rangesim.ambient import Ambient
 from rangesim.bounds import Metres, check_fields, whole
+from rangesim.catalogue import scene_names
 from rangesim.config import check_keys, from_dict, to_dict
 from rangesim.errors import FileFormatError
 from rangesim.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
@@ -25,7 +26,8 @@ class Experiment:
 
     Parameters
     ----------
-    scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...).
+    scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...), or the name of a scene that comes with the
+        package, such as tabletop.
     material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
     unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
@@ -78,6 +80,8 @@ class Experiment:
 def load_experiment(path: str | Path) -> Experiment:
     """The experiment of a TOML file; a relative scene path counts from the file's directory.
 
+    A scene that comes with the package is meant where its name is given and no file of that name is there.
+
     Raises
     ------
     FileFormatError
@@ -94,7 +98,9 @@ def load_experiment(path: str | Path) -> Experiment:
         raise FileFormatError(f"{path} is no valid TOML: {error}.") from error
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
-    return replace(experiment, scene=str(path.parent / experiment.scene))
+    beside = path.parent / experiment.scene
+    comes_along = experiment.scene in scene_names() and not beside.is_file()
+    return experiment if comes_along else replace(experiment, scene=str(beside))
 
 
 def experiment_from_dict(data: Mapping[str, Any]) -> Experiment:

@@ -36,7 +36,7 @@ def provenance(
         "experiment": experiment_to_dict(experiment),
         "scene": {
             "name": scene.name,
-            "sha256": _checksum(Path(experiment.scene)),
+            "sha256": _checksum(scene.source),
             "working_distance_m": scene.working_distance_m,
             "shapes": [to_dict(i) for i in scene.instances],
         },
@@ -51,9 +51,9 @@ def provenance(
     }
 
 
-def _checksum(path: Path) -> str | None:
-    """SHA-256 of a file; None if the scene came from elsewhere."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+def _checksum(path: Path | None) -> str | None:
+    """SHA-256 of the scene's file; None if there is none, or none any more."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None
 
 
 def _version(package: str) -> str:

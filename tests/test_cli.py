@@ -171,6 +171,7 @@ def _write_bad_files(folder: Path) -> None:
     ("arguments", "sentence"),
     [
         (["run", "none.xml"], "none.xml does not exist"),
+        (["run", "tabeltop"], "did you mean 'tabletop'"),
         (["run", "broken.xml"], "broken.xml is no scene Mitsuba can load"),
         (["run", "blind.xml"], "perspective sensor, got none"),
         (["run", "points.ply"], "which has no faces"),

@@ -40,6 +40,13 @@ def test_examples_are_valid(path: Path) -> None:
     assert Path(experiment.scene).is_file()
 
 
+def test_a_scene_that_comes_along_is_named_and_a_file_beside_goes_first(tmp_path: Path) -> None:
+    (tmp_path / "e.toml").write_text('scene = "plane"')
+    assert load_experiment(tmp_path / "e.toml").scene == "plane"
+    (tmp_path / "plane").write_text("mine")
+    assert load_experiment(tmp_path / "e.toml").scene == str(tmp_path / "plane")
+
+
 def test_the_first_example_states_the_defaults() -> None:
     example = load_experiment(ROOT / "examples" / "tabletop.toml")
     usual = Experiment(example.scene)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rangesim.catalogue import scene_names
 from rangesim.cli.progress import progress_bar, say_where
 
 if TYPE_CHECKING:
@@ -24,7 +25,11 @@ BASELINE_HELP = (
 
 def run_command(
     scene: Annotated[
-        Path | None, typer.Argument(help="Mitsuba 3 scene (.xml) or mesh (.ply, .obj, .glb, .stl, .off), in metres.")
+        Path | None,
+        typer.Argument(
+            help="Mitsuba 3 scene (.xml) or mesh (.ply, .obj, .glb, .stl, .off), in metres, or the name of a scene "
+            f"that comes with rangesim: {', '.join(scene_names())}."
+        ),
     ] = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Directory for the results; an older result is replaced.")
@@ -74,7 +79,7 @@ def run_command(
 
     Examples:
 
-      rangesim run scenes/tabletop.xml --out out/tabletop
+      rangesim run tabletop --out out/tabletop
 
       rangesim run part.ply --material glossy --sensor gray --sensor gray-phase --baseline 0.1 --out out/part
 

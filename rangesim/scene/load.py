@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.catalogue import CATALOGUE, scene_file
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.medium import is_boundary, why_not_traced
@@ -27,10 +28,6 @@ from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.scene import Instance, Scene
 
 Source = str | Path | Mapping[str, Any]
-
-_INSTALLED = Path(__file__).resolve().parent / "catalogue"
-CATALOGUE = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[2] / "scenes"
-"""Directory that holds `materials/`: a copy inside an installed package, `scenes` in a checkout."""
 
 
 def load_scene(
@@ -45,8 +42,9 @@ def load_scene(
 
     Parameters
     ----------
-    source : path of a Mitsuba 3 XML file or of a mesh (PLY, OBJ, GLB, STL), or a Mitsuba scene dictionary. XML and
-        dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
+    source : path of a Mitsuba 3 XML file or of a mesh (PLY, OBJ, GLB, STL), the name of a scene that comes with the
+        package (`rangesim.catalogue.scene_names`; a file of that name goes first), or a Mitsuba scene dictionary. XML
+        and dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
         ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
         `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md);
@@ -90,6 +88,7 @@ def load_scene(
         T_world_camera=T_world_camera,
         working_distance_m=_median_depth(loaded, camera, T_world_camera),
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
+        source=None if isinstance(source, Mapping) else scene_file(source),
         reload=lambda: instantiate()[0],
     )
 
@@ -113,9 +112,7 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
 def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Path) -> Any:
     if isinstance(source, Mapping):
         return mi.parser.parse_dict(config, dict(source))
-    path = Path(source)
-    if not path.is_file():
-        raise FileFormatError(f"expected a scene or mesh file, but {path} does not exist.")
+    path = scene_file(source)
     if _is_mesh(path):
         return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, folder))
     if path.suffix.lower() != ".xml":
