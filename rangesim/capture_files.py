@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.output import DirectoryKind, new_directory, write_manifest
+from pcgraph.output import DirectoryKind, new_directory, recover, write_manifest
 from rangesim import __version__
 from rangesim.ambient import Ambient
 from rangesim.capture import DTYPES, Capture
@@ -19,9 +19,10 @@ from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
 from rangesim.image_files import SUFFIXES, read_stack, write_grey
 from rangesim.rig import Rig
-from rangesim.schema import read_sidecar, write_json
+from rangesim.schema import write_json
 from rangesim.sensors import Sensor
 from rangesim.spad import SpadDetector
+from rangesim.text_files import read_json
 
 SIDECAR = "capture.json"
 FORMAT = "rangesim-capture"
@@ -88,7 +89,12 @@ def load_capture(directory: str | Path) -> Capture:
         the file.
     """
     sidecar = Path(directory) / SIDECAR
-    settings = read_sidecar(sidecar, FORMAT)
+    recover(directory, FileFormatError)
+    if not sidecar.is_file():
+        raise FileFormatError(f"{directory} is no {FORMAT} directory: it has no {SIDECAR}.")
+    settings = read_json(sidecar)
+    if not isinstance(settings, dict) or settings.get("format") != FORMAT:
+        raise FileFormatError(f"{sidecar} is no {FORMAT} file.")
     if settings.get("format_version") != FORMAT_VERSION:
         raise FileFormatError(
             f"{sidecar}: expected format version {FORMAT_VERSION}, got {settings.get('format_version')!r}."

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesim.config import nearest
 from rangesim.errors import FileFormatError
 
 _INSTALLED = Path(__file__).resolve().parent / "scene" / "catalogue"
@@ -26,6 +25,8 @@ def scene_file(source: str | Path) -> Path:
     FileFormatError
         Neither; the message says which names there are.
     """
+    from rangesim.config import nearest  # imports NumPy, which the command line's help does without
+
     path, names = Path(source), scene_names()
     if path.is_file():
         return path

@@ -22,8 +22,16 @@ from rangesim.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.provenance import provenance
-from rangesim.result_files import RESULT, SETTINGS, load_result, save_causes, save_range_image
-from rangesim.schema import write_json
+from rangesim.result_files import (
+    RESULT,
+    SETTINGS,
+    MeasurementRecord,
+    load_result,
+    save_causes,
+    save_range_image,
+    save_rows,
+)
+from rangesim.schema import write_record
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -81,7 +89,7 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
             for one in instruments:
                 say(f"Measuring with {one.name}", _share(number, len(passes), 1.0))
                 measure(one, signals, folder / one.name, noise_seed(experiment, one), experiment.ambient)
-        write_json(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
+        write_record(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
         say("Writing the report", 0.97)
         result = load_result(folder)
         _write_comparison(folder, [(m.name, m.rows) for m in result.measurements])
@@ -106,15 +114,15 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
         causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
     save_causes(causes, folder / "causes.npz")
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.shares(signals.truth), strict=True)]
-    write_json(folder / "comparison.json", {"outlier_m": comparison.outlier_m, "rows": rows})
+    save_rows(comparison.outlier_m, rows, folder)
     with timed(times, "points"):
         cloud = image.to_point_cloud()
     if cloud.valid.sum() >= FEWEST_POINTS:
         cloud.save(folder / "cloud.ply")
         with timed(times, "segmentation"):
             segment(cloud, folder / "segmentation.npz")
-    facts = acquisition(capture, one.timing, moves)
-    write_json(folder / "measurement.json", {**facts, "points": int(cloud.valid.sum()), "times_s": times})
+    facts = acquisition(capture, one.timing, moves, int(cloud.valid.sum()), times)
+    write_record(folder / "measurement.json", facts)
 
 
 def _in_time(one: Instrument) -> PhotoDetector | None:
@@ -160,7 +168,9 @@ def noise_seed(experiment: Experiment, one: Instrument) -> int:
     return int(np.random.SeedSequence([experiment.seed, position]).generate_state(1)[0])
 
 
-def acquisition(capture: Capture, timing: Timing, moves: bool) -> dict[str, Any]:
+def acquisition(
+    capture: Capture, timing: Timing, moves: bool, points: int, times_s: dict[str, float]
+) -> MeasurementRecord:
     """Frames and time of a capture; exposure None for a noise-free one, which takes no time.
 
     Exposures follow each other at once, or, where something moves, as the timing says.
@@ -173,13 +183,15 @@ def acquisition(capture: Capture, timing: Timing, moves: bool) -> dict[str, Any]
         pause = max(exposure, timing.frame_period_s) if moves else exposure
         lines = camera[0] if timing.lines == "rows" else camera[1]
         taken = (shots - 1) * pause + exposure + (lines - 1) * (timing.line_period_s if moves else 0.0)
-    return {
-        "sensor": capture.sensor.type_name,
-        "frames": len(capture.frames),
-        "exposure_s": exposure,
-        "acquisition_s": taken,
-        "pixels": int(capture.frames[0].size),
-    }
+    return MeasurementRecord(
+        sensor=capture.sensor.type_name,
+        frames=len(capture.frames),
+        exposure_s=exposure,
+        acquisition_s=taken,
+        pixels=int(capture.frames[0].size),
+        points=points,
+        times_s=times_s,
+    )
 
 
 @contextmanager

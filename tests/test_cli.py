@@ -178,7 +178,7 @@ def _write_bad_files(folder: Path) -> None:
         (["run", PLANE, "--spp", "-3"], "spp .* at least 1, got -3"),
         (["run", PLANE, "--width", "0"], "width .* at least 1, got 0"),
         (["run", PLANE, "--sensor", "grey"], "did you mean 'gray'"),
-        (["run", PLANE, "--baseline", "-1"], "positive baseline_m"),
+        (["run", PLANE, "--baseline", "-1"], "baseline_m to be positive"),
         (["run", "points.ply", "--material", "glass"], "material"),
         (["run", PLANE, "--material", "glossy"], "names its own materials"),
         (["run", "--config", "none.toml"], "none.toml does not exist"),
@@ -274,7 +274,7 @@ def test_progress_shows_on_a_terminal_alone(
 
 def test_version_and_help(command: Command) -> None:
     assert command("--version").out == f"rangesim {rangesim.__version__}\n"
-    for name in ("run", "decode", "compare", "report", "doctor"):
+    for name in ("run", "decode", "compare", "report", "verify", "doctor"):
         assert name in command("--help").out
         assert command(name, "--help").status == 0
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import re
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from browser import browser
@@ -57,7 +59,8 @@ def test_the_table_shows_the_statistics(html: str) -> None:
 
 def test_text_from_outside_is_escaped(tmp_path: Path) -> None:
     result = load_result(small_result())
-    result.info["scene"]["name"] = "<script>alert(1)</script>"
+    scene = msgspec.structs.replace(result.info.scene, name="<script>alert(1)</script>")
+    result = replace(result, info=msgspec.structs.replace(result.info, scene=scene))
     from rangesim.report import write_report
 
     write_report(result, tmp_path / "report.html")
@@ -176,7 +179,7 @@ def _measured(sensor: str, complete: float, median: float, outliers: float, acqu
     row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
     row |= {"failed": 0.05, "causes": {"multipath": 0.04, "low_signal": 0.01}}
     rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
-    facts = {"acquisition_s": acquisition_s, "frames": 10}
+    facts = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
     return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, facts=facts)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from browser import BROWSER, Page, browser
@@ -204,13 +205,13 @@ def _crafted_result() -> Result:
     measurements = tuple(
         _crafted(m, name, i < 2) for i, (m, name) in enumerate(zip(plain.measurements, names, strict=True))
     )
-    info = {
-        **plain.info,
-        "scene": {"name": f"scene {HOSTILE}", "sha256": HOSTILE},
-        "variant": HOSTILE,
-        "versions": {f"version {HOSTILE}": HOSTILE},
-        "experiment": {f"setting {HOSTILE}": HOSTILE, "instrument": [{HOSTILE: [HOSTILE]}]},
-    }
+    info = msgspec.structs.replace(
+        plain.info,
+        scene=msgspec.structs.replace(plain.info.scene, name=f"scene {HOSTILE}", sha256=HOSTILE),
+        variant=HOSTILE,
+        versions={f"version {HOSTILE}": HOSTILE},
+        experiment={f"setting {HOSTILE}": HOSTILE, "instrument": [{HOSTILE: [HOSTILE]}]},
+    )
     return replace(plain, measurements=measurements, info=info)
 
 

@@ -10,7 +10,7 @@ import typer
 
 import rangesim
 from rangesim.cli.decode import decode_command
-from rangesim.cli.results import compare_command, report_command
+from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
 from rangesim.doctor import doctor_command
 from rangesim.errors import RangesimError
@@ -22,6 +22,7 @@ app.command("run")(run_command)
 app.command("decode")(decode_command)
 app.command("compare")(compare_command)
 app.command("report")(report_command)
+app.command("verify")(verify_command)
 app.command("doctor")(doctor_command)
 
 

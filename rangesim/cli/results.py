@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim compare` and `rangesim report`: results that are there already."""
+"""`rangesim compare`, `report` and `verify`: results that are there already."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def compare_command(
 
     tables = []
     for folder in results:
-        for entry in read_settings(folder)["instruments"]:
-            name = entry["name"] if len(results) == 1 else f"{folder}: {entry['name']}"
-            tables.append((name, read_rows(folder / entry["name"])))
+        for entry in read_settings(folder).instruments:
+            name = entry.name if len(results) == 1 else f"{folder}: {entry.name}"
+            tables.append((name, read_rows(folder / entry.name)))
     if markdown:
         typer.echo(in_markdown(tables), nl=False)
     else:
@@ -50,6 +50,45 @@ def report_command(
     page = render_report(load_result(result))
     replace_listed_file(result, "report.html", page.encode(), RESULT)
     typer.echo(f"{result / 'report.html'}")
+
+
+def verify_command(
+    directory: Annotated[
+        Path, typer.Argument(help="A directory that rangesim wrote: a result, a capture, or what it decodes to.")
+    ],
+) -> None:
+    """Compare a directory with its manifest: every file's size and SHA-256.
+
+    Ends with status 1 if a file is missing or holds something else. Files of your own beside them are named and counted
+    for nothing.
+
+    Example:
+
+      rangesim verify out/tabletop
+    """
+    from pcgraph.output import verify_directory
+    from rangesim.capture_files import CAPTURE
+    from rangesim.cli.decoded_files import DECODED
+    from rangesim.errors import FileFormatError
+    from rangesim.result_files import RESULT
+
+    kinds = (RESULT, CAPTURE, DECODED)
+    kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)
+    if kind is None:
+        raise FileFormatError(
+            f"expected a directory that rangesim wrote, with {', '.join(k.sidecar for k in kinds[:-1])} or "
+            f"{kinds[-1].sidecar}; {directory} has none of them."
+        )
+    found = verify_directory(directory, kind)
+    for word, names in (("missing", found.missing), ("changed", found.changed), ("not rangesim's", found.foreign)):
+        for name in names:
+            typer.echo(f"{word}: {directory / name}")
+    if found.missing or found.changed:
+        raise FileFormatError(
+            f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} hold "
+            "something else than was written."
+        )
+    typer.echo(f"{directory}: all {found.files} files are as they were written.")
 
 
 def _print(markdown: str) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -107,12 +106,14 @@ def run_command(
 
 def _say_what_measured_nothing(out: Path) -> None:
     """A line on stderr if some instrument has not a single point: most often the scene is not in metres."""
-    from rangesim.result_files import read_settings
+    from rangesim.result_files import MeasurementRecord, read_settings
+    from rangesim.schema import read_record
 
-    distance = read_settings(out)["scene"]["working_distance_m"]
-    results = {p.parent.name: json.loads(p.read_text(encoding="utf-8")) for p in out.glob("*/measurement.json")}
-    blind = sorted(name for name, result in results.items() if result["points"] == 0)
+    settings = read_settings(out)
+    names = [entry.name for entry in settings.instruments]
+    blind = [name for name in names if not read_record(out / name / "measurement.json", MeasurementRecord).points]
     if blind:
+        distance = settings.scene.working_distance_m
         typer.echo(
             f"rangesim: {', '.join(blind)} measured no pixel at all, at a working distance of {distance:g} m; "
             "coordinates are metres (a mesh in millimetres needs --unit-m 0.001); in the dark, --spp or power helps.",

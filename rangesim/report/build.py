@@ -53,7 +53,7 @@ def context(result: Result) -> dict[str, Any]:
         "script": Markup("\n".join(_asset(name) for name in SCRIPTS)),
         "rules": StyleRules(),
         "content_policy": content_policy,
-        "scene": result.info["scene"],
+        "scene": result.info.scene,
         "titles": names,
         "references": [m.name for m in measurements if tables.is_reference(m)],
         "settings_line": tables.settings_line(result.experiment, camera[2], camera[1]),
@@ -74,8 +74,8 @@ def context(result: Result) -> dict[str, Any]:
         "costs": tables.cost_table(measurements),
         "transport": _transport(result, names),
         "viewer": _viewer_data(result, names, error),
-        "settings": _flat(result.info["experiment"]),
-        "versions": {**result.info["versions"], "Mitsuba variant": result.info["variant"]},
+        "settings": _flat(result.info.experiment),
+        "versions": {**result.info.versions, "Mitsuba variant": result.info.variant},
     }
 
 
@@ -92,11 +92,9 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
 
 def _frames(m: Measurement) -> dict[str, Any]:
     f = m.facts
-    taken = f"{f['frames']} frames"
-    if f["exposure_s"] is not None:
-        taken += (
-            f", {tables.seconds(f['exposure_s'])} each" if f["frames"] != 1 else f", {tables.seconds(f['exposure_s'])}"
-        )
+    taken = f"{f.frames} frames"
+    if f.exposure_s is not None:
+        taken += f", {tables.seconds(f.exposure_s)} each" if f.frames != 1 else f", {tables.seconds(f.exposure_s)}"
     else:
         taken += ", noise-free"
     return {
@@ -120,11 +118,11 @@ def _light(result: Result, number: int) -> dict[str, Any]:
 
 
 def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
-    times = result.info["times_s"]
+    times = result.info.times_s
     return [
         {
             "names": ", ".join(names[m.name] for m in result.measurements if m.light_pass == number),
-            "frames": str(sum(m.facts["frames"] for m in result.measurements if m.light_pass == number)),
+            "frames": str(sum(m.facts.frames for m in result.measurements if m.light_pass == number)),
             "time": tables.seconds(times[f"transport_{number}"]),
         }
         for number in range(1, len(result.energy) + 1)

@@ -204,10 +204,10 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
     """Per instrument: frames, exposure, acquisition, decoding, segmentation, points per pixel."""
     table = []
     for m in measurements:
-        f, times = m.facts, m.facts["times_s"]
-        cells = [str(f["frames"]), seconds(f["exposure_s"]), seconds(f["acquisition_s"])]
+        f, times = m.facts, m.facts.times_s
+        cells = [str(f.frames), seconds(f.exposure_s), seconds(f.acquisition_s)]
         cells += [seconds(times.get(stage)) for stage in ("exposure", "decode", "points", "segmentation")]
-        table.append((m.name, [*cells, f"{f['points']:,}".replace(",", " "), f"{f['points'] / f['pixels']:.2f}"]))
+        table.append((m.name, [*cells, f"{f.points:,}".replace(",", " "), f"{f.points / f.pixels:.2f}"]))
     return table
 
 
