@@ -82,8 +82,8 @@ def check_fields(setting: Any) -> None:
 
 def check_number(name: str, value: Any, bounds: Bounds) -> None:
     """Raise ValueError unless `value` is a number, and within its bounds."""
-    if not _is_number(value) or value not in bounds:
-        raise ValueError(f"expected {name} to be {bounds}, got {shown(value)}.")
+    kind = int if bounds.words.startswith("a whole number") else float
+    _number(kind, value.item() if isinstance(value, np.generic) else value, name, bounds)
 
 
 @lru_cache(maxsize=256)

@@ -10,15 +10,20 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pcgraph.output import write_file
-from rangesim.config import from_dict, to_dict
+from rangesim.bounds import Bounds, check_number, whole
+from rangesim.config import from_dict, shown, to_dict
 from rangesim.errors import FileFormatError
 from rangesim.rig import Intrinsics, Rig
+from rangesim.text_files import check_xml, read_json
 
+LARGEST = 1e9
+"""Of a number in a calibration file: pixels, millimetres, coefficients."""
 _SHAPES = {
     "img_shape": 2,
     "cam_int": 9,
@@ -60,10 +65,14 @@ def load_calibration(
         raise FileFormatError(f"{path} does not exist; expected a calibration file (.xml or .json).")
     if path.suffix.lower() != ".xml":
         return _load_json(path)
-    if code_step < 1 or not unit_m > 0:
-        raise ValueError(f"expected a positive code_step and unit_m, got {code_step} and {unit_m}.")
+    check_number("code_step", code_step, whole(1, "projector"))
+    check_number("unit_m", unit_m, Bounds("metres per unit", 1e-9, 1e6))
     if projector_size is None:
         raise ValueError(f"expected projector_size (width, height) in pixels: {path} does not hold it.")
+    if not isinstance(projector_size, Sequence) or len(projector_size) != 2:
+        raise ValueError(f"expected projector_size (width, height) in pixels, got {shown(projector_size)}.")
+    for name, size in zip(("projector width", "projector height"), projector_size, strict=True):
+        check_number(name, size, whole(1, "projector"))
     values = _read_opencv(path)
     try:
         return _rig(values, projector_size, code_step, unit_m)
@@ -78,20 +87,14 @@ def save_calibration(rig: Rig, path: str | Path) -> None:
 
 def _load_json(path: Path) -> Rig:
     try:
-        return from_dict(Rig, json.loads(path.read_text(encoding="utf-8")), "rig")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path} is no text file.") from error
-    except json.JSONDecodeError as error:
-        raise FileFormatError(f"{path} is no valid JSON: {error}.") from error
+        return from_dict(Rig, read_json(path), "rig")
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
 
 
 def _read_opencv(path: Path) -> dict[str, np.ndarray]:
-    try:
-        root = ET.parse(path).getroot()
-    except ET.ParseError as error:
-        raise FileFormatError(f"{path} is no valid XML: {error}.") from error
+    check_xml(path)
+    root = ET.parse(path).getroot()
     values = {}
     for name, size in _SHAPES.items():
         text = root.findtext(f"{name}/data")
@@ -101,12 +104,16 @@ def _read_opencv(path: Path) -> dict[str, np.ndarray]:
             values[name] = np.array(text.split(), dtype=np.float64)
         except ValueError as error:
             raise FileFormatError(f"{path}: matrix {name!r} does not hold numbers.") from error
+        if not (np.abs(values[name]) < LARGEST).all():
+            raise FileFormatError(f"{path}: expected numbers below {LARGEST:g} in {name!r}, got {text.split()}.")
         if values[name].size != size:
             raise FileFormatError(f"{path}: expected {size} numbers in {name!r}, got {values[name].size}.")
     return values
 
 
 def _rig(values: dict[str, np.ndarray], projector_size: tuple[int, int], code_step: int, unit_m: float) -> Rig:
+    if (values["img_shape"] % 1 != 0).any():
+        raise ValueError(f"expected img_shape to hold whole numbers, got {values['img_shape'].tolist()}.")
     height, width = (int(n) for n in values["img_shape"])
     projector_from_camera = np.eye(4)
     projector_from_camera[:3, :3] = _nearest_rotation(values["roration"].reshape(3, 3))
@@ -125,5 +132,7 @@ def _intrinsics(width: int, height: int, matrix: np.ndarray, distortion: np.ndar
 
 
 def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    u, _, vt = np.linalg.svd(matrix)
+    u, scales, vt = np.linalg.svd(matrix)
+    if not np.allclose(scales, 1, atol=0.01):
+        raise ValueError(f"expected 'roration' to hold a rotation matrix, got {matrix.tolist()}.")
     return np.asarray(u @ vt)

@@ -134,7 +134,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     if hint is np.ndarray or get_origin(hint) is np.ndarray:
         try:
             return np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{where}: expected an array of numbers, got {shown(value)}.") from error
     try:
         return msgspec.convert(value, hint)

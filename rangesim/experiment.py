@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from rangesim.errors import FileFormatError
 from rangesim.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.motion import Motion
 from rangesim.motion.settings import motion_from_dict
+from rangesim.text_files import read_toml
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,7 @@ def load_experiment(path: str | Path) -> Experiment:
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; expected an experiment (.toml).")
     try:
-        experiment = experiment_from_dict(tomllib.loads(path.read_text(encoding="utf-8")))
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path} is no text file.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileFormatError(f"{path} is no valid TOML: {error}.") from error
+        experiment = experiment_from_dict(read_toml(path))
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
     beside = path.parent / experiment.scene

@@ -3,14 +3,26 @@
 
 from __future__ import annotations
 
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from rangesim import limits
 from rangesim.errors import FileFormatError
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".exr")
 """Files that `read_grey` takes for images."""
+_BROKEN = (
+    *(OSError, ValueError, SyntaxError, RuntimeError, LookupError, TypeError, EOFError, ArithmeticError, MemoryError),
+    *(struct.error, zlib.error),
+)
+"""What Pillow and OpenEXR raise on a file that is no image, or broken."""
 
 
 def write_grey(path: Path, image: np.ndarray) -> None:
@@ -38,8 +50,25 @@ def read_grey(path: Path) -> np.ndarray:
         return _read_exr(path) if path.suffix.lower() == ".exr" else _read_raster(path)
     except FileFormatError:
         raise
-    except (OSError, ValueError, SyntaxError, RuntimeError, KeyError) as error:
+    except _BROKEN as error:
         raise FileFormatError(f"{path} cannot be read as an image: {error}.") from error
+
+
+def check_size(path: Path) -> None:
+    """Raise FileFormatError if the header of an image file states more pixels, or bytes, than the limits allow.
+
+    Nothing is decoded. A file that is no image, or of another format than those of `read_grey`, passes.
+    """
+    try:
+        if path.suffix.lower() == ".exr":
+            _open_exr(path)
+        else:
+            with _open_raster(path):
+                pass
+    except FileFormatError:
+        raise
+    except _BROKEN:
+        return  # whoever decodes it says so
 
 
 def read_stack(paths: list[Path]) -> np.ndarray:
@@ -67,9 +96,23 @@ def read_stack(paths: list[Path]) -> np.ndarray:
     return frames
 
 
+def _open_exr(path: Path) -> None:
+    """Check the sizes in the headers of an OpenEXR file, before the library allocates them."""
+    import OpenEXR
+
+    pixels = size = 0
+    for part in OpenEXR.File(str(path), header_only=True).parts:
+        low, high = part.header["dataWindow"]
+        area = math.prod(max(0, int(b) - int(a) + 1) for a, b in zip(low, high, strict=True))
+        pixels, size = max(pixels, area), size + 4 * area * len(part.header["channels"])
+    limits.check("pixels", pixels, f"pixels in {path}", FileFormatError)
+    limits.check("bytes", size, f"bytes in {path}, decompressed", FileFormatError)
+
+
 def _read_exr(path: Path) -> np.ndarray:
     import OpenEXR
 
+    _open_exr(path)
     channels = {name: c.pixels for name, c in OpenEXR.File(str(path), separate_channels=True).channels().items()}
     if "Y" in channels:
         return np.asarray(channels["Y"], dtype=np.float32)
@@ -77,10 +120,32 @@ def _read_exr(path: Path) -> np.ndarray:
     return np.asarray(0.299 * r + 0.587 * g + 0.114 * b, dtype=np.float32)
 
 
-def _read_raster(path: Path) -> np.ndarray:
-    from PIL import Image
+@contextmanager
+def _open_raster(path: Path) -> Iterator[Any]:
+    """The Pillow image of a file, not yet decoded, whose size is within the limits.
 
-    with Image.open(path) as image:
+    `Image.open` would try every format, and apply a limit of its own, which is one for the whole process.
+    """
+    from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, TiffImagePlugin
+
+    plugins = (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
+               PpmImagePlugin.PpmImageFile, TiffImagePlugin.TiffImageFile)  # fmt: skip
+    with path.open("rb") as file:
+        start = file.read(16)
+        for plugin in plugins:
+            factory, accepts = Image.OPEN[plugin.format]
+            if accepts is None or accepts(start) is not True:
+                continue
+            file.seek(0)
+            with factory(file, str(path)) as image:
+                limits.check("pixels", image.width * image.height, f"pixels in {path}", FileFormatError)
+                yield image
+            return
+    raise FileFormatError(f"{path} cannot be read as an image: it is none of {', '.join(p.format for p in plugins)} or OpenEXR.")
+
+
+def _read_raster(path: Path) -> np.ndarray:
+    with _open_raster(path) as image:
         if image.format == "PNG" and _is_deep_colour_png(path):
             raise FileFormatError(f"{path} is a colour PNG of 16 bits, which is not supported; convert it to grey.")
         if image.mode in ("I;16", "I;16L", "I;16B", "I;16N", "I"):

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays of .npz files, read within the limits: sizes are known, and checked, before anything is decompressed."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from rangesim import limits
+from rangesim.config import shown
+from rangesim.errors import FileFormatError
+
+KINDS = "biufcSU"
+"""Kinds of NumPy types that are read: numbers and text of fixed size, no objects."""
+MAX_ARRAYS = 1000
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    """Arrays of a .npz file by name, as `numpy.savez` and `numpy.savez_compressed` write it.
+
+    Nothing is unpickled. Their sizes, as the file states them, are checked against the limit `bytes` first, and hold:
+    a member that is longer or shorter than it states is refused.
+
+    Parameters
+    ----------
+    names : those to read; None: all.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing, broken, too large, lacks one of `names`, or holds objects.
+    """
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = _members(archive, path)
+            wanted = list(members) if names is None else list(names)
+            missing = [name for name in wanted if name not in members]
+            if missing:
+                raise FileFormatError(f"{path}: expected an array {missing[0]!r}, found none of that name.")
+            total = sum(members[name].file_size for name in wanted)
+            limits.check("bytes", total, f"bytes in {path}, decompressed", FileFormatError)
+            return {name: _read(archive, members[name], f"{path}: array {shown(name)}") for name in wanted}
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError) as error:
+        reason = getattr(error, "strerror", None) or str(error) or "it ends early"
+        raise FileFormatError(f"{path} cannot be read as .npz: {reason}.") from error
+    except (NotImplementedError, RuntimeError, ValueError, OverflowError) as error:  # of odd entries in the directory
+        raise FileFormatError(f"{path} cannot be read as .npz: {error}.") from error
+
+
+def _members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
+    entries = archive.infolist()
+    if len(entries) > MAX_ARRAYS:
+        raise FileFormatError(f"{path}: expected at most {MAX_ARRAYS} arrays, got {len(entries)}.")
+    members: dict[str, zipfile.ZipInfo] = {}
+    for entry in entries:
+        name = entry.filename.removesuffix(".npy")
+        if name == entry.filename or entry.flag_bits & 1 or entry.compress_type not in _METHODS or name in members:
+            raise FileFormatError(
+                f"{path}: expected arrays (.npy) as numpy.savez writes them, got {shown(entry.filename)}."
+            )
+        members[name] = entry
+    return members
+
+
+def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: str) -> np.ndarray:
+    with archive.open(entry) as file:
+        shape, fortran_order, dtype = _header(file, place)
+        size = math.prod(shape) * dtype.itemsize
+        if size != entry.file_size - file.tell():
+            raise FileFormatError(f"{place}: expected {size} bytes as its header says, got another number.")
+        array: np.ndarray = np.empty(math.prod(shape), dtype=dtype)
+        view, filled = array.view(np.uint8).data, 0
+        while filled < size:
+            count = file.readinto(view[filled:])  # type: ignore[attr-defined]
+            if not count:
+                raise FileFormatError(f"{place} ends early.")
+            filled += count
+        file.read(1)  # the end, where the checksum is compared
+    return array.reshape(shape, order="F" if fortran_order else "C")
+
+
+def _header(file: IO[bytes], place: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    try:
+        version = np.lib.format.read_magic(file)
+        if version not in _HEADERS:
+            raise ValueError(f"version {version} is unknown")
+        shape, fortran_order, dtype = _HEADERS[version](file)
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError) as error:
+        raise FileFormatError(f"{place}: its header is broken: {' '.join(str(error).split())[:200]}.") from error
+    if dtype.kind not in KINDS or dtype.itemsize == 0 or len(shape) > 8 or any(n < 0 for n in shape):
+        raise FileFormatError(f"{place}: expected numbers or text, got {shown(dtype)} of shape {shown(shape)}.")
+    return shape, fortran_order, dtype
