@@ -18,17 +18,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from scipy.special import ndtr
 
+from rangesim.bounds import Bounds, check_fields
 from rangesim.sunlight import BELOW_W_M2, EDGES_NM, SPECTRAL_W_M2_NM, TOTAL_W_M2
 
 SECOND_RADIATION_CONSTANT = 1.438_776_877e-2
 """h c / k in metre kelvins (CODATA 2018)."""
 LUMINOUS_EFFICACY = 683.0
 """Lumens per watt at the peak of V(lambda)."""
+Kelvins = Annotated[float, Bounds("positive and finite", 300, 1e5)]
+Strength = Annotated[float, Bounds("0 or positive", 0, 1e12)]
 _VISIBLE_NM = np.arange(380.0, 781.0)
 
 
@@ -81,7 +84,10 @@ class Tungsten(Illuminant):
     temperature_k : float, kelvins; CIE illuminant A is 2856, a halogen lamp about 3000.
     """
 
-    temperature_k: float = 2856.0
+    temperature_k: Kelvins = 2856.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def below(self, wavelength_nm: np.ndarray) -> np.ndarray:
         """15 / pi^4 sum of e^(-n x) / n (x^3 + 3 x^2 / n + 6 x / n^2 + 6 / n^3), x = c2 / (lambda T).
@@ -134,23 +140,15 @@ class Ambient:
     """
 
     illuminant: Literal["sun", "tungsten", "led"]
-    illuminance_lux: float | None = None
-    irradiance_w_m2: float | None = None
-    scene_irradiance_w_m2: float = 1.0
-    temperature_k: float = 2856.0
+    illuminance_lux: Strength | None = None
+    irradiance_w_m2: Strength | None = None
+    scene_irradiance_w_m2: Annotated[float, Bounds("positive and finite", 1e-9, 1e12)] = 1.0
+    temperature_k: Kelvins = 2856.0
 
     def __post_init__(self) -> None:
-        if self.illuminant not in ("sun", "tungsten", "led"):
-            raise ValueError(f"expected an illuminant out of sun, tungsten, led, got {self.illuminant!r}.")
+        check_fields(self)
         if self.illuminance_lux is not None and self.irradiance_w_m2 is not None:
             raise ValueError("expected illuminance_lux or irradiance_w_m2, got both.")
-        for name in ("illuminance_lux", "irradiance_w_m2"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < np.inf:
-                raise ValueError(f"expected {name} to be at least 0 and finite, got {value}.")
-        for name in ("scene_irradiance_w_m2", "temperature_k"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"expected {name} to be positive and finite, got {getattr(self, name)}.")
 
     def check_emitters(self, scene_has_any: bool) -> None:
         """Raise ValueError if there is light to scale, but none in the scene."""

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pcgraph.output import write_file
 from rangesim.config import from_dict, to_dict
 from rangesim.errors import FileFormatError
 from rangesim.rig import Intrinsics, Rig
-from rangesim.staging import write_file
 
 _SHAPES = {
     "img_shape": 2,
@@ -73,7 +73,7 @@ def load_calibration(
 
 def save_calibration(rig: Rig, path: str | Path) -> None:
     """Write a rig as JSON; `load_calibration` reads it back equal."""
-    write_file(Path(path), (json.dumps(to_dict(rig), indent=1) + "\n").encode())
+    write_file(Path(path), (json.dumps(to_dict(rig), indent=1) + "\n").encode(), FileFormatError, make_parents=True)
 
 
 def _load_json(path: Path) -> Rig:

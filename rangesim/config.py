@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import reprlib
 import types
 import typing
 from collections.abc import Mapping
@@ -52,7 +53,7 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
     """
     place = where or cls.__name__
     if not isinstance(data, Mapping):
-        raise ValueError(f"{place}: expected a table of settings, got {type(data).__name__} {data!r}.")
+        raise ValueError(f"{place}: expected a table of settings, got {type(data).__name__} {shown(data)}.")
     values = dict(data)
     cls = _concrete(cls, values, place)
     hints = get_type_hints(cls)
@@ -68,17 +69,32 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
         raise ValueError(f"{place}: {error}") from error
 
 
+def shown(value: Any) -> str:
+    """`repr` of a value for a message, cut to a readable length."""
+    if isinstance(value, int) and abs(value) >= 10**30:
+        return f"{'-' if value < 0 else ''}2^{value.bit_length() - 1} or more"  # Python refuses to print the longest
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape} and type {value.dtype}"
+    return _SHORT.repr(value)
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 100
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxarray = 8
+_SHORT.maxlevel = 3
+
+
 def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:
     """Raise ValueError on the first key that is not valid, naming the nearest valid one."""
     valid = list(valid)
     for key in given:
         if key not in valid:
-            raise ValueError(f"{place}: unknown key {key!r}{nearest(key, valid)}; valid are {', '.join(valid)}.")
+            raise ValueError(f"{place}: unknown key {shown(key)}{nearest(key, valid)}; valid are {', '.join(valid)}.")
 
 
 def nearest(name: str, valid: typing.Iterable[str]) -> str:
     """' (did you mean ...?)' if some valid name is close to `name`, else ''."""
-    close = difflib.get_close_matches(str(name), list(valid), n=1, cutoff=0.5)
+    close = difflib.get_close_matches(str(name)[:100], list(valid), n=1, cutoff=0.5)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
@@ -97,7 +113,7 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     tag = values.pop("type", own)
     if tag not in choices:
         raise ValueError(
-            f"{place}: expected 'type' to be one of {', '.join(choices)}, got {tag!r}{nearest(str(tag), choices)}."
+            f"{place}: expected 'type' to be one of {', '.join(choices)}, got {shown(tag)}{nearest(str(tag), choices)}."
         )
     return choices[tag]
 
@@ -110,7 +126,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         hint = next(arg for arg in get_args(hint) if arg is not type(None))
     if get_origin(hint) is typing.Literal and value not in get_args(hint):
         valid = get_args(hint)
-        raise ValueError(f"{where}: expected one of {', '.join(valid)}, got {value!r}{nearest(value, valid)}.")
+        raise ValueError(f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(value, valid)}.")
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_dict(hint, value, where)
     if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):
@@ -119,11 +135,11 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         try:
             return np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{where}: expected an array of numbers, got {value!r}.") from error
+            raise ValueError(f"{where}: expected an array of numbers, got {shown(value)}.") from error
     try:
         return msgspec.convert(value, hint)
     except msgspec.ValidationError as error:
         expected, _, rest = str(error).partition(", got ")
         inner = rest.partition(" - at `$")[2].rstrip("`")  # such as [1]
         wanted = expected.replace("`", "").replace("Expected", "expected")
-        raise ValueError(f"{where}{inner}: {wanted}, got {value!r}.") from error
+        raise ValueError(f"{where}{inner}: {wanted}, got {shown(value)}.") from error

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 
+from rangesim.bounds import Bounds, Fraction, Metres, PositiveFraction, Seconds, Wavelength, check_fields
 from rangesim.rig import Rig
 from rangesim.sensors import DirectToF, Sensor
 
@@ -23,6 +24,11 @@ if TYPE_CHECKING:
 
 PLANCK_TIMES_C = 6.626_070_15e-34 * 299_792_458.0
 """h c in joule metres, exact."""
+
+
+Bits = Annotated[int, Bounds("a number of bits", 1, 16)]
+BandWidth = Annotated[float, Bounds("0 or positive", 1e-12, 2e-2, or_zero=True)]
+"""Metres."""
 
 
 class PhotoDetector(ABC):
@@ -74,20 +80,10 @@ class PhotoDetector(ABC):
         etendue = np.pi * rig.camera_aperture_radius_m**2 / (camera.fx * camera.fy)
         return float(etendue * self.quantum_efficiency * self.wavelength_m / PLANCK_TIMES_C)
 
-    def _check(self, *positive: str) -> None:
-        for name in ("wavelength_m", "min_exposure_s", "max_exposure_s", *positive):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"expected {name} to be positive and finite, got {getattr(self, name)}.")
-        if not 0 < self.quantum_efficiency <= 1:
-            raise ValueError(f"expected a quantum_efficiency in (0, 1], got {self.quantum_efficiency}.")
-        if not 0 <= self.ambient_transmission <= 1:
-            raise ValueError(f"expected an ambient_transmission in 0..1, got {self.ambient_transmission}.")
-        if not 0 <= self.band_width_m < 2 * self.wavelength_m:
-            raise ValueError(
-                f"expected a band_width_m of at least 0 m and a filter that ends above 0 m, got {self.band_width_m}."
-            )
-        if not 1 <= self.bits <= 16:
-            raise ValueError(f"expected 1 to 16 bits, got {self.bits}.")
+    def _check(self) -> None:
+        check_fields(self)
+        if self.band_width_m >= 2 * self.wavelength_m:
+            raise ValueError(f"expected a band_width_m whose filter ends above 0 m, got {self.band_width_m}.")
         if self.min_exposure_s > self.max_exposure_s:
             raise ValueError(
                 f"expected min_exposure_s <= max_exposure_s, got {self.min_exposure_s} > {self.max_exposure_s}."
@@ -123,29 +119,24 @@ class Detector(PhotoDetector):
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
     """
 
-    wavelength_m: float = 850e-9
-    quantum_efficiency: float = 0.4
-    full_well_e: float = 12_000.0
-    read_noise_e: float = 5.0
-    dark_current_e_s: float = 20.0
-    bits: int = 12
-    offset_dn: float = 16.0
-    ambient_transmission: float = 0.05
-    band_width_m: float = 50e-9
-    pixel_pitch_m: float = 5e-6
-    min_exposure_s: float = 10e-6
-    max_exposure_s: float = 0.1
+    wavelength_m: Wavelength = 850e-9
+    quantum_efficiency: PositiveFraction = 0.4
+    full_well_e: Annotated[float, Bounds("positive and finite", 1, 1e9)] = 12_000.0
+    read_noise_e: Annotated[float, Bounds("0 or positive", 0, 1e9)] = 5.0
+    dark_current_e_s: Annotated[float, Bounds("0 or positive", 0, 1e12)] = 20.0
+    bits: Bits = 12
+    offset_dn: Annotated[float, Bounds("0 or positive", 0, 65535)] = 16.0
+    ambient_transmission: Fraction = 0.05
+    band_width_m: BandWidth = 50e-9
+    pixel_pitch_m: Metres = 5e-6
+    min_exposure_s: Seconds = 10e-6
+    max_exposure_s: Seconds = 0.1
 
     type_name: ClassVar[str] = "emva1288"
 
     def __post_init__(self) -> None:
-        self._check("full_well_e", "pixel_pitch_m")
-        if self.read_noise_e < 0 or self.dark_current_e_s < 0:
-            raise ValueError(
-                f"expected no negative noise, got read_noise_e {self.read_noise_e}, "
-                f"dark_current_e_s {self.dark_current_e_s}."
-            )
-        if not 0 <= self.offset_dn < self.max_dn:
+        self._check()
+        if self.offset_dn >= self.max_dn:
             raise ValueError(f"expected 0 <= offset_dn < {self.max_dn}, got {self.offset_dn}.")
 
     @classmethod

@@ -7,9 +7,11 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from rangesim import limits
 from rangesim.ambient import Ambient
+from rangesim.bounds import Metres, check_fields, whole
 from rangesim.catalogue import scene_names
 from rangesim.config import check_keys, from_dict, to_dict
 from rangesim.errors import FileFormatError
@@ -41,12 +43,12 @@ class Experiment:
 
     scene: str
     material: str | None = None
-    unit_m: float | None = None
-    width: int | None = None
-    height: int | None = None
-    spp: int = 64
-    max_depth: int = 5
-    photons: int | None = None
+    unit_m: Metres | None = None
+    width: Annotated[int, whole(1, "pixels")] | None = None
+    height: Annotated[int, whole(1, "pixels")] | None = None
+    spp: Annotated[int, whole(1, "spp")] = 64
+    max_depth: Annotated[int, whole(1, "depth")] = 5
+    photons: Annotated[int, whole(0, "photons")] | None = None
     glint: bool = True
     seed: int = 0
     ambient: Ambient | None = None
@@ -54,12 +56,11 @@ class Experiment:
     motion: Motion | None = None
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "spp", "max_depth"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"expected {name} to be a whole number of at least 1, got {value}.")
-        if self.photons is not None and self.photons < 0:
-            raise ValueError(f"expected no negative number of photons, got {self.photons}.")
+        check_fields(self)
+        if not self.scene:
+            raise ValueError("expected scene to be the path of a scene or a mesh, got an empty one.")
+        limits.check("pixels", (self.width or 1) * (self.height or 1), f"pixels, not {self.width} x {self.height}")
+        limits.check("instruments", len(self.instruments), "instruments")
         if self.seed < 0:
             raise ValueError(f"expected a seed of at least 0, got {self.seed}.")
         for one in self.instruments if self.motion else ():
@@ -72,8 +73,7 @@ class Experiment:
         names = [i.name for i in self.instruments]
         if not names:
             raise ValueError("expected at least one instrument, got none.")
-        twice = [n for n in names if names.count(n) > 1]
-        if twice:
+        if twice := [n for n in names if names.count(n) > 1]:
             raise ValueError(f"expected instruments of different names, got {twice[0]!r} twice.")
 
 

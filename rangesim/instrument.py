@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from rangesim.config import check_keys, from_dict, nearest, to_dict
+from rangesim.bounds import Exponent, Metres, Seconds, Watts, check_fields
+from rangesim.config import check_keys, from_dict, nearest, shown, to_dict
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.motion import Timing
-from rangesim.rig import check_optics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 from rangesim.spad import SpadDetector
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 TOF_BASELINE_M = 0.03
 """Metres from the camera's lens to the lamp beside it, of a time-of-flight camera."""
+LONGEST_NAME = 100
+"""Characters; the name becomes that of a directory."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
@@ -28,15 +30,15 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 class Optics:
     """Lenses of an instrument; see `rangesim.rig.Rig` for the parameters. The default is a sharp, even pinhole."""
 
-    camera_aperture_radius_m: float = 0.75e-3
-    projector_aperture_radius_m: float = 2e-3
-    camera_focus_m: float | None = None
-    projector_focus_m: float | None = None
-    camera_vignetting: float = 0.0
-    projector_vignetting: float = 0.0
+    camera_aperture_radius_m: Metres = 0.75e-3
+    projector_aperture_radius_m: Metres = 2e-3
+    camera_focus_m: Metres | None = None
+    projector_focus_m: Metres | None = None
+    camera_vignetting: Exponent = 0.0
+    projector_vignetting: Exponent = 0.0
 
     def __post_init__(self) -> None:
-        check_optics(self)
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -61,19 +63,18 @@ class Instrument:
     sensor: Sensor
     detector: PhotoDetector | None = None
     noise: bool = True
-    baseline_m: float | None = None
-    power_w: float = 1.0
-    exposure_s: float | None = None
+    baseline_m: Metres | None = None
+    power_w: Watts = 1.0
+    exposure_s: Seconds | None = None
     optics: Optics = field(default_factory=Optics)
     timing: Timing = field(default_factory=Timing)
 
     def __post_init__(self) -> None:
-        if not _NAME.fullmatch(self.name):
-            raise ValueError(f"expected a name of letters, digits, - and _, got {self.name!r}.")
-        for name in ("baseline_m", "power_w", "exposure_s"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise ValueError(f"expected a positive {name}, got {value}.")
+        check_fields(self)
+        if not _NAME.fullmatch(self.name) or len(self.name) > LONGEST_NAME:
+            raise ValueError(
+                f"expected a name of letters, digits, - and _, at most {LONGEST_NAME}, got {shown(self.name)}."
+            )
         usual = self.detector or default_detector(self.sensor)
         object.__setattr__(self, "detector", usual if self.noise else None)
 
@@ -118,13 +119,13 @@ def instrument(name: str, **settings: Any) -> Instrument:
 
 
 def _unknown(name: str) -> str:
-    return f"expected a sensor out of {', '.join(SENSORS)}, got {name!r}{nearest(name, SENSORS)}."
+    return f"expected a sensor out of {', '.join(SENSORS)}, got {shown(name)}{nearest(name, SENSORS)}."
 
 
 def instrument_from_dict(table: Any, place: str) -> Instrument:
     """An instrument; its sensor is a table with a `type`, or a short name out of `SENSORS`."""
     if not isinstance(table, Mapping):
-        raise ValueError(f"{place}: expected a table of settings, got {table!r}.")
+        raise ValueError(f"{place}: expected a table of settings, got {shown(table)}.")
     values = dict(table)
     check_keys(values, [f.name for f in fields(Instrument)], place)
     sensor = values.get("sensor")

@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rangesim
+from pcgraph.output import new_directory
 from rangesim.capture import Capture
+from rangesim.capture_files import write_capture
 from rangesim.causes import explain
 from rangesim.experiment import Experiment
 from rangesim.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.provenance import provenance
-from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, save_range_image
-from rangesim.staging import new_directory, write_json
+from rangesim.result_files import RESULT, SETTINGS, load_result, save_causes, save_range_image
+from rangesim.schema import write_json
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -42,7 +44,8 @@ FEWEST_POINTS = 3
 def run(experiment: Experiment, out: str | Path, progress: Progress | None = None, scene: Scene | None = None) -> None:
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
-    The directory appears when all is done; a failure leaves nothing behind. An older result of that name is replaced.
+    The files appear when all is done; a failure leaves nothing behind. An older result of that name is replaced; files
+    that somebody else put there stay. See `pcgraph.output`.
 
     Parameters
     ----------
@@ -51,7 +54,8 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        A setting out of range, a scene that cannot be loaded, foreign contents in `out`, or no suitable LLVM.
+        A setting out of range, a scene that cannot be loaded, no suitable LLVM, or an `out` that cannot take a result
+        (see `pcgraph.output.check_directory`).
     """
     import mitsuba as mi
 
@@ -59,7 +63,7 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
     from rangesim.report import write_report
 
     say = progress or (lambda stage, share: None)
-    with new_directory(out, SETTINGS, FORMAT) as folder:
+    with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
         times: dict[str, float] = {}
         say("Loading the scene", 0.0)
         with timed(times, "load"):
@@ -92,7 +96,8 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     with timed(times, "exposure"):
         detector = _in_time(one) if moves else one.detector
         capture = rangesim.expose(signals, one.sensor, detector, one.exposure_s, seed, ambient)
-    capture.save(folder / "capture")
+    (folder / "capture").mkdir()
+    write_capture(capture, folder / "capture")
     with timed(times, "decode"):
         image = rangesim.decode(capture)
     save_range_image(image, folder / "range.npz")

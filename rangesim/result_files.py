@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of an experiment as a directory, and back.
 
-DIR/experiment.json      resolved settings, versions, and which instruments share which pass
+DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.output`
+    experiment.json      resolved settings, versions, and which instruments share which pass
     pass_1.npz           energy split and ground truth of each transport pass
     comparison.md        statistics of all instruments
     report.html
@@ -21,17 +22,20 @@ from typing import Any
 
 import numpy as np
 
+from pcgraph.output import DirectoryKind, recover
 from rangesim.capture import Capture
 from rangesim.capture_files import load_capture
 from rangesim.causes import CauseMap
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.range_image import RangeImage
+from rangesim.schema import read_sidecar
 from rangesim.signals import EnergySplit, GroundTruth
-from rangesim.staging import read_sidecar
 
 SETTINGS = "experiment.json"
 FORMAT = "rangesim-result"
+RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
+"""Directories that hold the results of an experiment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +122,7 @@ def load_result(directory: str | Path) -> Result:
 
 def read_settings(folder: Path) -> dict[str, Any]:
     """Contents of `experiment.json`; FileFormatError if there is none of ours."""
+    recover(folder, FileFormatError)
     return read_sidecar(folder / SETTINGS, FORMAT)
 
 

@@ -4,18 +4,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangesim.config import to_dict
+from rangesim import limits
+from rangesim.bounds import FARTHEST_M, Bounds, Exponent, Metres, Watts, check_fields, check_number, whole
+from rangesim.config import shown, to_dict
 from rangesim.distortion import distort, fold_radius2, undistort
 
 Array = NDArray[np.float64]
 
 RESIDUAL_PX = 1e-3
 """Where the inverse of a lens model reprojects worse than this, there is none."""
+
+
+FocalLength = Annotated[float, Bounds("positive and finite", 1e-3, 1e9)]
+"""Pixels."""
+PrincipalPoint = Annotated[float, Bounds("a pixel coordinate", -1e9, 1e9)]
+Coefficient = Annotated[float, Bounds("a coefficient", -1e6, 1e6)]
 
 
 @dataclass(frozen=True)
@@ -29,27 +37,26 @@ class Intrinsics:
     distortion : tuple of 0 to 5 floats, OpenCV's order k1, k2, p1, p2, k3.
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
+    width: Annotated[int, whole(1)]
+    height: Annotated[int, whole(1)]
+    fx: FocalLength
+    fy: FocalLength
+    cx: PrincipalPoint
+    cy: PrincipalPoint
+    distortion: tuple[Coefficient, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"expected a positive image size, got {self.width} x {self.height}.")
-        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
-            raise ValueError(f"expected positive finite focal lengths in pixels, got fx {self.fx}, fy {self.fy}.")
-        if len(self.distortion) > 5 or not np.isfinite(self.distortion).all():
-            raise ValueError(f"expected at most 5 finite distortion coefficients, got {self.distortion}.")
+        check_fields(self)
+        limits.check("pixels", self.width * self.height, f"pixels, not {shown(self.width)} x {shown(self.height)}")
+        if len(self.distortion) > 5:
+            raise ValueError(f"expected at most 5 distortion coefficients, got {shown(self.distortion)}.")
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov_x_deg: float) -> Intrinsics:
         """Square pixels, principal point in the centre, horizontal field of view in degrees."""
-        if not 0 < fov_x_deg < 180:
-            raise ValueError(f"expected a field of view between 0 and 180 degrees, got {fov_x_deg}.")
+        check_number("fov_x_deg", fov_x_deg, Bounds("degrees between 0 and 180", 1e-6, 180 - 1e-6))
+        for name, value in (("width", width), ("height", height)):
+            check_number(name, value, whole(1))
         f = 0.5 * width / np.tan(np.radians(fov_x_deg) / 2)
         return cls(width, height, float(f), float(f), width / 2, height / 2)
 
@@ -112,9 +119,14 @@ class Intrinsics:
 
 def pose(matrix: ArrayLike, name: str) -> Array:
     """A read-only (4, 4) float64 copy of a rigid transform; ValueError if it is not one."""
-    result: Array = np.array(matrix, dtype=np.float64)
+    try:
+        result: Array = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"expected {name} to be a (4, 4) matrix, got {shown(matrix)}.") from None
     if result.shape != (4, 4) or not np.isfinite(result).all():
         raise ValueError(f"expected {name} to be a finite (4, 4) matrix, got shape {result.shape}.")
+    if np.abs(result).max() > FARTHEST_M:
+        raise ValueError(f"expected {name} to move by at most {FARTHEST_M:g} m, got {np.abs(result).max():g}.")
     rotation = result[:3, :3]
     rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(result[3], [0, 0, 0, 1]):
@@ -143,22 +155,6 @@ def translation(x: float, y: float, z: float) -> Array:
     return result
 
 
-def check_optics(lenses: Any) -> None:
-    """Raise ValueError if apertures, focus or vignetting of a `Rig` (or of what sets them) are not possible."""
-    for device in ("camera", "projector"):
-        rules = (
-            (f"{device}_aperture_radius_m", "to be positive", lambda x: 0 < x < np.inf),
-            (f"{device}_focus_m", "to be positive and finite, or None for a sharp lens", lambda x: 0 < x < np.inf),
-            (f"{device}_vignetting", "to be an exponent of at least 0", lambda x: 0 <= x < np.inf),
-        )
-        for name, expected, holds in rules:
-            value = getattr(lenses, name)
-            if value is None and name.endswith("focus_m"):
-                continue
-            if not (isinstance(value, (int, float, np.number)) and holds(value)):
-                raise ValueError(f"expected {name} {expected}, got {value!r}.")
-
-
 @dataclass(frozen=True, eq=False)
 class Rig:
     """A camera and the emitter (projector or modulated lamp) fixed to it.
@@ -181,20 +177,18 @@ class Rig:
     projector: Intrinsics
     T_world_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     T_camera_projector: np.ndarray = field(default_factory=lambda: np.eye(4))
-    camera_aperture_radius_m: float = 0.75e-3
-    projector_aperture_radius_m: float = 2e-3
-    projector_power_w: float = 1.0
-    camera_focus_m: float | None = None
-    projector_focus_m: float | None = None
-    camera_vignetting: float = 0.0
-    projector_vignetting: float = 0.0
+    camera_aperture_radius_m: Metres = 0.75e-3
+    projector_aperture_radius_m: Metres = 2e-3
+    projector_power_w: Watts = 1.0
+    camera_focus_m: Metres | None = None
+    projector_focus_m: Metres | None = None
+    camera_vignetting: Exponent = 0.0
+    projector_vignetting: Exponent = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
         object.__setattr__(self, "T_camera_projector", pose(self.T_camera_projector, "T_camera_projector"))
-        if not (isinstance(self.projector_power_w, (int, float)) and 0 < self.projector_power_w < np.inf):
-            raise ValueError(f"expected projector_power_w to be positive, got {self.projector_power_w!r}.")
-        check_optics(self)
+        check_fields(self)
 
     def __eq__(self, other: Any) -> bool:
         return isinstance(other, Rig) and to_dict(self) == to_dict(other)

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 
-from rangesim.detector import PhotoDetector, streams
+from rangesim.bounds import Bounds, Fraction, PositiveFraction, Seconds, Wavelength
+from rangesim.detector import BandWidth, Bits, PhotoDetector, streams
 from rangesim.rig import Rig
 from rangesim.sensors import DirectToF, Sensor
 
@@ -36,22 +37,20 @@ class SpadDetector(PhotoDetector):
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
     """
 
-    wavelength_m: float = 905e-9
-    quantum_efficiency: float = 0.15
-    dark_counts_hz: float = 500.0
-    bits: int = 12
+    wavelength_m: Wavelength = 905e-9
+    quantum_efficiency: PositiveFraction = 0.15
+    dark_counts_hz: Annotated[float, Bounds("0 or positive", 0, 1e12)] = 500.0
+    bits: Bits = 12
     pile_up: bool = False
-    ambient_transmission: float = 0.02
-    band_width_m: float = 30e-9
-    min_exposure_s: float = 10e-6
-    max_exposure_s: float = 0.1
+    ambient_transmission: Fraction = 0.02
+    band_width_m: BandWidth = 30e-9
+    min_exposure_s: Seconds = 10e-6
+    max_exposure_s: Seconds = 0.1
 
     type_name: ClassVar[str] = "spad"
 
     def __post_init__(self) -> None:
         self._check()
-        if self.dark_counts_hz < 0:
-            raise ValueError(f"expected no negative dark_counts_hz, got {self.dark_counts_hz}.")
 
     @property
     def capacity_e(self) -> float:

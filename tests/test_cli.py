@@ -258,18 +258,6 @@ def test_a_failure_halfway_leaves_nothing(command: Command, tmp_path: Path, monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interruption_is_said_and_leaves_nothing(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("rangesim.report.write_report", interrupt)
-    answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
-    assert (answer.status, answer.err) == (130, "rangesim: interrupted; nothing was written.\n")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_progress_shows_on_a_terminal_alone(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

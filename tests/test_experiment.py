@@ -68,7 +68,7 @@ def test_the_first_example_states_the_defaults() -> None:
         ({"scene": "a", "instrument": [{"name": "x"}]}, "missing 'sensor'"),
         ({"scene": "a", "instrument": [{"sensor": "grey"}]}, r"instrument\[0\].*did you mean 'gray'"),
         ({"scene": "a", "instrument": [{"sensor": "amcw", "basline_m": 1.0}]}, "did you mean 'baseline_m'"),
-        ({"scene": "a", "instrument": [{"sensor": "amcw", "baseline_m": 0.0}]}, "positive baseline_m"),
+        ({"scene": "a", "instrument": [{"sensor": "amcw", "baseline_m": 0.0}]}, "baseline_m to be positive"),
         ({"scene": "a", "instrument": [{"sensor": "amcw", "name": "../x"}]}, "name of letters"),
         ({"scene": "a", "instrument": [{"sensor": "amcw"}, {"sensor": "amcw"}]}, "'amcw' twice"),
         ({"scene": "a", "instrument": [{"name": "x", "sensor": {"type": "amcw"}}]}, "did you mean 'amcw-tof'"),
@@ -200,7 +200,7 @@ def test_optics_photons_and_glint_reach_the_pass() -> None:
     scene = rangesim.load_scene(ROOT / "scenes" / "plane.xml")
     rig = experiment.instruments[0].rig(scene)
     assert (rig.projector_focus_m, rig.camera_focus_m, rig.camera_vignetting) == (0.8, None, 4.0)
-    with pytest.raises(ValueError, match="expected no negative number of photons, got -1"):
+    with pytest.raises(ValueError, match="expected photons to be a whole number of at least 0, got -1"):
         Experiment("x.xml", photons=-1)
 
 

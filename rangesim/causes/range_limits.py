@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesim.decoding.amcw import MAX_RANGE_M
 from rangesim.range_image import RangeImage
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.sensors import AmcwToF, DirectToF, Sensor
@@ -16,7 +15,7 @@ from rangesim.status import Status
 def is_beyond_range(sensor: Sensor, path_length_m: np.ndarray) -> np.ndarray:
     """(...) bool: path lengths beyond twice the unambiguous range, or outside the histogram; else False."""
     if isinstance(sensor, AmcwToF):
-        return np.asarray(path_length_m > 2 * min(sensor.unambiguous_range_m, MAX_RANGE_M))
+        return np.asarray(path_length_m > sensor.searched_m)
     if isinstance(sensor, DirectToF):
         start_m, bins_m = sensor.start_s * SPEED_OF_LIGHT, sensor.bins * sensor.bin_s * SPEED_OF_LIGHT
         return np.asarray((path_length_m < start_m) | (path_length_m > start_m + bins_m))

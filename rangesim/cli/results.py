@@ -43,10 +43,12 @@ def report_command(
 
       rangesim report out/tabletop
     """
-    from rangesim.report import write_report
-    from rangesim.result_files import load_result
+    from pcgraph.output import replace_listed_file
+    from rangesim.report import render_report
+    from rangesim.result_files import RESULT, load_result
 
-    write_report(load_result(result), result / "report.html")
+    page = render_report(load_result(result))
+    replace_listed_file(result, "report.html", page.encode(), RESULT)
     typer.echo(f"{result / 'report.html'}")
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rangesim.catalogue import scene_names
-from rangesim.cli.progress import progress_bar
+from rangesim.cli.progress import progress_bar, say_where
 
 if TYPE_CHECKING:
     from rangesim.experiment import Experiment
@@ -94,8 +94,11 @@ def run_command(
         )
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
+    from pcgraph.output import check_directory
     from rangesim.pipeline import run
+    from rangesim.result_files import RESULT
 
+    say_where(out, check_directory(out, RESULT, inputs=[experiment.scene]))
     with progress_bar() as progress:
         run(experiment, out, progress)
     _say_what_measured_nothing(out)

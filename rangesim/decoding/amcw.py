@@ -23,8 +23,6 @@ from rangesim.sensors import AmcwToF
 from rangesim.status import Status
 
 TAPS = 4
-MAX_RANGE_M = 100.0
-"""Ranges beyond are not searched, even if the frequencies were unambiguous farther out."""
 MAX_RESIDUAL_TURNS = 0.1
 """A frequency whose phase is farther than this from that of the common path length contradicts it."""
 MAX_AMBIGUITY = 0.5
@@ -65,8 +63,7 @@ def decode_amcw(capture: Capture, correct_wiggling: bool = True) -> RangeImage:
     groups = np.split(capture.frames, len(sensor.modulation_hz))
     phases = [tap_phase(taps, exact_square) for taps in groups]
     weights = [_weight(capture, phase, f) for phase, f in zip(phases, sensor.modulation_hz, strict=True)]
-    longest = min(2 * sensor.unambiguous_range_m, 2 * MAX_RANGE_M)
-    unwrapped = unwrap([p.turns for p in phases], sensor.modulation_hz, weights, longest)
+    unwrapped = unwrap([p.turns for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
 
     status = np.zeros(capture.frames.shape[1:], dtype=np.uint8)
     contradiction = (unwrapped.residual_turns > MAX_RESIDUAL_TURNS) | (unwrapped.ambiguity > MAX_AMBIGUITY)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rangesim.config import check_keys, from_dict
+from rangesim.config import check_keys, from_dict, shown
 from rangesim.motion.track import Motion, Track
 
 
@@ -21,7 +21,7 @@ def motion_from_dict(data: Any, place: str = "motion") -> Motion:
         Unknown keys or kinds of track, or values that a track refuses; the message names the place.
     """
     if not isinstance(data, Mapping) or not isinstance(data.get("objects", {}), Mapping):
-        raise ValueError(f"{place}: expected a table of settings, got {data!r}.")
+        raise ValueError(f"{place}: expected a table of settings, got {shown(data)}.")
     check_keys(data, ("objects", "rig"), place)
     objects = {name: _track(table, f"{place}.objects.{name}") for name, table in data.get("objects", {}).items()}
     rig = data.get("rig")

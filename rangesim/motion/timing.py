@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
+from rangesim import limits
+from rangesim.bounds import Bounds, Pause, check_fields, whole
 from rangesim.rig import Array, Intrinsics
 from rangesim.sensors import Sensor
 
@@ -65,26 +67,17 @@ class Timing:
         A number out of its range.
     """
 
-    frame_period_s: float = 1 / 60
-    line_period_s: float = 0.0
+    frame_period_s: Pause = 1 / 60
+    line_period_s: Pause = 0.0
     lines: Literal["rows", "columns"] = "rows"
-    bands: int = 16
+    bands: Annotated[int, whole(1, "passes")] = 16
     single_tap: bool = False
-    start_s: float = 0.0
-    exposure_s: float = 0.0
-    exposure_samples: int = 1
+    start_s: Annotated[float, Bounds("a time in seconds", -1e12, 1e12)] = 0.0
+    exposure_s: Pause = 0.0
+    exposure_samples: Annotated[int, whole(1, "passes")] = 1
 
     def __post_init__(self) -> None:
-        for name in ("frame_period_s", "line_period_s", "exposure_s"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"expected {name} to be 0 or more seconds, got {getattr(self, name)}.")
-        for name in ("bands", "exposure_samples"):
-            if not isinstance(getattr(self, name), (int, np.integer)) or getattr(self, name) < 1:
-                raise ValueError(f"expected {name} to be a whole number of at least 1, got {getattr(self, name)!r}.")
-        if self.lines not in ("rows", "columns"):
-            raise ValueError(f"expected lines to be 'rows' or 'columns', got {self.lines!r}.")
-        if not np.isfinite(self.start_s):
-            raise ValueError(f"expected a finite start_s in seconds, got {self.start_s}.")
+        check_fields(self)
 
     def exposure_of_frames(self, sensor: Sensor) -> np.ndarray:
         """(k,) int64, index of the exposure that fills each frame of a sensor."""
@@ -93,6 +86,9 @@ class Timing:
     def exposure_times_s(self, sensor: Sensor) -> Array:
         """(e,) float64, seconds, middle of each exposure in line 0."""
         exposures = int(self.exposure_of_frames(sensor)[-1]) + 1
+        bands = self.bands if self.line_period_s else 1
+        passes = exposures * bands * self.exposure_samples
+        limits.check("passes", passes, f"passes for {exposures} exposures in {bands} bands")
         return np.asarray(self.start_s + self.frame_period_s * np.arange(exposures), dtype=np.float64)
 
     def reference_s(self, sensor: Sensor, camera: Intrinsics) -> float:

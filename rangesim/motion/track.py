@@ -6,13 +6,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangesim.config import nearest, to_dict
+from rangesim.bounds import Bounds, Coordinate, check_fields
+from rangesim.config import nearest, shown, to_dict
 from rangesim.rig import Array, Rig, pose
+
+Rate = Annotated[float, Bounds("a rate per second", -1e6, 1e6)]
 
 
 class Track(ABC):
@@ -54,13 +57,18 @@ class PoseTrack(Track):
     type_name: ClassVar[str] = "poses"
 
     def __post_init__(self) -> None:
-        times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
+        try:
+            times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(
+                f"expected times and poses of numbers, got {shown(self.times_s)} and {shown(self.poses)}."
+            ) from None
         if times.ndim != 1 or len(times) == 0 or poses.shape != (len(times), 4, 4):
             raise ValueError(
                 f"expected times (n,) and as many poses (n, 4, 4), got shapes {times.shape} and {poses.shape}."
             )
         if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise ValueError(f"expected times that increase, in seconds, got {times.tolist()}.")
+            raise ValueError(f"expected times that increase, in seconds, got {shown(times.tolist())}.")
         poses = np.stack([pose(p, f"pose {i} of the track") for i, p in enumerate(poses)])
         for name, value in (("times_s", times), ("poses", poses)):
             value.setflags(write=False)
@@ -94,18 +102,16 @@ class SteadyTrack(Track):
     centre_m : (x, y, z), metres, world, a point of the axis of rotation at time 0; it moves with the velocity.
     """
 
-    velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity_m_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+    rotation_rad_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
+    centre_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
 
     type_name: ClassVar[str] = "steady"
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("velocity_m_s", "rotation_rad_s", "centre_m"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape != (3,) or not np.isfinite(value).all():
-                raise ValueError(f"expected {name} to be three finite numbers, got {getattr(self, name)!r}.")
-            object.__setattr__(self, name, tuple(map(float, value)))
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
 
     def at(self, time_s: float) -> Array:
         from scipy.spatial.transform import Rotation
@@ -153,9 +159,11 @@ class Motion:
     rig: Track | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.objects, Mapping):
+            raise ValueError(f"expected objects to map shape names to tracks, got {shown(self.objects)}.")
         for what, track in (*self.objects.items(), *((("rig", self.rig),) if self.rig is not None else ())):
             if not isinstance(track, Track):
-                raise ValueError(f"expected a PoseTrack or a SteadyTrack for {what!r}, got {track!r}.")
+                raise ValueError(f"expected a PoseTrack or a SteadyTrack for {what!r}, got {shown(track)}.")
 
     def check(self, names: Iterable[str]) -> None:
         """Raise ValueError if an object that moves is none of these shapes."""

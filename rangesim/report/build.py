@@ -10,6 +10,8 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from pcgraph.output import write_file
+from rangesim.errors import FileFormatError
 from rangesim.report import cloud, figures, palette, tables
 from rangesim.report.policy import StyleRules, content_policy, visible
 from rangesim.report.verdict import verdict
@@ -19,14 +21,23 @@ SCRIPTS = ("viewer.js", "report.js")
 
 
 def write_report(result: Result, path: Path) -> None:
-    """Write the report of a result; the file appears when it is complete."""
+    """Write the report of a result; the file appears when it is complete.
+
+    Raises
+    ------
+    FileFormatError
+        The place cannot be written.
+    """
+    write_file(path, render_report(result).encode(), FileFormatError)
+
+
+def render_report(result: Result) -> str:
+    """The report of a result as HTML."""
     environment = Environment(
         autoescape=True, finalize=visible, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string(_asset("report.html.j2"))
-    staging = path.with_name(f".{path.name}.part")
-    staging.write_text(template.render(context(result)), encoding="utf-8")
-    staging.replace(path)
+    return template.render(context(result))
 
 
 def context(result: Result) -> dict[str, Any]:

@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
+from rangesim.bounds import Bounds, Hertz, check_fields, whole
 from rangesim.response.base import KINDS, DenseResponse, LightPath, Math, SparseResponse
 
 SPEED_OF_LIGHT = 299_792_458.0
 """Metres per second in vacuum, exact."""
+
+
+StartLength = Annotated[float, Bounds("a length in metres", -1e6, 1e6)]
+BinLength = Annotated[float, Bounds("positive and finite", 1e-8, 1e6)]
 
 
 @dataclass(frozen=True)
@@ -22,9 +27,12 @@ class Phasor(DenseResponse):
     period, which hold odd harmonics (the "wiggling" error of AMCW cameras).
     """
 
-    modulation_hz: float
+    modulation_hz: Hertz
     square: bool = False
     channels: ClassVar[int] = 2  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
         turns = path.path_length_m * (self.modulation_hz / SPEED_OF_LIGHT)
@@ -53,9 +61,12 @@ class FirstReturn(DenseResponse):
 class LengthBins(SparseResponse):
     """Histogram over the path length (round trip), `channels` bins from `start_m`, `width_m` each."""
 
-    start_m: float
-    width_m: float
-    channels: int  # type: ignore[misc]
+    start_m: StartLength
+    width_m: BinLength
+    channels: Annotated[int, whole(1, "bins")]  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def bin(self, path: LightPath, m: Math) -> Any:
         index, inside = _length_bin(path, m, self.start_m, self.width_m, self.channels)
@@ -70,9 +81,12 @@ class LengthSplit(SparseResponse):
     the bins the `rangesim.signals.EnergySplit` of what lies within them.
     """
 
-    start_m: float
-    width_m: float
-    bins: int
+    start_m: StartLength
+    width_m: BinLength
+    bins: Annotated[int, whole(1, "bins")]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def channels(self) -> int:  # type: ignore[override]

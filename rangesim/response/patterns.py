@@ -5,12 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
+from rangesim import limits
+from rangesim.bounds import Bounds, check_fields
+from rangesim.config import shown
 from rangesim.response.base import DenseResponse, LightPath, Math
 from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
+
+Axis = Annotated[int, Bounds("0 (columns) or 1 (rows)", 0, 1)]
 
 
 @dataclass(frozen=True)
@@ -20,11 +25,16 @@ class GrayBits(DenseResponse):
     Out of focus, the edges of the stripes become error functions.
     """
 
-    axis: int
+    axis: Axis
     """0: columns (u), 1: rows (v)."""
-    bits: int
-    shift: int = 0
+    bits: Annotated[int, Bounds("a number of bits", 1, 32)]
+    shift: Annotated[int, Bounds("a number of bits", 0, 31)] = 0
     """Finest bits left out."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.shift >= self.bits:
+            raise ValueError(f"expected shift to leave at least one of {self.bits} bits, got {self.shift}.")
 
     @property
     def channels(self) -> int:  # type: ignore[override]
@@ -46,9 +56,12 @@ class Fringes(DenseResponse):
     Out of focus, and where the projector's pixels are finite, they lose contrast.
     """
 
-    axis: int
-    period_px: float
+    axis: Axis
+    period_px: Annotated[float, Bounds("positive and finite", 1e-3, 1e6)]
     channels: ClassVar[int] = 2  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
         phase = path[self.axis] * (2 * np.pi / self.period_px)
@@ -66,6 +79,14 @@ class Images(DenseResponse):
     """
 
     patterns: np.ndarray
+
+    def __post_init__(self) -> None:
+        values = self.patterns
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub" or values.ndim != 3 or not values.size:
+            raise ValueError(f"expected patterns to be an array (k, height, width) of numbers, got {shown(values)}.")
+        limits.check("frames", len(values), "patterns")
+        if not np.isfinite(values).all():
+            raise ValueError("expected patterns to be finite, got NaN or infinite pixels.")
 
     @property
     def channels(self) -> int:  # type: ignore[override]

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
+from rangesim import limits
+from rangesim.bounds import Bounds, check_fields, whole
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
 from rangesim.sensors.base import Sensor
 
@@ -41,26 +43,20 @@ class StructuredLight(Sensor):
        phase-shift light projection", Applied Optics 38 (1999).
     """
 
-    projector_width: int = 1280
-    projector_height: int = 800
+    projector_width: Annotated[int, whole(2, "projector")] = 1280
+    projector_height: Annotated[int, whole(2, "projector")] = 800
     code: Literal["gray", "gray-phase"] = "gray-phase"
     axes: tuple[Literal["columns", "rows"], ...] = ("columns",)
-    period_px: float = 16.0
-    steps: int = 4
+    period_px: Annotated[float, Bounds("projector pixels", 2, 1e6)] = 16.0
+    steps: Annotated[int, whole(3, "steps")] = 4
 
     type_name: ClassVar[str] = "structured-light"
 
     def __post_init__(self) -> None:
-        if self.code not in CODES:
-            raise ValueError(f"expected code to be one of {', '.join(CODES)}, got {self.code!r}.")
-        if not self.axes or any(a not in AXES for a in self.axes) or list(self.axes) != sorted(set(self.axes)):
+        check_fields(self)
+        if not self.axes or list(self.axes) != sorted(set(self.axes)):
             raise ValueError(f"expected axes to be columns, rows or both in that order, got {self.axes!r}.")
-        if self.projector_width < 2 or self.projector_height < 2:
-            raise ValueError(f"expected 2 x 2 pixels or more, got {self.projector_width} x {self.projector_height}.")
-        if self.steps < 3:
-            raise ValueError(f"expected at least 3 phase steps, got {self.steps}.")
-        if not self.period_px >= 2:
-            raise ValueError(f"expected a fringe period of at least 2 projector pixels, got {self.period_px}.")
+        limits.check("pixels", self.projector_width * self.projector_height, "pixels of a projector")
 
     def size(self, axis: str) -> int:
         """Projector pixels along `axis`."""
@@ -106,6 +102,8 @@ class StructuredLight(Sensor):
 
     def patterns(self) -> np.ndarray:
         """(k, projector_height, projector_width) float32 in 0..1: the patterns as shown, at pixel centres."""
+        size = 4 * self.n_frames * self.projector_width * self.projector_height
+        limits.check("bytes", size, f"bytes of {self.n_frames} patterns")
         x, y = np.meshgrid(np.arange(self.projector_width) + 0.5, np.arange(self.projector_height) + 0.5)
         path = LightPath(x, y, 0 * x, True)
         weights = [np.stack(r.weights(path, NumpyMath())) for r in self.responses()]  # type: ignore[arg-type]

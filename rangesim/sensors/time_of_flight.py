@@ -5,15 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
+from rangesim import limits
+from rangesim.bounds import HERTZ, Bounds, Hertz, check_fields, check_number, whole
 from rangesim.response import SPEED_OF_LIGHT, FirstReturn, LengthBins, Phasor, Response
 from rangesim.sensors.base import Sensor
 
 OVERSAMPLING = 4
 """Bins of the transport pass per bin of a sensor with a pulse."""
+MAX_RANGE_M = 100.0
+"""Ranges beyond are not searched by phase unwrapping, even if the frequencies were unambiguous farther out."""
 TAPS = 4
 """Frames of an AMCW camera per frequency."""
 
@@ -54,27 +58,37 @@ class AmcwToF(Sensor):
     waveform : "sine", or "square" for a square source against a square reference (triangle correlation, "wiggling").
     """
 
-    modulation_hz: tuple[float, ...] = (20e6, 80e6, 100e6)
-    contrast: float = 0.8
+    modulation_hz: tuple[Hertz, ...] = (20e6, 80e6, 100e6)
+    contrast: Annotated[float, Bounds("a positive fraction", 1e-3, 1)] = 0.8
     waveform: Literal["sine", "square"] = "sine"
 
     type_name: ClassVar[str] = "amcw-tof"
 
     def __post_init__(self) -> None:
         if isinstance(self.modulation_hz, (int, float)):
+            check_number("modulation_hz", self.modulation_hz, HERTZ)
             object.__setattr__(self, "modulation_hz", (float(self.modulation_hz),))
-        if not self.modulation_hz or not all(f > 0 for f in self.modulation_hz):
-            raise ValueError(f"expected positive modulation frequencies in hertz, got {self.modulation_hz}.")
-        if not 0 < self.contrast <= 1:
-            raise ValueError(f"expected a contrast in (0, 1], got {self.contrast}.")
-        if self.waveform not in ("sine", "square"):
-            raise ValueError(f"expected waveform 'sine' or 'square', got {self.waveform!r}.")
+        check_fields(self)
+        if not self.modulation_hz:
+            raise ValueError("expected modulation_hz to hold at least one frequency in hertz, got none.")
+        limits.check("frequencies", len(self.modulation_hz), "frequencies in modulation_hz")
+        limits.check("wraps", self.wraps, "wraps of the highest frequency before all frequencies repeat")
 
     @property
     def unambiguous_range_m(self) -> float:
         """Range beyond which all frequencies together wrap, c / (2 gcd f); frequencies are taken to 1 kHz."""
         common = int(np.gcd.reduce([round(f / 1e3) for f in self.modulation_hz])) * 1e3
         return SPEED_OF_LIGHT / (2 * max(common, 1e3))
+
+    @property
+    def searched_m(self) -> float:
+        """Path length up to which decoding tells the wraps of the highest frequency apart."""
+        return min(2 * self.unambiguous_range_m, 2 * MAX_RANGE_M)
+
+    @property
+    def wraps(self) -> int:
+        """How often the highest frequency wraps within `searched_m`: the candidates of phase unwrapping."""
+        return max(1, int(np.ceil(self.searched_m * max(self.modulation_hz) / SPEED_OF_LIGHT - 1e-6)))
 
     def responses(self) -> tuple[Response, ...]:
         return tuple(Phasor(f, self.waveform == "square") for f in self.modulation_hz)
@@ -106,18 +120,20 @@ class DirectToF(Sensor):
         pulse, paths are sorted into `OVERSAMPLING` times finer bins, so that the blur keeps their place within a bin.
     """
 
-    bins: int = 256
-    bin_s: float = 100e-12
-    start_s: float = 0.0
-    pulse_fwhm_s: float = 0.0
+    bins: Annotated[int, whole(2, "bins")] = 256
+    bin_s: Annotated[float, Bounds("positive and finite", 1e-15, 1e-3)] = 100e-12
+    start_s: Annotated[float, Bounds("0 or positive", 1e-15, 1e-3, or_zero=True)] = 0.0
+    pulse_fwhm_s: Annotated[float, Bounds("0 or positive", 1e-15, 1e-3, or_zero=True)] = 0.0
 
     type_name: ClassVar[str] = "direct-tof"
 
     def __post_init__(self) -> None:
-        if self.bins < 2 or not self.bin_s > 0 or self.start_s < 0 or self.pulse_fwhm_s < 0:
+        check_fields(self)
+        limits.check("bins", self.bins * self._fine, f"bins, {self._fine} of the pass for each of the sensor")
+        if self.pulse_fwhm_s > self.bins * self.bin_s:
             raise ValueError(
-                f"expected 2 bins or more of positive width and no negative start or pulse width, got {self.bins} bins "
-                f"of {self.bin_s} s from {self.start_s} s, pulse {self.pulse_fwhm_s} s."
+                f"expected pulse_fwhm_s to be within the histogram of {self.bins * self.bin_s:g} s, "
+                f"got {self.pulse_fwhm_s:g}."
             )
 
     def responses(self) -> tuple[Response, ...]:
