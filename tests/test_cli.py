@@ -149,6 +149,24 @@ def test_compare_and_report(command: Command, tmp_path: Path) -> None:
     assert (copy / "report.html").read_bytes() == (small_result() / "report.html").read_bytes()
 
 
+@pytest.mark.parametrize("options", [[], ["--markdown"]])
+def test_names_are_printed_as_they_are(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
+    """A folder in brackets, a material of another's result: no markup, no column, no order to the terminal."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "out[red]"
+    shutil.copytree(small_result(), folder)
+    for path in folder.glob("*/comparison.json"):
+        path.write_text(path.read_text().replace('"glossy"', '"[/x]|\\u001b[3m<i>"'))
+    answer = command("compare", folder.name, folder.name, *options)
+    assert answer.status == 0
+    assert "\x1b" not in answer.out
+    plain = re.sub(r"\\([\\`<\[|])", r"\1", answer.out) if options else answer.out
+    assert "out[red]" in plain
+    assert r"[/x]|\u001b[3m<i>" in plain
+
+
 def _write_bad_files(folder: Path) -> None:
     (folder / "broken.xml").write_text('<scene version="3.0.0"><shape', encoding="utf-8")
     (folder / "blind.xml").write_text('<scene version="3.0.0"><shape type="sphere"/></scene>', encoding="utf-8")

@@ -96,14 +96,17 @@ def _print(markdown: str) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    head, _, *lines = ([cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines())
+    from rangesim.report.tables import cells
+
+    head, _, *lines = (cells(line) for line in markdown.splitlines())
     table = Table(box=box.SIMPLE_HEAD)
     for i, name in enumerate(head):
         words = i < 2 or name.startswith("because")
         table.add_column(name, justify="left" if words else "right", overflow="fold")
     for before, line in zip([head, *lines], lines, strict=False):
-        table.add_row("" if line[0] == before[0] else line[0], *line[1:])
+        table.add_row(*map(Text, ("" if line[0] == before[0] else line[0], *line[1:])))  # brackets are no markup
     console = Console()
     if not console.is_terminal:
         console = Console(width=140)

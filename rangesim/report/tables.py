@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +12,7 @@ from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.experiment import Experiment
 from rangesim.report import palette
 from rangesim.report.figures import Share
+from rangesim.report.policy import visible
 from rangesim.result_files import Measurement
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 
@@ -18,6 +20,12 @@ Rows = list[dict[str, Any]]
 
 UNRELIABLE = 0.5
 """Share of outliers or of missing pixels from which a sensor is called unreliable on a material."""
+
+_SPECIAL = re.compile(r"([\\`|\[]|<(?! ))")
+"""What Markdown reads as more than text; "< 0.1" is none of it."""
+_ESCAPED = re.compile(r"\\([\\`|\[<])")
+_BORDER = re.compile(r"(?<!\\)\|")
+_BREAKS = re.compile(r"[\t\r\n]+")
 
 
 @dataclass(frozen=True)
@@ -154,15 +162,23 @@ def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
     return errors + "\n" + _markdown(tables, ["failed (%)", "because (% of the pixels)"], _failures)
 
 
+def cells(line: str) -> list[str]:
+    """Cells of a line of such a table, as they were before they became Markdown."""
+    return [_ESCAPED.sub(r"\1", cell.strip()) for cell in _BORDER.split(line)[1:-1]]
+
+
+def _line(texts: Sequence[str]) -> str:
+    """A line of a table; what Markdown or a terminal would take for more than text is escaped or spelt out."""
+    return "| " + " | ".join(_SPECIAL.sub(r"\\\1", visible(_BREAKS.sub(" ", text))) for text in texts) + " |"
+
+
 def _markdown(
-    tables: Sequence[tuple[str, Rows]], heads: list[str], cells: Callable[[dict[str, Any]], list[str]]
+    tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]
 ) -> str:
-    lines = ["| " + " | ".join(["material", "sensor", *heads]) + " |", "|" + " --- |" * (2 + len(heads))]
+    lines = [_line(["material", "sensor", *heads]), "|" + " --- |" * (2 + len(heads))]
     for material in dict.fromkeys(row["material"] for _, rows in tables for row in rows):
         for name, rows in tables:
-            lines += [
-                "| " + " | ".join([material, name, *cells(row)]) + " |" for row in rows if row["material"] == material
-            ]
+            lines += [_line([material, name, *texts(row)]) for row in rows if row["material"] == material]
     return "\n".join(lines) + "\n"
 
 
