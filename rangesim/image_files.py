@@ -141,7 +141,9 @@ def _open_raster(path: Path) -> Iterator[Any]:
                 limits.check("pixels", image.width * image.height, f"pixels in {path}", FileFormatError)
                 yield image
             return
-    raise FileFormatError(f"{path} cannot be read as an image: it is none of {', '.join(p.format for p in plugins)} or OpenEXR.")
+    raise FileFormatError(
+        f"{path} cannot be read as an image: it is none of {', '.join(p.format for p in plugins)} or OpenEXR."
+    )
 
 
 def _read_raster(path: Path) -> np.ndarray:
