@@ -277,7 +277,7 @@ def test_one_side_alone_keeps_the_aspect_ratio() -> None:
     scene = rangesim.load_scene(SCENES / "plane.xml")
     for rig in (scene.rig(width=320), scene.rig(height=240)):
         assert (rig.camera.width, rig.camera.height) == (320, 240)
-    with pytest.raises(ValueError, match="positive image size"):
+    with pytest.raises(ValueError, match="whole number of at least 1"):
         scene.rig(width=0, height=4)
 
 
