@@ -250,5 +250,5 @@ def test_deep_and_coloured_images_come_in_unharmed_or_are_refused(tmp_path: Path
 def test_calibration_settings_must_be_positive(tmp_path: Path) -> None:
     (tmp_path / "a.xml").write_text("<o/>")
     for wrong in ({"code_step": 0}, {"unit_m": 0.0}):
-        with pytest.raises(ValueError, match="code_step|unit_m"):
+        with pytest.raises(ValueError, match=r"code_step|unit_m"):
             load_calibration(tmp_path / "a.xml", (8, 8), **wrong)  # type: ignore[arg-type]
