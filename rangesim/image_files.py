@@ -126,7 +126,15 @@ def _open_raster(path: Path) -> Iterator[Any]:
 
     `Image.open` would try every format, and apply a limit of its own, which is one for the whole process.
     """
-    from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, TiffImagePlugin
+    from PIL import (
+        BmpImagePlugin,
+        Image,
+        JpegImagePlugin,
+        PngImagePlugin,
+        PpmImagePlugin,
+        TiffImagePlugin,
+        UnidentifiedImageError,
+    )
 
     plugins = (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
                PpmImagePlugin.PpmImageFile, TiffImagePlugin.TiffImageFile)  # fmt: skip
@@ -141,9 +149,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
                 limits.check("pixels", image.width * image.height, f"pixels in {path}", FileFormatError)
                 yield image
             return
-    raise FileFormatError(
-        f"{path} cannot be read as an image: it is none of {', '.join(p.format for p in plugins)} or OpenEXR."
-    )
+    raise UnidentifiedImageError(f"it is none of {', '.join(p.format for p in plugins)} or OpenEXR")
 
 
 def _read_raster(path: Path) -> np.ndarray:

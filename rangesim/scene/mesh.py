@@ -9,6 +9,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from rangesim import limits
+from rangesim.bounds import FARTHEST_M
 from rangesim.config import nearest
 from rangesim.errors import FileFormatError
 
@@ -38,6 +40,8 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path) ->
     vertices = vertices * unit_m
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
+    if not (np.abs(vertices) <= FARTHEST_M).all():
+        raise FileFormatError(f"expected {path} within {FARTHEST_M:g} metres; what is its unit? See unit_m.")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = float(np.linalg.norm(high - low))
     if not size > 0:
@@ -80,6 +84,9 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))
     if len(faces) == 0:
         raise FileFormatError(f"expected a triangle mesh in {path}, which has no faces.")
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
+        raise FileFormatError(f"expected vertices of three numbers in {path}, got an array of shape {vertices.shape}.")
+    limits.check("points", max(len(vertices), len(faces)), f"vertices or faces in {path}", FileFormatError)
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
         raise FileFormatError(f"expected finite vertices and valid face indices in {path}; repair the mesh first.")
     return vertices, faces
