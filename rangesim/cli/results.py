@@ -69,6 +69,7 @@ def verify_command(
     from pcgraph.output import verify_directory
     from rangesim.capture_files import CAPTURE
     from rangesim.cli.decoded_files import DECODED
+    from rangesim.config import visible
     from rangesim.errors import FileFormatError
     from rangesim.result_files import RESULT
 
@@ -82,7 +83,7 @@ def verify_command(
     found = verify_directory(directory, kind)
     for word, names in (("missing", found.missing), ("changed", found.changed), ("not rangesim's", found.foreign)):
         for name in names:
-            typer.echo(f"{word}: {directory / name}")
+            typer.echo(visible(f"{word}: {directory / name}"))
     if found.missing or found.changed:
         raise FileFormatError(
             f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} hold "
