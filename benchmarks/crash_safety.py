@@ -74,7 +74,9 @@ class Place:
     def run(self) -> float:
         """Replace the result in peace; seconds."""
         start = time.monotonic()
-        subprocess.run(self.command(self.seed + 1), check=True, capture_output=True, timeout=120)
+        done = subprocess.run(self.command(self.seed + 1), check=False, capture_output=True, timeout=120)
+        if done.returncode:
+            raise RuntimeError(f"a run in peace ended with status {done.returncode}: {done.stderr.decode()[-2000:]}")
         self.seed += 1
         return time.monotonic() - start
 
@@ -166,7 +168,10 @@ def trial(
         ends[how] += 1
         wrong = place.failures(attempted) + ([] if how in known else [how])
         if number % 5 == 4:
-            place.run()
+            try:
+                place.run()
+            except RuntimeError as error:
+                wrong.append(str(error))
             wrong += [f"litter: {found}" for found in place.litter()] + place.failures(place.seed)
         failures += bool(wrong)
         for sentence in wrong:
