@@ -15,6 +15,7 @@ from rangesim.errors import FileFormatError
 from rangesim.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.motion import Motion
 from rangesim.motion.settings import motion_from_dict
+from rangesim.seeds import check_seed
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Experiment:
     max_depth : longest path in segments up to the light; 2 is direct light alone.
     photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
     glint : whether the camera sees the projector's lens in mirrors.
-    seed : of transport and noise; the same seed gives the same bytes.
+    seed : of transport and noise, 0 to 2^64 - 1; the same seed gives the same bytes.
     ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
     instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
     motion : what moves; None: nothing.
@@ -58,8 +59,7 @@ class Experiment:
                 raise ValueError(f"expected {name} to be a whole number of at least 1, got {value}.")
         if self.photons is not None and self.photons < 0:
             raise ValueError(f"expected no negative number of photons, got {self.photons}.")
-        if self.seed < 0:
-            raise ValueError(f"expected a seed of at least 0, got {self.seed}.")
+        object.__setattr__(self, "seed", check_seed(self.seed))
         for one in self.instruments if self.motion else ():
             period_s = one.timing.frame_period_s
             if one.exposure_s is not None and 0 < period_s < one.exposure_s:

@@ -21,6 +21,7 @@ from rangesim.motion import transport_moving
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.provenance import provenance
 from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, save_range_image
+from rangesim.seeds import derived_seed
 from rangesim.staging import new_directory, write_json
 
 if TYPE_CHECKING:
@@ -151,8 +152,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
 
 def noise_seed(experiment: Experiment, one: Instrument) -> int:
     """Seed of an instrument's noise: its own for each position in the experiment."""
-    position = experiment.instruments.index(one)
-    return int(np.random.SeedSequence([experiment.seed, position]).generate_state(1)[0])
+    return derived_seed(experiment.seed, experiment.instruments.index(one))
 
 
 def acquisition(capture: Capture, timing: Timing, moves: bool) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from rangesim.light_transport.medium import Media, bounded
 from rangesim.light_transport.photon_flight import MAX_CHAIN
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import random_stream, stratified
+from rangesim.light_transport.sampling import Seed, random_stream, stratified
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
@@ -132,7 +132,7 @@ def _near_the_lens(
 def _lanes(pixel: np.ndarray, seed: int, paths: int) -> tuple[Any, Any, Any]:
     """Pixels, their random numbers, and the number of paths, on the renderer's side."""
     lanes = mi.UInt32(pixel.astype(np.uint32))
-    rng = random_stream(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes ^ 0x85EBCA6B)
+    rng = random_stream(Seed.of(seed), lanes ^ 0x85EBCA6B)
     return lanes, rng, dr.opaque(mi.UInt32, paths)
 
 

@@ -26,7 +26,7 @@ from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import random_stream, stratified
+from rangesim.light_transport.sampling import Seed, Stream, random_stream, stratified
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
 
@@ -37,7 +37,7 @@ class Settings(NamedTuple):
     lamps : whether that light has a direction worth sampling; uniform surroundings are found best by the BSDF alone.
     """
 
-    seed: Any
+    seed: Seed
     spp: Any
     max_depth: Any
     rr_depth: Any
@@ -87,8 +87,9 @@ def trace(
     lanes = dr.width(pixel)
     lane = dr.arange(mi.UInt32, lanes)
     rng = random_stream(settings.seed, pixel)
-    choice = random_stream(settings.seed, pixel, apart=True)  # of photons; they change no other light
-    turns = random_stream(pixel >> 4, settings.seed).next_uint32()  # shared by neighbours; evenly spread from here on
+    choice = random_stream(settings.seed, pixel, Stream.SECOND)  # of photons; they change no other light
+    # Shared by neighbours; evenly spread from here on
+    turns = random_stream(settings.seed, pixel >> 4, Stream.THIRD).next_uint32()
     width = mi.UInt32(camera.size.x)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     shift = mi.Point2f(rng.next_float32(), rng.next_float32())

@@ -16,9 +16,11 @@ from rangesim.light_transport.ground_truth import ground_truth
 from rangesim.light_transport.loop import Radiance, Settings, trace
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.responses import Accumulators
+from rangesim.light_transport.sampling import Seed
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
+from rangesim.seeds import check_seed
 from rangesim.sensors import Sensor
 from rangesim.signals import EnergySplit, Signals
 
@@ -59,7 +61,8 @@ def transport(
         asks for, at most four pixels of the projector or three of the camera at the working distance. Caustics are
         blurred by about half of it.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
-    seed : int; the same seed gives the same bytes, whatever the number of threads and the memory budget.
+    seed : int, 0 to 2^64 - 1; the same seed gives the same bytes, whatever the number of threads and the memory
+        budget, and each its own noise.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed
         come on top, some 200 bytes each.
     progress : called with the share done, 0..1, after each tile.
@@ -69,7 +72,8 @@ def transport(
     ValueError
         A number out of its range, patterns that do not fit the projector, or too little memory.
     """
-    _check(scene, rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    _check(scene, rig, sensors, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    seed = check_seed(seed)
     check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
@@ -77,7 +81,7 @@ def transport(
     radiances: list[np.ndarray] = []
     camera, projector = Device.camera(rig), Device.projector(rig)
     settings = Settings(
-        seed=dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
+        seed=Seed.of(seed),
         spp=dr.opaque(mi.UInt32, spp),
         max_depth=dr.opaque(mi.UInt32, max_depth),
         rr_depth=dr.opaque(mi.UInt32, rr_depth),
@@ -139,15 +143,13 @@ def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, at_lea
         yield begin, min(begin + size, pixels)
 
 
-def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], seed: int, **counts: int) -> None:
+def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], **counts: int) -> None:
     if not isinstance(scene, Scene):
         raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
     if not isinstance(rig, Rig):
         raise ValueError(f"expected a Rig, as scene.rig() returns, got {type(rig).__name__}.")
     if not isinstance(sensors, Sequence) or not all(isinstance(s, (Sensor, Response)) for s in sensors):
         raise ValueError(f"expected a list of sensors, for example [StructuredLight()], got {sensors!r}.")
-    if not isinstance(seed, (int, np.integer)):
-        raise ValueError(f"expected seed to be a whole number, got {seed!r}.")
     for sensor in sensors:
         sensor.check(rig.projector.width, rig.projector.height)
     for name, value in counts.items():

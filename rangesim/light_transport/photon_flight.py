@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.medium import Media
-from rangesim.light_transport.sampling import random_stream
+from rangesim.light_transport.sampling import Seed, random_stream
 
 LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
@@ -43,7 +43,7 @@ def fly(
     """Landings of photons sent through projector pixels, and the sums of `PhotonBalance`."""
     pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(projector.size.x)
     photon = mi.UInt32(number.astype(np.uint32))
-    rng = random_stream(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), photon ^ 0x9E3779B9)
+    rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
     landing, fate = _chain(
