@@ -232,7 +232,6 @@ def test_progress_ends_at_one_and_changes_nothing(corner: rangesim.Scene) -> Non
     assert all_bytes(transport(corner, rig, all_sensors(), spp=4, progress=shares.append)) == all_bytes(quiet)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    assert len(shares) > 4
 
 
 def test_independent_seeds_are_unbiased(corner: rangesim.Scene) -> None:
