@@ -32,6 +32,7 @@ from rangesim.result_files import (
     save_rows,
 )
 from rangesim.schema import write_record
+from rangesim.seeds import derived_seed
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -164,8 +165,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
 
 def noise_seed(experiment: Experiment, one: Instrument) -> int:
     """Seed of an instrument's noise: its own for each position in the experiment."""
-    position = experiment.instruments.index(one)
-    return int(np.random.SeedSequence([experiment.seed, position]).generate_state(1)[0])
+    return derived_seed(experiment.seed, experiment.instruments.index(one))
 
 
 def acquisition(
