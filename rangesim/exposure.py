@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rangesim.bounds import SECONDS, check_number
 from rangesim.capture import Capture, bright_level
 from rangesim.detector import PhotoDetector
 from rangesim.rig import Rig
@@ -53,8 +54,8 @@ def expose(
     if detector is not None and not isinstance(detector, PhotoDetector):
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
     seed = check_seed(seed)
-    if exposure_s is not None and not 0 < exposure_s < np.inf:
-        raise ValueError(f"expected an exposure of more than 0 s, got {exposure_s}.")
+    if exposure_s is not None:
+        check_number("exposure_s", exposure_s, SECONDS)
     if ambient is not None:
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or isinstance(sensor, IdealToF):

@@ -122,6 +122,8 @@ class EdgeModel:
             ) from None
         try:
             content = json.loads(text)
+        except RecursionError:
+            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}, which is nested too deep") from None
         except ValueError as error:
             raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}: {error}") from None
         if not isinstance(content, dict) or content.pop("format", None) != _FORMAT:
@@ -138,4 +140,7 @@ class EdgeModel:
 def _numbers(values: object) -> tuple[float, ...]:
     if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
         raise ValueError(f"expected numbers in a model, got {values!r}; write it with EdgeModel.save")
-    return tuple(float(value) for value in values)
+    try:
+        return tuple(float(value) for value in values)
+    except OverflowError:
+        raise ValueError("expected numbers in a model, got one beyond a float; write it with EdgeModel.save") from None

@@ -86,21 +86,23 @@ def check_depth(state: Any, label: str) -> None:
 
 def check_dictionary(scene: Any, label: str) -> None:
     """Raise FileFormatError if a scene dictionary is nested deeper than the limit, or holds what Mitsuba crashes on."""
-    if is_nested_deeper(scene, limits.current().nesting):
-        limits.check("nesting", limits.current().nesting + 1, f"levels in {label}", FileFormatError)
-    todo, entries = [("", scene)], 0
+    deepest, entries = limits.current().nesting, 0
+    todo = [(1, "", scene)]
     while todo:
-        place, table = todo.pop()
-        for key, value in table.items():
-            entries += 1
-            where = f"{place}.{key}".lstrip(".") if isinstance(key, str) else ""
-            if not where:
-                raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
-            if isinstance(value, Mapping):
-                todo.append((where, value))
-            elif value is None or (isinstance(value, int) and abs(value) >= 1 << 63):
-                raise FileFormatError(f"{label}: expected {where[:200]} to be a value of 64 bits, got {shown(value)}.")
+        depth, place, table = todo.pop()
+        limits.check("nesting", depth, f"levels in {label}", FileFormatError)
+        entries += len(table)
         limits.check("shapes", entries // ENTRIES_PER_SHAPE, f"shapes of entries in {label}", FileFormatError)
+        for key, value in table.items():
+            if isinstance(value, Mapping):
+                todo.append((depth + 1, f"{place}{key}.", value))
+            elif isinstance(value, (list, tuple)) and is_nested_deeper(value, deepest):
+                limits.check("nesting", deepest + 1, f"levels in {label}", FileFormatError)
+            elif value is None or (isinstance(value, int) and abs(value) >= 1 << 63):
+                name = f"{place}{key}"[-200:]
+                raise FileFormatError(f"{label}: expected {name} to be a value of 64 bits, got {shown(value)}.")
+            if not isinstance(key, str):
+                raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
 
 
 def check_properties(state: Any, label: str) -> None:
