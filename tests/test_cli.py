@@ -177,7 +177,7 @@ def _write_bad_files(folder: Path) -> None:
         (["run", PLANE, "--spp", "-3"], "spp .* at least 1, got -3"),
         (["run", PLANE, "--width", "0"], "width .* at least 1, got 0"),
         (["run", PLANE, "--sensor", "grey"], "did you mean 'gray'"),
-        (["run", PLANE, "--baseline", "-1"], "positive baseline_m"),
+        (["run", PLANE, "--baseline", "-1"], "baseline_m to be positive"),
         (["run", "points.ply", "--material", "glass"], "material"),
         (["run", PLANE, "--material", "glossy"], "names its own materials"),
         (["run", "--config", "none.toml"], "none.toml does not exist"),
