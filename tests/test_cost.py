@@ -52,7 +52,8 @@ def test_memory_grows_with_pixels_and_bins() -> None:
     assert 3 * frames < of(many).memory_bytes < 6 * frames
 
 
-def test_what_exceeds_the_memory_is_refused_before_the_work(tmp_path: Path) -> None:
+def test_what_exceeds_the_memory_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cost, "available_memory_bytes", lambda: 16 * 10**9)
     large = Experiment(MATTE, width=10_000, height=10_000, spp=1)
     start = time.monotonic()
     with pytest.raises(ValueError, match=r"expected a run within the .* GB .* this one takes about 200 M light paths"):

@@ -386,7 +386,7 @@ def test_wrong_kinds_of_arguments_get_one_clear_sentence(corner: rangesim.Scene)
         "a Detector": lambda: rangesim.expose(signals, sensor, "x"),
         "a Capture": lambda: rangesim.decode(None),
         "a path or a scene": lambda: rangesim.load_scene(3),
-        "whole numbers": lambda: corner.rig(width=1.5),  # type: ignore[arg-type]
+        "a whole number": lambda: corner.rig(width=1.5),  # type: ignore[arg-type]
         "a positive baseline": lambda: corner.rig(baseline_m="a"),  # type: ignore[arg-type]
     }
     for message, call in wrong.items():
