@@ -7,6 +7,8 @@ that the damage gets past the parser, to where values are believed.
 
 from __future__ import annotations
 
+import copy
+import datetime
 import io
 import json
 import math
@@ -157,7 +159,7 @@ def mutate_tree(tree: Any, rng: Random) -> Any:
             holder[f"{key}_2"] = holder[key]
         case 3:
             other, its_key = rng.choice(places)
-            holder[key] = json.loads(json.dumps(other[its_key])) if its_key in _keys(other) else None
+            holder[key] = copy.deepcopy(other[its_key]) if its_key in _keys(other) else None
         case 4:
             holder[key] = [holder[key]]
         case _:
@@ -199,7 +201,9 @@ def _toml(value: Any) -> str:
         return "[" + ", ".join(map(_toml, value)) + "]"
     if isinstance(value, float):
         return repr(value)
-    return "1979-05-27" if value is None else json.dumps(value)  # TOML knows no null, but dates
+    if value is None:  # TOML knows no null, but dates
+        value = datetime.date(1979, 5, 27)
+    return value.isoformat() if hasattr(value, "isoformat") else json.dumps(value)
 
 
 def _keys(holder: Any) -> Any:

@@ -34,6 +34,7 @@ class Reader:
     by_hand : makes hostile inputs of a seed and one of its targets.
     share : tries of this reader for each try of a cheap one.
     command : name of the program if `read` is a command line, which ends in exit status 0, 1 and a line, or 2.
+    refuses : names of the exceptions by which it refuses; not subclasses of ValueError, for those have escaped.
     check : looks at what `read` returned; an AssertionError is a failure.
     names_file : whether a refusal must name the file.
     may_write : patterns of paths that it may leave in the folder of the input.
@@ -47,6 +48,7 @@ class Reader:
     by_hand: tuple[Callable[[Input, str], Made], ...] = ()
     share: float = 1.0
     command: str = ""
+    refuses: tuple[str, ...] = ("ValueError", "FileFormatError")
     check: Callable[[Any], None] = field(default=lambda result: None)
     names_file: bool = True
     may_write: tuple[str, ...] = ()
@@ -297,6 +299,7 @@ _RESULT_PARTS = {
     "tables": ("result/*/comparison.json", "result/*/measurement.json"),
     "captures": ("result/*/capture/*",),
 }
+_CLOUD = ("CloudReadError",)
 _IMAGES = {"png": "png", "tif": "tiff", "bmp": "bmp", "jpg": "jpeg", "pgm": "pgm"}
 _RUN = "run {entry} --out {out} --sensor ideal-tof --width 16 --height 12 --spp 1 --photons 1000"
 _DECODE = "decode {entry} --out {out} --code gray --projector 8x8 --axes columns,rows --bits 8"
@@ -307,9 +310,17 @@ _CALIBRATED = "decode {entry} --out {out} --calibration"
 READERS = {
     reader.name: reader
     for reader in (
-        Reader("ply", _cloud, partial(seeds.cloud_files, "ply"), by_hand=(_lies("ply"),), check=_arrays_agree),
-        Reader("pcd", _cloud, partial(seeds.cloud_files, "pcd"), by_hand=(_lies("pcd"),), check=_arrays_agree),
-        Reader("edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,)),
+        *(
+            Reader(
+                suffix, _cloud, partial(seeds.cloud_files, suffix), by_hand=(_lies(suffix),), refuses=_CLOUD,
+                check=_arrays_agree,
+            )
+            for suffix in ("ply", "pcd")
+        ),
+        Reader(
+            "edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,),
+            refuses=("ValueError", *_CLOUD),
+        ),
         *(
             Reader(
                 f"mesh-{suffix}", _scene, partial(seeds.mesh_files, suffix), by_hand=(hostile.meshes,), share=0.5,

@@ -178,25 +178,24 @@ class Worker:
 
 def _call(reader: Reader, path: Path, arguments: tuple[str, ...]) -> Answer:
     """The answer of a reader, without a look at what it printed or left."""
-    from pcgraph.errors import PcgraphError
-    from rangesim.errors import FileFormatError
-
     if reader.command:
         sys.argv = [reader.command, *arguments]
     try:
         result = reader.read(path, arguments)
-    except (ValueError, FileFormatError, PcgraphError) as error:
-        kind = type(error)
-        right = kind is ValueError or isinstance(error, (FileFormatError, PcgraphError))
-        if reader.command or not right:  # no subclasses of ValueError, such as UnicodeDecodeError: those escaped
-            return Answer("failed", "exception", kind.__name__, _place(error), str(error)[:2000])
-        return Answer("refused", "", kind.__name__, _place(error), str(error))
     except SystemExit as end:
         if reader.command and end.code in (0, 1, 2, None):
             return Answer("refused" if end.code else "accepted", "", str(end.code or 0), _place(end))
         return Answer("failed", "exception", "SystemExit", _place(end), str(end))
-    except BaseException as error:  # noqa: BLE001 - whatever it is, it is a failure that is written down
-        return Answer("failed", "exception", type(error).__name__, _place(error), str(error)[:2000])
+    except BaseException as error:  # noqa: BLE001 - whatever it is, it is judged and written down
+        refused = type(error).__name__ in reader.refuses and not reader.command
+        text = str(error) if refused else str(error)[:2000]
+        return Answer(
+            "refused" if refused else "failed",
+            "" if refused else "exception",
+            type(error).__name__,
+            _place(error),
+            text,
+        )
     finally:
         sys.stdout.flush()
         sys.stderr.flush()
@@ -208,6 +207,14 @@ def _call(reader: Reader, path: Path, arguments: tuple[str, ...]) -> Answer:
             "failed", "result", type(error).__name__, f"{Path(place.filename).name}: {place.line}", str(error)[:2000]
         )
     return Answer("accepted")
+
+
+def _is_refusal(error: BaseException, reader: Reader) -> bool:
+    """Whether an exception is one by which this reader refuses; a subclass of ValueError is not: that one escaped."""
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    if type(error) is not ValueError:
+        kinds.discard("ValueError")
+    return not reader.command and bool(kinds & set(reader.refuses))
 
 
 def _fault_of_message(message: str, path: Path, one: Input, names_file: bool, command: bool) -> str:

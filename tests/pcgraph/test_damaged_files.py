@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of any fields, parts of files, and files that lie: a cloud whose arrays agree, or one sentence, in little memory.
+"""Files of any fields, parts of files, and files that lie: a cloud whose arrays agree, or one sentence; soon.
 
 Mutated ones are the business of tests/fuzz.
 """
