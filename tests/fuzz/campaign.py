@@ -25,6 +25,7 @@ from threading import Lock
 from types import TracebackType
 from typing import Any
 
+from fuzz.hostile import NONSENSE
 from fuzz.inputs import Input, dumps, from_json, to_json
 from fuzz.readers import READERS, Cases
 from fuzz.worker import LIMIT_S, PACKAGES, ROOT, Answer
@@ -87,7 +88,8 @@ class Watch:
         self._end()
         if late:
             return Answer("failed", "late", "no answer", _place(trace), f"no answer in {LIMIT_S:g} s", seconds)
-        assert process.returncode is not None
+        if process.returncode == 1 and "fuzz/worker.py" in said:
+            raise RuntimeError(f"the harness itself failed on {request['reader']}, seed {request['seed']}: {said}")
         signal = f"signal {-process.returncode}" if process.returncode < 0 else f"exit {process.returncode}"
         kind = "memory" if "memory" in said.lower() or "bad_alloc" in said else "crash"
         return Answer("failed", kind, signal, _place(trace), said, seconds)
@@ -206,7 +208,10 @@ def fuzz_reader(
     tally, lost = Tally(cases.reader.name), 0
     for number in numbers:
         answer = watch.answer(tally.reader, seed=seed, case=number)
-        tally.add(answer, number, cases.name(number))
+        name = cases.name(number)
+        if answer.outcome == "accepted" and name.startswith(NONSENSE):
+            answer = replace(answer, outcome="failed", kind="accepted", error=name)
+        tally.add(answer, number, name)
         lost += answer.kind in ("late", "crash", "memory")
         if lost >= MAX_LOST:
             tally.given_up = True

@@ -17,6 +17,8 @@ from fuzz.inputs import Content, Fifo, Folder, Input, Link, Sparse
 from fuzz.mutation import npz_of, png_of
 
 Made = dict[str, Callable[[], Input]]
+NONSENSE = "nonsense, "
+"""Inputs whose names start with it must be refused; of the others either answer is right."""
 
 NAMES = (
     "a b.{}", "-rf.{}", "caf\u00e9 \U0001f600.{}", "a" * 200 + ".{}", "two\nlines.{}", "\x1b[31mred.{}",
@@ -101,7 +103,7 @@ def json_trees(seed: Input, target: str) -> Made:
         "100 000 braces": lambda: b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
         "nested value": lambda: json.dumps(data).replace(": ", ": " + "[" * 900 + "]" * 900 + ', "x": ', 1).encode(),
         "deeply nested value": lambda: whole.rstrip()[:-1] + b', "x": ' + b"[" * 50_000 + b"]" * 50_000 + b"}",
-        "number of 5000 digits": lambda: with_first_number("9" * 5000),
+        "nonsense, number of 5000 digits": lambda: with_first_number("9" * 5000),
         "number of 4000 digits": lambda: with_first_number("9" * 4000),
         "not a number": lambda: with_first_number("NaN"),
         "infinite": lambda: with_first_number("Infinity"),
@@ -287,9 +289,9 @@ def toml_files(seed: Input, target: str) -> Made:
         "100 000 brackets": scene + b"x = " + b"[" * 100_000 + b"]" * 100_000,
         "100 000 open brackets": b"x = " + b"[" * 100_000,
         "20 000 braces": scene + b"x = " + b"{a=" * 20_000 + b"1" + b"}" * 20_000,
-        "20 000 dots": b"a" + b".a" * 20_000 + b" = 1\n" + scene,
+        "nonsense, 20 000 dots": b"a" + b".a" * 20_000 + b" = 1\n" + scene,
         "20 000 dotted tables": b"[a" + b".a" * 20_000 + b"]\n",
-        "number of 5000 digits": scene + b"spp = " + b"9" * 5000,
+        "nonsense, number of 5000 digits": scene + b"spp = " + b"9" * 5000,
         "number of 4000 digits": scene + b"spp = " + b"9" * 4000,
         "hexadecimal of 5000 digits": scene + b"spp = 0x" + b"f" * 5000,
         "spp 10^9": scene + b"spp = 1000000000\n",
@@ -297,32 +299,32 @@ def toml_files(seed: Input, target: str) -> Made:
         "size 10^6": scene + b"width = 1000000\nheight = 1000000\n",
         "depth 10^9": scene + b"max_depth = 1000000000\n",
         "photons 10^12": scene + b"photons = 1000000000000\n",
-        "seed 2^70": scene + b"seed = 1180591620717411303424\n",
-        "seed -1": scene + b"seed = -1\n",
-        "width true": scene + b"width = true\n",
-        "infinite period": sensor + b"type = 'structured-light'\nperiod_px = inf\n",
-        "nan period": sensor + b"type = 'structured-light'\nperiod_px = nan\n",
+        "nonsense, seed 2^70": scene + b"seed = 1180591620717411303424\n",
+        "nonsense, seed -1": scene + b"seed = -1\n",
+        "nonsense, width true": scene + b"width = true\n",
+        "nonsense, infinite period": sensor + b"type = 'structured-light'\nperiod_px = inf\n",
+        "nonsense, nan period": sensor + b"type = 'structured-light'\nperiod_px = nan\n",
         "tiny period": sensor + b"type = 'structured-light'\nperiod_px = 1e-300\n",
-        "steps 10^30": sensor + b"type = 'structured-light'\ncode = 'gray-phase'\nsteps = 1" + b"0" * 30,
-        "steps 10^9": sensor + b"type = 'structured-light'\ncode = 'gray-phase'\nsteps = 1000000000",
-        "projector 10^9": sensor + b"type = 'structured-light'\nprojector_width = 1000000000\n",
-        "axes twice": sensor + b"type = 'structured-light'\naxes = ['columns', 'columns']\n",
+        "nonsense, steps 10^30": sensor + b"type = 'structured-light'\ncode = 'gray-phase'\nsteps = 1" + b"0" * 30,
+        "nonsense, steps 10^9": sensor + b"type = 'structured-light'\ncode = 'gray-phase'\nsteps = 1000000000",
+        "nonsense, projector 10^9": sensor + b"type = 'structured-light'\nprojector_width = 1000000000\n",
+        "nonsense, axes twice": sensor + b"type = 'structured-light'\naxes = ['columns', 'columns']\n",
         "10^5 axes": sensor + b"type = 'structured-light'\naxes = [" + b"'rows'," * 100_000 + b"]\n",
-        "bins 10^9": sensor + b"type = 'direct-tof'\nbins = 1000000000\n",
-        "bin 1e-300": sensor + b"type = 'direct-tof'\nbin_s = 1e-300\n",
-        "infinite pulse": sensor + b"type = 'direct-tof'\npulse_fwhm_s = inf\n",
+        "nonsense, bins 10^9": sensor + b"type = 'direct-tof'\nbins = 1000000000\n",
+        "nonsense, bin 1e-300": sensor + b"type = 'direct-tof'\nbin_s = 1e-300\n",
+        "nonsense, infinite pulse": sensor + b"type = 'direct-tof'\npulse_fwhm_s = inf\n",
         "frequency 2^63": sensor + b"type = 'amcw-tof'\nmodulation_hz = [9223372036854775808.0]\n",
         "frequencies close by": sensor + b"type = 'amcw-tof'\nmodulation_hz = [1e12, 1.000000001e12]\n",
-        "infinite frequency": sensor + b"type = 'amcw-tof'\nmodulation_hz = [inf]\n",
+        "nonsense, infinite frequency": sensor + b"type = 'amcw-tof'\nmodulation_hz = [inf]\n",
         "10^5 frequencies": sensor + b"type = 'amcw-tof'\nmodulation_hz = [" + b"1e6," * 100_000 + b"]\n",
-        "power 1e300": scene + b"[[instrument]]\nsensor = 'amcw'\npower_w = 1e300\n",
-        "power nan": scene + b"[[instrument]]\nsensor = 'amcw'\npower_w = nan\n",
-        "baseline inf": scene + b"[[instrument]]\nsensor = 'amcw'\nbaseline_m = inf\n",
+        "nonsense, power 1e300": scene + b"[[instrument]]\nsensor = 'amcw'\npower_w = 1e300\n",
+        "nonsense, power nan": scene + b"[[instrument]]\nsensor = 'amcw'\npower_w = nan\n",
+        "nonsense, baseline inf": scene + b"[[instrument]]\nsensor = 'amcw'\nbaseline_m = inf\n",
         "2000 instruments": scene
         + b"".join(b"[[instrument]]\nname = 'i%d'\nsensor = 'amcw'\n" % i for i in range(2000)),
-        "names of files": scene + b"[[instrument]]\nname = '../../x'\nsensor = 'amcw'\n",
-        "name empty": scene + b"[[instrument]]\nname = ''\nsensor = 'amcw'\n",
-        "name NUL": scene + b'[[instrument]]\nname = "a\\u0000b"\nsensor = "amcw"\n',
+        "nonsense, names of files": scene + b"[[instrument]]\nname = '../../x'\nsensor = 'amcw'\n",
+        "nonsense, name empty": scene + b"[[instrument]]\nname = ''\nsensor = 'amcw'\n",
+        "nonsense, name NUL": scene + b'[[instrument]]\nname = "a\\u0000b"\nsensor = "amcw"\n',
         "scene NUL": b'scene = "a\\u0000b"\n',
         "dates": b"scene = 1979-05-27T07:32:00Z\n",
         "key twice": scene + scene,
@@ -346,13 +348,14 @@ def xml_files(seed: Input, target: str) -> Made:
     sphere = '<shape type="sphere"><float name="radius" value="{}"/>{}</shape>'
     glass = '<bsdf type="dielectric"><float name="int_ior" value="{}"/></bsdf>'
     light = '<emitter type="constant"><spectrum name="radiance" value="{}"/></emitter>'
+    scaled = '<shape type="cube"><transform name="to_world"><scale value="{}"/></transform></shape>'
     lol = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">' + "".join(
         f'<!ENTITY {chr(98 + i)} "{f"&{chr(97 + i)};" * 10}">' for i in range(9)
     )
     made = {
-        "20 000 nested bsdf": inside('<shape type="sphere">' + nested("bsdf", "twosided", 20_000) + "</shape>"),
-        "2000 nested bsdf": inside('<shape type="sphere">' + nested("bsdf", "twosided", 2000) + "</shape>"),
-        "300 nested bsdf": inside('<shape type="sphere">' + nested("bsdf", "mask", 300) + "</shape>"),
+        "nonsense, 20 000 nested bsdf": inside(sphere.format("1", nested("bsdf", "twosided", 20_000))),
+        "2000 nested bsdf": inside(sphere.format("1", nested("bsdf", "twosided", 2000))),
+        "300 nested bsdf": inside(sphere.format("1", nested("bsdf", "mask", 300))),
         "200 000 nested bsdf": inside(nested("bsdf", "twosided", 200_000)),
         "20 000 nested textures": inside(nested("texture", "bitmap", 20_000)),
         "20 000 nested unknown": inside("<x>" * 20_000 + "</x>" * 20_000),
@@ -361,12 +364,12 @@ def xml_files(seed: Input, target: str) -> Made:
         "bsdfs that refer to each other": inside(
             '<bsdf type="twosided" id="a"><ref id="b"/></bsdf><bsdf type="twosided" id="b"><ref id="a"/></bsdf>'
         ),
-        "includes itself": inside(f'<include filename="{target}"/>'),
+        "nonsense, includes itself": inside(f'<include filename="{target}"/>'),
         "includes a directory": inside('<include filename="."/>'),
-        "includes an endless file": inside('<include filename="/dev/zero"/>'),
+        "nonsense, includes an endless file": inside('<include filename="/dev/zero"/>'),
         "includes a password file": inside('<include filename="/etc/passwd"/>'),
         "includes nothing": inside('<include filename=""/>'),
-        "laughs": (lol + f"]><scene version='3.0.0'>&{chr(98 + 8)};</scene>").encode(),
+        "nonsense, laughs": (lol + f"]><scene version='3.0.0'>&{chr(98 + 8)};</scene>").encode(),
         "external entity": b'<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><scene version="3.0.0">&a;</scene>',
         "no root": b"<?xml version='1.0'?>",
         "wrong root": b"<bsdf type='diffuse'/>",
@@ -390,44 +393,44 @@ def xml_files(seed: Input, target: str) -> Made:
         "name of a shape of escapes": inside('<shape type="sphere" id="a&#27;[31m"><ref id="nothing&#27;"/></shape>'),
         "encoding lies": b'<?xml version="1.0" encoding="utf-16"?>' + whole,
         "encoding unknown": b'<?xml version="1.0" encoding="klingon"?>' + whole,
-        "reflectance 2": inside(sphere.format("1", diffuse.format("spectrum", "2"))),
-        "reflectance -1": inside(sphere.format("1", diffuse.format("spectrum", "-1"))),
-        "reflectance nan": inside(sphere.format("1", diffuse.format("spectrum", "nan"))),
-        "reflectance of colour nan": inside(sphere.format("1", diffuse.format("rgb", "nan,nan,nan"))),
-        "reflectance of colour 1e30": inside(sphere.format("1", diffuse.format("rgb", "1e30,0,0"))),
+        "nonsense, reflectance 2": inside(sphere.format("1", diffuse.format("spectrum", "2"))),
+        "nonsense, reflectance -1": inside(sphere.format("1", diffuse.format("spectrum", "-1"))),
+        "nonsense, reflectance nan": inside(sphere.format("1", diffuse.format("spectrum", "nan"))),
+        "nonsense, reflectance of colour nan": inside(sphere.format("1", diffuse.format("rgb", "nan,nan,nan"))),
+        "nonsense, reflectance of colour 1e30": inside(sphere.format("1", diffuse.format("rgb", "1e30,0,0"))),
         "reflectance of colour 4 numbers": inside(sphere.format("1", diffuse.format("rgb", "1,1,1,1"))),
         "reflectance of 10^5 wavelengths": inside(
             sphere.format("1", diffuse.format("spectrum", ",".join(f"{i}:0.5" for i in range(100_000))))
         ),
         "reflectance of wavelengths backwards": inside(sphere.format("1", diffuse.format("spectrum", "700:1,400:0"))),
-        "radius nan": inside(sphere.format("nan", "")),
-        "radius -1": inside(sphere.format("-1", "")),
+        "nonsense, radius nan": inside(sphere.format("nan", "")),
+        "nonsense, radius -1": inside(sphere.format("-1", "")),
         "radius 0": inside(sphere.format("0", "")),
-        "radius inf": inside(sphere.format("inf", "")),
-        "radius 1e12": inside(sphere.format("1e12", "")),
-        "radius 1e38": inside(sphere.format("1e38", "")),
-        "index nan": inside(sphere.format("1", glass.format("nan"))),
-        "index -1": inside(sphere.format("1", glass.format("-1"))),
+        "nonsense, radius inf": inside(sphere.format("inf", "")),
+        "nonsense, radius 1e12": inside(sphere.format("1e12", "")),
+        "nonsense, radius 1e38": inside(sphere.format("1e38", "")),
+        "nonsense, index nan": inside(sphere.format("1", glass.format("nan"))),
+        "nonsense, index -1": inside(sphere.format("1", glass.format("-1"))),
         "index 0": inside(sphere.format("1", glass.format("0"))),
-        "index inf": inside(sphere.format("1", glass.format("inf"))),
-        "radiance nan": inside(light.format("nan")),
-        "radiance -1": inside(light.format("-1")),
-        "radiance 1e300": inside(light.format("1e300")),
-        "scale 0": inside('<shape type="cube"><transform name="to_world"><scale value="0"/></transform></shape>'),
-        "scale nan": inside('<shape type="cube"><transform name="to_world"><scale value="nan"/></transform></shape>'),
-        "matrix of nan": inside(
+        "nonsense, index inf": inside(sphere.format("1", glass.format("inf"))),
+        "nonsense, radiance nan": inside(light.format("nan")),
+        "nonsense, radiance -1": inside(light.format("-1")),
+        "nonsense, radiance 1e300": inside(light.format("1e300")),
+        "scale 0": inside(scaled.format("0")),
+        "nonsense, scale nan": inside(scaled.format("nan")),
+        "nonsense, matrix of nan": inside(
             f'<shape type="cube"><transform name="to_world"><matrix value="{"nan " * 16}"/></transform></shape>'
         ),
         "look at itself": inside(
             '<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,0" target="0,0,0" up="0,0,1"/>'
             "</transform></sensor>"
         ),
-        "field of view nan": text.replace('name="fov" value="40"', 'name="fov" value="nan"').encode(),
-        "field of view 180": text.replace('name="fov" value="40"', 'name="fov" value="180"').encode(),
-        "film 10^9": text.replace('name="width" value="16"', 'name="width" value="1000000000"').encode(),
-        "film 2^31": text.replace('name="width" value="16"', 'name="width" value="2147483648"').encode(),
-        "film -1": text.replace('name="width" value="16"', 'name="width" value="-1"').encode(),
-        "film 0": text.replace('name="width" value="16"', 'name="width" value="0"').encode(),
+        "nonsense, field of view nan": text.replace('name="fov" value="40"', 'name="fov" value="nan"').encode(),
+        "nonsense, field of view 180": text.replace('name="fov" value="40"', 'name="fov" value="180"').encode(),
+        "nonsense, film 10^9": text.replace('name="width" value="16"', 'name="width" value="1000000000"').encode(),
+        "nonsense, film 2^31": text.replace('name="width" value="16"', 'name="width" value="2147483648"').encode(),
+        "nonsense, film -1": text.replace('name="width" value="16"', 'name="width" value="-1"').encode(),
+        "nonsense, film 0": text.replace('name="width" value="16"', 'name="width" value="0"').encode(),
         "film true": text.replace(
             '<integer name="width" value="16"/>', '<boolean name="width" value="true"/>'
         ).encode(),
@@ -464,7 +467,8 @@ def opencv_calibrations(seed: Input, target: str) -> Made:
             values, end, after = numbers.partition(b"</data>")
             changed = " ".join([word, *values.decode().split()[1:]]).encode()
             content = start + f"<{name}".encode() + before + mark + changed + end + after
-            made[f"{name} {word[:8]}"] = partial(seed.with_file, target, content)
+            nonsense = "nonsense, " if word in ("nan", "inf", "-inf", "1e400", "x", "") else ""
+            made[f"{nonsense}{name} {word[:8]}"] = partial(seed.with_file, target, content)
     deep = b"<opencv_storage>" + b"<a>" * 100_000 + b"</a>" * 100_000 + b"</opencv_storage>"
     made["100 000 nested"] = partial(seed.with_file, target, deep)
     many = whole.replace(b"<data>", b"<data>" + b"1 " * 1_000_000, 1)

@@ -169,10 +169,7 @@ def mutate_tree(tree: Any, rng: Random) -> Any:
 
 def mutate_json(content: bytes, rng: Random) -> bytes:
     """JSON with values of its tree mutated; now and then with a key twice."""
-    try:
-        tree = json.loads(content)
-    except ValueError:
-        return mutate_words(content, rng)
+    tree = json.loads(content)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         tree = mutate_tree(tree, rng)
     text = json.dumps(tree, indent=1)
@@ -183,10 +180,7 @@ def mutate_json(content: bytes, rng: Random) -> bytes:
 
 def mutate_toml(content: bytes, rng: Random) -> bytes:
     """TOML with values of its tree mutated."""
-    try:
-        tree = tomllib.loads(content.decode())
-    except ValueError:
-        return mutate_words(content, rng)
+    tree = tomllib.loads(content.decode())
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         tree = mutate_tree(tree, rng)
     if not isinstance(tree, dict):
@@ -257,10 +251,7 @@ NAMES = _words(
 
 def mutate_xml(content: bytes, rng: Random) -> bytes:
     """XML with attributes, tags and branches of its tree mutated."""
-    try:
-        root = ET.fromstring(content)
-    except (ET.ParseError, ValueError, LookupError):
-        return mutate_words(content, rng)
+    root = ET.fromstring(content)
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         _mutate_element(root, rng)
     text = ET.tostring(root, encoding="unicode")
@@ -317,11 +308,8 @@ def _text(rng: Random, numbers: bool = False) -> str:
 
 def mutate_npz(content: bytes, rng: Random) -> bytes:
     """A NumPy archive with members lost, renamed, reshaped, of another type, of hostile values, or lying headers."""
-    try:
-        with np.load(io.BytesIO(content)) as data:
-            arrays = {name: data[name] for name in data.files}
-    except Exception:  # noqa: BLE001 - whatever an earlier mutation did to it
-        return mutate_bytes(content, rng)
+    with np.load(io.BytesIO(content)) as data:
+        arrays = {name: data[name] for name in data.files}
     raw: dict[str, bytes] = {}
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         if not arrays:
@@ -514,6 +502,14 @@ BY_SUFFIX: dict[str, tuple[Mutator, ...]] = {
 def mutators_of(name: str) -> tuple[Mutator, ...]:
     """Mutators that suit a file of this name."""
     return BY_SUFFIX.get("." + name.rpartition(".")[2].lower(), BINARY)
+
+
+def mutate(name: str, content: bytes, rng: Random) -> bytes:
+    """The content of a file of this name, mutated; bytes alone where it is of its kind no longer."""
+    try:
+        return rng.choice(mutators_of(name))(content, rng)
+    except Exception:  # noqa: BLE001 - whatever an earlier mutation did to it
+        return mutate_bytes(content, rng)
 
 
 def mutate_arguments(arguments: tuple[str, ...], rng: Random) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from fuzz import hostile, seeds
 from fuzz.cloud_files import lies
 from fuzz.hostile import Made
 from fuzz.inputs import Input
-from fuzz.mutation import MAX_BYTES, mutate_arguments, mutators_of
+from fuzz.mutation import MAX_BYTES, mutate, mutate_arguments
 
 Arguments = tuple[str, ...]
 
@@ -96,7 +96,7 @@ class Cases:
             content = one.files[target]
             assert isinstance(content, bytes)
             if len(content) < MAX_BYTES:
-                one = one.with_file(target, rng.choice(mutators_of(target))(content, rng))
+                one = one.with_file(target, mutate(target, content, rng))
         return one
 
     def name(self, number: int) -> str:
@@ -238,6 +238,11 @@ def _sidecar_trees(seed: Input, target: str) -> Made:
     return hostile.json_trees(seed, target) if target.endswith(".json") else {}
 
 
+def _settings_to_run(seed: Input, target: str) -> Made:
+    """Settings that can be run soon, or must be refused."""
+    return {n: make for n, make in hostile.toml_files(seed, target).items() if n != "2000 instruments"}
+
+
 def _by_suffix(seed: Input, target: str) -> Made:
     """What is made by hand of a file in a result, by its suffix; of one file of each kind."""
     if target.endswith(".json"):
@@ -263,6 +268,39 @@ def _with_arguments(make: Callable[[], seeds.Seeds], *lines: str) -> Callable[[]
 def _beside_a_plane() -> seeds.Seeds:
     """A scene of a plane, to be run."""
     return {"plane": seeds.of_file("plane.xml", (seeds.SCENES / "plane.xml").read_bytes())}
+
+
+def _small_experiment() -> seeds.Seeds:
+    """An experiment on a plane, to be run; its command line makes it small."""
+    plane = (seeds.SCENES / "plane.xml").read_bytes()
+    text = b"""scene = "plane.xml"
+seed = 1
+max_depth = 3
+[[instrument]]
+name = "gray"
+[instrument.sensor]
+type = "structured-light"
+projector_width = 32
+projector_height = 24
+code = "gray-phase"
+period_px = 8.0
+steps = 4
+[[instrument]]
+name = "spad"
+power_w = 0.5
+[instrument.sensor]
+type = "direct-tof"
+bins = 64
+bin_s = 400e-12
+pulse_fwhm_s = 1e-9
+[[instrument]]
+name = "amcw"
+baseline_m = 0.03
+[instrument.sensor]
+type = "amcw-tof"
+modulation_hz = [20e6, 100e6]
+"""
+    return {"small": seeds.of_file("experiment.toml", text, **{"plane.xml": plane})}
 
 
 def _calibrated_captures() -> seeds.Seeds:
@@ -301,9 +339,9 @@ _RESULT_PARTS = {
 }
 _CLOUD = ("CloudReadError",)
 _IMAGES = {"png": "png", "tif": "tiff", "bmp": "bmp", "jpg": "jpeg", "pgm": "pgm"}
-_RUN = "run {entry} --out {out} --sensor ideal-tof --width 16 --height 12 --spp 1 --photons 1000"
+_RUN = "run {entry} --out {out} --width 16 --height 12 --spp 1 --photons 1000"
 _DECODE = "decode {entry} --out {out} --code gray --projector 8x8 --axes columns,rows --bits 8"
-_MORE = "--seed 1 --baseline 0.2 --max-depth 3"
+_MORE = "--sensor ideal-tof --seed 1 --baseline 0.2 --max-depth 3"
 _PLAIN = "decode {entry} --out {out}"
 _CALIBRATED = "decode {entry} --out {out} --calibration"
 
@@ -367,11 +405,15 @@ READERS = {
             ("*.json", "*.xml", "*/00*.png"), share=0.2, command="rangesim", may_write=("out*",),
         ),
         Reader(
+            "run-experiment", _rangesim, _with_arguments(_small_experiment, f"run --config {_RUN[4:]}"), ("*.toml",),
+            (_settings_to_run,), share=0.05, command="rangesim", may_write=("out*",),
+        ),
+        Reader(
             "options-decode", _rangesim, _with_arguments(_bare_images, _DECODE), share=0.2, command="rangesim",
             names_file=False, may_write=("*",), mutates_arguments=True,
         ),
         Reader(
-            "options-run", _rangesim, _with_arguments(_beside_a_plane, _RUN, f"{_RUN} {_MORE}"),
+            "options-run", _rangesim, _with_arguments(_beside_a_plane, f"{_RUN} --sensor gray", f"{_RUN} {_MORE}"),
             share=0.05, command="rangesim", names_file=False, may_write=("*",), mutates_arguments=True,
         ),
         Reader(

@@ -44,7 +44,7 @@ class Answer:
     """What became of one input.
 
     outcome : accepted, refused or failed.
-    kind : of a failure: exception, message, warning, output, leak, result, late, crash, memory.
+    kind : of a failure: exception, message, warning, output, leak, result, late, crash, memory, accepted.
     error : type of the exception. place : innermost line of the packages. message : text of the exception.
     seconds : wall-clock time. peak_mb : memory beyond what the process held before.
     """
@@ -187,15 +187,10 @@ def _call(reader: Reader, path: Path, arguments: tuple[str, ...]) -> Answer:
             return Answer("refused" if end.code else "accepted", "", str(end.code or 0), _place(end))
         return Answer("failed", "exception", "SystemExit", _place(end), str(end))
     except BaseException as error:  # noqa: BLE001 - whatever it is, it is judged and written down
-        refused = type(error).__name__ in reader.refuses and not reader.command
-        text = str(error) if refused else str(error)[:2000]
-        return Answer(
-            "refused" if refused else "failed",
-            "" if refused else "exception",
-            type(error).__name__,
-            _place(error),
-            text,
-        )
+        kind, place = type(error).__name__, _place(error)
+        if _is_refusal(error, reader):
+            return Answer("refused", "", kind, place, str(error))
+        return Answer("failed", "exception", kind, place, str(error)[:2000])
     finally:
         sys.stdout.flush()
         sys.stderr.flush()
