@@ -175,7 +175,7 @@ def test_what_is_no_seed_is_refused_everywhere(scene: Scene, signals: rangesim.S
         lambda: expose(signals, AmcwToF(), seed=seed),  # noise-free, and yet
         lambda: Experiment("scene.xml", seed=seed),
     ):
-        with pytest.raises(ValueError, match=r"^expected seed to be a whole number from 0 to 2\^64 - 1, got .*\.$"):
+        with pytest.raises(ValueError, match=r"^expected seed to be a whole number.*, got .*\.$"):
             call()
 
 
