@@ -137,9 +137,11 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         if value is None and type(None) in get_args(hint):
             return None
         hint = next(arg for arg in get_args(hint) if arg is not type(None))
-    if get_origin(hint) is typing.Literal and value not in get_args(hint):
+    if get_origin(hint) is typing.Literal and not (isinstance(value, str) and value in get_args(hint)):
         valid = get_args(hint)
-        raise ValueError(f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(value, valid)}.")
+        raise ValueError(
+            f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(str(value), valid)}."
+        )
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_dict(hint, value, where)
     if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):
