@@ -115,7 +115,7 @@ class EdgeModel:
         ValueError
             The file holds no such model.
         """
-        text = read_file(path, CloudReadError)
+        text = read_file(Path(path), CloudReadError)
         try:
             content = json.loads(text)
         except RecursionError:

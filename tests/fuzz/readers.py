@@ -329,7 +329,7 @@ def _one_cloud() -> seeds.Seeds:
 
 
 _RESULT_PARTS = {
-    "settings": ("result/experiment.json", "result/*manifest*"),
+    "settings": ("result/experiment.json",),
     "passes": ("result/pass_*.npz",),
     "range": ("result/*/range.npz",),
     "causes": ("result/*/causes.npz",),
@@ -392,6 +392,10 @@ READERS = {
             "report", _rangesim, _with_arguments(seeds.results, "report {entry}"),
             ("result/*.json", "result/*.npz", "result/*/capture/00*"), (_by_suffix,), share=0.2, command="rangesim",
             may_write=("result/report.html",),
+        ),
+        Reader(
+            "verify", _rangesim, _with_arguments(seeds.results, "verify {entry}"), ("result/manifest.json",),
+            (_by_suffix,), share=0.5, command="rangesim",
         ),
         Reader(
             "compare", _rangesim, _with_arguments(seeds.results, "compare {entry}"),
