@@ -27,6 +27,7 @@ def end_on_signals(program: str, writes: bool) -> None:
     ----------
     program : begins the line. writes : whether the command writes files, so that the line says what became of them.
     """
+    _open_standard_streams()
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -34,6 +35,19 @@ def end_on_signals(program: str, writes: bool) -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup and the like
             signal.signal(number, lambda *_: None)
     threading.Thread(target=_wait, args=(reader, program, writes), name="interrupts", daemon=True).start()
+
+
+def _open_standard_streams() -> None:
+    """Open those that the parent closed (`>&-`): a file would take their numbers, and what libraries print."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(1, "w", closefd=False)
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(2, "w", closefd=False)
 
 
 def _wait(reader: int, program: str, writes: bool) -> None:
@@ -44,13 +58,15 @@ def _wait(reader: int, program: str, writes: bool) -> None:
 
 
 def _end(number: int, program: str, writes: bool) -> None:
-    output = sys.modules.get("pcgraph.output")  # not loaded: nothing was begun
-    began = bool(output.abandon()) if output is not None and hasattr(output, "abandon") else False
-    done = output is not None and getattr(output, "completed", 0) > 0
-    text = "; nothing was written" if writes and (began or not done) else ""
-    with contextlib.suppress(OSError, ValueError):
-        sys.stdout.flush()
-    clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
-    with contextlib.suppress(OSError):
-        os.write(2, f"{clear}{program}: interrupted{text}.\n".encode())
-    os._exit(128 + number)
+    try:
+        output = sys.modules.get("pcgraph.output")  # not loaded: nothing was begun
+        began = bool(output.abandon()) if output is not None and hasattr(output, "abandon") else False
+        done = output is not None and getattr(output, "completed", 0) > 0
+        text = "; nothing was written" if writes and (began or not done) else ""
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
+        with contextlib.suppress(OSError):
+            os.write(2, f"{clear}{program}: interrupted{text}.\n".encode())
+    finally:
+        os._exit(128 + number)

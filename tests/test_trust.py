@@ -188,7 +188,7 @@ def test_what_a_killed_run_left_is_cleared_by_the_next(tmp_path: Path) -> None:
     out = tmp_path / "n"
     line = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--spp", "20000", "--out", str(out)]
     with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while not (out / STAGING / "new").exists():
+        while not list((out / STAGING).glob("work-*")):
             assert process.poll() is None
             time.sleep(0.01)
         process.kill()

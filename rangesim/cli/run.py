@@ -97,10 +97,11 @@ def run_command(
     from rangesim.pipeline import run
     from rangesim.result_files import RESULT
 
-    say_where(out, check_directory(out, RESULT, inputs=[experiment.scene]))
+    target = check_directory(out, RESULT, inputs=[experiment.scene])
+    say_where(out, target)
     with progress_bar() as progress:
         run(experiment, out, progress)
-    _say_what_measured_nothing(out)
+    _say_what_measured_nothing(target)
     typer.echo(f"{out / 'report.html'}")
 
 
