@@ -209,7 +209,7 @@ def main() -> None:
         if as_root:
             _mount(small, "", 64 << 10)
             on_tmpfs = Place(small)
-            ends, wrong = trial("full disk (tmpfs)", options.disks - half, on_tmpfs,
+            _, wrong = trial("full disk (tmpfs)", options.disks - half, on_tmpfs,
                                 lambda seed: full(on_tmpfs, seed, rng, True), {"fitted", "refused"})  # fmt: skip
             result["full_disks"] += options.disks - half
             result["full_disk_failures"] += wrong

@@ -29,6 +29,7 @@ def end_on_signals(program: str, writes: bool) -> None:
     ----------
     program : begins the line. writes : whether the command writes files, so that the line says what became of them.
     """
+    _open_standard_streams()
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -37,6 +38,19 @@ def end_on_signals(program: str, writes: bool) -> None:
             signal.signal(number, lambda *_: None)
     atexit.register(_stay)
     threading.Thread(target=_wait, args=(reader, program, writes), name="interrupts", daemon=True).start()
+
+
+def _open_standard_streams() -> None:
+    """Open those that the parent closed (`>&-`): a file would take their numbers, and what libraries print."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(1, "w", closefd=False)
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(2, "w", closefd=False)
 
 
 _ending = threading.Event()
@@ -56,27 +70,26 @@ def _wait(reader: int, program: str, writes: bool) -> None:
 
 
 def _end(number: int, program: str, writes: bool) -> None:
-    _ending.set()
-    with contextlib.suppress(OSError, ValueError):
-        sys.stdout.flush()
-    clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
-    screen = _last_words()
-    output = sys.modules.get("pcgraph.output")  # not loaded: nothing was begun
-    began = bool(output.abandon()) if output is not None and hasattr(output, "abandon") else False
-    done = output is not None and getattr(output, "completed", 0) > 0
-    text = "; nothing was written" if writes and (began or not done) else ""
-    with contextlib.suppress(OSError):
-        os.write(screen, f"{clear}{program}: interrupted{text}.\n".encode())
-    os._exit(128 + number)
+    try:
+        _ending.set()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
+        screen = _last_words()
+        output = sys.modules.get("pcgraph.output")  # not loaded: nothing was begun
+        began = bool(output.abandon()) if output is not None and hasattr(output, "abandon") else False
+        done = output is not None and getattr(output, "completed", 0) > 0
+        text = "; nothing was written" if writes and (began or not done) else ""
+        with contextlib.suppress(OSError):
+            os.write(screen, f"{clear}{program}: interrupted{text}.\n".encode())
+    finally:
+        os._exit(128 + number)
 
 
 def _last_words() -> int:
     """A handle to what was stderr; from now on nobody else's words come through."""
-    try:
-        screen = os.dup(2)
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 1)
-        os.dup2(nowhere, 2)
-    except OSError:  # stderr is closed
-        return 2
+    screen = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
     return screen

@@ -25,7 +25,7 @@ import shutil
 import stat
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -42,10 +42,11 @@ MANIFEST = "manifest.json"
 MANIFEST_FORMAT = "rangesim-manifest"
 MANIFEST_VERSION = 1
 MAX_MANIFEST_BYTES = 64 << 20
-_JOURNAL, _LOCK, _NEW, _OLD = "journal.json", "lock", "new", "old"
+_JOURNAL, _LOCK, _WORK, _NEW, _OLD = "journal.json", "lock", "work", "new", "old"
 _DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quota is used up",
          errno.EFBIG: "the file would be larger than allowed", errno.EROFS: "the file system is read-only",
          errno.EIO: "the device fails"}  # fmt: skip
+_LONGEST_NAME = 255
 _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
 
 
@@ -99,18 +100,22 @@ def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence
         holds an input or lies in one, or another process is writing to it.
     """
     named = Path(directory)
-    if named.is_symlink() and not named.exists():
-        raise kind.error(f"{named} is a link to {os.readlink(named)}, which does not exist; name another place.")
-    target = Path(os.path.realpath(named))
-    if os.path.lexists(target) and not target.is_dir():
-        raise kind.error(f"{named} exists and is no directory; name another place.")
-    for source in inputs:
-        _check_apart(named, target, Path(source), kind)
-    if target.is_dir():
-        if _is_claimed(target):
-            raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
-        if not (target / STAGING).exists():  # what a killed process left there is looked at once it is cleared
-            _check_contents(named, target, kind)
+    try:
+        if named.is_symlink() and not named.exists():
+            raise kind.error(f"{named} is a link to {os.readlink(named)}, which does not exist; name another place.")
+        target = Path(os.path.realpath(named))
+        if os.path.lexists(target) and not target.is_dir():
+            raise kind.error(f"{named} exists and is no directory; name another place.")
+        for source in inputs:
+            _check_apart(named, target, Path(source), kind)
+        if target.is_dir():
+            if _is_claimed(target):
+                raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
+            if not (target / STAGING).exists():  # what a killed process left there is looked at once it is cleared
+                _check_contents(named, target, kind, inputs)
+    except OSError as problem:
+        place = f" ({os.fsdecode(problem.filename)})" if problem.filename else ""
+        raise kind.error(f"cannot write to {named}: {_why(problem)}{place}; name another place.") from problem
     return target
 
 
@@ -132,9 +137,13 @@ def new_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence[s
     with _one_sentence(named, target, kind):
         staging = _Staging.claim(named, target, kind)
         try:
-            _check_contents(named, target, kind)
+            _check_contents(named, target, kind, inputs)
             yield staging.make_new()
             staging.commit(named, kind)
+        except OSError:
+            if staging.was_moved():
+                raise kind.error(_moved(named)) from None  # no directory is to be created: see `_one_sentence`
+            raise
         finally:
             staging.release()
 
@@ -145,29 +154,35 @@ def write_manifest(folder: Path, kind: DirectoryKind) -> None:
     (folder / MANIFEST).write_bytes(_manifest(kind, files))
 
 
-def replace_listed_file(directory: str | Path, name: str, content: bytes, kind: DirectoryKind) -> None:
+def replace_listed_file(directory: str | Path, name: str, make: Callable[[], bytes], kind: DirectoryKind) -> None:
     """Write the file `name` of a complete directory anew, and its manifest.
+
+    `make` returns the content; nobody else replaces the directory from when it is called to the end.
 
     Raises
     ------
     kind.error
         The file was changed by somebody else, or another process is writing to the directory.
     """
-    folder = Path(os.path.realpath(directory))
-    with _one_sentence(Path(directory), folder, kind):
+    named, folder = Path(directory), Path(os.path.realpath(directory))
+    with _one_sentence(named, folder, kind):
         recover(folder, kind.error)
-        if _is_claimed(folder):
-            raise kind.error(f"another process is writing to {directory}; wait for it.")
-        files = read_manifest(folder, kind)
-        path = folder / name
-        if os.path.lexists(path) and not (_is_plain_file(path) and _digest(path) in files.get(name, [])):
-            raise kind.error(f"{path} was changed since rangesim wrote it; move it away first.")
-        new = Digest(len(content), hashlib.sha256(content).hexdigest())
-        # Both contents are ours while one takes the place of the other
-        _write(folder / MANIFEST, _manifest(kind, files | {name: [*files.get(name, []), new]}))
-        _write(path, content)
-        _write(folder / MANIFEST, _manifest(kind, files | {name: [new]}))
-        _count()
+        read_manifest(folder, kind)
+        staging = _Staging.claim(named, folder, kind)
+        try:
+            content = make()
+            files = read_manifest(folder, kind)
+            path = folder / name
+            if os.path.lexists(path) and not (_is_plain_file(path) and _digest(path) in files.get(name, [])):
+                raise kind.error(f"{path} was changed since rangesim wrote it; move it away first.")
+            new = Digest(len(content), hashlib.sha256(content).hexdigest())
+            # Both contents are ours while one takes the place of the other
+            _write(folder / MANIFEST, _manifest(kind, files | {name: [*files.get(name, []), new]}))
+            _write(path, content)
+            _write(folder / MANIFEST, _manifest(kind, files | {name: [new]}))
+            _count()
+        finally:
+            staging.release()
 
 
 def read_manifest(directory: Path, kind: DirectoryKind) -> dict[str, list[Digest]]:
@@ -237,7 +252,7 @@ def recover(directory: str | Path, error: type[Exception]) -> None:
     try:
         try:
             _carry_out(target)
-            shutil.rmtree(staging, ignore_errors=True)
+            _dissolve(staging)
         finally:
             os.close(handle)
     except OSError as problem:
@@ -276,6 +291,9 @@ class _Staging:
         self.target, self.path = target, target / STAGING
         self.made = [path for path in (target, *target.parents) if not path.exists()]
         self.handle: int | None = None
+        self.process = os.getpid()
+        self.work = self.path / f"{_WORK}-{os.urandom(8).hex()}"  # its own name: see `is_ours`
+        self.manifest: Digest | None = None
 
     @classmethod
     def claim(cls, named: Path, target: Path, kind: DirectoryKind) -> _Staging:
@@ -283,16 +301,14 @@ class _Staging:
         with _claims_lock:
             claim = cls(target)
             try:
-                target.mkdir(parents=True, exist_ok=True)
-                if not claim.path.exists():
-                    claim.path.mkdir(exist_ok=True)
-                elif not _is_staging(claim.path):
-                    raise kind.error(f"{claim.path} is not what rangesim keeps its work in; move it away.")
-                claim.handle = _lock(claim.path)
+                while not claim.take(kind):
+                    time.sleep(0.001)
                 if claim.handle is None:
                     raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
                 _carry_out(target)
-                claim.clear()
+                _clear(claim.path)
+                if _is_plain_file(target / MANIFEST):
+                    claim.manifest = _digest(target / MANIFEST)
                 _clear_parts(target, claim.listed(kind).keys() | {MANIFEST})
             except BaseException:
                 claim.release()
@@ -300,27 +316,53 @@ class _Staging:
             _claims[claim.path] = claim
         return claim
 
+    def take(self, kind: DirectoryKind) -> bool:
+        """Try to lock the staging directory, made if need be; whether it was still there."""
+        self.target.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.mkdir(exist_ok=True)
+            if not _is_staging(self.path):
+                if os.path.lexists(self.path):
+                    raise kind.error(f"{self.path} is not what rangesim keeps its work in; move it away.")
+                return False
+            self.handle = _lock(self.path)
+        except FileNotFoundError:  # its owner has just removed it
+            return False
+        return True
+
     def make_new(self) -> Path:
         """The directory to fill."""
-        (self.path / _NEW).mkdir()
-        return self.path / _NEW
+        self.work.mkdir()
+        return self.work
 
-    def clear(self) -> None:
-        """Remove all but the lock."""
-        for entry in self.path.iterdir():
-            if entry.name == _LOCK:
-                continue
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry, ignore_errors=True)
-            else:
-                entry.unlink()
+    def is_ours(self) -> bool:
+        """Whether this process made the claim, and the directory is still where it was.
+
+        A user may move or remove it meanwhile, and another process may work in a new one of that name; and a child of
+        this process shares the claim.
+        """
+        if self.handle is None or self.process != os.getpid():
+            return False
+        try:
+            return os.path.samestat(os.stat(self.path / _LOCK), os.fstat(self.handle))
+        except FileNotFoundError:
+            return False
+
+    def was_moved(self) -> bool:
+        """Whether the directory is no longer where this process made it."""
+        return self.handle is not None and self.process == os.getpid() and not self.is_ours()
 
     def commit(self, named: Path, kind: DirectoryKind) -> None:
         """List the new files in a manifest, flush them, and let them take their places."""
-        new = self.path / _NEW
-        write_manifest(new, kind)
-        _flush_tree(new)
+        if self.process != os.getpid():
+            return
+        write_manifest(self.work, kind)
+        _flush_tree(self.work)
         with _claims_lock:
+            if self.was_moved():
+                raise kind.error(_moved(named))
+            new = self.path / _NEW
+            self.work.rename(new)
             old = self.listed(kind)
             names = _walk(new)
             obstacle = next((name for name in names if _is_in_the_way(self.target, name, old)), None)
@@ -330,6 +372,8 @@ class _Staging:
                     f"{named / obstacle} came or was changed while the work went on; it was left as it is, and the new "
                     f"result is in {kept}."
                 )
+            for name in old:  # what may fail, fails before
+                _make_plain_parents(self.path, f"{_OLD}/{name}")
             _write(self.path / _JOURNAL, _json({"retire": old, "place": names}))
             try:
                 _carry_out(self.target)
@@ -339,10 +383,15 @@ class _Staging:
         _count()
 
     def listed(self, kind: DirectoryKind) -> dict[str, list[Digest]]:
-        """Files of the older result that are still as they were written, its manifest among them."""
+        """Files of the older result that are still as they were written, its manifest among them.
+
+        A manifest that came while the work went on is the user's, and so is what it lists.
+        """
         try:
+            if self.manifest is None or _digest(self.target / MANIFEST) != self.manifest:
+                return {}
             files = read_manifest(self.target, kind)
-        except kind.error:
+        except (kind.error, FileNotFoundError):
             return {}
         kept = {name: digests for name, digests in files.items() if _is_as_listed(self.target, name, files)}
         return {**kept, MANIFEST: [_digest(self.target / MANIFEST)]}
@@ -360,12 +409,55 @@ class _Staging:
         """Remove the staging directory, but for a replacement that is still to be completed; give up the lock."""
         with _claims_lock:
             _claims.pop(self.path, None)
-            if self.handle is not None:
-                if not (self.path / _JOURNAL).exists():
-                    shutil.rmtree(self.path, ignore_errors=True)
-                os.close(self.handle)
+            handle = self.handle
+            try:
+                if self.is_ours() and not (self.path / _JOURNAL).exists():
+                    _dissolve(self.path)
+            finally:  # also when a second Ctrl-C ends the clearing: the lock of a living process would stay
                 self.handle = None
-            _remove_empty(self.made)
+                if handle is not None:
+                    os.close(handle)
+            if self.process == os.getpid():
+                _remove_empty(self.made)
+
+
+def _moved(named: Path) -> str:
+    return f"{named} was moved or removed while the work went on; nothing was written there."
+
+
+def _clear(staging: Path) -> None:
+    """Remove all but the lock from a staging directory."""
+    for entry in staging.iterdir():
+        if entry.name == _LOCK:
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink()
+
+
+def _dissolve(staging: Path) -> None:
+    """Remove a staging directory whose lock is held; the lock last, so that nobody takes it for a foreign one."""
+    with suppress(OSError):  # the next one clears it
+        _clear(staging)
+        (staging / _LOCK).unlink()
+        staging.rmdir()
+
+
+def _forget_claims() -> None:
+    """In a child of a process: what its parent has begun is none of its business."""
+    global _claims_lock
+    _claims_lock = threading.RLock()
+    for claim in _claims.values():
+        if claim.handle is not None:
+            os.close(claim.handle)
+            claim.handle = None
+    _claims.clear()
+    _parts.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_claims)
 
 
 def _carry_out(target: Path) -> None:
@@ -384,7 +476,12 @@ def _carry_out(target: Path) -> None:
             continue
         if _is_as_listed(target, name, {name: digests}):
             _make_plain_parents(staging, f"{_OLD}/{name}")
-            (target / name).rename(staging / _OLD / name)
+            try:
+                (target / name).rename(staging / _OLD / name)
+            except OSError as problem:
+                if problem.errno != errno.EXDEV:
+                    raise
+                (target / name).unlink()  # something is mounted below the target
     for name in sorted(waiting, key=lambda n: (n == MANIFEST, n)):  # without it, no directory of ours is complete
         if not _is_reached_plainly(staging, f"{_NEW}/{name}"):
             raise OSError(errno.ELOOP, "a link in the staging directory", str(staging / _NEW / name))
@@ -409,8 +506,8 @@ def _read_journal(path: Path) -> tuple[dict[str, list[Digest]], list[str]]:
         raise OSError(errno.EINVAL, "its journal is damaged; remove the staging directory", str(path)) from error
 
 
-def _check_contents(named: Path, target: Path, kind: DirectoryKind) -> None:
-    """Refuse what is neither empty nor an older result of the same kind as it was written."""
+def _check_contents(named: Path, target: Path, kind: DirectoryKind, inputs: Sequence[str | Path]) -> None:
+    """Refuse what is neither empty nor an older result of the same kind as it was written, and what holds an input."""
     entries = [entry.name for entry in target.iterdir() if entry.name != STAGING]
     if not entries:
         return
@@ -431,10 +528,18 @@ def _check_contents(named: Path, target: Path, kind: DirectoryKind) -> None:
             f"{named / changed} was changed since rangesim wrote it; nothing was written, move it away or name another "
             "place."
         )
+    fixed = next((n for n in (*files, MANIFEST) if os.path.lexists(target / n) and not _may_move(target / n)), None)
+    if fixed is not None:
+        raise kind.error(f"{named / fixed} cannot be replaced: permission denied; name another place.")
+    for source in inputs:
+        real = Path(os.path.realpath(source))
+        within = real.relative_to(target).as_posix() if target in real.parents else None
+        if within is not None and any(name == within or name.startswith(f"{within}/") for name in files):
+            raise kind.error(f"the input {source} is a part of {named}, which would be replaced; name another place.")
 
 
 def _check_apart(named: Path, target: Path, source: Path, kind: DirectoryKind) -> None:
-    """Refuse an output that is an input, lies inside one, or is a directory of ours around one."""
+    """Refuse an output that is an input or lies inside one."""
     real = Path(os.path.realpath(source))
     if target == real:
         raise kind.error(f"{named} is the input itself; name another place.")
@@ -449,6 +554,16 @@ def _is_in_the_way(target: Path, name: str, listed: Mapping[str, Any]) -> bool:
         if os.path.lexists(parent) and not is_directory and parent.relative_to(target).as_posix() not in listed:
             return True
     return os.path.lexists(target / name) and name not in listed
+
+
+def _may_move(path: Path) -> bool:
+    """Whether this process may rename a file: that is up to its directory."""
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        return False
+    folder = path.parent.stat()
+    if not folder.st_mode & stat.S_ISVTX or not hasattr(os, "geteuid"):
+        return True
+    return os.geteuid() in (0, folder.st_uid, path.lstat().st_uid)
 
 
 def _states_kind(sidecar: Path, kind: str) -> bool:
@@ -479,6 +594,8 @@ def write_file(path: Path, content: bytes, error: type[Exception], make_parents:
     missing = [parent for parent in target.parents if not parent.exists()] if make_parents else []
     if os.path.lexists(target) and not target.is_file():
         raise error(f"cannot write {path}: it exists and is no plain file; choose another path.")
+    if os.path.lexists(target) and not os.access(target, os.W_OK):
+        raise error(f"cannot write {path}: it is read-only; choose another path.")
     done = False
     try:
         if make_parents:
@@ -496,8 +613,10 @@ def write_file(path: Path, content: bytes, error: type[Exception], make_parents:
 
 def _write(target: Path, content: bytes) -> None:
     """Put `content` in place of a plain file, or of nothing, by a temporary file beside it, flushed."""
-    _clear_parts(target.parent, {target.name})
+    _clear_parts(target.parent, {target.name, hashlib.sha256(os.fsencode(target.name)).hexdigest()})
     part = target.with_name(f".{target.name}.{os.urandom(8).hex()}.part")
+    if len(os.fsencode(part.name)) > _LONGEST_NAME:
+        part = target.with_name(f".{hashlib.sha256(os.fsencode(target.name)).hexdigest()}.{os.urandom(8).hex()}.part")
     _parts.add(str(part))
     try:
         handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
@@ -608,10 +727,18 @@ def _make_plain_parents(folder: Path, name: str) -> None:
 
 
 def _is_staging(path: Path) -> bool:
-    """Whether a directory of the staging's name is one: it holds its lock, or nothing."""
+    """Whether a directory of the staging's name is one: it holds its lock, or nothing.
+
+    Its owner may make or remove it meanwhile; the lock comes first and goes last.
+    """
     if path.is_symlink() or not path.is_dir():
         return False
-    return _is_plain_file(path / _LOCK) or not any(path.iterdir())
+    try:
+        names = os.listdir(path)
+    except FileNotFoundError:
+        return False
+    lock = path / _LOCK
+    return not names or (_LOCK in names and (_is_plain_file(lock) or not os.path.lexists(lock)))
 
 
 def _is_plain_file(path: Path) -> bool:
@@ -673,7 +800,13 @@ def _move_to_free_place(source: Path, place: Path) -> None:
     except OSError:  # a file system without hard links
         if os.path.lexists(place):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(place)) from None
-        source.rename(place)
+        try:
+            source.rename(place)
+        except OSError as problem:
+            if problem.errno != errno.EXDEV or not _is_plain_file(source):
+                raise
+            _write(place, source.read_bytes())  # something is mounted below the target
+            source.unlink()
         return
     source.unlink()
 
@@ -727,7 +860,7 @@ def _lock(staging: Path, seconds: float = 0.0) -> int | None:
 def _is_claimed(target: Path) -> bool:
     """Whether a living process writes to a directory; this looks without making anything."""
     path = target / STAGING / _LOCK
-    if fcntl is None or not path.exists():
+    if fcntl is None or not _is_plain_file(path):
         return False
     try:
         handle = os.open(path, os.O_RDONLY)

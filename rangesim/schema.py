@@ -45,6 +45,8 @@ def read_record(path: Path, kind: type[R]) -> R:
     FileFormatError
         The file is missing, broken, of another format or version, or a value is not what `kind` says.
     """
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise FileFormatError(f"{path} is no plain file.")
     data = read_json(path)
     expected = {f.name: f.type for f in msgspec.structs.fields(kind) if f.name in ("format", "format_version")}
     for name, constant in expected.items():  # before all other fields: they may be those of another version

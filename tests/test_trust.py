@@ -11,7 +11,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -188,7 +190,7 @@ def test_what_a_killed_run_left_is_cleared_by_the_next(tmp_path: Path) -> None:
     out = tmp_path / "n"
     line = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--spp", "20000", "--out", str(out)]
     with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while not (out / STAGING / "new").exists():
+        while not list((out / STAGING).glob("work-*")):
             assert process.poll() is None
             time.sleep(0.01)
         process.kill()
@@ -234,3 +236,81 @@ def test_verify_takes_captures_and_decoded_ones_too(tmp_path: Path) -> None:
     assert done.stderr.endswith("hold something else than was written.\n")
     assert_refused(command("verify", tmp_path), "expected a directory that rangesim wrote")
     assert SIDECAR in command("verify", tmp_path).stderr
+
+
+# ---- Found by attack ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="streams are closed in a child before it runs")
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_closed_standard_streams_are_no_obstacle(tmp_path: Path, closed: tuple[int, ...]) -> None:
+    """`rangesim ... >&- 2>&-`: it works, no file takes the number of a stream, and signals end it as ever."""
+
+    def close() -> None:
+        for descriptor in closed:
+            os.close(descriptor)
+
+    out = tmp_path / "n"
+    start = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--out", str(out)]
+    assert subprocess.run(start, timeout=120, check=False, preexec_fn=close).returncode == 0
+    assert command("verify", out).returncode == 0
+    shutil.rmtree(out)
+    with subprocess.Popen([*start, "--spp", "200000"], preexec_fn=close) as process:
+        wait_until(lambda: bool(list((out / STAGING).glob("work-*"))), process)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) == 130
+    assert not out.exists()
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[Any]) -> None:
+    for _ in range(3000):
+        if condition():
+            return
+        assert process.poll() is None
+        time.sleep(0.01)
+    pytest.fail("it never came")
+
+
+def test_a_place_whose_name_leads_through_what_is_not_there(tmp_path: Path) -> None:
+    done = run(tmp_path / "none" / ".." / "n")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "n" / "report.html").is_file()
+
+
+def test_verify_prints_a_line_for_each_file_whatever_its_name(tmp_path: Path) -> None:
+    folder = tmp_path / "n"
+    shutil.copytree(small_result() / "lines" / "capture", folder)
+    for name in (b"a\nchanged: b", b"\x1b[31mred", b"\xff"):
+        Path(os.fsdecode(os.fsencode(folder) + b"/" + name)).touch()
+    done = command("verify", folder)
+    assert done.returncode == 0
+    assert done.stdout.count("\n") == 4
+    assert "\x1b" not in done.stdout
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+@pytest.mark.parametrize("name", ["lines/measurement.json", "lines/comparison.json", "lines/capture/capture.json"])
+def test_pipes_in_a_result_are_not_waited_for(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "n"
+    shutil.copytree(small_result(), folder)
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    done = command("report", folder)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert str(folder / name).rpartition("/")[0] in done.stderr
+
+
+def test_a_report_is_of_the_result_it_is_written_to(tmp_path: Path) -> None:
+    """While it is made no run replaces the result."""
+    out = tmp_path / "n"
+    shutil.copytree(small_result(), out)
+    line = [sys.executable, "-m", "rangesim", "report", str(out)]
+    with subprocess.Popen(line, stdout=subprocess.DEVNULL) as process:
+        wait_until((out / STAGING / "lock").exists, process)
+        process.send_signal(signal.SIGSTOP)
+        assert_refused(run(out), "another process is writing")
+        process.send_signal(signal.SIGCONT)
+        assert process.wait(timeout=60) == 0
+    assert command("verify", out).returncode == 0
+    assert not (out / STAGING).exists()

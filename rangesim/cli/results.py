@@ -45,10 +45,10 @@ def report_command(
     """
     from pcgraph.output import replace_listed_file
     from rangesim.report import render_report
-    from rangesim.result_files import RESULT, load_result
+    from rangesim.result_files import RESULT, load_result, read_settings
 
-    page = render_report(load_result(result))
-    replace_listed_file(result, "report.html", page.encode(), RESULT)
+    read_settings(result)  # says what it is, if it is no result
+    replace_listed_file(result, "report.html", lambda: render_report(load_result(result)).encode(), RESULT)
     typer.echo(f"{result / 'report.html'}")
 
 
@@ -83,7 +83,7 @@ def verify_command(
     found = verify_directory(directory, kind)
     for word, names in (("missing", found.missing), ("changed", found.changed), ("not rangesim's", found.foreign)):
         for name in names:
-            typer.echo(visible(f"{word}: {directory / name}"))
+            typer.echo(visible(f"{word}: {directory / name}").replace("\n", "\\n"))
     if found.missing or found.changed:
         raise FileFormatError(
             f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} hold "

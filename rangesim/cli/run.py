@@ -106,10 +106,11 @@ def run_command(
         typer.echo(cost)
         cost.check_memory()
         return
-    say_where(out, check_directory(out, RESULT, inputs=[experiment.scene]))
+    target = check_directory(out, RESULT, inputs=[experiment.scene])
+    say_where(out, target)
     with progress_bar() as progress:
         pipeline.run(experiment, out, progress, announce=_announce)
-    _say_what_measured_nothing(out)
+    _say_what_measured_nothing(target)
     typer.echo(f"{out / 'report.html'}")
 
 

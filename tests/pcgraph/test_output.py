@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -339,8 +340,16 @@ def steps_of_a_replacement(tmp_path: Path) -> int:
             (Path, "mkdir"),
         ):
             patch.setattr(owner, name, counted(getattr(owner, name)))
+        patch.setattr(output._Staging, "release", end_of_process)
         publish(tmp_path / "count", NEW)
+    output._claims.clear()
     return calls[0]
+
+
+def end_of_process(claim: output._Staging) -> None:
+    """What is left to do for a claim whose process is killed: the system closes its files."""
+    if claim.handle is not None:
+        os.close(claim.handle)
 
 
 def test_a_process_that_dies_at_any_step_leaves_the_old_or_the_new(tmp_path: Path) -> None:
@@ -354,7 +363,7 @@ def test_a_process_that_dies_at_any_step_leaves_the_old_or_the_new(tmp_path: Pat
         write(target, MINE)
         with pytest.MonkeyPatch.context() as patch:
             count_down(patch, step, Stop)
-            patch.setattr(output._Staging, "release", lambda claim: os.close(claim.handle) if claim.handle else None)
+            patch.setattr(output._Staging, "release", end_of_process)
             with pytest.raises(Stop):
                 publish(target, NEW)
         output._claims.clear()
@@ -402,7 +411,7 @@ def test_a_killed_process_leaves_staging_that_the_next_one_clears(tmp_path: Path
             publish(target, OLD)
         done = subprocess.run([sys.executable, "-c", code, str(target)], check=False, timeout=60)
         assert done.returncode == -9
-        assert (target / STAGING / "new" / "half").exists()
+        assert list((target / STAGING).glob("work-*/half"))
         publish(target, NEW)
         assert contents(target) == NEW
         assert not (target / STAGING).exists()
@@ -461,17 +470,17 @@ def test_parts_of_dead_writers_are_cleared_and_those_of_living_ones_stay(tmp_pat
 
 def test_one_file_of_a_directory_is_replaced_with_its_digest(tmp_path: Path) -> None:
     publish(tmp_path / "n", OLD)
-    replace_listed_file(tmp_path / "n", "a.txt", b"again", KIND)
+    replace_listed_file(tmp_path / "n", "a.txt", lambda: b"again", KIND)
     assert is_whole(tmp_path / "n")
     assert contents(tmp_path / "n") == {**OLD, "a.txt": "again"}
     (tmp_path / "n" / "a.txt").write_text("by hand")
     with pytest.raises(Refused, match=r"a\.txt was changed since rangesim wrote it"):
-        replace_listed_file(tmp_path / "n", "a.txt", b"again", KIND)
+        replace_listed_file(tmp_path / "n", "a.txt", lambda: b"again", KIND)
     (tmp_path / "n" / "a.txt").unlink()
     (tmp_path / "n" / "a.txt").symlink_to(tmp_path / "victim")
     (tmp_path / "victim").write_text("again")
     with pytest.raises(Refused, match="was changed"):
-        replace_listed_file(tmp_path / "n", "a.txt", b"evil", KIND)
+        replace_listed_file(tmp_path / "n", "a.txt", lambda: b"evil", KIND)
     assert (tmp_path / "victim").read_text() == "again"
 
 
@@ -482,7 +491,7 @@ def test_a_replaced_file_is_ours_at_every_step(tmp_path: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             count_down(patch, step, Stop)
             with suppress(Stop):
-                replace_listed_file(target, "a.txt", b"again", KIND)
+                replace_listed_file(target, "a.txt", lambda: b"again", KIND)
         assert is_whole(target), step
         publish(target, NEW)
         assert contents(target) == NEW
@@ -520,3 +529,215 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+# ---- Found by attack ------------------------------------------------------------------------------------------------
+
+
+def in_another_process(code: str, *arguments: object) -> subprocess.Popen[str]:
+    """A process that has the module's names, KIND and `publish` at hand."""
+    lines = (
+        "import json, os, sys; from pathlib import Path\nfrom pcgraph.output import *\n"
+        "KIND = DirectoryKind('test-kind', 'sidecar.json', OSError)\n"
+        "def fill(folder, name):\n"
+        "    (folder / 'sidecar.json').write_text(json.dumps({'format': 'test-kind'}))\n"
+        "    (folder / name).write_text(name)\n"
+    )
+    line = [sys.executable, "-c", lines + code, *map(str, arguments)]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(line, stdin=pipe, stdout=pipe, stderr=subprocess.STDOUT, text=True)
+
+
+def publish_while(target: Path, act: Callable[[Path], object]) -> None:
+    """Publish NEW; what `act` does happens while the work goes on."""
+    with new_directory(target, KIND) as folder:
+        write(folder, {"sidecar.json": json.dumps({"format": "test-kind"}), **NEW})
+        act(folder)
+
+
+def test_a_directory_that_is_moved_away_takes_its_work_along(tmp_path: Path) -> None:
+    """The user moves it and starts another run of that name: neither publishes, nor clears, what is the other's."""
+    code = (
+        "with new_directory(sys.argv[1], KIND) as folder:\n"
+        "    fill(folder, 'B1'); print('in', flush=True); sys.stdin.readline(); (folder / 'B2').write_text('B2')\n"
+    )
+    others = []
+
+    def move_and_start_another(folder: Path) -> None:
+        (tmp_path / "n").rename(tmp_path / "moved")
+        others.append(in_another_process(code, tmp_path / "n"))
+        assert others[0].stdout is not None
+        assert others[0].stdout.readline() == "in\n"
+        (folder / "A").write_text("A")
+
+    with pytest.raises(Refused, match="was moved or removed while the work went on"):
+        publish_while(tmp_path / "n", move_and_start_another)
+    assert others[0].communicate("\n", timeout=30) == ("", None)
+    assert contents(tmp_path / "n") == {"B1": "B1", "B2": "B2"}
+    assert is_whole(tmp_path / "n")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="children share claims where processes fork")
+@pytest.mark.parametrize("end", [SystemExit, None])
+def test_a_child_that_leaves_the_block_changes_nothing(tmp_path: Path, end: type[BaseException] | None) -> None:
+    code = (
+        "try:\n"
+        "    with new_directory(sys.argv[1], KIND) as folder:\n"
+        "        fill(folder, 'a'); child = os.fork()\n"
+        f"        if child == 0 and {end is not None}:\n"
+        "            sys.exit()\n"
+        "        if child: os.waitpid(child, 0); (folder / 'b').write_text('b')\n"
+        "finally:\n"
+        "    if child == 0: os._exit(0)\n"
+    )
+    assert in_another_process(code, tmp_path / "n").communicate(timeout=30) == ("", None)
+    assert contents(tmp_path / "n") == {"a": "a", "b": "b"}
+    assert not (tmp_path / "n" / STAGING).exists()
+
+
+def test_a_result_copied_there_while_the_work_goes_on_is_the_users(tmp_path: Path) -> None:
+    publish(tmp_path / "best", OLD)
+    for name in ("new", "old"):
+        if name == "old":
+            publish(tmp_path / name, {"z": "z"})
+        copy = partial(shutil.copytree, tmp_path / "best", tmp_path / name, dirs_exist_ok=True)
+        with pytest.raises(Refused, match="came or was changed while the work went on"):
+            publish_while(tmp_path / name, lambda _, copy=copy: copy())  # type: ignore[misc]
+        assert contents(tmp_path / name).items() >= OLD.items()
+
+
+def test_a_replacement_crosses_file_systems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Something is mounted below the output, here `deep`: no link and no rename leads there."""
+
+    def refusing(call: Callable[..., object]) -> Callable[..., object]:
+        def wrapper(source: str | Path, place: str | Path, **kwargs: object) -> object:
+            if Path(source).parent != Path(place).parent and "deep" in str(source) + str(place):
+                raise OSError(errno.EXDEV, os.strerror(errno.EXDEV), str(source), None, str(place))
+            return call(source, place, **kwargs)
+
+        return wrapper
+
+    publish(tmp_path / "n", OLD)
+    write(tmp_path / "n", MINE)
+    for owner, name in ((os, "link"), (os, "rename"), (Path, "rename")):
+        monkeypatch.setattr(owner, name, refusing(getattr(owner, name)))
+    publish(tmp_path / "n", NEW)
+    assert contents(tmp_path / "n") == {**NEW, **MINE}
+    assert is_whole(tmp_path / "n")
+    assert not (tmp_path / "n" / STAGING).exists()
+
+
+def test_a_second_interrupt_gives_the_directory_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C twice, the second while the first is cleared up, in an interpreter that lives on."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    def interrupt_twice(_: Path) -> None:
+        monkeypatch.setattr(shutil, "rmtree", interrupted)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        publish_while(tmp_path / "n", interrupt_twice)
+    monkeypatch.undo()
+    publish(tmp_path / "n", NEW)
+    assert contents(tmp_path / "n") == NEW
+
+
+def test_a_process_killed_while_it_clears_up_leaves_what_the_next_one_knows(tmp_path: Path) -> None:
+    real = os.unlink
+    for step in range(8):
+        target = tmp_path / f"n{step}"
+        publish(target, OLD)
+        left = [step]
+
+        def unlink(path: str, left: list[int] = left, **kwargs: int) -> None:
+            left[0] -= 1
+            if left[0] < 0:
+                raise Stop
+            real(path, **kwargs)
+
+        def fail(_: Path, unlink: Callable[..., None] = unlink) -> None:
+            patch.setattr(os, "unlink", unlink)
+            raise ValueError
+
+        with pytest.MonkeyPatch.context() as patch, suppress(Stop, ValueError):
+            publish_while(target, fail)
+        publish(target, NEW)
+        assert contents(target) == NEW
+
+
+def test_processes_that_meet_say_so_and_nothing_else(tmp_path: Path) -> None:
+    """Claims that are made while others are given up: no work is lost, and no other error comes."""
+    code = (
+        "import time; until = time.time() + 2.5\n"
+        "while time.time() < until:\n"
+        "    try:\n"
+        "        with new_directory(sys.argv[1], KIND) as folder:\n"
+        "            fill(folder, 'a')\n"
+        "            if os.urandom(1) < b'\\x80': raise KeyError\n"
+        "    except KeyError: pass\n"
+        "    except OSError as error:\n"
+        "        if 'another process' not in str(error): print(error)\n"
+    )
+    processes = [in_another_process(code, tmp_path / "deep" / "n") for _ in range(3)]
+    said = "".join(process.communicate(timeout=60)[0] for process in processes)
+    assert "is not what rangesim keeps its work in" not in said
+    assert "cannot create the directory" not in said
+
+
+def test_an_input_that_the_older_result_holds_is_refused(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+    write(tmp_path / "n", MINE)
+    refuse(tmp_path / "n", "is a part of", (tmp_path / "n" / "gone" / "c.txt",))
+    refuse(tmp_path / "n", "is a part of", (tmp_path / "n" / "gone",))
+    check_directory(tmp_path / "n", KIND, [tmp_path / "n" / "NOTES.md"])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_a_pipe_named_as_the_lock_is_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "n" / STAGING).mkdir(parents=True)
+    os.mkfifo(tmp_path / "n" / STAGING / "lock")
+    code = "with new_directory(sys.argv[1], KIND): pass"
+    with in_another_process(code, tmp_path / "n") as process:
+        assert "is not what rangesim keeps its work in" in process.communicate(timeout=20)[0]
+
+
+def test_names_as_long_as_the_file_system_takes_them(tmp_path: Path) -> None:
+    for _ in range(2):
+        write_file(tmp_path / ("a" * 251 + ".ply"), b"x", Refused)
+        publish(tmp_path / ("d" * 255), OLD)
+    refuse(tmp_path / ("d" * 256), "File name too long")
+    with pytest.raises(Refused, match="File name too long"):
+        write_file(tmp_path / ("a" * 256), b"x", Refused)
+    assert sorted(len(p.name) for p in tmp_path.iterdir()) == [255, 255]
+
+
+def test_what_the_user_made_read_only_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "x").write_text("mine")
+    (tmp_path / "x").chmod(0o444)
+    if os.access(tmp_path / "x", os.W_OK):  # root may write everything
+        monkeypatch.setattr(os, "access", lambda path, mode: Path(path).stat().st_mode & 0o200)
+    with pytest.raises(Refused, match="it is read-only"):
+        write_file(tmp_path / "x", b"ours", Refused)
+    assert (tmp_path / "x").read_text() == "mine"
+
+
+def test_what_cannot_be_moved_away_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A directory of somebody else's below: the swap would end half-way."""
+    publish(tmp_path / "n", OLD)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "deep")
+    refuse(tmp_path / "n", r"deep/b\.txt cannot be replaced: permission denied")
+
+
+def test_a_file_is_made_while_nobody_else_replaces_the_directory(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+
+    def make() -> bytes:
+        with pytest.raises(Refused, match="another process is writing"):
+            publish(tmp_path / "n", NEW)
+        return b"again"
+
+    replace_listed_file(tmp_path / "n", "a.txt", make, KIND)
+    assert contents(tmp_path / "n") == {**OLD, "a.txt": "again"}
+    assert not (tmp_path / "n" / STAGING).exists()
