@@ -203,7 +203,7 @@ def main() -> None:
                             {"at a call", "not killed", "SIGKILL", "SIGTERM", "SIGINT"})  # fmt: skip
         result |= {"kills": options.kills, "kill_failures": wrong}
         half = options.disks // 2 if as_root else options.disks
-        ends, wrong = trial("full disk (file size)", half, place, lambda seed: full(place, seed, rng, False),
+        _, wrong = trial("full disk (file size)", half, place, lambda seed: full(place, seed, rng, False),
                             {"fitted", "refused"})  # fmt: skip
         result |= {"full_disks": half, "full_disk_failures": wrong}
         if as_root:
