@@ -140,7 +140,8 @@ def full(place: Place, attempted: int, rng: random.Random, tmpfs: bool) -> str:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
     if tmpfs:
-        used = sum(p.stat().st_size for p in place.out.parent.rglob("*") if p.is_file())
+        state = os.statvfs(place.out.parent)
+        used = (state.f_blocks - state.f_bfree) * state.f_frsize
         _mount(place.out.parent, "remount,", used // 1024 + rng.randrange(40, 1200))
     done = subprocess.run(
         place.command(attempted), capture_output=True, check=False, timeout=120, preexec_fn=None if tmpfs else limit
@@ -158,10 +159,8 @@ def _mount(folder: Path, option: str, kilobytes: int) -> None:
     subprocess.run(["mount", *source, "-o", f"{option}size={kilobytes}k", "tmpfs", str(folder)], check=True)
 
 
-def trial(
-    name: str, count: int, place: Place, attempt: Callable[[int], str], known: set[str]
-) -> tuple[Counter[str], int]:
-    """Attempts, each checked, until `count` of them met a kill or a full disk; how they ended, and the failures."""
+def trial(name: str, count: int, place: Place, attempt: Callable[[int], str], known: set[str]) -> int:
+    """Attempts, each checked, until `count` of them met a kill or a full disk; the number of failures."""
     ends: Counter[str] = Counter()
     failures = number = 0
     while sum(n for how, n in ends.items() if how not in HARMLESS) < count:
@@ -180,7 +179,7 @@ def trial(
         for sentence in wrong:
             print(f"{name} {number}, {how}: {sentence}")
     print(name, dict(ends), "failures:", failures, flush=True)
-    return ends, failures
+    return failures
 
 
 def main() -> None:
@@ -199,17 +198,17 @@ def main() -> None:
     try:
         place = Place(folder / "disk")
         usual_s = place.run()
-        ends, wrong = trial("kills", options.kills, place, lambda seed: killed(place, seed, rng, usual_s),
+        wrong = trial("kills", options.kills, place, lambda seed: killed(place, seed, rng, usual_s),
                             {"at a call", "not killed", "SIGKILL", "SIGTERM", "SIGINT"})  # fmt: skip
         result |= {"kills": options.kills, "kill_failures": wrong}
         half = options.disks // 2 if as_root else options.disks
-        _, wrong = trial("full disk (file size)", half, place, lambda seed: full(place, seed, rng, False),
+        wrong = trial("full disk (file size)", half, place, lambda seed: full(place, seed, rng, False),
                             {"fitted", "refused"})  # fmt: skip
         result |= {"full_disks": half, "full_disk_failures": wrong}
         if as_root:
             _mount(small, "", 64 << 10)
             on_tmpfs = Place(small)
-            _, wrong = trial("full disk (tmpfs)", options.disks - half, on_tmpfs,
+            wrong = trial("full disk (tmpfs)", options.disks - half, on_tmpfs,
                                 lambda seed: full(on_tmpfs, seed, rng, True), {"fitted", "refused"})  # fmt: skip
             result["full_disks"] += options.disks - half
             result["full_disk_failures"] += wrong
