@@ -133,6 +133,26 @@ def test_a_foreign_file_named_like_segments_stays(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scan.ply", "scan.segments.npz", "scan.segments.ply"]
 
 
+def test_segments_corrected_by_hand_stay(tmp_path: Path) -> None:
+    cloud = tmp_path / "scan.ply"
+    shutil.copy(small_result() / "lines" / "cloud.ply", cloud)
+    arrays, points = tmp_path / "scan.segments.npz", tmp_path / "scan.segments.ply"
+    assert command("segment", cloud, "--out", tmp_path, package="pcgraph").returncode == 0
+    with np.load(arrays) as file:
+        corrected = dict(file)
+    corrected["labels"] += 1
+    for path in (points, arrays):
+        if path == points:
+            path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+        else:
+            np.savez(path, **corrected)
+        mine = path.read_bytes()
+        done = command("segment", cloud, "--out", tmp_path, package="pcgraph")
+        assert_refused(done, f"{path.name} exists and was not written by pcgraph, or changed since")
+        assert path.read_bytes() == mine
+        path.unlink()
+
+
 # ---- Durable and clean ----------------------------------------------------------------------------------------------
 
 
