@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick lint format constraints audit clean system
+.PHONY: help demo test test-quick fuzz lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -22,6 +22,12 @@ test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run e
 
 test-quick: $(VENV)/.installed-test ## the tests without those marked slow, without coverage
 	$(BIN)/python -m pytest -m "not slow"
+
+N := 20000
+SEED := $(shell date +%Y%m%d)
+JOBS := $(shell nproc 2>/dev/null || echo 1)
+fuzz: $(VENV)/.installed-test ## N=100000 mutated and hostile files over all readers; new failures go to tests/fuzz/corpus
+	PYTHONPATH=$(CURDIR):$(CURDIR)/tests $(BIN)/python -m fuzz --n $(N) --seed $(SEED) --jobs $(JOBS) --keep
 
 lint: $(VENV)/.installed-test ## ruff and mypy
 	$(BIN)/ruff check

@@ -51,7 +51,9 @@ for owner, name in ((os, "link"), (os, "replace"), (Path, "rename"), (Path, "unl
 from rangesim.__main__ import main
 main()
 """
-CALLS = 90
+HARMLESS = {"not killed", "fitted"}
+"""How an attempt ends that the run outlives."""
+CALLS = 70
 """About as many of these calls there are in one replacement."""
 MINE = {"NOTES.md": "mine", "gray/thoughts.txt": "mine too", "mydata/x.csv": "1,2"}
 
@@ -74,7 +76,9 @@ class Place:
     def run(self) -> float:
         """Replace the result in peace; seconds."""
         start = time.monotonic()
-        subprocess.run(self.command(self.seed + 1), check=True, capture_output=True, timeout=120)
+        done = subprocess.run(self.command(self.seed + 1), check=False, capture_output=True, timeout=120)
+        if done.returncode:
+            raise RuntimeError(f"a run in peace ended with status {done.returncode}: {done.stderr.decode()[-2000:]}")
         self.seed += 1
         return time.monotonic() - start
 
@@ -157,16 +161,20 @@ def _mount(folder: Path, option: str, kilobytes: int) -> None:
 def trial(
     name: str, count: int, place: Place, attempt: Callable[[int], str], known: set[str]
 ) -> tuple[Counter[str], int]:
-    """`count` attempts, checked one by one; how they ended, and the number of failures."""
+    """Attempts, each checked, until `count` of them met a kill or a full disk; how they ended, and the failures."""
     ends: Counter[str] = Counter()
-    failures = 0
-    for number in range(count):
+    failures = number = 0
+    while sum(n for how, n in ends.items() if how not in HARMLESS) < count:
+        number += 1
         attempted = place.seed + 1000
         how = attempt(attempted)
         ends[how] += 1
         wrong = place.failures(attempted) + ([] if how in known else [how])
-        if number % 5 == 4:
-            place.run()
+        if number % 5 == 0:
+            try:
+                place.run()
+            except RuntimeError as error:
+                wrong.append(str(error))
             wrong += [f"litter: {found}" for found in place.litter()] + place.failures(place.seed)
         failures += bool(wrong)
         for sentence in wrong:
@@ -193,17 +201,17 @@ def main() -> None:
         usual_s = place.run()
         ends, wrong = trial("kills", options.kills, place, lambda seed: killed(place, seed, rng, usual_s),
                             {"at a call", "not killed", "SIGKILL", "SIGTERM", "SIGINT"})  # fmt: skip
-        result |= {"kills": options.kills - ends["not killed"], "kill_failures": wrong}
+        result |= {"kills": options.kills, "kill_failures": wrong}
         half = options.disks // 2 if as_root else options.disks
-        ends, wrong = trial("full disk (file size)", half, place, lambda seed: full(place, seed, rng, False),
+        _, wrong = trial("full disk (file size)", half, place, lambda seed: full(place, seed, rng, False),
                             {"fitted", "refused"})  # fmt: skip
-        result |= {"full_disks": half - ends["fitted"], "full_disk_failures": wrong}
+        result |= {"full_disks": half, "full_disk_failures": wrong}
         if as_root:
             _mount(small, "", 64 << 10)
             on_tmpfs = Place(small)
-            ends, wrong = trial("full disk (tmpfs)", options.disks - half, on_tmpfs,
+            _, wrong = trial("full disk (tmpfs)", options.disks - half, on_tmpfs,
                                 lambda seed: full(on_tmpfs, seed, rng, True), {"fitted", "refused"})  # fmt: skip
-            result["full_disks"] += options.disks - half - ends["fitted"]
+            result["full_disks"] += options.disks - half
             result["full_disk_failures"] += wrong
     finally:
         if os.path.ismount(small):

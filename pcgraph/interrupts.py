@@ -11,11 +11,13 @@ Only the standard library is imported, so that this can come before every other 
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
 import sys
 import threading
+import time
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
@@ -34,6 +36,7 @@ def end_on_signals(program: str, writes: bool) -> None:
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup and the like
             signal.signal(number, lambda *_: None)
+    atexit.register(_stay)
     threading.Thread(target=_wait, args=(reader, program, writes), name="interrupts", daemon=True).start()
 
 
@@ -50,6 +53,15 @@ def _open_standard_streams() -> None:
         sys.stderr = os.fdopen(2, "w", closefd=False)
 
 
+_ending = threading.Event()
+
+
+def _stay() -> None:
+    """Keep the main thread, whose work has just been taken away, from ending the process with an error of its own."""
+    while _ending.is_set():
+        time.sleep(1.0)
+
+
 def _wait(reader: int, program: str, writes: bool) -> None:
     while True:
         number = os.read(reader, 1)[0]
@@ -59,14 +71,25 @@ def _wait(reader: int, program: str, writes: bool) -> None:
 
 def _end(number: int, program: str, writes: bool) -> None:
     try:
+        _ending.set()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
+        screen = _last_words()
         output = sys.modules.get("pcgraph.output")  # not loaded: nothing was begun
         began = bool(output.abandon()) if output is not None and hasattr(output, "abandon") else False
         done = output is not None and getattr(output, "completed", 0) > 0
         text = "; nothing was written" if writes and (began or not done) else ""
-        with contextlib.suppress(OSError, ValueError):
-            sys.stdout.flush()
-        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
         with contextlib.suppress(OSError):
-            os.write(2, f"{clear}{program}: interrupted{text}.\n".encode())
+            os.write(screen, f"{clear}{program}: interrupted{text}.\n".encode())
     finally:
         os._exit(128 + number)
+
+
+def _last_words() -> int:
+    """A handle to what was stderr; from now on nobody else's words come through."""
+    screen = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    return screen

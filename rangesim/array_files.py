@@ -12,6 +12,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from pcgraph.plain_files import check_file
 from rangesim import limits
 from rangesim.config import shown
 from rangesim.errors import FileFormatError
@@ -42,6 +43,7 @@ def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[st
         The file is missing, broken, too large, lacks one of `names`, or holds objects.
     """
     path = Path(path)
+    check_file(path, FileFormatError)
     try:
         with zipfile.ZipFile(path) as archive:
             members = _members(archive, path)
@@ -80,7 +82,10 @@ def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: str) -> np.nd
         size = math.prod(shape) * dtype.itemsize
         if size != entry.file_size - file.tell():
             raise FileFormatError(f"{place}: expected {size} bytes as its header says, got another number.")
-        array: np.ndarray = np.empty(math.prod(shape), dtype=dtype)
+        try:
+            array: np.ndarray = np.empty(math.prod(shape), dtype=dtype)
+        except MemoryError:
+            raise FileFormatError(f"{place}: its {size} bytes do not fit into memory.") from None
         view, filled = array.view(np.uint8).data, 0
         while filled < size:
             count = file.readinto(view[filled:])  # type: ignore[attr-defined]

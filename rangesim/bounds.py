@@ -57,7 +57,8 @@ Metres = Annotated[float, Bounds("positive and finite", 1e-9, FARTHEST_M)]
 Watts = Annotated[float, Bounds("positive and finite", 1e-12, 1e9)]
 HERTZ = Bounds("positive and finite", 1.0, 1e12)
 Hertz = Annotated[float, HERTZ]
-Seconds = Annotated[float, Bounds("positive and finite", 1e-15, 1e6)]
+SECONDS = Bounds("positive and finite", 1e-15, 1e6)
+Seconds = Annotated[float, SECONDS]
 Pause = Annotated[float, Bounds("0 or positive", 1e-15, 1e6, or_zero=True)]
 Wavelength = Annotated[float, Bounds("positive and finite", 1e-8, 1e-2)]
 Exponent = Annotated[float, Bounds("an exponent of at least 0", 0, 100)]

@@ -14,7 +14,7 @@ from pcgraph.output import DirectoryKind, new_directory, recover, write_manifest
 from rangesim import __version__
 from rangesim.ambient import Ambient
 from rangesim.capture import DTYPES, Capture
-from rangesim.config import check_keys, from_dict, to_dict
+from rangesim.config import check_keys, from_dict, shown, to_dict
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
 from rangesim.image_files import SUFFIXES, read_stack, write_grey
@@ -97,7 +97,7 @@ def load_capture(directory: str | Path) -> Capture:
         raise FileFormatError(f"{sidecar} is no {FORMAT} file.")
     if settings.get("format_version") != FORMAT_VERSION:
         raise FileFormatError(
-            f"{sidecar}: expected format version {FORMAT_VERSION}, got {settings.get('format_version')!r}."
+            f"{sidecar}: expected format version {FORMAT_VERSION}, got {shown(settings.get('format_version'))}."
         )
     try:
         check_keys(settings, _KEYS, str(sidecar))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 import reprlib
 import types
 import typing
@@ -84,6 +85,18 @@ _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxarray = 8
 _SHORT.maxlevel = 3
 
 
+def visible(text: str) -> str:
+    """Text whose control characters are spelt out, as `\\u202e`.
+
+    They would turn round, break or hide the text beside them, or give orders to a terminal; and half a surrogate pair
+    cannot be written at all.
+    """
+    return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
+
+
 def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:
     """Raise ValueError on the first key that is not valid, naming the nearest valid one."""
     valid = list(valid)
@@ -124,9 +137,11 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         if value is None and type(None) in get_args(hint):
             return None
         hint = next(arg for arg in get_args(hint) if arg is not type(None))
-    if get_origin(hint) is typing.Literal and value not in get_args(hint):
+    if get_origin(hint) is typing.Literal and not (isinstance(value, str) and value in get_args(hint)):
         valid = get_args(hint)
-        raise ValueError(f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(value, valid)}.")
+        raise ValueError(
+            f"{where}: expected one of {', '.join(valid)}, got {shown(value)}{nearest(str(value), valid)}."
+        )
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return from_dict(hint, value, where)
     if get_origin(hint) is tuple and dataclasses.is_dataclass(get_args(hint)[0]):

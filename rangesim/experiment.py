@@ -17,6 +17,7 @@ from rangesim.errors import FileFormatError
 from rangesim.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.motion import Motion
 from rangesim.motion.settings import motion_from_dict
+from rangesim.seeds import check_seed
 from rangesim.text_files import read_toml
 
 
@@ -35,7 +36,7 @@ class Experiment:
     max_depth : longest path in segments up to the light; 2 is direct light alone.
     photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
     glint : whether the camera sees the projector's lens in mirrors.
-    seed : of transport and noise; the same seed gives the same bytes.
+    seed : of transport and noise, 0 to 2^64 - 1; the same seed gives the same bytes.
     ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
     instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
     motion : what moves; None: nothing.
@@ -61,8 +62,7 @@ class Experiment:
             raise ValueError("expected scene to be the path of a scene or a mesh, got an empty one.")
         limits.check("pixels", (self.width or 1) * (self.height or 1), f"pixels, not {self.width} x {self.height}")
         limits.check("instruments", len(self.instruments), "instruments")
-        if self.seed < 0:
-            raise ValueError(f"expected a seed of at least 0, got {self.seed}.")
+        object.__setattr__(self, "seed", check_seed(self.seed))
         for one in self.instruments if self.motion else ():
             period_s = one.timing.frame_period_s
             if one.exposure_s is not None and 0 < period_s < one.exposure_s:

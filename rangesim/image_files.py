@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
+import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pcgraph.plain_files import check_file
 from rangesim import limits
 from rangesim.errors import FileFormatError
 
@@ -46,12 +49,15 @@ def read_grey(path: Path) -> np.ndarray:
     FileFormatError
         The file cannot be read, or its pixels are none of these types.
     """
+    check_file(path, FileFormatError)
     try:
-        return _read_exr(path) if path.suffix.lower() == ".exr" else _read_raster(path)
+        with _quiet():
+            return _read_exr(path) if path.suffix.lower() == ".exr" else _read_raster(path)
     except FileFormatError:
         raise
     except _BROKEN as error:
-        raise FileFormatError(f"{path} cannot be read as an image: {error}.") from error
+        reason = " ".join(str(error).split())[:200] or "it is damaged"
+        raise FileFormatError(f"{path} cannot be read as an image: {reason}.") from error
 
 
 def check_size(path: Path) -> None:
@@ -59,12 +65,14 @@ def check_size(path: Path) -> None:
 
     Nothing is decoded. A file that is no image, or of another format than those of `read_grey`, passes.
     """
+    check_file(path, FileFormatError)
     try:
-        if path.suffix.lower() == ".exr":
-            _open_exr(path)
-        else:
-            with _open_raster(path):
-                pass
+        with _quiet():
+            if path.suffix.lower() == ".exr":
+                _open_exr(path)
+            else:
+                with _open_raster(path):
+                    pass
     except FileFormatError:
         raise
     except _BROKEN:
@@ -86,7 +94,12 @@ def read_stack(paths: list[Path]) -> np.ndarray:
         image = read_grey(path)
         if first is None:
             first = image
-            frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
+            try:
+                frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
+            except MemoryError:
+                raise FileFormatError(
+                    f"{path}: {len(paths)} frames of {image.shape[1]} x {image.shape[0]} do not fit into memory."
+                ) from None
         if image.shape != first.shape or image.dtype != first.dtype:
             raise FileFormatError(
                 f"{path}: expected {first.shape[1]} x {first.shape[0]} {first.dtype} as {paths[0].name}, "
@@ -94,6 +107,27 @@ def read_stack(paths: list[Path]) -> np.ndarray:
             )
         frames[i] = image
     return frames
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep libraries from printing: OpenEXR and libtiff write to stderr what they also raise, Pillow warns of metadata
+    that nobody here reads."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            kept = os.dup(2)
+        except OSError:  # stderr is closed
+            yield
+            return
+        try:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, 2)
+            os.close(nowhere)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def _open_exr(path: Path) -> None:
@@ -126,7 +160,15 @@ def _open_raster(path: Path) -> Iterator[Any]:
 
     `Image.open` would try every format, and apply a limit of its own, which is one for the whole process.
     """
-    from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, TiffImagePlugin
+    from PIL import (
+        BmpImagePlugin,
+        Image,
+        JpegImagePlugin,
+        PngImagePlugin,
+        PpmImagePlugin,
+        TiffImagePlugin,
+        UnidentifiedImageError,
+    )
 
     plugins = (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
                PpmImagePlugin.PpmImageFile, TiffImagePlugin.TiffImageFile)  # fmt: skip
@@ -141,9 +183,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
                 limits.check("pixels", image.width * image.height, f"pixels in {path}", FileFormatError)
                 yield image
             return
-    raise FileFormatError(
-        f"{path} cannot be read as an image: it is none of {', '.join(p.format for p in plugins)} or OpenEXR."
-    )
+    raise UnidentifiedImageError(f"it is none of {', '.join(p.format for p in plugins)} or OpenEXR")
 
 
 def _read_raster(path: Path) -> np.ndarray:

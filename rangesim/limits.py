@@ -46,6 +46,7 @@ class Limits:
     instruments : of one experiment.
     points : vertices, or faces, of one mesh file.
     shapes : of one scene.
+    memory : bytes that a run may take by its estimate; unless it is set, what the machine has available.
     bytes : of the arrays that one file holds once it is decompressed.
     text : bytes of one JSON, TOML or XML file.
     nesting : levels of JSON, TOML, XML and scene dictionaries.
@@ -65,6 +66,7 @@ class Limits:
     instruments: int = 100
     points: int = 100_000_000
     shapes: int = 100_000
+    memory: int = 1 << 50
     bytes: int = 4 << 30
     text: int = 64 << 20
     nesting: int = 100

@@ -17,6 +17,7 @@ from pcgraph.output import new_directory
 from rangesim.capture import Capture
 from rangesim.capture_files import write_capture
 from rangesim.causes import explain
+from rangesim.cost import Cost, estimate_cost
 from rangesim.experiment import Experiment
 from rangesim.instrument import Instrument
 from rangesim.motion import transport_moving
@@ -32,6 +33,7 @@ from rangesim.result_files import (
     save_rows,
 )
 from rangesim.schema import write_record
+from rangesim.seeds import derived_seed
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -49,7 +51,13 @@ FEWEST_POINTS = 3
 """Fewer points are no cloud worth grouping."""
 
 
-def run(experiment: Experiment, out: str | Path, progress: Progress | None = None, scene: Scene | None = None) -> None:
+def run(
+    experiment: Experiment,
+    out: str | Path,
+    progress: Progress | None = None,
+    scene: Scene | None = None,
+    announce: Callable[[Cost], None] | None = None,
+) -> None:
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
     The files appear when all is done; a failure leaves nothing behind. An older result of that name is replaced; files
@@ -58,12 +66,13 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
     Parameters
     ----------
     scene : a scene that is loaded already, for example from a dictionary; `experiment.scene` then only names it.
+    announce : called with the estimated cost before the work starts.
 
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        A setting out of range, a scene that cannot be loaded, no suitable LLVM, or an `out` that cannot take a result
-        (see `pcgraph.output.check_directory`).
+        A setting out of range, more memory than there is, a scene that cannot be loaded, no suitable LLVM, or an `out`
+        that cannot take a result (see `pcgraph.output.check_directory`).
     """
     import mitsuba as mi
 
@@ -80,9 +89,13 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
             )
         if experiment.ambient is not None:
             experiment.ambient.check_emitters(scene.has_ambient)
+        passes = group_by_rig(experiment, scene)
+        cost = estimate_cost(experiment, scene, passes, trial=announce is not None)
+        cost.check_memory()
+        if announce is not None:
+            announce(cost)
         with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
             compile_kernels()
-        passes = group_by_rig(experiment, scene)
         for number, (rig, instruments) in enumerate(passes, 1):
             signals = _trace(experiment, scene, rig, instruments, say, number, len(passes), times)
             signals.save(str(folder / f"pass_{number}.npz"))
@@ -94,6 +107,18 @@ def run(experiment: Experiment, out: str | Path, progress: Progress | None = Non
         result = load_result(folder)
         _write_comparison(folder, [(m.name, m.rows) for m in result.measurements])
         write_report(result, folder / "report.html")
+
+
+def estimate(experiment: Experiment) -> Cost:
+    """Cost of `run`, in light paths, memory and time; the scene is loaded, and rendered small if it may take long.
+
+    Raises
+    ------
+    ValueError, FileFormatError, EnvironmentProblem
+        As `run`, but for the memory.
+    """
+    scene = rangesim.load_scene(experiment.scene, material=experiment.material, unit_m=experiment.unit_m)
+    return estimate_cost(experiment, scene, group_by_rig(experiment, scene))
 
 
 def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient: Ambient | None = None) -> None:
@@ -164,8 +189,7 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
 
 def noise_seed(experiment: Experiment, one: Instrument) -> int:
     """Seed of an instrument's noise: its own for each position in the experiment."""
-    position = experiment.instruments.index(one)
-    return int(np.random.SeedSequence([experiment.seed, position]).generate_state(1)[0])
+    return derived_seed(experiment.seed, experiment.instruments.index(one))
 
 
 def acquisition(

@@ -62,6 +62,8 @@ class Intrinsics:
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """The same lens with another pixel count; the horizontal field of view and the shape of pixels are kept."""
+        for name, value in (("width", width), ("height", height)):
+            check_number(name, value, whole(1, "pixels"))
         scale = width / self.width
         cx, cy = (self.cx - self.width / 2) * scale + width / 2, (self.cy - self.height / 2) * scale + height / 2
         return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy, self.distortion)
@@ -138,6 +140,9 @@ def pose(matrix: ArrayLike, name: str) -> Array:
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
     """(4, 4) T_world_device of a device at `origin` that looks at `target`, metres, OpenCV frame."""
     o, t, u = (np.asarray(a, dtype=np.float64) for a in (origin, target, up))
+    for name, value in (("origin", o), ("target", t), ("up", u)):
+        if value.shape != (3,) or not (np.abs(value) <= FARTHEST_M).all():
+            raise ValueError(f"expected {name} to be three finite coordinates, got {shown(value.tolist())}.")
     z = t - o
     x = np.cross(z, u)
     if np.linalg.norm(z) == 0 or np.linalg.norm(x) == 0:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+from pcgraph.plain_files import check_file
 from rangesim import limits
 from rangesim.errors import FileFormatError
 
@@ -24,6 +25,7 @@ _PARAMETER = re.compile(r"\$(\w+)")
 def read_text(path: str | Path) -> str:
     """Contents of a UTF-8 file; FileFormatError if it is missing, too large or no text."""
     path = Path(path)
+    check_file(path, FileFormatError)
     try:
         limits.check("text", path.stat().st_size, f"bytes in {path}", FileFormatError)
         return path.read_text(encoding="utf-8")
@@ -100,6 +102,7 @@ class _Xml:
         """Check a file that stands `depth` levels deep inside the files `within`."""
         if path in within:
             raise FileFormatError(f"{path} includes itself.")
+        check_file(path, FileFormatError)
         try:
             self.size += path.stat().st_size
             limits.check("text", self.size, f"bytes in {path} and what it includes", FileFormatError)

@@ -45,6 +45,7 @@ def test_pcgraph_never_imports_rangesim_or_a_renderer(path: Path) -> None:
 STOREYS = [
     "errors",
     "output",
+    "plain_files",
     "interrupts",
     "cloud",
     "parallel",

@@ -106,7 +106,7 @@ def test_a_mesh_in_millimetres(tmp_path: Path) -> None:
     path = write(tmp_path / "mesh.obj", TETRAHEDRON)
     metres, millimetres = rangesim.load_scene(path), rangesim.load_scene(path, unit_m=0.001)
     assert millimetres.working_distance_m == pytest.approx(0.001 * metres.working_distance_m, rel=1e-3)
-    with pytest.raises(ValueError, match="positive number of metres"):
+    with pytest.raises(ValueError, match="unit_m to be positive and finite metres"):
         rangesim.load_scene(path, unit_m=0.0)
     with pytest.raises(ValueError, match="scale the shapes"):
         rangesim.load_scene(SCENES / "plane.xml", unit_m=0.001)
@@ -277,7 +277,7 @@ def test_one_side_alone_keeps_the_aspect_ratio() -> None:
     scene = rangesim.load_scene(SCENES / "plane.xml")
     for rig in (scene.rig(width=320), scene.rig(height=240)):
         assert (rig.camera.width, rig.camera.height) == (320, 240)
-    with pytest.raises(ValueError, match="whole number of at least 1"):
+    with pytest.raises(ValueError, match="width to be a whole number of at least 1"):
         scene.rig(width=0, height=4)
 
 

@@ -38,7 +38,7 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise CloudReadError(
-            f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)}"
+            f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)[:200]}"
         )
     return Cloud(
         points=_stack(columns, ("x", "y", "z"), shape),

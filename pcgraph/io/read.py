@@ -10,6 +10,7 @@ from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudReadError
 from pcgraph.io.pcd import read_pcd
 from pcgraph.io.ply import read_ply
+from pcgraph.plain_files import read_file
 
 _READERS = {".pcd": read_pcd, ".ply": read_ply}
 
@@ -33,10 +34,7 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise CloudReadError(f"expected a file ending in {' or '.join(_READERS)}, got {path.name!r}: convert it first")
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise CloudReadError(f"cannot read {path}: {error.strerror or error}") from None
+    content = read_file(path, CloudReadError)
     try:
         return reader(content)
     except CloudReadError as error:

@@ -15,6 +15,7 @@ from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.relations import angle_between
 from pcgraph.output import write_file
+from pcgraph.plain_files import read_file
 
 _FORMAT = "pcgraph edge model 1"
 
@@ -114,28 +115,31 @@ class EdgeModel:
         ValueError
             The file holds no such model.
         """
-        try:
-            text = Path(path).read_bytes()
-        except OSError as error:
-            raise CloudReadError(
-                f"cannot read {path}: {error.strerror or error}; give a file of EdgeModel.save"
-            ) from None
+        text = read_file(Path(path), CloudReadError)
         try:
             content = json.loads(text)
+        except RecursionError:
+            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}, which is nested too deep") from None
         except ValueError as error:
             raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}: {error}") from None
         if not isinstance(content, dict) or content.pop("format", None) != _FORMAT:
             raise ValueError(f"expected a file of format {_FORMAT!r}, got {path}; write it with EdgeModel.save")
         if set(content) != {field.name for field in fields(cls)}:
-            raise ValueError(f"expected the fields of EdgeModel, got {sorted(content)} in {path}")
+            raise ValueError(f"expected the fields of EdgeModel, got {str(sorted(content))[:200]} in {path}")
         if not isinstance(content["names"], list) or not all(isinstance(name, str) for name in content["names"]):
             raise ValueError(f"expected a list of names in {path}; write it with EdgeModel.save")
-        means, scales, weights = (_numbers(content[key]) for key in ("means", "scales", "coefficients"))
-        intercept, altitude = _numbers([content["intercept"], content["object_altitude"]])
-        return cls(tuple(content["names"]), means, scales, weights, intercept, altitude)
+        try:
+            means, scales, weights = (_numbers(content[key]) for key in ("means", "scales", "coefficients"))
+            intercept, altitude = _numbers([content["intercept"], content["object_altitude"]])
+            return cls(tuple(content["names"]), means, scales, weights, intercept, altitude)
+        except (ValueError, OverflowError) as error:
+            raise ValueError(f"{path}: {error}") from None
 
 
 def _numbers(values: object) -> tuple[float, ...]:
     if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
-        raise ValueError(f"expected numbers in a model, got {values!r}; write it with EdgeModel.save")
-    return tuple(float(value) for value in values)
+        raise ValueError(f"expected numbers in a model, got {str(values)[:100]}; write it with EdgeModel.save")
+    try:
+        return tuple(float(value) for value in values)
+    except OverflowError:
+        raise ValueError("expected numbers in a model, got one beyond a float; write it with EdgeModel.save") from None

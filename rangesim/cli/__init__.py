@@ -54,5 +54,7 @@ def main() -> None:
     except (RangesimError, ValueError, OSError) as error:
         if "--debug" in sys.argv:
             raise
-        typer.echo(f"rangesim: {' '.join(str(error).split())}", err=True)
+        from rangesim.config import visible  # names in files give a terminal no orders
+
+        typer.echo(f"rangesim: {visible(' '.join(str(error).split()))}", err=True)
         sys.exit(1)

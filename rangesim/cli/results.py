@@ -69,6 +69,7 @@ def verify_command(
     from pcgraph.output import verify_directory
     from rangesim.capture_files import CAPTURE
     from rangesim.cli.decoded_files import DECODED
+    from rangesim.config import visible
     from rangesim.errors import FileFormatError
     from rangesim.result_files import RESULT
 
@@ -82,18 +83,13 @@ def verify_command(
     found = verify_directory(directory, kind)
     for word, names in (("missing", found.missing), ("changed", found.changed), ("not rangesim's", found.foreign)):
         for name in names:
-            typer.echo(f"{word}: {_printable(directory / name)}")
+            typer.echo(visible(f"{word}: {directory / name}").replace("\n", "\\n"))
     if found.missing or found.changed:
         raise FileFormatError(
             f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} hold "
             "something else than was written."
         )
     typer.echo(f"{directory}: all {found.files} files are as they were written.")
-
-
-def _printable(path: Path) -> str:
-    """A path on one line, whatever its bytes are."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(path))
 
 
 def _print(markdown: str) -> None:

@@ -13,6 +13,7 @@ from rangesim.catalogue import scene_names
 from rangesim.cli.progress import progress_bar, say_where
 
 if TYPE_CHECKING:
+    from rangesim.cost import Cost
     from rangesim.experiment import Experiment
 
 SENSOR_HELP = "gray, gray-phase, amcw, direct-tof or ideal-tof; repeat for more. (default: gray-phase, amcw, ideal-tof)"
@@ -73,6 +74,9 @@ def run_command(
     noise_free: Annotated[
         bool, typer.Option("--noise-free", help="Ideal electronics: no noise, no quantisation.")
     ] = False,
+    estimate: Annotated[
+        bool, typer.Option("--estimate", help="Print what the run will cost, and end; nothing is written.")
+    ] = False,
 ) -> None:
     """Measure a scene with several sensors, and write captures, clouds, segments and report.html.
 
@@ -94,15 +98,26 @@ def run_command(
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
     from pcgraph.output import check_directory
-    from rangesim.pipeline import run
+    from rangesim import pipeline
     from rangesim.result_files import RESULT
 
+    if estimate:
+        cost = pipeline.estimate(experiment)
+        typer.echo(cost)
+        cost.check_memory()
+        return
     target = check_directory(out, RESULT, inputs=[experiment.scene])
     say_where(out, target)
     with progress_bar() as progress:
-        run(experiment, out, progress)
+        pipeline.run(experiment, out, progress, announce=_announce)
     _say_what_measured_nothing(target)
     typer.echo(f"{out / 'report.html'}")
+
+
+def _announce(cost: Cost) -> None:
+    """A line on stderr if the run is long or large."""
+    if cost.is_large:
+        typer.echo(f"rangesim: this takes {cost}.", err=True)
 
 
 def _say_what_measured_nothing(out: Path) -> None:

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from pcgraph.output import write_file
 from rangesim.errors import FileFormatError
 from rangesim.report import cloud, figures, palette, tables
-from rangesim.report.policy import StyleRules, content_policy, visible
+from rangesim.report.policy import StyleRules, content_policy, visible_text
 from rangesim.report.verdict import verdict
 from rangesim.result_files import Measurement, Result
 
@@ -34,7 +34,7 @@ def write_report(result: Result, path: Path) -> None:
 def render_report(result: Result) -> str:
     """The report of a result as HTML."""
     environment = Environment(
-        autoescape=True, finalize=visible, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string(_asset("report.html.j2"))
     return template.render(context(result))
@@ -133,7 +133,7 @@ def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str,
     far = cloud.far_limit(result.measurements)
     truth = result.measurements[0].truth
     return {
-        "instruments": [cloud.packed_measurement(m, visible(names[m.name]), far) for m in result.measurements],
+        "instruments": [cloud.packed_measurement(m, visible_text(names[m.name]), far) for m in result.measurements],
         "errorColors": error.ravel().tolist(),
         "errorKneeM": palette.ERROR_KNEE_M,
         "errorLimitM": palette.ERROR_LIMIT_M,
@@ -141,7 +141,7 @@ def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str,
         "status": list(palette.STATUS_NAMES.values()),
         "causes": palette.OUTCOME_NAMES,
         "causeColors": palette.OUTCOME_COLORS.ravel().tolist(),
-        "materials": [visible(n) for n in truth.material_names],
+        "materials": [visible_text(n) for n in truth.material_names],
         "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
         "material": cloud.pack(truth.material.astype("int8")),
     }

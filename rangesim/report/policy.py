@@ -16,7 +16,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
+from rangesim.config import visible
+
 _DECLARATIONS = re.compile(r"[a-z]+:[-#%.,() a-z0-9]+(;[a-z]+:[-#%.,() a-z0-9]+)*")
 
 
@@ -36,14 +37,9 @@ def content_policy(style: str, script: str) -> str:
     )
 
 
-def visible(value: Any) -> Any:
-    """Text whose control characters are spelt out, as `\\u202e`; anything else as it is.
-
-    They would turn round, break or hide the text beside them, and half a surrogate pair cannot be written at all.
-    """
-    if not isinstance(value, str) or isinstance(value, Markup):
-        return value
-    return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", value)
+def visible_text(value: Any) -> Any:
+    """Text of a result with its control characters spelt out; anything else as it is."""
+    return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 class StyleRules:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
+from rangesim.config import visible
 from rangesim.experiment import Experiment
 from rangesim.report import palette
 from rangesim.report.figures import Share
-from rangesim.report.policy import visible
 from rangesim.result_files import Measurement
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 

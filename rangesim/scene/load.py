@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.bounds import Bounds, check_number
 from rangesim.catalogue import CATALOGUE, scene_file
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
@@ -25,7 +26,9 @@ from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import is_cutout, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.nodes import ids_of_shapes, take_material_classes
+from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
+from rangesim.text_files import check_xml
 
 Source = str | Path | Mapping[str, Any]
 
@@ -72,8 +75,8 @@ def load_scene(
             raise ValueError(
                 f"a unit can be chosen for a bare mesh alone; scale the shapes of {label} to metres instead."
             )
-    if unit_m is not None and not 0 < unit_m < np.inf:
-        raise ValueError(f"expected a positive number of metres per unit, got {unit_m}.")
+    if unit_m is not None:
+        check_number("unit_m", unit_m, Bounds("positive and finite metres per unit", 1e-9, 1e6))
     select_variant(variant)
     retroreflector.register()
     instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, label)
@@ -100,10 +103,12 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
     try:
         with tempfile.TemporaryDirectory() as folder, _own_file_resolver():
             state = _parse(config, source, material, unit_m, Path(folder))
+            check_depth(state, label)
             mi.parser.transform_all(config, state)
             ids, classes = ids_of_shapes(state, label), take_material_classes(state)
+            check_properties(state, label)
             loaded = mi.parser.instantiate(config, state)
-    except RuntimeError as error:
+    except (RuntimeError, TypeError, OverflowError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))[:400]
         raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
@@ -111,6 +116,7 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
 
 def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Path) -> Any:
     if isinstance(source, Mapping):
+        check_dictionary(source, "the scene dictionary")
         return mi.parser.parse_dict(config, dict(source))
     path = scene_file(source)
     if _is_mesh(path):
@@ -120,6 +126,10 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
     resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
+    try:
+        check_xml(path, resolve=lambda name: Path(str(mi.file_resolver().resolve(name))))
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} is no scene Mitsuba can load: {error}") from error
     return mi.parser.parse_file(config, str(path))
 
 
@@ -145,6 +155,7 @@ def _check(scene: Any, ids: set[str], sensor: int, label: str) -> None:
         )
     if not 0 <= sensor < len(scene.sensors()):
         raise ValueError(f"expected a sensor from 0 to {len(scene.sensors()) - 1} of {label}, got {sensor}.")
+    check_vertices(scene, label)
     for shape in scene.shapes():
         if shape.id() not in ids:
             raise FileFormatError(

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from pcgraph.plain_files import check_file
+from rangesim import limits
+from rangesim.bounds import FARTHEST_M
 from rangesim.config import nearest
 from rangesim.errors import FileFormatError
 
@@ -38,6 +42,8 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path) ->
     vertices = vertices * unit_m
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
+    if not (np.abs(vertices) <= FARTHEST_M).all():
+        raise FileFormatError(f"expected {path} within {FARTHEST_M:g} metres; what is its unit? See unit_m.")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = float(np.linalg.norm(high - low))
     if not size > 0:
@@ -73,13 +79,30 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) float64 vertices in metres and (m, 3) faces of a mesh file, parts of a scene graph put in their places."""
     import trimesh
 
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it says there what it also raises
+    check_file(path, FileFormatError)
+
+    class Beside(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
+        """Finds the files that a mesh refers to: plain files beside it or below."""
+
+        def get(self, name: str) -> bytes:
+            check_file(Path(self.parent) / name.strip(), FileFormatError)
+            return bytes(super().get(name))
+
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(path, process=False, resolver=Beside(str(path)))
+    except FileFormatError:
+        raise
     except Exception as error:  # each of trimesh's parsers fails in its own way
-        raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {error}.") from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {reason}.") from error
     vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))
     if len(faces) == 0:
         raise FileFormatError(f"expected a triangle mesh in {path}, which has no faces.")
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
+        raise FileFormatError(f"expected vertices of three numbers in {path}, got an array of shape {vertices.shape}.")
+    limits.check("points", max(len(vertices), len(faces)), f"vertices or faces in {path}", FileFormatError)
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
         raise FileFormatError(f"expected finite vertices and valid face indices in {path}; repair the mesh first.")
     return vertices, faces

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from rangesim.bounds import Bounds, check_number, whole
 from rangesim.rig import Intrinsics, Rig, look_at, pose
 
+BASELINE = Bounds("a positive baseline in metres", 1e-9, 1e6)
 PROJECTOR_PIXELS = (1280, 800)
 
 
@@ -80,17 +82,17 @@ class Scene:
         width, height : camera pixels; default as in the scene file; one alone keeps the aspect ratio. The
             horizontal field of view is kept.
         """
+        for name, value in (("width", width), ("height", height)):
+            if value is not None:
+                check_number(name, value, whole(1, "pixels"))
         if width is None:
             width = self.camera.width if height is None else round(height * self.camera.width / self.camera.height)
         if height is None:
-            height = round(width * self.camera.height / self.camera.width)
-        if not all(isinstance(n, (int, np.integer)) for n in (width, height)):
-            raise ValueError(f"expected whole numbers of camera pixels, got {width} x {height}.")
+            height = max(1, round(width * self.camera.height / self.camera.width))
         camera = self.camera.resized(width, height)
         if baseline_m is None:
             baseline_m = float(f"{0.2 * self.working_distance_m:.1g}")
-        if not isinstance(baseline_m, (int, float)) or not baseline_m > 0:
-            raise ValueError(f"expected a positive baseline in metres, got {baseline_m}.")
+        check_number("baseline_m", baseline_m, BASELINE)
         target = (0.0, 0.0, self.working_distance_m)
         return Rig(
             camera=camera,

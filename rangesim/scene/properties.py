@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the properties of a scene may be: checked on the parsed nodes, before Mitsuba makes objects of them.
+
+Mitsuba takes most numbers as they come; a reflectance of 2 or a radius of NaN shows, if at all, as odd light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim import limits
+from rangesim.bounds import FARTHEST_M, Bounds
+from rangesim.config import shown
+from rangesim.errors import FileFormatError
+from rangesim.image_files import check_size
+from rangesim.text_files import is_nested_deeper
+
+ANY = Bounds("finite", -1e30, 1e30)
+PLACE = Bounds("a coordinate in metres", -FARTHEST_M, FARTHEST_M)
+POSITIVE = Bounds("positive and finite", 1e-12, 1e12)
+LENGTH = Bounds("positive and finite", 1e-12, FARTHEST_M)
+NOT_NEGATIVE = Bounds("0 or positive, and finite", 0, 1e12)
+FRACTION = Bounds("a fraction", 0, 1)
+
+PROPERTIES: dict[str, dict[str, Bounds]] = {
+    "Shape": {"radius": LENGTH, "center": PLACE, "p0": PLACE, "p1": PLACE},
+    "BSDF": dict.fromkeys(
+        (
+            *("reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance", "transmittance"),
+            *("diffuse_transmittance", "base_color", "roughness", "metallic", "anisotropic", "spec_trans", "spec_tint"),
+            *("sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "flatness", "opacity", "weight"),
+        ),
+        FRACTION,
+    )
+    | dict.fromkeys(("int_ior", "ext_ior"), Bounds("a positive index of refraction", 1e-3, 1e3))
+    | dict.fromkeys(("eta", "k"), Bounds("an index of refraction of at least 0", 0, 1e4))
+    | dict.fromkeys(("alpha", "alpha_u", "alpha_v"), Bounds("a roughness of at least 0", 0, 10))
+    | {"exponent": NOT_NEGATIVE},
+    "Emitter": dict.fromkeys(("radiance", "irradiance", "intensity", "scale"), NOT_NEGATIVE)
+    | {"position": PLACE, "filename": NOT_NEGATIVE, "bitmap": NOT_NEGATIVE},
+    "Medium": {"albedo": FRACTION} | dict.fromkeys(("sigma_t", "sigma_a", "sigma_s", "scale"), NOT_NEGATIVE),
+    "Unknown": {"falloff": Bounds("an exponent of at least 0", 0, 1000)},  # a BSDF in Python, such as retroreflector
+    "PhaseFunction": {"g": Bounds("above -1 and below 1", -0.9999, 0.9999)},
+    "Sensor": {"fov": Bounds("degrees between 0 and 180", 1e-3, 179.999)}
+    | dict.fromkeys(("near_clip", "far_clip"), POSITIVE),
+    "Film": dict.fromkeys(("width", "height"), Bounds("a whole number of at least 1", 1)),
+}
+"""Bounds of the properties of each kind of node, in Mitsuba's words; the others have to be finite."""
+COLOURS = ("value", "color", "color0", "color1", "filename", "bitmap", "data")
+"""Properties of a texture that hold what the property it stands for may be."""
+ENTRIES_PER_SHAPE = 20
+"""Of a scene dictionary, at most, on average; one that holds the same dictionary again and again has more."""
+FLOAT_IMAGES = (".exr", ".pfm", ".hdr", ".rgbe")
+"""Texture files whose values may lie outside 0..1."""
+
+
+def check_depth(state: Any, label: str) -> None:
+    """Raise FileFormatError if the nodes of a scene refer to each other in chains beyond the limit `nesting`, on which
+    Mitsuba would run out of stack, or if it has too many shapes."""
+    shapes = sum(node.type == mi.ObjectType.Shape for node in state.nodes)
+    limits.check("shapes", shapes, f"shapes in {label}", FileFormatError)
+    by_id = {node.props.id(): index for index, node in enumerate(state.nodes)}
+    children = [_children(node, by_id) for node in state.nodes]
+    waiting = [0] * len(children)  # for so many nodes that refer to it
+    for child in chain.from_iterable(children):
+        waiting[child] += 1
+    depth = [1] * len(children)
+    ready = [index for index, count in enumerate(waiting) if count == 0]
+    for parent in ready:  # grows: each node comes after all that refer to it
+        for child in children[parent]:
+            depth[child] = max(depth[child], depth[parent] + 1)
+            waiting[child] -= 1
+            if waiting[child] == 0:
+                ready.append(child)
+    if len(ready) == len(children):  # else some refer to each other in a circle, which Mitsuba names
+        limits.check("nesting", max(depth, default=0), f"objects of {label} that refer to each other", FileFormatError)
+
+
+def check_dictionary(scene: Any, label: str) -> None:
+    """Raise FileFormatError if a scene dictionary is nested deeper than the limit, or holds what Mitsuba crashes on."""
+    deepest, entries = limits.current().nesting, 0
+    todo = [(1, "", scene)]
+    while todo:
+        depth, place, table = todo.pop()
+        limits.check("nesting", depth, f"levels in {label}", FileFormatError)
+        entries += len(table)
+        limits.check("shapes", entries // ENTRIES_PER_SHAPE, f"shapes of entries in {label}", FileFormatError)
+        for key, value in table.items():
+            if isinstance(value, Mapping):
+                todo.append((depth + 1, f"{place}{key}.", value))
+            elif isinstance(value, (list, tuple)) and is_nested_deeper(value, deepest):
+                limits.check("nesting", deepest + 1, f"levels in {label}", FileFormatError)
+            elif value is None or (isinstance(value, int) and abs(value) >= 1 << 63):
+                name = f"{place}{key}"[-200:]
+                raise FileFormatError(f"{label}: expected {name} to be a value of 64 bits, got {shown(value)}.")
+            if not isinstance(key, str):
+                raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
+
+
+def check_properties(state: Any, label: str) -> None:
+    """Raise FileFormatError on the first property of a node that is not finite, or out of its bounds.
+
+    The message names the node and the property: 'shape "ball": expected radius to be positive and finite, got nan'.
+    """
+    parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
+    for index, node in enumerate(state.nodes):
+        bounds = PROPERTIES.get(node.type.name, {})
+        for key, value in node.props.items():
+            checked = _Property(state, key, bounds.get(key, ANY))
+            problem = checked.problem(value)
+            if problem:
+                raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
+        if node.type == mi.ObjectType.Film:
+            width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
+            limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
+
+
+def check_vertices(scene: Any, label: str) -> None:
+    """Raise FileFormatError on the first mesh with a vertex that is not finite, or too far out, or without extent."""
+    for shape in scene.shapes():
+        parameters = mi.traverse(shape) if shape.is_mesh() else {}
+        if "vertex_positions" not in parameters:  # a rectangle calls itself a mesh
+            continue
+        vertices = np.array(parameters["vertex_positions"])
+        limits.check("points", len(vertices) // 3, f"vertices of shape {shape.id()!r}", FileFormatError)
+        if not len(vertices):
+            raise FileFormatError(f"{label}: shape {shape.id()!r}: expected at least one triangle, got none.")
+        faces = np.array(parameters["faces"])
+        if len(faces) and faces.max() >= len(vertices) // 3:
+            raise FileFormatError(
+                f'{label}: shape "{shape.id()}": expected faces of its {len(vertices) // 3} vertices, '
+                f"got vertex {faces.max()}."
+            )
+        far = ~(np.abs(vertices) <= FARTHEST_M)
+        if far.any():
+            raise FileFormatError(
+                f'{label}: shape "{shape.id()}": expected the vertices to be {PLACE}, got {vertices[far][0]:g}.'
+            )
+        corners = vertices.reshape(-1, 3)
+        if not (corners.max(axis=0) > corners.min(axis=0)).any():
+            raise FileFormatError(f'{label}: shape "{shape.id()}": expected an extent, but all its vertices coincide.')
+
+
+class _Property:
+    """A property of a node, and the bounds of all numbers in it."""
+
+    def __init__(self, state: Any, key: str, bounds: Bounds) -> None:
+        self.state, self.key, self.bounds = state, key, bounds
+
+    def problem(self, value: Any, key: str = "") -> str:
+        """What is wrong with the value of the property, or an empty text."""
+        key = key or self.key
+        if isinstance(value, mi.Properties.ResolvedReference):
+            return self._problem_of_texture(self.state.nodes[value.index()], key)
+        if _is_transform(value):
+            return _problem_of_transform(value, key)
+        if key.endswith("filename") and isinstance(value, str):
+            return self._problem_of_image(Path(str(mi.file_resolver().resolve(value))), key)
+        if key in ("width", "height") and isinstance(value, float):
+            return f"expected {key} to be {self.bounds}, got {shown(value)}"
+        for number in _numbers(value):
+            if number not in self.bounds:
+                return f"expected {key} to be {self.bounds}, got {shown(number)}"
+        return ""
+
+    def _problem_of_texture(self, node: Any, key: str) -> str:
+        if node.type not in (mi.ObjectType.Texture, mi.ObjectType.Volume) or self.bounds is ANY:
+            return ""
+        for inner, value in node.props.items():
+            if inner in COLOURS:
+                problem = self.problem(value, f"{key}.{inner}")
+                if problem:
+                    return problem
+        return ""
+
+    def _problem_of_image(self, path: Path, key: str) -> str:
+        if not path.is_file():
+            return ""  # Mitsuba says so
+        check_size(path)
+        if self.bounds is ANY or path.suffix.lower() not in FLOAT_IMAGES:
+            return ""
+        values = np.array(mi.Bitmap(str(path)), dtype=np.float64)
+        return self._problem_of_array(values, f"the pixels of {key} {path.name}")
+
+    def _problem_of_array(self, values: np.ndarray, name: str) -> str:
+        wrong = ~((values >= self.bounds.low) & (values <= self.bounds.high))
+        return f"expected {name} to be {self.bounds}, got {values[wrong][0]:g}" if wrong.any() else ""
+
+
+def _numbers(value: Any) -> Iterable[float]:
+    """All numbers in the value of a property; none if it holds another kind of thing."""
+    if isinstance(value, bool):
+        return ()
+    if isinstance(value, (int, float)):
+        return (value,)
+    if hasattr(value, "is_uniform"):
+        return (*value.values, *value.wavelengths)
+    if isinstance(value, dr.ArrayBase):
+        return _extremes(np.array(value, dtype=np.float64))
+    if isinstance(value, mi.Bitmap):
+        return _extremes(np.array(value, dtype=np.float64))
+    return ()
+
+
+def _extremes(values: np.ndarray) -> Iterable[float]:
+    """Least and largest value, NaN if there is one."""
+    return (float(values.min()), float(values.max())) if values.size else ()
+
+
+def _is_transform(value: Any) -> bool:
+    return hasattr(value, "matrix") and hasattr(value, "inverse_transpose")
+
+
+def _problem_of_transform(value: Any, key: str) -> str:
+    matrix = np.array(value.matrix, dtype=np.float64)
+    if not (np.abs(matrix) <= FARTHEST_M).all():  # also of NaN
+        largest = matrix.flat[int(np.argmax(np.where(np.isnan(matrix), math.inf, np.abs(matrix))))]
+        return f"expected {key} to hold finite numbers up to {FARTHEST_M:g}, got {largest:g}"
+    if key == "to_world" and (np.linalg.norm(matrix[:3, :3], axis=0) == 0).any():
+        return f"expected {key} to leave the shape an extent, got a scale of 0"
+    return ""
+
+
+def _children(node: Any, by_id: dict[str, int]) -> list[int]:
+    """Indices of the nodes that a node refers to, before Mitsuba has resolved references by id."""
+    named = (value.id() for _, value in node.props.items() if isinstance(value, mi.Properties.Reference))
+    return [value.index() for _, value in _references(node)] + [by_id[name] for name in named if name in by_id]
+
+
+def _references(node: Any) -> Iterator[tuple[str, Any]]:
+    return ((key, value) for key, value in node.props.items() if isinstance(value, mi.Properties.ResolvedReference))
+
+
+def _place(state: Any, parents: dict[int, int], index: int) -> str:
+    """Kind and id of a node; of one without an id, its plugin and the node that holds it."""
+    node = state.nodes[index]
+    kind, name = node.type.name.lower(), node.props.id()
+    if name and not name.startswith("_arg_"):
+        return f'{kind} "{name}"'
+    plugin = f'{kind} "{node.props.plugin_name()}"'
+    holder = parents.get(index)
+    if holder is None or state.nodes[holder].type == mi.ObjectType.Scene:
+        return plugin
+    return f"{plugin} of {_place(state, parents, holder)}"

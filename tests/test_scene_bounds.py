@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes with properties that are none: refused where they enter, with the names of the shape and the property."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from rangesim import limits
+from rangesim.errors import FileFormatError
+from rangesim.image_files import write_grey
+from rangesim.scene import load_scene
+
+CAMERA: dict[str, Any] = {
+    "type": "perspective",
+    "fov": 40.0,
+    "film": {"type": "hdrfilm", "width": 16, "height": 12},
+}
+XML_CAMERA = '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/></film></sensor>'
+
+
+@pytest.fixture(autouse=True)
+def _at_once() -> Iterator[None]:
+    start = time.monotonic()
+    yield
+    assert time.monotonic() - start < 5
+
+
+def scene(camera: dict[str, Any] | None = None, **things: Any) -> dict[str, Any]:
+    return {"type": "scene", "camera": CAMERA | (camera or {}), "light": {"type": "constant"}} | things
+
+
+def ball(bsdf: Any = None, **changes: Any) -> dict[str, Any]:
+    place = {"center": [0.0, 0.0, 3.0], "radius": 0.5}
+    return scene(ball={"type": "sphere", **place, "paint": bsdf or {"type": "diffuse"}} | changes)
+
+
+def rgb(*value: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(value)}
+
+
+def look(scale: Any = 1.0, move: Any = 0.0) -> Any:
+    turn = mi.ScalarTransform4f
+    return turn().translate([0, 0, move]) @ turn().scale(scale)
+
+
+def test_a_good_scene_loads() -> None:
+    assert load_scene(ball()).instances[0].name == "ball"
+
+
+NONSENSE: dict[str, tuple[Any, str]] = {
+    "radius nan": (lambda: ball(radius=math.nan), 'shape "ball": expected radius to be positive and .* got nan'),
+    "radius negative": (lambda: ball(radius=-1.0), 'shape "ball": expected radius to be positive'),
+    "radius 0": (lambda: ball(radius=0.0), 'shape "ball": expected radius to be positive'),
+    "radius far": (lambda: ball(radius=1e12), 'shape "ball": expected radius'),
+    "centre nan": (lambda: ball(center=[0, math.nan, 0]), 'shape "ball": expected center .* got nan'),
+    "centre far": (lambda: ball(center=[0, 1e12, 0]), 'shape "ball": expected center .* got 1000000000000'),
+    "place nan": (lambda: ball(to_world=look(math.nan)), 'shape "ball": expected to_world .* got nan'),
+    "place far": (lambda: ball(to_world=look(move=1e12)), 'shape "ball": expected to_world'),
+    "no area": (lambda: scene(card={"type": "rectangle", "to_world": look([1, 0, 1])}), 'shape "card": .* extent'),
+    "reflectance": (lambda: ball({"type": "diffuse", "reflectance": 2.0}), "expected reflectance to be a fraction"),
+    "reflectance int": (lambda: ball({"type": "diffuse", "reflectance": 2}), "expected reflectance to be a fraction"),
+    "reflectance nan": (lambda: ball({"type": "diffuse", "reflectance": math.nan}), "reflectance .* got nan"),
+    "reflectance rgb": (lambda: ball({"type": "diffuse", "reflectance": rgb(0.1, 1.5, 0)}), "reflectance .* got 1.5"),
+    "reflectance below": (lambda: ball({"type": "diffuse", "reflectance": rgb(0.1, -1, 0)}), "reflectance .* got -1"),
+    "nested": (
+        lambda: ball({"type": "twosided", "bsdf": {"type": "plastic", "diffuse_reflectance": 3.0}}),
+        "expected diffuse_reflectance to be a fraction",
+    ),
+    "checkerboard": (
+        lambda: ball({"type": "diffuse", "reflectance": {"type": "checkerboard", "color0": rgb(0, 0, 7)}}),
+        "reflectance.color0 to be a fraction, 0 to 1, got 7",
+    ),
+    "pixels": (
+        lambda: ball({"type": "diffuse", "reflectance": {"type": "bitmap", "data": mi.TensorXf([9.0], (1, 1, 1))}}),
+        "reflectance.data to be a fraction, 0 to 1, got 9",
+    ),
+    "alpha": (lambda: ball({"type": "roughconductor", "alpha": -0.1}), "expected alpha to be a roughness .* got -0.1"),
+    "alpha nan": (lambda: ball({"type": "roughconductor", "alpha": math.nan}), "expected alpha .* got nan"),
+    "ior nan": (lambda: ball({"type": "dielectric", "int_ior": math.nan}), "expected int_ior .* got nan"),
+    "ior 0": (lambda: ball({"type": "dielectric", "int_ior": 0.0}), "expected int_ior .* got 0.0"),
+    "ior negative": (lambda: ball({"type": "dielectric", "ext_ior": -1.5}), "expected ext_ior .* got -1.5"),
+    "eta nan": (lambda: ball({"type": "conductor", "eta": math.nan, "k": 1.0}), "expected eta .* got nan"),
+    "falloff": (
+        lambda: ball({"type": "retroreflector", "falloff": -1.0, "b": {"type": "roughconductor"}}),
+        "expected falloff .* got -1",
+    ),
+    "radiance": (lambda: scene(light={"type": "constant", "radiance": -1.0}), 'emitter "light": expected radiance'),
+    "radiance nan": (lambda: scene(light={"type": "constant", "radiance": math.nan}), "expected radiance .* got nan"),
+    "radiance rgb": (lambda: ball(glow={"type": "area", "radiance": rgb(1, math.inf, 0)}), "radiance .* got inf"),
+    "radiance large": (lambda: ball(glow={"type": "area", "radiance": 1e300}), "expected radiance .* got 1e.300"),
+    "point": (lambda: scene(lamp={"type": "point", "position": [0, 0, 1e12]}), 'emitter "lamp": expected position'),
+    "fov": (lambda: scene(camera={"fov": 180.0}), 'sensor "camera": expected fov to be degrees'),
+    "fov nan": (lambda: scene(camera={"fov": math.nan}), 'sensor "camera": expected fov .* got nan'),
+    "fov negative": (lambda: scene(camera={"fov": -3.0}), 'sensor "camera": expected fov'),
+    "near": (lambda: scene(camera={"near_clip": math.nan}), "expected near_clip .* got nan"),
+    "camera far": (lambda: scene(camera={"to_world": look(move=1e12)}), 'sensor "camera": expected to_world'),
+    "film": (lambda: scene(camera={"film": {"type": "hdrfilm", "width": 0, "height": 9}}), "width to be a whole"),
+    "large film": (
+        lambda: scene(camera={"film": {"type": "hdrfilm", "width": 10**6, "height": 10**6}}),
+        "at most 100000000 pixels of the film",
+    ),
+    "long film": (lambda: scene(camera={"film": {"type": "hdrfilm", "width": 10**30, "height": 1}}), "."),
+    "true": (lambda: ball(radius=True), "."),
+    "text": (lambda: ball(radius="large"), "."),
+    "none": (lambda: ball(radius=None), "."),
+    "list": (lambda: ball(radius=[1]), "."),
+    "albedo": (
+        lambda: ball({"type": "null"}, interior={"type": "homogeneous", "albedo": 1.5, "sigma_t": 1.0}),
+        'medium .*expected albedo to be a fraction',
+    ),
+    "sigma": (
+        lambda: ball({"type": "null"}, interior={"type": "homogeneous", "albedo": 0.5, "sigma_t": -1.0}),
+        "expected sigma_t to be 0 or positive",
+    ),
+    "anisotropy": (
+        lambda: ball({"type": "null"}, interior={"type": "homogeneous", "p": {"type": "hg", "g": 1.0}}),
+        "expected g to be above -1",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", NONSENSE)
+def test_nonsense_in_a_dictionary_is_one_sentence(case: str) -> None:
+    load_scene(ball())  # selects the variant
+    make, message = NONSENSE[case]
+    with pytest.raises((FileFormatError, ValueError), match=message) as caught:
+        load_scene(make())
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ('<shape type="sphere" id="ball"><float name="radius" value="nan"/></shape>', 'shape "ball": expected radius'),
+        ('<shape type="sphere"><float name="radius" value="-1"/></shape>', 'shape "sphere_.*": expected radius'),
+        ('<shape type="sphere"><float name="radius" value="1e400"/></shape>', "radius"),
+        (
+            '<shape type="sphere" id="ball"><bsdf type="twosided"><bsdf type="diffuse">'
+            '<rgb name="reflectance" value="0, 2, 0"/></bsdf></bsdf></shape>',
+            'bsdf "diffuse" of bsdf "twosided" of shape "ball": expected reflectance to be a fraction, 0 to 1, got 2',
+        ),
+        (
+            '<bsdf type="diffuse" id="paint"><spectrum name="reflectance" value="400:0.5, 500:1.5"/></bsdf>'
+            '<shape type="sphere"><ref id="paint"/></shape>',
+            'bsdf "paint": expected reflectance to be a fraction, 0 to 1, got 1.5',
+        ),
+        ('<shape type="sphere"><transform name="to_world"><translate x="1e12"/></transform></shape>', "to_world"),
+        ('<shape type="cube"><transform name="to_world"><scale value="0"/></transform></shape>', "to_world|invert"),
+        ('<shape type="obj"><string name="filename" value="missing.obj"/></shape>', "missing.obj"),
+    ],
+)  # fmt: skip
+def test_nonsense_in_a_file_is_one_sentence(tmp_path: Path, body: str, message: str) -> None:
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}{body}</scene>')
+    with pytest.raises(FileFormatError, match=message) as caught:
+        load_scene(tmp_path / "a.xml")
+    assert len(str(caught.value)) < 600
+
+
+def mesh(tmp_path: Path, name: str, text: bytes) -> Path:
+    (tmp_path / name).write_bytes(text)
+    kind = name.rpartition(".")[2]
+    body = f'<shape type="{kind}" id="part"><string name="filename" value="{name}"/></shape>'
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}{body}</scene>')
+    return tmp_path / "a.xml"
+
+
+PLY = b"""ply
+format ascii 1.0
+element vertex %s
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_index
+end_header
+%s
+3 0 1 2
+"""
+MESHES = {
+    "good.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ""),
+    "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "."),
+    "far.obj": (b"v 1e12 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "part.*vertices"),
+    "malformed.obj": (b"v x y z\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "."),
+    "short.obj": (b"v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "."),
+    "index.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "."),
+    "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "extent"),
+    "empty.obj": (b"v 1 1 1\n", "."),
+    "good.ply": (PLY % (b"3", b"0 0 0\n1 0 0\n0 1 0"), ""),
+    "nan.ply": (PLY % (b"3", b"nan 0 0\n1 0 0\n0 1 0"), "nan.ply|vertices"),
+    "inf.ply": (PLY % (b"3", b"inf 0 0\n1 0 0\n0 1 0"), "inf.ply|vertices"),
+    "large.ply": (PLY % (b"4000000000000", b"0 0 0\n1 0 0\n0 1 0"), "."),
+    "index.ply": (
+        (PLY % (b"3", b"0 0 0\n1 0 0\n0 1 0")).replace(b"3 0 1 2", b"3 0 1 9"),
+        "got vertex 9|be read",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_meshes_in_scenes_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    text, message = MESHES[name]
+    path = mesh(tmp_path, name, text)
+    if not message:
+        assert load_scene(path).instances[0].name == "part"
+        return
+    with pytest.raises(FileFormatError, match=message):
+        load_scene(path)
+
+
+@pytest.mark.parametrize("name", [name for name in MESHES if MESHES[name][1]])
+def test_bare_meshes_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(MESHES[name][0])
+    with pytest.raises(FileFormatError) as caught:
+        load_scene(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 600
+
+
+def test_bare_meshes_have_a_size(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes(MESHES["good.obj"][0])
+    with limits.raised(points=2), pytest.raises(FileFormatError, match="at most 2 "):
+        load_scene(tmp_path / "a.obj")
+    (tmp_path / "b.obj").write_bytes(MESHES["good.obj"][0].replace(b"1 0 0", b"2 0 0"))
+    with pytest.raises(FileFormatError, match=r"b\.obj within 1e\+06 metres"):
+        load_scene(tmp_path / "b.obj", unit_m=1e6)
+    for wrong in (0, -1, math.nan, True, "mm", 1e300):
+        with pytest.raises(ValueError, match="unit_m"):
+            load_scene(tmp_path / "a.obj", unit_m=wrong)  # type: ignore[arg-type]
+
+
+def textured(tmp_path: Path, name: str) -> Path:
+    texture = f'<texture type="bitmap" name="reflectance"><string name="filename" value="{name}"/></texture>'
+    body = f'<shape type="rectangle" id="card"><bsdf type="diffuse">{texture}</bsdf></shape>'
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}{body}</scene>')
+    return tmp_path / "a.xml"
+
+
+@pytest.mark.parametrize("value", [0.5, 1.5, -0.5, math.nan, math.inf])
+def test_textures_are_fractions_too(tmp_path: Path, value: float) -> None:
+    write_grey(tmp_path / "t.exr", np.full((4, 4), value, np.float32))
+    path = textured(tmp_path, "t.exr")
+    if value == 0.5:
+        load_scene(path)
+        return
+    with pytest.raises(FileFormatError, match=rf"reflectance.filename t.exr to be a fraction, 0 to 1, got {value:g}"):
+        load_scene(path)
+
+
+def test_texture_bombs_are_refused_by_their_header(tmp_path: Path) -> None:
+    (tmp_path / "t.pgm").write_bytes(b"P5 100000 100000 255\n" + bytes(100))
+    with pytest.raises(FileFormatError, match="at most 100000000 pixels"):
+        load_scene(textured(tmp_path, "t.pgm"))
+
+
+DEEP = 20_000
+
+
+def test_deep_files_are_refused_before_mitsuba_runs_out_of_stack(tmp_path: Path) -> None:
+    path = tmp_path / "a.xml"
+    deep = '<bsdf type="twosided">' * DEEP + "</bsdf>" * DEEP
+    path.write_text(f'<scene version="3.0.0">{XML_CAMERA}<shape type="sphere">{deep}</shape></scene>')
+    with pytest.raises(FileFormatError, match="expected at most 100 levels"):
+        load_scene(path)
+    (tmp_path / "b.xml").write_text(f'<scene version="3.0.0">{deep}</scene>')
+    path.write_text(f'<scene version="3.0.0">{XML_CAMERA}<include filename="b.xml"/></scene>')
+    with pytest.raises(FileFormatError, match=r"expected at most 100 levels in .*b\.xml"):
+        load_scene(path)
+    path.write_text(
+        f'<scene version="3.0.0"><default name="part" value="b"/>{XML_CAMERA}<include filename="$part.xml"/></scene>'
+    )
+    with pytest.raises(FileFormatError, match=r"expected at most 100 levels in .*b\.xml"):
+        load_scene(path)
+    path.write_text(f'<scene version="3.0.0">{XML_CAMERA}<include filename="a.xml"/></scene>')
+    with pytest.raises(FileFormatError, match="includes itself"):
+        load_scene(path)
+
+
+def test_includes_that_double_are_refused(tmp_path: Path) -> None:
+    for i in range(12):
+        twice = f'<include filename="s{i + 1}.xml"/>' * 4
+        (tmp_path / f"s{i}.xml").write_text(f'<scene version="3.0.0">{twice}<!--{"x" * 100_000}--></scene>')
+    (tmp_path / "s12.xml").write_text('<scene version="3.0.0"/>')
+    with pytest.raises(FileFormatError, match=r"bytes in .* and what it includes"):
+        load_scene(tmp_path / "s0.xml")
+
+
+def test_long_chains_of_references_are_refused(tmp_path: Path) -> None:
+    links = "".join(f'<bsdf type="twosided" id="b{i}"><ref id="b{i + 1}"/></bsdf>' for i in range(20_000))
+    body = f'{links}<bsdf type="diffuse" id="b20000"/><shape type="sphere"><ref id="b0"/></shape>'
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}{body}</scene>')
+    with pytest.raises(FileFormatError, match="refer to each other"):
+        load_scene(tmp_path / "a.xml")
+
+
+def test_deep_dictionaries_are_refused() -> None:
+    bsdf: dict[str, Any] = {"type": "diffuse"}
+    for _ in range(DEEP):
+        bsdf = {"type": "twosided", "bsdf": bsdf}
+    with pytest.raises(FileFormatError, match="expected at most 100 levels"):
+        load_scene(ball(bsdf))
+    loop = ball()
+    loop["again"] = loop
+    with pytest.raises(FileFormatError, match="expected at most 100 levels"):
+        load_scene(loop)
+
+
+def test_scenes_have_a_number_of_shapes() -> None:
+    with limits.raised(shapes=2), pytest.raises(FileFormatError, match="expected at most 2 shapes"):
+        load_scene(scene(**{f"s{i}": {"type": "sphere"} for i in range(3)}))
+
+
+def test_an_envmap_may_be_bright_but_not_nan(tmp_path: Path) -> None:
+    for value in (50.0, math.nan):
+        write_grey(tmp_path / "sky.exr", np.full((4, 8), value, np.float32))
+        light = {"type": "envmap", "filename": str(tmp_path / "sky.exr")}
+        if value == 50.0:
+            load_scene(ball() | {"light": light})
+        else:
+            with pytest.raises(FileFormatError, match=r"sky\.exr to be 0 or positive, and finite"):
+                load_scene(ball() | {"light": light})
