@@ -116,7 +116,7 @@ def _check_targets(targets: list[Path]) -> None:
             raise CloudWriteError(f"{target} is a link to a file that does not exist; choose another --out")
         if target.exists() and not (target.is_file() and is_segmentation(target)):
             raise CloudWriteError(
-                f"{target} exists and was not written by pcgraph; move it away or choose another --out"
+                f"{target} exists and was not written by pcgraph, or changed since; move it or choose another --out"
             )
     above = next(folder for folder in (targets[0].parent, *targets[0].absolute().parents) if folder.exists())
     if not above.is_dir():

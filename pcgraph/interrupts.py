@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT and SIGTERM end a command with one line, whatever it is doing.
+"""SIGINT, SIGTERM and SIGHUP end a command with one line, whatever it is doing.
 
 Python runs its handlers between two bytecodes of the main thread, and handlers that raise can be swallowed: by an
 import half done, by a compiler that calls back, by a destructor. So the handlers here do nothing, and a thread that
@@ -19,11 +19,11 @@ import sys
 import threading
 import time
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 
 def end_on_signals(program: str, writes: bool) -> None:
-    """Let SIGINT and SIGTERM remove work in progress, print one line, and end with status 130 or 143.
+    """Let the signals remove work in progress, print one line, and end with status 130, 143 or 129.
 
     Parameters
     ----------

@@ -309,7 +309,7 @@ class _Staging:
                 _clear(claim.path)
                 if _is_plain_file(target / MANIFEST):
                     claim.manifest = _digest(target / MANIFEST)
-                _clear_parts(target, claim.listed(kind).keys() | {MANIFEST})
+                _clear_parts(target, _listed_names(target, kind) | {MANIFEST})
             except BaseException:
                 claim.release()
                 raise
@@ -564,6 +564,13 @@ def _may_move(path: Path) -> bool:
     if not folder.st_mode & stat.S_ISVTX or not hasattr(os, "geteuid"):
         return True
     return os.geteuid() in (0, folder.st_uid, path.lstat().st_uid)
+
+
+def _listed_names(target: Path, kind: DirectoryKind) -> set[str]:
+    try:
+        return set(read_manifest(target, kind))
+    except kind.error:
+        return set()
 
 
 def _states_kind(sidecar: Path, kind: str) -> bool:

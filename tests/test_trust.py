@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,26 @@ def test_a_foreign_file_named_like_segments_stays(tmp_path: Path) -> None:
     for _ in range(2):  # one's own are replaced
         assert command("segment", cloud, "--out", tmp_path, package="pcgraph").returncode == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scan.ply", "scan.segments.npz", "scan.segments.ply"]
+
+
+def test_segments_corrected_by_hand_stay(tmp_path: Path) -> None:
+    cloud = tmp_path / "scan.ply"
+    shutil.copy(small_result() / "lines" / "cloud.ply", cloud)
+    arrays, points = tmp_path / "scan.segments.npz", tmp_path / "scan.segments.ply"
+    assert command("segment", cloud, "--out", tmp_path, package="pcgraph").returncode == 0
+    with np.load(arrays) as file:
+        corrected = dict(file)
+    corrected["labels"] += 1
+    for path in (points, arrays):
+        if path == points:
+            path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+        else:
+            np.savez(path, **corrected)
+        mine = path.read_bytes()
+        done = command("segment", cloud, "--out", tmp_path, package="pcgraph")
+        assert_refused(done, f"{path.name} exists and was not written by pcgraph, or changed since")
+        assert path.read_bytes() == mine
+        path.unlink()
 
 
 # ---- Durable and clean ----------------------------------------------------------------------------------------------
@@ -260,6 +281,22 @@ def test_closed_standard_streams_are_no_obstacle(tmp_path: Path, closed: tuple[i
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) == 130
     assert not out.exists()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="terminals hang up on POSIX")
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_closed_terminal_ends_a_run_as_an_interrupt_does(tmp_path: Path, ignored: bool) -> None:
+    """But not with nohup, which ignores the signal beforehand."""
+    out = tmp_path / "n"
+    line = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--spp", "20000", "--out", str(out)]
+    start = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN) if ignored else None
+    with subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=start) as process:
+        wait_until(lambda: bool(list((out / STAGING).glob("work-*"))), process)
+        process.send_signal(signal.SIGHUP)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == (0 if ignored else 129)
+        assert err == ("" if ignored else "rangesim: interrupted; nothing was written.\n")
+    assert out.exists() == ignored
 
 
 def wait_until(condition: Callable[[], bool], process: subprocess.Popen[Any]) -> None:

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import os
+import re
 import zipfile
 from os import PathLike
 from pathlib import Path
@@ -22,19 +25,38 @@ if TYPE_CHECKING:
 
 
 FORMAT = "pcgraph-segmentation"
-"""By which a file of ours is known: a comment in a PLY file, the array `format` in an .npz file."""
+"""By which a file of ours is known, and the SHA-256 of its bytes: a comment in a PLY file or an .npz file.
+
+The sum is that of the file with zeros in place of the sum. Who corrects labels by hand makes the file their own.
+"""
+_SEAL = re.compile(rf"{FORMAT} sha256 (?P<sum>[0-9a-f]{{64}})(?:\n|\Z)".encode())
+_UNSEALED = f"{FORMAT} sha256 {'0' * 64}"
+_BLOCK = 1 << 20
 
 
 def is_segmentation(path: Path) -> bool:
-    """Whether a file is one that `write_segmentation` wrote."""
-    if path.suffix.lower() == ".ply":
-        with path.open("rb") as stream:
-            return f"\ncomment {FORMAT}\n".encode() in stream.read(200)
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return "format" in arrays and str(arrays["format"]) == FORMAT
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
-        return False
+    """Whether a file is one that `write_segmentation` wrote, and nobody changed."""
+    with path.open("rb") as stream:
+        start = 0 if path.suffix.lower() == ".ply" else max(0, stream.seek(0, os.SEEK_END) - len(_UNSEALED))
+        stream.seek(start)
+        seal = _SEAL.search(stream.read(200))
+        if seal is None:
+            return False
+        stream.seek(0)
+        sha256, left = hashlib.sha256(), start + seal.start("sum")
+        while left and (block := stream.read(min(left, _BLOCK))):
+            sha256.update(block)
+            left -= len(block)
+        sha256.update(b"0" * len(stream.read(64)))
+        while block := stream.read(_BLOCK):
+            sha256.update(block)
+    return sha256.hexdigest().encode() == seal["sum"]
+
+
+def _sealed(content: bytes, place: int) -> bytes:
+    """The bytes of a file with its sum in place of the zeros after `place`."""
+    start = content.index(_UNSEALED.encode(), place) + len(_UNSEALED) - 64
+    return content[:start] + hashlib.sha256(content).hexdigest().encode() + content[start + 64 :]
 
 
 def write_segmentation(
@@ -87,7 +109,7 @@ def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     columns: dict[str, NDArray[np.generic]] = {name: points[:, i] for i, name in enumerate("xyz")}
     columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
     columns |= {"labels": kept, "supervoxels": segmentation.supervoxels.reshape(-1)[finite]}
-    return encode_ply(columns, FORMAT)
+    return _sealed(encode_ply(columns, _UNSEALED), 0)
 
 
 def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) -> bytes:
@@ -103,4 +125,7 @@ def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     arrays["viewpoint"] = segmentation.viewpoint
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-    return stream.getvalue()
+    with zipfile.ZipFile(stream, "a") as archive:
+        archive.comment = _UNSEALED.encode()
+    content = stream.getvalue()
+    return _sealed(content, len(content) - len(_UNSEALED))
