@@ -15,6 +15,7 @@ from typing import Any
 from xml.parsers import expat
 
 from rangesim import limits
+from rangesim.config import brief
 from rangesim.errors import FileFormatError
 
 _LONG_KEY = r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){%d}"""
@@ -41,7 +42,7 @@ def read_json(path: str | Path) -> Any:
     except RecursionError:
         raise _too_deep(path) from None
     except ValueError as error:  # also of a number of more digits than Python converts
-        raise FileFormatError(f"{path} is no valid JSON: {error}.") from error
+        raise FileFormatError(f"{path} is no valid JSON: {brief(error)}.") from error
     if is_nested_deeper(data, limits.current().nesting):
         raise _too_deep(path)
     return data
@@ -58,7 +59,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     except RecursionError:
         raise _too_deep(path) from None
     except ValueError as error:
-        raise FileFormatError(f"{path} is no valid TOML: {error}.") from error
+        raise FileFormatError(f"{path} is no valid TOML: {brief(error)}.") from error
     if is_nested_deeper(data, deepest):
         raise _too_deep(path)
     return data
@@ -134,7 +135,7 @@ class _Xml:
         try:
             parser.Parse(data, True)
         except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: of an unknown encoding
-            raise FileFormatError(f"{path} is no valid XML: {error}.") from error
+            raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
 
 
 def _too_deep(path: str | Path) -> FileFormatError:
