@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick lint format clean system
+.PHONY: help demo test test-quick fuzz lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -23,6 +23,12 @@ test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run e
 test-quick: $(VENV)/.installed-test ## the tests without those marked slow, without coverage
 	$(BIN)/python -m pytest -m "not slow"
 
+N := 20000
+SEED := $(shell date +%Y%m%d)
+JOBS := $(shell nproc 2>/dev/null || echo 1)
+fuzz: $(VENV)/.installed-test ## N=100000 mutated and hostile files over all readers; new failures go to tests/fuzz/corpus
+	PYTHONPATH=$(CURDIR):$(CURDIR)/tests $(BIN)/python -m fuzz --n $(N) --seed $(SEED) --jobs $(JOBS) --keep
+
 lint: $(VENV)/.installed-test ## ruff and mypy
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -32,21 +38,28 @@ format: $(VENV)/.installed-test ## let ruff put the code in order
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
+constraints: ## write constraints.txt anew: the newest versions within the ranges of pyproject.toml (python3.11)
+	@PYTHON=$${PYTHON:-python3.11} scripts/setup constraints
+
+audit: $(VENV)/.installed-test ## licences of all dependencies; known vulnerabilities of the pinned versions (needs network)
+	$(BIN)/python scripts/licences.py
+	@scripts/setup audit
+
 clean: ## remove the environment, caches and results
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The system libraries are looked at every time, which is quick; packages are installed only when
-# pyproject.toml has changed.
+# pyproject.toml or constraints.txt has changed.
 system:
 	@scripts/setup system
 
-$(VENV)/.installed: pyproject.toml scripts/setup | system
+$(VENV)/.installed: pyproject.toml constraints.txt scripts/setup | system
 	@scripts/setup venv $(VENV)
 	@scripts/setup install $(VENV)
 	@touch $@
 
-$(VENV)/.installed-test: pyproject.toml scripts/setup | system
+$(VENV)/.installed-test: pyproject.toml constraints.txt scripts/setup | system
 	@scripts/setup system --test
 	@scripts/setup venv $(VENV)
 	@scripts/setup install $(VENV) test

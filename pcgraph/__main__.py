@@ -1,9 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m pcgraph``."""
+"""``python -m pcgraph``, and the script ``pcgraph``: signals are taken care of before anything else is imported."""
 
 from __future__ import annotations
 
-from pcgraph.cli import main
+
+def main() -> None:
+    """Run the command line."""
+    from pcgraph.interrupts import end_on_signals
+
+    end_on_signals("pcgraph", writes=True)
+    from pcgraph.cli import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from enum import StrEnum
 from pathlib import Path
@@ -86,7 +87,7 @@ def segment(
 
 
 def main() -> None:
-    """Run the command line; the entry point of the script ``pcgraph``."""
+    """Run the command line."""
     app(prog_name="pcgraph")
 
 
@@ -98,9 +99,30 @@ def _targets(cloud: Path, out: Path | None) -> list[Path]:
             raise CloudWriteError(f"cannot write {out}: there is no folder {out.parent}; create it first")
         if out.resolve() == cloud.resolve():
             raise CloudWriteError(f"--out is the input itself, {out}: choose another name")
-        return [out]
-    folder = Path() if out is None else out
-    return [folder / f"{cloud.stem}.segments{suffix}" for suffix in (".ply", ".npz")]
+        targets = [out]
+    else:
+        folder = Path() if out is None else out
+        targets = [folder / f"{cloud.stem}.segments{suffix}" for suffix in (".ply", ".npz")]
+    _check_targets(targets)
+    return targets
+
+
+def _check_targets(targets: list[Path]) -> None:
+    """Refuse to write where a file of the user's is, or where nothing can be written; this writes nothing."""
+    from pcgraph.io.write import is_segmentation
+
+    for target in targets:
+        if target.is_symlink() and not target.exists():
+            raise CloudWriteError(f"{target} is a link to a file that does not exist; choose another --out")
+        if target.exists() and not (target.is_file() and is_segmentation(target)):
+            raise CloudWriteError(
+                f"{target} exists and was not written by pcgraph; move it away or choose another --out"
+            )
+    above = next(folder for folder in (targets[0].parent, *targets[0].absolute().parents) if folder.exists())
+    if not above.is_dir():
+        raise CloudWriteError(f"cannot create the folder {targets[0].parent}: {above} is a file; choose another --out")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise CloudWriteError(f"cannot write to {above}: permission denied; choose another --out")
 
 
 def _segmentation(
@@ -139,6 +161,7 @@ def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDAr
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CloudWriteError(f"cannot create the folder {folder}: {error.strerror}; choose another --out") from None
+    _check_targets(targets)  # the segmentation took its time
     for target in targets:
         write_segmentation(target, cloud, result, labels)
 

@@ -7,7 +7,10 @@ Names are imported when they are first used, so that decoding a real capture sta
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+
+TYPE_CHECKING = False  # the module typing would double the time of this import
+if TYPE_CHECKING:
+    from typing import Any
 
 _HOME = {
     "Ambient": "rangesim.ambient",

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pcgraph.output import write_file
 from rangesim.bounds import Bounds, check_number, whole
 from rangesim.config import from_dict, shown, to_dict
 from rangesim.errors import FileFormatError
 from rangesim.rig import Intrinsics, Rig
-from rangesim.staging import write_file
 from rangesim.text_files import check_xml, read_json
 
 LARGEST = 1e9
@@ -82,7 +82,7 @@ def load_calibration(
 
 def save_calibration(rig: Rig, path: str | Path) -> None:
     """Write a rig as JSON; `load_calibration` reads it back equal."""
-    write_file(Path(path), (json.dumps(to_dict(rig), indent=1) + "\n").encode())
+    write_file(Path(path), (json.dumps(to_dict(rig), indent=1) + "\n").encode(), FileFormatError, make_parents=True)
 
 
 def _load_json(path: Path) -> Rig:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pcgraph.output import DirectoryKind, new_directory, recover, write_manifest
 from rangesim import __version__
 from rangesim.ambient import Ambient
 from rangesim.capture import DTYPES, Capture
@@ -18,13 +19,16 @@ from rangesim.detector import Detector, PhotoDetector
 from rangesim.errors import FileFormatError
 from rangesim.image_files import SUFFIXES, read_stack, write_grey
 from rangesim.rig import Rig
+from rangesim.schema import write_json
 from rangesim.sensors import Sensor
 from rangesim.spad import SpadDetector
-from rangesim.staging import new_directory, read_sidecar, write_json
+from rangesim.text_files import read_json
 
 SIDECAR = "capture.json"
 FORMAT = "rangesim-capture"
 FORMAT_VERSION = 1
+CAPTURE = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
+"""Directories that hold a capture."""
 DETECTORS = (Detector, SpadDetector)
 """What the key `detector` of a sidecar may hold."""
 _KEYS = (
@@ -44,23 +48,35 @@ _KEYS = (
 def save_capture(capture: Capture, directory: str | Path) -> None:
     """Write a capture as a directory: PNG (8 or 16 bits) or EXR (float32) per frame, and `capture.json`.
 
-    The directory appears only when it is complete. An older capture of that name is replaced.
+    The files appear when all are complete. An older capture of that name is replaced; files that somebody else put
+    there stay.
 
     Raises
     ------
     FileFormatError
-        `directory` exists and is neither empty nor a capture, or the frames do not fit 16 bits.
+        `directory` exists and is neither empty nor a capture as it was written, or the frames do not fit 16 bits.
+    """
+    with new_directory(directory, CAPTURE) as folder:
+        write_capture(capture, folder)
+
+
+def write_capture(capture: Capture, folder: Path) -> None:
+    """Write the files of a capture and their manifest into an empty directory, one that is still in the making.
+
+    Raises
+    ------
+    FileFormatError
+        The frames do not fit 16 bits.
     """
     if capture.is_digital and capture.frames.dtype.itemsize > 2 and capture.frames.max() > 65535:
         raise FileFormatError(
-            f"{directory}: the frames hold counts up to {capture.frames.max()}, the files at most 65535; "
-            "expose shorter."
+            f"{folder}: the frames hold counts up to {capture.frames.max()}, the files at most 65535; expose shorter."
         )
-    with new_directory(directory, SIDECAR, FORMAT) as folder:
-        names = _file_names(capture)
-        for name, frame in zip(names, capture.frames, strict=True):
-            write_grey(folder / name, frame.astype(np.uint16) if frame.dtype == np.uint32 else frame)
-        write_json(folder / SIDECAR, _sidecar(capture, names))
+    names = _file_names(capture)
+    for name, frame in zip(names, capture.frames, strict=True):
+        write_grey(folder / name, frame.astype(np.uint16) if frame.dtype == np.uint32 else frame)
+    write_json(folder / SIDECAR, _sidecar(capture, names))
+    write_manifest(folder, CAPTURE)
 
 
 def load_capture(directory: str | Path) -> Capture:
@@ -73,7 +89,12 @@ def load_capture(directory: str | Path) -> Capture:
         the file.
     """
     sidecar = Path(directory) / SIDECAR
-    settings = read_sidecar(sidecar, FORMAT)
+    recover(directory, FileFormatError)
+    if not sidecar.is_file():
+        raise FileFormatError(f"{directory} is no {FORMAT} directory: it has no {SIDECAR}.")
+    settings = read_json(sidecar)
+    if not isinstance(settings, dict) or settings.get("format") != FORMAT:
+        raise FileFormatError(f"{sidecar} is no {FORMAT} file.")
     if settings.get("format_version") != FORMAT_VERSION:
         raise FileFormatError(
             f"{sidecar}: expected format version {FORMAT_VERSION}, got {settings.get('format_version')!r}."

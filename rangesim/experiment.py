@@ -11,11 +11,13 @@ from typing import Annotated, Any
 from rangesim import limits
 from rangesim.ambient import Ambient
 from rangesim.bounds import Metres, check_fields, whole
+from rangesim.catalogue import scene_names
 from rangesim.config import check_keys, from_dict, to_dict
 from rangesim.errors import FileFormatError
 from rangesim.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.motion import Motion
 from rangesim.motion.settings import motion_from_dict
+from rangesim.seeds import check_seed
 from rangesim.text_files import read_toml
 
 
@@ -25,7 +27,8 @@ class Experiment:
 
     Parameters
     ----------
-    scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...).
+    scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...), or the name of a scene that comes with the
+        package, such as tabletop.
     material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
     unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
@@ -33,7 +36,7 @@ class Experiment:
     max_depth : longest path in segments up to the light; 2 is direct light alone.
     photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
     glint : whether the camera sees the projector's lens in mirrors.
-    seed : of transport and noise; the same seed gives the same bytes.
+    seed : of transport and noise, 0 to 2^64 - 1; the same seed gives the same bytes.
     ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
     instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
     motion : what moves; None: nothing.
@@ -59,8 +62,7 @@ class Experiment:
             raise ValueError("expected scene to be the path of a scene or a mesh, got an empty one.")
         limits.check("pixels", (self.width or 1) * (self.height or 1), f"pixels, not {self.width} x {self.height}")
         limits.check("instruments", len(self.instruments), "instruments")
-        if self.seed < 0:
-            raise ValueError(f"expected a seed of at least 0, got {self.seed}.")
+        object.__setattr__(self, "seed", check_seed(self.seed))
         for one in self.instruments if self.motion else ():
             period_s = one.timing.frame_period_s
             if one.exposure_s is not None and 0 < period_s < one.exposure_s:
@@ -78,6 +80,8 @@ class Experiment:
 def load_experiment(path: str | Path) -> Experiment:
     """The experiment of a TOML file; a relative scene path counts from the file's directory.
 
+    A scene that comes with the package is meant where its name is given and no file of that name is there.
+
     Raises
     ------
     FileFormatError
@@ -90,7 +94,9 @@ def load_experiment(path: str | Path) -> Experiment:
         experiment = experiment_from_dict(read_toml(path))
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
-    return replace(experiment, scene=str(path.parent / experiment.scene))
+    beside = path.parent / experiment.scene
+    comes_along = experiment.scene in scene_names() and not beside.is_file()
+    return experiment if comes_along else replace(experiment, scene=str(beside))
 
 
 def experiment_from_dict(data: Mapping[str, Any]) -> Experiment:

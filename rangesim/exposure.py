@@ -11,6 +11,7 @@ from rangesim.bounds import SECONDS, check_number
 from rangesim.capture import Capture, bright_level
 from rangesim.detector import PhotoDetector
 from rangesim.rig import Rig
+from rangesim.seeds import check_seed
 from rangesim.sensors import IdealToF, Sensor
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def expose(
         float32 radiance in W/m2/sr, unfiltered ambient light included. `IdealToF` has no noise model: its
         frames are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
-    seed : int, of the noise. Every frame has its own stream; the same seed gives the same bytes.
+    seed : int, 0 to 2^64 - 1, of the noise. Every frame has its own stream; the same seed gives the same bytes.
     ambient : Ambient, what kind of light the scene's own emitters give, and how strong: the detector's
         band (`band_width_m`) then decides what counts of it. None: unknown, and the detector's
         `ambient_transmission` does. Other light needs no new pass.
@@ -47,11 +48,12 @@ def expose(
     Raises
     ------
     ValueError
-        The pass lacks the sensor's signals, the exposure is not positive, detector and sensor do not go
-        together, or ambient light is stated for a scene that has none.
+        The pass lacks the sensor's signals, the exposure is not positive, the seed is out of its range, detector and
+        sensor do not go together, or ambient light is stated for a scene that has none.
     """
     if detector is not None and not isinstance(detector, PhotoDetector):
         raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
+    seed = check_seed(seed)
     if exposure_s is not None:
         check_number("exposure_s", exposure_s, SECONDS)
     if ambient is not None:

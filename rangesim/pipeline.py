@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rangesim
+from pcgraph.output import new_directory
 from rangesim.capture import Capture
+from rangesim.capture_files import write_capture
 from rangesim.causes import explain
 from rangesim.cost import Cost, estimate_cost
 from rangesim.experiment import Experiment
@@ -21,8 +23,17 @@ from rangesim.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.provenance import provenance
-from rangesim.result_files import FORMAT, SETTINGS, load_result, save_causes, save_range_image
-from rangesim.staging import new_directory, write_json
+from rangesim.result_files import (
+    RESULT,
+    SETTINGS,
+    MeasurementRecord,
+    load_result,
+    save_causes,
+    save_range_image,
+    save_rows,
+)
+from rangesim.schema import write_record
+from rangesim.seeds import derived_seed
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -49,7 +60,8 @@ def run(
 ) -> None:
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
-    The directory appears when all is done; a failure leaves nothing behind. An older result of that name is replaced.
+    The files appear when all is done; a failure leaves nothing behind. An older result of that name is replaced; files
+    that somebody else put there stay. See `pcgraph.output`.
 
     Parameters
     ----------
@@ -59,8 +71,8 @@ def run(
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        A setting out of range, more memory than there is, a scene that cannot be loaded, foreign contents in `out`,
-        or no suitable LLVM.
+        A setting out of range, more memory than there is, a scene that cannot be loaded, no suitable LLVM, or an `out`
+        that cannot take a result (see `pcgraph.output.check_directory`).
     """
     import mitsuba as mi
 
@@ -68,7 +80,7 @@ def run(
     from rangesim.report import write_report
 
     say = progress or (lambda stage, share: None)
-    with new_directory(out, SETTINGS, FORMAT) as folder:
+    with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
         times: dict[str, float] = {}
         say("Loading the scene", 0.0)
         with timed(times, "load"):
@@ -90,7 +102,7 @@ def run(
             for one in instruments:
                 say(f"Measuring with {one.name}", _share(number, len(passes), 1.0))
                 measure(one, signals, folder / one.name, noise_seed(experiment, one), experiment.ambient)
-        write_json(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
+        write_record(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
         say("Writing the report", 0.97)
         result = load_result(folder)
         _write_comparison(folder, [(m.name, m.rows) for m in result.measurements])
@@ -117,7 +129,8 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     with timed(times, "exposure"):
         detector = _in_time(one) if moves else one.detector
         capture = rangesim.expose(signals, one.sensor, detector, one.exposure_s, seed, ambient)
-    capture.save(folder / "capture")
+    (folder / "capture").mkdir()
+    write_capture(capture, folder / "capture")
     with timed(times, "decode"):
         image = rangesim.decode(capture)
     save_range_image(image, folder / "range.npz")
@@ -126,15 +139,15 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
         causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
     save_causes(causes, folder / "causes.npz")
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.shares(signals.truth), strict=True)]
-    write_json(folder / "comparison.json", {"outlier_m": comparison.outlier_m, "rows": rows})
+    save_rows(comparison.outlier_m, rows, folder)
     with timed(times, "points"):
         cloud = image.to_point_cloud()
     if cloud.valid.sum() >= FEWEST_POINTS:
         cloud.save(folder / "cloud.ply")
         with timed(times, "segmentation"):
             segment(cloud, folder / "segmentation.npz")
-    facts = acquisition(capture, one.timing, moves)
-    write_json(folder / "measurement.json", {**facts, "points": int(cloud.valid.sum()), "times_s": times})
+    facts = acquisition(capture, one.timing, moves, int(cloud.valid.sum()), times)
+    write_record(folder / "measurement.json", facts)
 
 
 def _in_time(one: Instrument) -> PhotoDetector | None:
@@ -176,11 +189,12 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
 
 def noise_seed(experiment: Experiment, one: Instrument) -> int:
     """Seed of an instrument's noise: its own for each position in the experiment."""
-    position = experiment.instruments.index(one)
-    return int(np.random.SeedSequence([experiment.seed, position]).generate_state(1)[0])
+    return derived_seed(experiment.seed, experiment.instruments.index(one))
 
 
-def acquisition(capture: Capture, timing: Timing, moves: bool) -> dict[str, Any]:
+def acquisition(
+    capture: Capture, timing: Timing, moves: bool, points: int, times_s: dict[str, float]
+) -> MeasurementRecord:
     """Frames and time of a capture; exposure None for a noise-free one, which takes no time.
 
     Exposures follow each other at once, or, where something moves, as the timing says.
@@ -193,13 +207,15 @@ def acquisition(capture: Capture, timing: Timing, moves: bool) -> dict[str, Any]
         pause = max(exposure, timing.frame_period_s) if moves else exposure
         lines = camera[0] if timing.lines == "rows" else camera[1]
         taken = (shots - 1) * pause + exposure + (lines - 1) * (timing.line_period_s if moves else 0.0)
-    return {
-        "sensor": capture.sensor.type_name,
-        "frames": len(capture.frames),
-        "exposure_s": exposure,
-        "acquisition_s": taken,
-        "pixels": int(capture.frames[0].size),
-    }
+    return MeasurementRecord(
+        sensor=capture.sensor.type_name,
+        frames=len(capture.frames),
+        exposure_s=exposure,
+        acquisition_s=taken,
+        pixels=int(capture.frames[0].size),
+        points=points,
+        times_s=times_s,
+    )
 
 
 @contextmanager

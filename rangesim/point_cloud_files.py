@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pcgraph.output import write_file
+from rangesim.errors import FileFormatError
 from rangesim.point_cloud import PointCloud
-from rangesim.staging import write_file
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short",
               "u4": "uint", "i4": "int"}  # fmt: skip
@@ -27,13 +28,16 @@ def save_point_cloud(cloud: PointCloud, path: str | Path) -> None:
     ------
     ValueError
         The suffix is neither, or the cloud has no finite point.
+    FileFormatError
+        The place cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in (".ply", ".pcd"):
         raise ValueError(f"expected a file name ending in .ply or .pcd, got {path.name!r}.")
     if not cloud.valid.any():
         raise ValueError(f"expected at least one finite point to write to {path.name}, got none.")
-    write_file(path, _ply_bytes(cloud.finite()) if path.suffix.lower() == ".ply" else _pcd_bytes(cloud))
+    content = _ply_bytes(cloud.finite()) if path.suffix.lower() == ".ply" else _pcd_bytes(cloud)
+    write_file(path, content, FileFormatError, make_parents=True)
 
 
 def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:

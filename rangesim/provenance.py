@@ -8,12 +8,12 @@ import platform
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rangesim.config import to_dict
 from rangesim.experiment import Experiment, experiment_to_dict
 from rangesim.instrument import Instrument
-from rangesim.result_files import FORMAT
+from rangesim.result_files import InstrumentRecord, ResultRecord, SceneRecord, ShapeRecord
 
 if TYPE_CHECKING:
     from rangesim.rig import Rig
@@ -28,32 +28,31 @@ def provenance(
     passes: Sequence[tuple[Rig, Sequence[Instrument]]],
     variant: str,
     times_s: dict[str, float],
-) -> dict[str, Any]:
+) -> ResultRecord:
     """Contents of `experiment.json`."""
     placed = {i.name: (number, rig) for number, (rig, ones) in enumerate(passes, 1) for i in ones}
-    return {
-        "format": FORMAT,
-        "experiment": experiment_to_dict(experiment),
-        "scene": {
-            "name": scene.name,
-            "sha256": _checksum(Path(experiment.scene)),
-            "working_distance_m": scene.working_distance_m,
-            "shapes": [to_dict(i) for i in scene.instances],
-        },
-        "passes": len(passes),
-        "instruments": [
-            {"name": i.name, "pass": placed[i.name][0], "rig": to_dict(placed[i.name][1])}
+    return ResultRecord(
+        experiment=experiment_to_dict(experiment),
+        scene=SceneRecord(
+            name=scene.name,
+            sha256=_checksum(scene.source),
+            working_distance_m=scene.working_distance_m,
+            shapes=[ShapeRecord(name=i.name, material=i.material) for i in scene.instances],
+        ),
+        passes=len(passes),
+        instruments=[
+            InstrumentRecord(name=i.name, light_pass=placed[i.name][0], rig=to_dict(placed[i.name][1]))
             for i in experiment.instruments
         ],
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
-        "variant": variant,
-        "times_s": times_s,
-    }
+        versions={"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        variant=variant,
+        times_s=times_s,
+    )
 
 
-def _checksum(path: Path) -> str | None:
-    """SHA-256 of a file; None if the scene came from elsewhere."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+def _checksum(path: Path | None) -> str | None:
+    """SHA-256 of the scene's file; None if there is none, or none any more."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None
 
 
 def _version(package: str) -> str:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of an experiment as a directory, and back.
 
-DIR/experiment.json      resolved settings, versions, and which instruments share which pass
+DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.output`
+    experiment.json      resolved settings, versions, and which instruments share which pass
     pass_1.npz           energy split and ground truth of each transport pass
     comparison.md        statistics of all instruments
     report.html
@@ -14,24 +15,161 @@ DIR/experiment.json      resolved settings, versions, and which instruments shar
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
+from pcgraph.output import DirectoryKind, recover
 from rangesim.capture import Capture
 from rangesim.capture_files import load_capture
-from rangesim.causes import CauseMap
+from rangesim.causes import Cause, CauseMap
+from rangesim.comparison import ALL
+from rangesim.config import shown
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.range_image import RangeImage
+from rangesim.schema import (
+    ArraySpec,
+    Count,
+    Fraction,
+    Metres,
+    Name,
+    Positive,
+    Record,
+    Seconds,
+    read_checked_arrays,
+    read_record,
+    write_record,
+)
 from rangesim.signals import EnergySplit, GroundTruth
-from rangesim.staging import read_sidecar
+from rangesim.status import Status
 
 SETTINGS = "experiment.json"
 FORMAT = "rangesim-result"
+RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
+"""Directories that hold the results of an experiment."""
+
+
+# ---- What the files hold -------------------------------------------------------------------------------------------
+
+
+class ShapeRecord(Record, frozen=True, kw_only=True):
+    """A shape of the scene."""
+
+    name: str
+    material: Name
+
+
+class SceneRecord(Record, frozen=True, kw_only=True):
+    """The scene that was measured. sha256 : of its file; None if it came from elsewhere."""
+
+    name: str
+    sha256: str | None
+    working_distance_m: Positive
+    shapes: list[ShapeRecord]
+
+
+class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": "pass"}):
+    """An instrument, the pass it took part in (from 1), and its rig."""
+
+    name: Name
+    light_pass: Count
+    rig: dict[str, Any]
+
+
+class ResultRecord(Record, frozen=True, kw_only=True):
+    """`experiment.json`."""
+
+    format: Literal["rangesim-result"] = "rangesim-result"
+    format_version: Literal[1] = 1
+    experiment: dict[str, Any]
+    scene: SceneRecord
+    passes: Count
+    instruments: list[InstrumentRecord]
+    versions: dict[str, str]
+    variant: str
+    times_s: dict[str, Seconds]
+
+
+class MeasurementRecord(Record, frozen=True, kw_only=True):
+    """`measurement.json`: frames, exposure and time per stage; exposure None for a noise-free capture."""
+
+    format: Literal["rangesim-measurement"] = "rangesim-measurement"
+    format_version: Literal[1] = 1
+    sensor: Name
+    frames: Count
+    exposure_s: Positive | None
+    acquisition_s: Seconds | None
+    pixels: Count
+    points: Count
+    times_s: dict[str, Seconds]
+
+
+class RowRecord(Record, frozen=True, kw_only=True):
+    """Statistics of one material class; see `rangesim.comparison.ErrorStatistics` and `rangesim.causes.CauseMap`."""
+
+    material: Name
+    pixels: Count
+    lit: Count
+    completeness: Fraction | None
+    coverage: Fraction | None
+    bias_m: Metres | None
+    median_abs_m: Metres | None
+    rmse_m: Metres | None
+    p95_abs_m: Metres | None
+    outlier_rate: Fraction | None
+    edge_pixels: Count
+    flying_rate: Fraction | None
+    failed: Fraction | None
+    causes: dict[str, Fraction]
+
+
+class ComparisonRecord(Record, frozen=True, kw_only=True):
+    """`comparison.json`: a row per material class, "all" last."""
+
+    format: Literal["rangesim-comparison"] = "rangesim-comparison"
+    format_version: Literal[1] = 1
+    outlier_m: Positive
+    rows: list[RowRecord]
+
+
+_FARTHEST_M = 1e9
+_RADIANCE = ArraySpec("float32", low=0)
+_DEPTH = ArraySpec("float32", low=-_FARTHEST_M, high=_FARTHEST_M, nan=True)
+_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_FARTHEST_M, nan=True)
+_PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
+    "truth_z": _TRUE_DEPTH,
+    "truth_range_m": _TRUE_DEPTH,
+    "truth_normal": ArraySpec("float32", ("h", "w", 3), low=-1.01, high=1.01, nan=True),
+    "truth_instance": ArraySpec("int32", low=-1),
+    "truth_material": ArraySpec("int32", low=-1),
+    "truth_projector_uv": ArraySpec("float32", ("h", "w", 2), nan=True, inf=True),
+    "truth_projector_visible": ArraySpec("bool"),
+    "truth_instance_names": ArraySpec("str", ("instances",)),
+    "truth_material_names": ArraySpec("str", ("materials",)),
+    "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
+}
+_RANGE = {
+    "z": _DEPTH,
+    "range_m": _DEPTH,
+    "confidence": ArraySpec("float32", low=0, high=1.001, nan=True),
+    "status": ArraySpec("uint8", high=max(Status)),
+    "intensity": ArraySpec("float32", nan=True),
+    "T_world_camera": ArraySpec("float64", (4, 4), required=False),
+    "projector_column": ArraySpec("float32", nan=True, required=False),
+    "projector_row": ArraySpec("float32", nan=True, required=False),
+}
+_CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
+_SEGMENTATION = {
+    "supervoxels": ArraySpec("int32", low=-1),
+    "labels": ArraySpec("int32", low=-1),
+    "parents": ArraySpec("int32", ("nodes",), low=0),
+    "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +196,7 @@ class Measurement:
     rows : statistics per material class, "all" last; see `rangesim.comparison.ErrorStatistics` and
         `rangesim.causes.CauseMap.shares`.
     segmentation : Segmentation, or None if there were no points to group.
-    facts : frames, exposure and time per stage; see `rangesim.pipeline`.
+    facts : MeasurementRecord, frames, exposure and time per stage.
     light_pass : int from 1, the transport pass the instrument took part in.
     """
 
@@ -69,7 +207,7 @@ class Measurement:
     causes: CauseMap
     rows: list[dict[str, Any]]
     segmentation: Segmentation | None
-    facts: dict[str, Any]
+    facts: MeasurementRecord
     light_pass: int
 
 
@@ -80,7 +218,10 @@ class Result:
     experiment: Experiment
     measurements: tuple[Measurement, ...]
     energy: tuple[EnergySplit, ...]
-    info: dict[str, Any]
+    info: ResultRecord
+
+
+# ---- Writing -------------------------------------------------------------------------------------------------------
 
 
 def save_range_image(image: RangeImage, path: Path) -> None:
@@ -94,59 +235,128 @@ def save_causes(causes: CauseMap, path: Path) -> None:
     np.savez_compressed(path, cause=causes.cause, tolerance_m=causes.tolerance_m)
 
 
+def save_rows(outlier_m: float, rows: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Write statistics per material class as `comparison.json`."""
+    write_record(folder / "comparison.json", ComparisonRecord(outlier_m=outlier_m, rows=[RowRecord(**r) for r in rows]))
+
+
+# ---- Reading -------------------------------------------------------------------------------------------------------
+
+
 def load_result(directory: str | Path) -> Result:
     """The result that `rangesim.pipeline.run` wrote.
 
     Raises
     ------
     FileFormatError
-        The directory is no result, or a part of it is missing or broken.
+        The directory is no result, or a part of it is missing or broken; the message names the file.
     """
     folder = Path(directory)
     info = read_settings(folder)
     try:
-        experiment = experiment_from_dict(info["experiment"])
-        passes = [_load_pass(folder / f"pass_{i + 1}.npz") for i in range(info["passes"])]
-        measurements = tuple(
-            _load_measurement(folder / entry["name"], passes[entry["pass"] - 1][1], entry["pass"])
-            for entry in info["instruments"]
-        )
-    except (OSError, KeyError, ValueError, IndexError) as error:
-        raise FileFormatError(f"{folder} is no complete result of rangesim: {error}.") from error
+        experiment = experiment_from_dict(info.experiment)
+    except ValueError as error:
+        raise FileFormatError(f"{folder / SETTINGS}: {error}") from error
+    names = [i.name for i in experiment.instruments]
+    if [entry.name for entry in info.instruments] != names:
+        raise FileFormatError(f"{folder / SETTINGS}: expected the instruments {shown(names)} as in its experiment.")
+    if {entry.light_pass for entry in info.instruments} != set(range(1, info.passes + 1)):
+        raise FileFormatError(f"{folder / SETTINGS}: expected each of {info.passes} passes to serve an instrument.")
+    if missing := [f"transport_{n}" for n in range(1, info.passes + 1) if f"transport_{n}" not in info.times_s]:
+        raise FileFormatError(f"{folder / SETTINGS}: expected the time {missing[0]} in times_s.")
+    sizes: dict[str, int] = {}
+    passes = [_load_pass(folder / f"pass_{n}.npz", sizes) for n in range(1, info.passes + 1)]
+    measurements = tuple(
+        _load_measurement(folder / entry.name, passes[entry.light_pass - 1][1], entry.light_pass, sizes)
+        for entry in info.instruments
+    )
     return Result(experiment, measurements, tuple(energy for energy, _ in passes), info)
 
 
-def read_settings(folder: Path) -> dict[str, Any]:
+def read_settings(folder: Path) -> ResultRecord:
     """Contents of `experiment.json`; FileFormatError if there is none of ours."""
-    return read_sidecar(folder / SETTINGS, FORMAT)
+    recover(folder, FileFormatError)
+    if not (folder / SETTINGS).is_file():
+        raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SETTINGS}.")
+    return read_record(folder / SETTINGS, ResultRecord)
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """Statistics per material class of one instrument, from its `comparison.json`."""
-    return list(json.loads((folder / "comparison.json").read_text(encoding="utf-8"))["rows"])
+    """Statistics per material class of one instrument, from its `comparison.json`; FileFormatError if it is broken."""
+    path = folder / "comparison.json"
+    record = read_record(path, ComparisonRecord)
+    materials = [row.material for row in record.rows]
+    if materials.count(ALL) != 1 or len(set(materials)) < len(materials):
+        raise FileFormatError(f"{path}: expected one row per material, and one {ALL!r}, got {shown(materials)}.")
+    valid = {c.name.lower() for c in Cause if c}
+    for row in record.rows:
+        if unknown := set(row.causes) - valid:
+            raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.material)}.")
+        if abs(sum(row.causes.values()) - (row.failed or 0)) > 1e-6:
+            raise FileFormatError(f"{path}: expected the causes of {shown(row.material)} to add up to what failed.")
+    return [msgspec.to_builtins(row) for row in record.rows]
 
 
-def _load_pass(path: Path) -> tuple[EnergySplit, GroundTruth]:
-    with np.load(path) as data:
-        energy = EnergySplit(**{f.name: data[f"energy_{f.name}"] for f in fields(EnergySplit)})
-        truth = {f.name: data[f"truth_{f.name}"] for f in fields(GroundTruth)}
+def _load_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
+    own = dict(sizes)  # passes may see other instances
+    data = read_checked_arrays(path, _PASS, own)
+    sizes |= {name: own[name] for name in ("h", "w")}
+    for ids in ("instance", "material"):
+        if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
+            raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
+    energy = EnergySplit(**{f.name: data[f"energy_{f.name}"] for f in fields(EnergySplit)})
+    truth: dict[str, Any] = {f.name: data[f"truth_{f.name}"] for f in fields(GroundTruth)}
     for name in ("instance_names", "material_names"):
         truth[name] = tuple(map(str, truth[name]))
     return energy, GroundTruth(**truth)
 
 
-def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int) -> Measurement:
+def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
     capture = load_capture(folder / "capture")
-    with np.load(folder / "range.npz") as data:
-        arrays = {name: data[name] for name in data.files}
-    rig = capture.rig
-    arrays["T_world_camera"] = rig.T_world_camera if rig else None
-    image = RangeImage(**arrays, camera=rig.camera if rig else None)
-    with np.load(folder / "causes.npz") as data:
-        causes = CauseMap(data["cause"], float(data["tolerance_m"]))
-    segmentation = None
-    if (folder / "segmentation.npz").is_file():
-        with np.load(folder / "segmentation.npz") as data:
-            segmentation = Segmentation(**{f.name: data[f.name] for f in fields(Segmentation)})
-    facts = json.loads((folder / "measurement.json").read_text(encoding="utf-8"))
-    return Measurement(folder.name, capture, image, truth, causes, read_rows(folder), segmentation, facts, light_pass)
+    if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
+        raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
+    arrays: dict[str, Any] = read_checked_arrays(folder / "range.npz", _RANGE, sizes)
+    if not np.array_equal(np.isfinite(arrays["z"]), arrays["status"] == Status.OK):
+        raise FileFormatError(f"{folder / 'range.npz'}: expected z to be finite where status is {Status.OK.value}.")
+    arrays["T_world_camera"] = capture.rig.T_world_camera
+    data = read_checked_arrays(folder / "causes.npz", _CAUSES, sizes)
+    facts = read_record(folder / "measurement.json", MeasurementRecord)
+    if (facts.sensor, facts.frames, facts.pixels) != (
+        capture.sensor.type_name, len(capture.frames), capture.frames[0].size
+    ):  # fmt: skip
+        raise FileFormatError(f"{folder / 'measurement.json'}: expected sensor, frames and pixels of the capture.")
+    return Measurement(
+        name=folder.name,
+        capture=capture,
+        image=RangeImage(**arrays, camera=capture.rig.camera),
+        truth=truth,
+        causes=CauseMap(data["cause"], float(data["tolerance_m"])),
+        rows=read_rows(folder),
+        segmentation=_load_segmentation(folder / "segmentation.npz", sizes),
+        facts=facts,
+        light_pass=light_pass,
+    )
+
+
+def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None:
+    if not path.is_file():
+        return None
+    data = read_checked_arrays(path, _SEGMENTATION, dict(sizes))
+    parents, altitudes = data["parents"], data["altitudes"]
+    nodes, leaves = len(parents), (len(parents) + 1) // 2
+    children = np.bincount(parents[: nodes - 1], minlength=nodes) if nodes and parents.max() < nodes else np.zeros(1)
+    is_tree = (
+        nodes % 2 == 1
+        and len(children) == nodes
+        and bool((parents[:-1] > np.arange(nodes - 1)).all())
+        and parents[-1] == nodes - 1
+        and not children[:leaves].any()
+        and bool((children[leaves:] == 2).all())
+        and bool((altitudes[parents] >= altitudes).all())
+    )
+    if not is_tree:
+        raise FileFormatError(f"{path}: expected parents and altitudes of a binary tree, its leaves first.")
+    for name in ("supervoxels", "labels"):
+        if data[name].max(initial=-1) >= leaves:
+            raise FileFormatError(f"{path}: array {name}: expected indices below the number of leaves, {leaves}.")
+    return Segmentation(**data)

@@ -44,7 +44,8 @@ def test_pcgraph_never_imports_rangesim_or_a_renderer(path: Path) -> None:
 
 STOREYS = [
     "errors",
-    "atomic",
+    "output",
+    "interrupts",
     "cloud",
     "parallel",
     "voxels",

@@ -149,6 +149,24 @@ def test_compare_and_report(command: Command, tmp_path: Path) -> None:
     assert (copy / "report.html").read_bytes() == (small_result() / "report.html").read_bytes()
 
 
+@pytest.mark.parametrize("options", [[], ["--markdown"]])
+def test_names_are_printed_as_they_are(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
+    """A folder in brackets, a material of another's result: no markup, no column, no order to the terminal."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "out[red]"
+    shutil.copytree(small_result(), folder)
+    for path in folder.glob("*/comparison.json"):
+        path.write_text(path.read_text().replace('"glossy"', '"[/x]|\\u001b[3m<i>"'))
+    answer = command("compare", folder.name, folder.name, *options)
+    assert answer.status == 0
+    assert "\x1b" not in answer.out
+    plain = re.sub(r"\\([\\`<\[|])", r"\1", answer.out) if options else answer.out
+    assert "out[red]" in plain
+    assert r"[/x]|\u001b[3m<i>" in plain
+
+
 def _write_bad_files(folder: Path) -> None:
     (folder / "broken.xml").write_text('<scene version="3.0.0"><shape', encoding="utf-8")
     (folder / "blind.xml").write_text('<scene version="3.0.0"><shape type="sphere"/></scene>', encoding="utf-8")
@@ -171,6 +189,7 @@ def _write_bad_files(folder: Path) -> None:
     ("arguments", "sentence"),
     [
         (["run", "none.xml"], "none.xml does not exist"),
+        (["run", "tabeltop"], "did you mean 'tabletop'"),
         (["run", "broken.xml"], "broken.xml is no scene Mitsuba can load"),
         (["run", "blind.xml"], "perspective sensor, got none"),
         (["run", "points.ply"], "which has no faces"),
@@ -257,18 +276,6 @@ def test_a_failure_halfway_leaves_nothing(command: Command, tmp_path: Path, monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interruption_is_said_and_leaves_nothing(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("rangesim.report.write_report", interrupt)
-    answer = command("run", PLANE, *IDEAL, *TINY, "--out", tmp_path / "a" / "b")
-    assert (answer.status, answer.err) == (130, "rangesim: interrupted; nothing was written.\n")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_progress_shows_on_a_terminal_alone(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,7 +292,7 @@ def test_progress_shows_on_a_terminal_alone(
 
 def test_version_and_help(command: Command) -> None:
     assert command("--version").out == f"rangesim {rangesim.__version__}\n"
-    for name in ("run", "decode", "compare", "report", "doctor"):
+    for name in ("run", "decode", "compare", "report", "verify", "doctor"):
         assert name in command("--help").out
         assert command(name, "--help").status == 0
 

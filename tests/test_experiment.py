@@ -40,6 +40,13 @@ def test_examples_are_valid(path: Path) -> None:
     assert Path(experiment.scene).is_file()
 
 
+def test_a_scene_that_comes_along_is_named_and_a_file_beside_goes_first(tmp_path: Path) -> None:
+    (tmp_path / "e.toml").write_text('scene = "plane"')
+    assert load_experiment(tmp_path / "e.toml").scene == "plane"
+    (tmp_path / "plane").write_text("mine")
+    assert load_experiment(tmp_path / "e.toml").scene == str(tmp_path / "plane")
+
+
 def test_the_first_example_states_the_defaults() -> None:
     example = load_experiment(ROOT / "examples" / "tabletop.toml")
     usual = Experiment(example.scene)
@@ -118,15 +125,15 @@ def test_the_result_holds_every_stage() -> None:
         assert m.image.z.shape == (90, 120) == m.truth.z.shape
         assert (np.isfinite(m.image.z) == (m.image.status == Status.OK)).all()
         assert m.segmentation is not None
-        assert (m.segmentation.supervoxels >= 0).sum() == m.facts["points"] == m.image.valid.sum()
-        assert {"exposure", "decode", "causes", "points", "segmentation"} == set(m.facts["times_s"])
+        assert (m.segmentation.supervoxels >= 0).sum() == m.facts.points == m.image.valid.sum()
+        assert {"exposure", "decode", "causes", "points", "segmentation"} == set(m.facts.times_s)
         assert m.rows[-1]["material"] == "all"
-    acquired = {m.name: m.facts["acquisition_s"] for m in result.measurements}
+    acquired = {m.name: m.facts.acquisition_s for m in result.measurements}
     assert acquired["ideal"] is None
     lines, histogram = result.measurements[0].facts, result.measurements[2].facts
-    assert lines["acquisition_s"] == pytest.approx(lines["frames"] * lines["exposure_s"])
-    assert histogram["acquisition_s"] == histogram["exposure_s"]  # all bins fill in one exposure
-    assert {"mitsuba", "drjit", "numpy", "python", "rangesim"} <= set(result.info["versions"])
+    assert lines.acquisition_s == pytest.approx(lines.frames * lines.exposure_s)
+    assert histogram.acquisition_s == histogram.exposure_s  # all bins fill in one exposure
+    assert {"mitsuba", "drjit", "numpy", "python", "rangesim"} <= set(result.info.versions)
 
 
 def test_the_captures_decode_to_the_same_range_images() -> None:
@@ -147,7 +154,7 @@ def test_a_sensor_that_sees_nothing_is_reported_as_such(tmp_path: Path) -> None:
     blind = Instrument("blind", SENSORS["lines"], exposure_s=1e-9)
     run(replace(small_experiment(), instruments=(blind,), spp=1), tmp_path / "dark")
     (measurement,) = load_result(tmp_path / "dark").measurements
-    assert measurement.facts["points"] == 0
+    assert measurement.facts.points == 0
     assert measurement.segmentation is None
     assert "measured nothing" in (tmp_path / "dark" / "report.html").read_text(encoding="utf-8")
 
@@ -169,7 +176,7 @@ def test_a_scene_from_a_dictionary_runs_too(tmp_path: Path) -> None:
     experiment = Experiment("cornell_box", width=64, height=64, spp=4, instruments=(instrument("ideal-tof"),))
     run(experiment, tmp_path / "box", scene=scene)
     (measurement,) = load_result(tmp_path / "box").measurements
-    assert measurement.facts["points"] > 0.9 * 64 * 64
+    assert measurement.facts.points > 0.9 * 64 * 64
     assert measurement.rows[-1]["median_abs_m"] < 0.01
 
 

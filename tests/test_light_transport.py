@@ -232,7 +232,6 @@ def test_progress_ends_at_one_and_changes_nothing(corner: rangesim.Scene) -> Non
     assert all_bytes(transport(corner, rig, all_sensors(), spp=4, progress=shares.append)) == all_bytes(quiet)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    assert len(shares) > 4
 
 
 def test_independent_seeds_are_unbiased(corner: rangesim.Scene) -> None:
@@ -355,10 +354,8 @@ def test_bad_numbers_get_one_clear_sentence(corner: rangesim.Scene, option: str,
         transport(corner, corner.rig(**SIZE), [], **{option: value})
 
 
-def test_a_seed_is_a_whole_number_and_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
+def test_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
     rig = corner.rig(**SIZE)
-    with pytest.raises(ValueError, match=r"expected seed to be a whole number, got 1\.5"):
-        transport(corner, rig, [], spp=1, seed=1.5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="projector of 1280 x 800"):
         transport(corner, rig, [Images(np.ones((2, 10, 10), np.float32))], spp=1)
     with pytest.raises(ValueError, match="a rig whose projector has 1280 x 800"):

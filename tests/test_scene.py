@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import rangesim
+from rangesim.catalogue import scene_names
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
 from rangesim.scene.materials import material_class
@@ -158,6 +160,47 @@ def test_a_missing_file_and_an_unknown_material(tmp_path: Path) -> None:
         rangesim.load_scene(SCENES / "plane.xml", material="mirror")
     with pytest.raises(ValueError, match="did you mean 'mirror'"):
         rangesim.load_scene(write(tmp_path / "mesh.obj", TETRAHEDRON), material="miror")
+
+
+def test_a_scene_that_comes_along_is_found_by_name_from_anywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plane").mkdir()  # a result of that name is no scene
+    assert scene_names() == ("cornell", "corner", "glassware", "matte", "plane", "tabletop")
+    scene = rangesim.load_scene("plane")
+    assert scene.name == "plane"
+    assert scene.source is not None
+    assert scene.source.samefile(SCENES / "plane.xml")
+    vessels = rangesim.load_scene("glassware")  # its meshes come along
+    assert {"bottle_left", "tumbler"} <= {one.name for one in vessels.instances}
+
+
+def test_a_file_of_that_name_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plane").write_text("mine")
+    with pytest.raises(FileFormatError, match=r"got plane\.$"):
+        rangesim.load_scene("plane")
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        (
+            "tabeltop",
+            "tabeltop does not exist, and no scene of that name comes with rangesim (did you mean 'tabletop'?); "
+            "those are cornell, corner, glassware, matte, plane, tabletop.",
+        ),
+        ("scenes/plane.xml", "; the scene that comes with rangesim is named plane, without folder and suffix."),
+        ("part.ply", "expected a scene or mesh file, but part.ply does not exist."),
+    ],
+)
+def test_an_unknown_name_is_told_the_known_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileFormatError, match=re.escape(sentence) + "$"):
+        rangesim.load_scene(name)
 
 
 CLASSES: list[tuple[dict[str, Any], str]] = [

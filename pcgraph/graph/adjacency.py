@@ -178,7 +178,8 @@ class AdjacencyGraph:
         ValueError
             The occlusions are those of other supervoxels.
         """
-        from pcgraph.atomic import write_bytes
+        from pcgraph.errors import CloudWriteError
         from pcgraph.graph.export import graphml
+        from pcgraph.output import write_file
 
-        write_bytes(Path(path), graphml(self, occlusions))
+        write_file(Path(path), graphml(self, occlusions), CloudWriteError)

@@ -57,17 +57,23 @@ def read_ply(content: bytes) -> Cloud:
     return cloud_from_columns(columns, (element.count,))
 
 
-def encode_ply(columns: dict[str, NDArray[np.generic]]) -> bytes:
+def encode_ply(columns: dict[str, NDArray[np.generic]], comment: str = "") -> bytes:
     """Bytes of a binary little-endian PLY file with one vertex property per column.
 
     Parameters
     ----------
     columns : mapping of property name to (n,) array of int32, uint8, float32 or float64
+    comment : one line of the header; empty for none
     """
     record = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     n_points = len(next(iter(columns.values())))
     rows = np.empty(n_points, record)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n_points}"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *([f"comment {comment}"] if comment else []),
+        f"element vertex {n_points}",
+    ]
     for name, column in columns.items():
         rows[name] = column
         lines.append(f"property {_NAMES[column.dtype.str[1:]]} {name}")

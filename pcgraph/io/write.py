@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,13 +12,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.atomic import write_bytes
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
 from pcgraph.io.ply import encode_ply
+from pcgraph.output import write_file
 
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
+
+
+FORMAT = "pcgraph-segmentation"
+"""By which a file of ours is known: a comment in a PLY file, the array `format` in an .npz file."""
+
+
+def is_segmentation(path: Path) -> bool:
+    """Whether a file is one that `write_segmentation` wrote."""
+    if path.suffix.lower() == ".ply":
+        with path.open("rb") as stream:
+            return f"\ncomment {FORMAT}\n".encode() in stream.read(200)
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return "format" in arrays and str(arrays["format"]) == FORMAT
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
+        return False
 
 
 def write_segmentation(
@@ -32,7 +49,7 @@ def write_segmentation(
     ----------
     path : str or path
         ``.ply``: the finite points, in input order, with a colour per label and the properties ``labels`` and
-        ``supervoxels`` (int32). ``.npz``: everything, in the input's shape: ``labels``, ``supervoxels``;
+        ``supervoxels`` (int32). ``.npz``: everything, in the input's shape: ``format``, ``labels``, ``supervoxels``;
         ``edges`` and ``edge_<feature>``; ``node_<feature>``; ``tree_parents``, ``tree_altitudes``;
         ``voxel_size``, ``seed_size``, ``viewpoint``.
     cloud : Cloud
@@ -51,7 +68,7 @@ def write_segmentation(
     encode = encoders.get(path.suffix.lower())
     if encode is None:
         raise CloudWriteError(f"expected an output file ending in {' or '.join(encoders)}, got {path.name!r}")
-    write_bytes(path, encode(cloud, segmentation, segmentation.labels if labels is None else labels))
+    write_file(path, encode(cloud, segmentation, segmentation.labels if labels is None else labels), CloudWriteError)
 
 
 def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -70,12 +87,13 @@ def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     columns: dict[str, NDArray[np.generic]] = {name: points[:, i] for i, name in enumerate("xyz")}
     columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
     columns |= {"labels": kept, "supervoxels": segmentation.supervoxels.reshape(-1)[finite]}
-    return encode_ply(columns)
+    return encode_ply(columns, FORMAT)
 
 
 def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) -> bytes:
     graph, tree = segmentation.graph, segmentation.tree
-    arrays: dict[str, NDArray[np.generic]] = {"labels": labels, "supervoxels": segmentation.supervoxels}
+    arrays: dict[str, NDArray[np.generic]] = {"format": np.array(FORMAT)}
+    arrays |= {"labels": labels, "supervoxels": segmentation.supervoxels}
     arrays["edges"] = graph.edges
     arrays |= {f"edge_{name}": column for name, column in graph.edge_features.columns().items()}
     arrays |= {f"node_{name}": column for name, column in graph.node_features.columns().items()}

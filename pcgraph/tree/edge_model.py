@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.atomic import write_bytes
-from pcgraph.errors import CloudReadError
+from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.relations import angle_between
+from pcgraph.output import write_file
 
 _FORMAT = "pcgraph edge model 1"
 
@@ -101,7 +101,7 @@ class EdgeModel:
             The place cannot be written.
         """
         content = {"format": _FORMAT} | {field.name: getattr(self, field.name) for field in fields(self)}
-        write_bytes(Path(path), json.dumps(content, indent=1).encode())
+        write_file(Path(path), json.dumps(content, indent=1).encode(), CloudWriteError)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> EdgeModel:

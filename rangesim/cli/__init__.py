@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from typing import Annotated
 
@@ -11,13 +10,10 @@ import typer
 
 import rangesim
 from rangesim.cli.decode import decode_command
-from rangesim.cli.results import compare_command, report_command
+from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
 from rangesim.doctor import doctor_command
 from rangesim.errors import RangesimError
-
-INTERRUPTED = 130
-"""Exit status that Typer gives to Ctrl-C."""
 
 app = typer.Typer(
     name="rangesim", no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False
@@ -26,6 +22,7 @@ app.command("run")(run_command)
 app.command("decode")(decode_command)
 app.command("compare")(compare_command)
 app.command("report")(report_command)
+app.command("verify")(verify_command)
 app.command("doctor")(doctor_command)
 
 
@@ -51,24 +48,13 @@ def root(
 
 
 def main() -> None:
-    """Entry point: errors become one sentence on stderr and exit status 1."""
-    usual = signal.signal(signal.SIGTERM, _end)
+    """Run the command line: errors become one sentence on stderr and exit status 1."""
     try:
         app()
-    except SystemExit as end:
-        if end.code == INTERRUPTED:
-            writes = {"run", "decode"} & set(sys.argv[1:3])  # their directories appear when they are complete
-            typer.echo(f"rangesim: interrupted{'; nothing was written' if writes else ''}.", err=True)
-        raise
     except (RangesimError, ValueError, OSError) as error:
         if "--debug" in sys.argv:
             raise
-        typer.echo(f"rangesim: {' '.join(str(error).split())}", err=True)
+        from rangesim.config import visible  # names in files give a terminal no orders
+
+        typer.echo(f"rangesim: {visible(' '.join(str(error).split()))}", err=True)
         sys.exit(1)
-    finally:
-        signal.signal(signal.SIGTERM, usual)
-
-
-def _end(number: int, _: object) -> None:
-    """Leave by an exception, so that half-written directories are removed."""
-    sys.exit(128 + number)

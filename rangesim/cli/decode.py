@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rangesim.cli.progress import say_where
+
 if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.range_image import RangeImage
@@ -56,9 +58,11 @@ def decode_command(
       rangesim decode images --projector 1024x768 --calibration board.xml --code-step 2 --out out/board
     """
     import rangesim
-    from rangesim.cli.decoded_files import write_decoded
+    from pcgraph.output import check_directory
+    from rangesim.cli.decoded_files import DECODED, write_decoded
 
     _refuse_what_would_be_ignored(context, capture, calibration)
+    say_where(out, check_directory(out, DECODED, inputs=[capture]))
     sensor = None if projector is None else _sensor(code, projector, axes, period, steps)
     loaded = _load(capture, sensor, bits)
     if calibration:

@@ -9,24 +9,28 @@ from pathlib import Path
 import numpy as np
 
 import rangesim
+from pcgraph.output import DirectoryKind, new_directory
 from rangesim.capture import Capture
 from rangesim.config import to_dict
+from rangesim.errors import FileFormatError
 from rangesim.range_image import RangeImage
 from rangesim.report import figures, palette
 from rangesim.result_files import save_range_image
-from rangesim.staging import new_directory, write_json
+from rangesim.schema import write_json
 
 SIDECAR = "decoded.json"
 FORMAT = "rangesim-decoded"
+DECODED = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
+"""Directories that hold what a capture decodes to."""
 
 
 def write_decoded(image: RangeImage, capture: Capture, directory: Path) -> None:
     """Write range.npz, pictures of its maps, the settings, and cloud.ply if there are points.
 
-    The directory appears when it is complete; FileFormatError if it exists and holds something else.
+    The files appear when all are complete; FileFormatError if the directory exists and holds something else.
     """
     settings = {"sensor": to_dict(capture.sensor), "rig": to_dict(capture.rig), "rangesim": rangesim.__version__}
-    with new_directory(directory, SIDECAR, FORMAT) as folder:
+    with new_directory(directory, DECODED) as folder:
         write_json(folder / SIDECAR, {"format": FORMAT, **settings})
         save_range_image(image, folder / "range.npz")
         for name, uri in _pictures(image).items():

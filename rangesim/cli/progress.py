@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A progress bar on stderr, where that is a terminal."""
+"""What a command says on stderr before and while it works."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+import typer
 
 
 @contextmanager
@@ -26,3 +29,9 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("Starting", total=1.0)
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
+
+
+def say_where(out: Path, target: Path) -> None:
+    """Print a line if the output is reached by a link, and so lies elsewhere than its name says."""
+    if out.is_symlink():
+        typer.echo(f"rangesim: {out} is a link; the results go to {target}.", err=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rangesim compare` and `rangesim report`: results that are there already."""
+"""`rangesim compare`, `report` and `verify`: results that are there already."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def compare_command(
 
     tables = []
     for folder in results:
-        for entry in read_settings(folder)["instruments"]:
-            name = entry["name"] if len(results) == 1 else f"{folder}: {entry['name']}"
-            tables.append((name, read_rows(folder / entry["name"])))
+        for entry in read_settings(folder).instruments:
+            name = entry.name if len(results) == 1 else f"{folder}: {entry.name}"
+            tables.append((name, read_rows(folder / entry.name)))
     if markdown:
         typer.echo(in_markdown(tables), nl=False)
     else:
@@ -43,11 +43,53 @@ def report_command(
 
       rangesim report out/tabletop
     """
-    from rangesim.report import write_report
-    from rangesim.result_files import load_result
+    from pcgraph.output import replace_listed_file
+    from rangesim.report import render_report
+    from rangesim.result_files import RESULT, load_result
 
-    write_report(load_result(result), result / "report.html")
+    page = render_report(load_result(result))
+    replace_listed_file(result, "report.html", page.encode(), RESULT)
     typer.echo(f"{result / 'report.html'}")
+
+
+def verify_command(
+    directory: Annotated[
+        Path, typer.Argument(help="A directory that rangesim wrote: a result, a capture, or what it decodes to.")
+    ],
+) -> None:
+    """Compare a directory with its manifest: every file's size and SHA-256.
+
+    Ends with status 1 if a file is missing or holds something else. Files of your own beside them are named and counted
+    for nothing.
+
+    Example:
+
+      rangesim verify out/tabletop
+    """
+    from pcgraph.output import verify_directory
+    from rangesim.capture_files import CAPTURE
+    from rangesim.cli.decoded_files import DECODED
+    from rangesim.config import visible
+    from rangesim.errors import FileFormatError
+    from rangesim.result_files import RESULT
+
+    kinds = (RESULT, CAPTURE, DECODED)
+    kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)
+    if kind is None:
+        raise FileFormatError(
+            f"expected a directory that rangesim wrote, with {', '.join(k.sidecar for k in kinds[:-1])} or "
+            f"{kinds[-1].sidecar}; {directory} has none of them."
+        )
+    found = verify_directory(directory, kind)
+    for word, names in (("missing", found.missing), ("changed", found.changed), ("not rangesim's", found.foreign)):
+        for name in names:
+            typer.echo(visible(f"{word}: {directory / name}"))
+    if found.missing or found.changed:
+        raise FileFormatError(
+            f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} hold "
+            "something else than was written."
+        )
+    typer.echo(f"{directory}: all {found.files} files are as they were written.")
 
 
 def _print(markdown: str) -> None:
@@ -55,14 +97,17 @@ def _print(markdown: str) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    head, _, *lines = ([cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines())
+    from rangesim.report.tables import cells
+
+    head, _, *lines = (cells(line) for line in markdown.splitlines())
     table = Table(box=box.SIMPLE_HEAD)
     for i, name in enumerate(head):
         words = i < 2 or name.startswith("because")
         table.add_column(name, justify="left" if words else "right", overflow="fold")
     for before, line in zip([head, *lines], lines, strict=False):
-        table.add_row("" if line[0] == before[0] else line[0], *line[1:])
+        table.add_row(*map(Text, ("" if line[0] == before[0] else line[0], *line[1:])))  # brackets are no markup
     console = Console()
     if not console.is_terminal:
         console = Console(width=140)

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rangesim.cli.progress import progress_bar
+from rangesim.catalogue import scene_names
+from rangesim.cli.progress import progress_bar, say_where
 
 if TYPE_CHECKING:
     from rangesim.cost import Cost
@@ -25,7 +25,11 @@ BASELINE_HELP = (
 
 def run_command(
     scene: Annotated[
-        Path | None, typer.Argument(help="Mitsuba 3 scene (.xml) or mesh (.ply, .obj, .glb, .stl, .off), in metres.")
+        Path | None,
+        typer.Argument(
+            help="Mitsuba 3 scene (.xml) or mesh (.ply, .obj, .glb, .stl, .off), in metres, or the name of a scene "
+            f"that comes with rangesim: {', '.join(scene_names())}."
+        ),
     ] = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Directory for the results; an older result is replaced.")
@@ -78,7 +82,7 @@ def run_command(
 
     Examples:
 
-      rangesim run scenes/tabletop.xml --out out/tabletop
+      rangesim run tabletop --out out/tabletop
 
       rangesim run part.ply --material glossy --sensor gray --sensor gray-phase --baseline 0.1 --out out/part
 
@@ -93,13 +97,16 @@ def run_command(
         )
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
+    from pcgraph.output import check_directory
     from rangesim import pipeline
+    from rangesim.result_files import RESULT
 
     if estimate:
         cost = pipeline.estimate(experiment)
         typer.echo(cost)
         cost.check_memory()
         return
+    say_where(out, check_directory(out, RESULT, inputs=[experiment.scene]))
     with progress_bar() as progress:
         pipeline.run(experiment, out, progress, announce=_announce)
     _say_what_measured_nothing(out)
@@ -114,12 +121,14 @@ def _announce(cost: Cost) -> None:
 
 def _say_what_measured_nothing(out: Path) -> None:
     """A line on stderr if some instrument has not a single point: most often the scene is not in metres."""
-    from rangesim.result_files import read_settings
+    from rangesim.result_files import MeasurementRecord, read_settings
+    from rangesim.schema import read_record
 
-    distance = read_settings(out)["scene"]["working_distance_m"]
-    results = {p.parent.name: json.loads(p.read_text(encoding="utf-8")) for p in out.glob("*/measurement.json")}
-    blind = sorted(name for name, result in results.items() if result["points"] == 0)
+    settings = read_settings(out)
+    names = [entry.name for entry in settings.instruments]
+    blind = [name for name in names if not read_record(out / name / "measurement.json", MeasurementRecord).points]
     if blind:
+        distance = settings.scene.working_distance_m
         typer.echo(
             f"rangesim: {', '.join(blind)} measured no pixel at all, at a working distance of {distance:g} m; "
             "coordinates are metres (a mesh in millimetres needs --unit-m 0.001); in the dark, --spp or power helps.",

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rangesim.light_transport.device import Device
@@ -31,12 +33,18 @@ def caustic_maps(
     seed: int,
     memory_bytes: int,
     media: Media | None,
+    report: Callable[[], None] = lambda: None,
 ) -> PhotonMaps | None:
-    """Maps for a pass of `spp` samples; None if there are no photons, nothing to send them through, or none landed."""
+    """Maps for a pass of `spp` samples; None if there are no photons, nothing to send them through, or none landed.
+
+    `report` is called after each kernel launch.
+    """
     if not photons or not has_delta(scene.mitsuba):
         return None
     maps, projector = min(spp, MOST_MAPS), Device.projector(rig)
-    landed = trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media)
+    landed = trace_photons(
+        scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media, report
+    )
     radius_m = radius_m or scene.working_distance_m * gathering_angle(rig, landed.per_pixel)
     irradiance = rig.projector_irradiance / scene.working_distance_m**2
     return PhotonMaps(landed, maps, radius_m, irradiance) if len(landed.flux) else None

@@ -96,10 +96,14 @@ class Device:
         p, exists = self._undistorted(pixel)
         return PrimaryRay(mi.Point3f(self.centre), self._direction(p), mi.Float(0), exists)
 
-    def centre_rays(self) -> PrimaryRay:
-        """The rays through the centres of all pixels, row by row, and the centre of the lens."""
-        width, height = (int(n[0]) for n in self.size)
-        index, row = dr.arange(mi.UInt32, width * height), mi.UInt32(self.size.x)
+    @property
+    def pixels(self) -> int:
+        """Pixels of the image."""
+        return int(self.size.x[0]) * int(self.size.y[0])
+
+    def centre_rays(self, begin: int, end: int) -> PrimaryRay:
+        """The rays through the centres of a range of pixels, row by row, and the centre of the lens."""
+        index, row = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin), mi.UInt32(self.size.x)
         return self.centre_ray(mi.Point2f(mi.Float(index % row) + 0.5, mi.Float(index // row) + 0.5))
 
     def sample_ray(self, pixel: Any, lens: Any) -> PrimaryRay:

@@ -10,9 +10,10 @@ The lens is not seen through a participating medium: its boundary ends a path.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -21,12 +22,13 @@ from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import spawn_close
+from rangesim.light_transport.launches import Launches, fewest_lanes
 from rangesim.light_transport.loop import mono
 from rangesim.light_transport.medium import Media, bounded
 from rangesim.light_transport.photon_flight import MAX_CHAIN
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import random_stream, stratified
+from rangesim.light_transport.sampling import Seed, random_stream, stratified
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
@@ -44,6 +46,8 @@ MOST_PATHS = 1 << 22
 """Of all pixels together."""
 PATHS_PER_PIXEL = (64, 4096)
 """Fewest and most."""
+SEGMENTS = 4
+"""Of a path, about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,20 +66,117 @@ class Glint:
         image.reshape(len(image), -1)[:, self.pixel] += values
 
 
-def trace_glint(scene: Any, rig: Rig, responses: Sequence[Response], seed: int, media: Media | None = None) -> Glint:
-    """What the camera of the rig sees of the projector's lens."""
+def trace_glint(
+    scene: Any,
+    rig: Rig,
+    responses: Sequence[Response],
+    seed: int,
+    media: Media | None = None,
+    report: Callable[[], None] = lambda: None,
+) -> Glint:
+    """What the camera of the rig sees of the projector's lens. `report` is called after each kernel launch."""
     camera, projector = Device.camera(rig), Device.projector(rig)
     h, w = rig.camera.height, rig.camera.width
+    view = View(scene, camera, media, Seed.of(seed))
     worth_probing = _worth_probing(scene, camera, projector, h, w, media)
-    pixel, radius_m = _near_the_lens(scene, rig, camera, projector, worth_probing, seed, media)
-    accumulators = Accumulators(responses, max(1, len(pixel)))
+    pixel, radius_m = _near_the_lens(view, rig, projector, worth_probing, report)
+    total = np.zeros(len(pixel), np.float32)
     if len(pixel) == 0:
-        return Glint(pixel, np.zeros(0, np.float32), [np.zeros((r.channels, 0), np.float32) for r in responses])
+        return Glint(pixel, total, [np.zeros((r.channels, 0), np.float32) for r in responses])
     paths = int(np.clip(MOST_PATHS // len(pixel), *PATHS_PER_PIXEL))
-    lens = Lens(rig, projector, radius_m, rig.projector_irradiance / (np.pi * radius_m**2) / paths)
-    dense, total = _paths_to_the_lens(scene, camera, lens, accumulators, *_lanes(pixel, seed, paths), media)
-    channels, sums = accumulators.images(dense, [total])
-    return Glint(pixel, sums[0], channels)
+    radiance = rig.projector_irradiance / (np.pi * radius_m**2) / paths
+    accumulators, launches = Accumulators(responses, len(pixel)), Launches()
+    for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=fewest_lanes()):
+        some, n = slice(begin, end), end - begin
+        lens = Lens(rig, projector, radius_m[some], radiance[some])
+        lanes = Lanes(view, pixel[some], paths)
+        place = dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, begin)
+        dr.eval(place)
+        state = PathState(
+            chain=lanes.start(),
+            throughput=dr.ones(mi.Float, n),
+            length=dr.zeros(mi.Float, n),
+            ior=dr.ones(mi.Float, n),
+            previous=dr.zeros(mi.Point3f, n),
+            channels=accumulators.zeros(n),
+            total=dr.zeros(mi.Float, n),
+        )
+        loop = partial(_paths_to_the_lens, lanes, lens, accumulators, place)
+        state, _ = launches.run(loop, state, n, accumulators.pending, lambda state: report())
+        accumulators.store(state.channels, some)
+        total[some] = state.total.numpy()
+    return Glint(pixel, total, accumulators.images())
+
+
+class View(NamedTuple):
+    """What the camera looks into, and the seed of its random numbers."""
+
+    scene: Any
+    camera: Device
+    media: Media | None
+    seed: Seed
+
+
+@dataclass
+class Chain:
+    """Where a lane is in the delta chains of its pixel.
+
+    rng : PCG32. k : UInt32, chains finished. length : UInt32, surfaces of this one so far. origin, direction : the ray.
+    """
+
+    rng: Any
+    k: Any
+    length: Any
+    origin: Any
+    direction: Any
+
+
+class Lanes:
+    """Pixels at work, a lane for each, and how many paths each of them sends.
+
+    Parameters
+    ----------
+    view : View
+    pixel : (lanes,) int, flat indices.
+    paths : int, for each pixel.
+    """
+
+    def __init__(self, view: View, pixel: np.ndarray, paths: int) -> None:
+        self.scene, self.camera, self.media, seed = view
+        self.pixel, self.paths = mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, paths)
+        self.rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
+        self.shift = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        width = mi.UInt32(self.camera.size.x)
+        self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
+
+    def start(self) -> Chain:
+        """The lanes before their first path."""
+        zero = dr.zeros(mi.UInt32, dr.width(self.pixel))
+        nowhere = dr.zeros(mi.Vector3f, dr.width(self.pixel))
+        return Chain(mi.PCG32(self.rng), zero, mi.UInt32(zero), mi.Point3f(nowhere), nowhere)
+
+
+@dataclass
+class ProbeState:
+    """What a lane carries from one probing segment to the next; see `_probe`."""
+
+    chain: Chain
+    nearest: Any
+    spread: Any
+    before: Any
+
+
+@dataclass
+class PathState:
+    """What a lane carries from one segment of its paths to the lens to the next; see `_paths_to_the_lens`."""
+
+    chain: Chain
+    throughput: Any
+    length: Any
+    ior: Any
+    previous: Any
+    channels: list[list[Any]]
+    total: Any
 
 
 class Lens:
@@ -102,58 +203,51 @@ class Lens:
 
 def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int, media: Media | None) -> np.ndarray:
     """Flat indices of the pixels around whose centre there is a delta surface, or the lens in plain view."""
-    rays = camera.centre_rays()
-    mask = meets_delta(scene, rays, media).reshape(h, w)
+    meets, exists = meets_delta(scene, camera, media)
+    mask = meets.reshape(h, w)
     uv, z = camera.project(mi.Point3f(projector.centre))
     u, v = float(uv.x[0]), float(uv.y[0])
     if float(z[0]) > 0 and 0 <= u < w and 0 <= v < h:
         mask[int(v), int(u)] = True
-    mask = binary_dilation(mask, np.ones((3, 3)))
-    if rays.exists is not None:  # a distorted lens may send no ray through some pixels
-        mask &= rays.exists.numpy().reshape(h, w)
-    return np.flatnonzero(mask)
+    return np.flatnonzero(binary_dilation(mask, np.ones((3, 3))) & exists.reshape(h, w))
 
 
 def _near_the_lens(
-    scene: Any, rig: Rig, camera: Device, projector: Device, pixel: np.ndarray, seed: int, media: Media | None
+    view: View, rig: Rig, projector: Device, pixel: np.ndarray, report: Callable[[], None]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Those of the pixels whose probes come near the lens, as measured by how far they spread; and for each of them
     the radius in metres of the disc to hit."""
     aperture = np.full(len(pixel), rig.projector_aperture_radius_m)
-    if len(pixel) == 0:
-        return pixel, aperture
-    lens = Lens(rig, projector, aperture, aperture)
-    nearest, spread = _probe(scene, camera, lens, *_lanes(pixel, seed, PROBES), media)
-    dr.eval([nearest, spread])
-    near = nearest.numpy() < aperture + NEAR * spread.numpy()
-    return pixel[near], np.clip(FINEST * spread.numpy(), aperture, MOST_ENLARGED * aperture)[near]
-
-
-def _lanes(pixel: np.ndarray, seed: int, paths: int) -> tuple[Any, Any, Any]:
-    """Pixels, their random numbers, and the number of paths, on the renderer's side."""
-    lanes = mi.UInt32(pixel.astype(np.uint32))
-    rng = random_stream(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes ^ 0x85EBCA6B)
-    return lanes, rng, dr.opaque(mi.UInt32, paths)
+    lens = Lens(rig, projector, aperture[:1], aperture[:1])
+    nearest, spread = np.empty(len(pixel), np.float32), np.empty(len(pixel), np.float32)
+    launches = Launches()
+    for begin, end in launches.ranges(len(pixel), SEGMENTS * PROBES, at_least=fewest_lanes()):
+        some, n = slice(begin, end), end - begin
+        lanes, far = Lanes(view, pixel[some], PROBES), dr.full(mi.Float, dr.inf, n)
+        state = ProbeState(lanes.start(), far, mi.Float(far), dr.full(mi.Point2f, dr.inf, n))
+        state, _ = launches.run(partial(_probe, lanes, lens), state, n, report=lambda state: report())
+        nearest[some], spread[some] = state.nearest.numpy(), state.spread.numpy()
+    spread = np.where(np.isfinite(spread), spread, np.float32(UNKNOWN_SPREAD * rig.projector_aperture_radius_m))
+    near = nearest < aperture + NEAR * spread
+    return pixel[near], np.clip(FINEST * spread, aperture, MOST_ENLARGED * aperture)[near]
 
 
 @dr.syntax
-def _probe(
-    scene: Any, camera: Device, lens: Lens, pixel: Any, rng: Any, paths: Any, media: Media | None = None
-) -> tuple[Any, Any]:
-    """Least distance at which each pixel's delta paths pass the lens's centre, and how far apart they cross its plane.
+def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[ProbeState, Any]:
+    """The state after at most so many turns of the loop, and the turns taken: the least distance at which each pixel's
+    delta paths pass the lens's centre, and how far apart they cross its plane (infinite where fewer than two do).
 
     Where light splits into reflection and refraction, probes take both alike, however faint one is.
     """
-    lanes = dr.width(pixel)
-    nearest, spread = dr.full(mi.Float, dr.inf, lanes), dr.full(mi.Float, dr.inf, lanes)
-    before = dr.full(mi.Point2f, dr.inf, lanes)  # where the last one crossed
-    shift, width = mi.Point2f(rng.next_float32(), rng.next_float32()), mi.UInt32(camera.size.x)
-    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
+    scene, camera, media = lanes.scene, lanes.camera, lanes.media
+    corner, shift, paths = lanes.corner, lanes.shift, lanes.paths
+    rng, k, chain = state.chain.rng, state.chain.k, state.chain.length
+    ray = mi.Ray3f(state.chain.origin, state.chain.direction)
+    nearest, spread, before = state.nearest, state.spread, state.before  # where the last one crossed
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
-    k, chain = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes)
-    ray = mi.Ray3f(dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes))
-    while k < paths:
+    done = dr.zeros(mi.UInt32, dr.width(k))
+    while (k < paths) & (done < most):
         primary = camera.centre_ray(corner + stratified(shift, k))
         ray.o, ray.d = dr.select(chain == 0, primary.origin, ray.o), dr.select(chain == 0, primary.direction, ray.d)
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
@@ -170,33 +264,26 @@ def _probe(
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (mono(weight) <= 0) | (chain >= MAX_CHAIN)
         chain = dr.select(ends, 0, chain)
         k = dr.select(ends, k + 1, k)
-    return nearest, dr.select(dr.isfinite(spread), spread, UNKNOWN_SPREAD * lens.radius)
+        done += 1
+    return ProbeState(Chain(rng, k, chain, ray.o, ray.d), nearest, spread, before), done
 
 
 @dr.syntax
 def _paths_to_the_lens(
-    scene: Any,
-    camera: Device,
-    lens: Lens,
-    accumulators: Accumulators,
-    pixel: Any,
-    rng: Any,
-    paths: Any,
-    media: Media | None = None,
-) -> tuple[list[list[Any]], Any]:
-    """Dense channels and radiance of the delta paths from each pixel to the lens; bins go to the accumulators."""
-    lanes = dr.width(pixel)
-    lane = dr.arange(mi.UInt32, lanes)
-    shift, width = mi.Point2f(rng.next_float32(), rng.next_float32()), mi.UInt32(camera.size.x)
-    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-    channels, total = accumulators.zeros(), dr.zeros(mi.Float, lanes)
+    lanes: Lanes, lens: Lens, accumulators: Accumulators, place: Any, state: PathState, most: Any
+) -> tuple[PathState, Any]:
+    """The state after at most so many turns of the loop, and the turns taken: dense channels and radiance of the delta
+    paths from each pixel to the lens; bins go to the accumulators, where the pixel has the number `place`."""
+    scene, camera, media = lanes.scene, lanes.camera, lanes.media
+    corner, shift, paths = lanes.corner, lanes.shift, lanes.paths
+    rng, k, chain = state.chain.rng, state.chain.k, state.chain.length
+    ray = mi.Ray3f(state.chain.origin, state.chain.direction)
+    throughput, length, ior, previous = state.throughput, state.length, state.ior, state.previous
+    channels, total = state.channels, state.total
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
-    k, chain = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes)
-    ray = mi.Ray3f(dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes))
-    throughput, length, ior = dr.ones(mi.Float, lanes), dr.zeros(mi.Float, lanes), dr.ones(mi.Float, lanes)
-    previous = dr.zeros(mi.Point3f, lanes)
-    while k < paths:
+    done = dr.zeros(mi.UInt32, dr.width(k))
+    while (k < paths) & (done < most):
         # ---- The next path starts at the camera ------------------------------------------------------
         starts = chain == 0
         on_lens = (
@@ -220,8 +307,8 @@ def _paths_to_the_lens(
         )
         radiance = dr.select(meets, radiance * lens.projector.pixel_density(-ray.d), 0)
         u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, dr.fma(ior, way, length)))
-        path = LightPath(u, v, path_length, dr.full(mi.Bool, False, lanes), mi.UInt32(GLINT))
-        channels = accumulators.add(channels, path, radiance, lane, meets)
+        path = LightPath(u, v, path_length, dr.full(mi.Bool, False, dr.width(k)), mi.UInt32(GLINT))
+        channels = accumulators.add(channels, path, radiance, place, meets)
         total += radiance
 
         # ---- On through delta interactions, or the next path -----------------------------------------
@@ -238,4 +325,6 @@ def _paths_to_the_lens(
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)
         throughput, ior = dr.select(ends, 1, throughput), dr.select(ends, 1, ior)
-    return channels, total
+        done += 1
+    at = Chain(rng, k, chain, ray.o, ray.d)
+    return PathState(at, throughput, length, ior, previous, channels, total), done

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.device import Device, connect
+from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.loop import mono
 from rangesim.rig import Rig
 from rangesim.scene import Scene
@@ -24,7 +25,33 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
     h, w = rig.camera.height, rig.camera.width
     camera, projector = Device.camera(rig), Device.projector(rig)
-    ray = camera.centre_rays()
+    launches, table = Launches(), _index_of_shape(scene)
+    parts = []
+    for begin, end in launches.ranges(h * w):
+        part = _truth(scene, camera, projector, table, begin, end)
+        launches.evaluate(part, end - begin)
+        parts.append([np.asarray(x.numpy()) for x in part])
+    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    hit, index, z, distance, visible, u, v, *normal = (column.reshape(h, w) for column in columns)
+    masked = lambda x: np.where(hit, x, np.float32(np.nan))  # noqa: E731
+    instance = np.where(hit, index, -1).astype(np.int32)
+    materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
+    return GroundTruth(
+        z=masked(z),
+        range_m=masked(distance),
+        normal=np.stack([masked(x) for x in normal], axis=-1),
+        instance=instance,
+        material=np.where(instance >= 0, materials[instance], -1).astype(np.int32),
+        projector_uv=np.stack([masked(u), masked(v)], axis=-1),
+        projector_visible=visible,
+        instance_names=tuple(i.name for i in scene.instances),
+        material_names=MATERIAL_CLASSES,
+    )
+
+
+def _truth(scene: Scene, camera: Device, projector: Device, table: Any, begin: int, end: int) -> list[Any]:
+    """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of the normal."""
+    ray = camera.centre_rays(begin, end)
     si = _first_surface(scene, mi.Ray3f(ray.origin, ray.direction))
     hit = si.is_valid() if ray.exists is None else si.is_valid() & ray.exists
     to_camera = camera.centre - mi.Vector3f(si.p)
@@ -34,24 +61,8 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     transmits = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
     visible = link.lit & (transmits | (dr.dot(normal, link.direction) > 0))
     z, distance = -dr.dot(to_camera, camera.z), dr.norm(to_camera)
-    index = dr.gather(mi.Int32, _index_of_shape(scene), dr.reinterpret_array(mi.UInt32, si.shape), hit)
-    dr.eval(hit, uv, visible, z, normal, index, distance)
-
-    inside = _image(hit, h, w)
-    masked = lambda x: np.where(inside, _image(x, h, w), np.float32(np.nan))  # noqa: E731
-    instance = np.where(inside, _image(index, h, w), -1).astype(np.int32)
-    materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
-    return GroundTruth(
-        z=masked(z),
-        range_m=masked(distance),
-        normal=np.stack([masked(normal[i]) for i in range(3)], axis=-1),
-        instance=instance,
-        material=np.where(instance >= 0, materials[instance], -1).astype(np.int32),
-        projector_uv=np.stack([masked(uv[i]) for i in range(2)], axis=-1),
-        projector_visible=_image(visible, h, w),
-        instance_names=tuple(i.name for i in scene.instances),
-        material_names=MATERIAL_CLASSES,
-    )
+    index = dr.gather(mi.Int32, table, dr.reinterpret_array(mi.UInt32, si.shape), hit)
+    return [hit, index, z, distance, visible, uv.x, uv.y, normal.x, normal.y, normal.z]
 
 
 def _first_surface(scene: Scene, ray: Any) -> Any:
@@ -73,7 +84,3 @@ def _index_of_shape(scene: Scene) -> Any:
     table = np.full(max(ids) + 1, -1, dtype=np.int32)
     table[ids] = np.arange(len(ids))
     return mi.Int32(table)
-
-
-def _image(array: Any, h: int, w: int) -> np.ndarray:
-    return np.asarray(array.numpy()).reshape(h, w)

@@ -4,7 +4,8 @@
 One lane owns one pixel and traces its samples one after the other; where a path ends, the lane starts the
 next sample in the same turn of the loop. So no lane idles while its neighbours finish, every channel is a
 register instead of a film, and each sum is made by one thread in one order: same seed, same bytes,
-whatever the number of threads or the size of a tile.
+whatever the number of threads. The loop is run in launches of bounded time, each of which takes some lanes so many
+turns further: what a lane has done is its `State`, so that neither the lanes of a launch nor its turns change a byte.
 
 Inside a translucent object a turn of the loop is a scattering event instead of a surface; a stay inside counts as one
 surface towards the depth, however often it scatters (`rangesim.light_transport.medium`).
@@ -16,18 +17,28 @@ non-delta vertex (`rangesim.light_transport.glint`).
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
+from rangesim.light_transport.launches import Launches, Report, fewest_lanes
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import random_stream, stratified
+from rangesim.light_transport.sampling import Seed, Stream, random_stream, stratified
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
+
+NEIGHBOURS = 256
+"""Pixels in a row that share a launch. Launches take such runs from all over the image: so their times are alike."""
+TURNS_PER_SAMPLE = 2
+"""As long as nothing is known."""
 
 
 class Settings(NamedTuple):
@@ -37,7 +48,7 @@ class Settings(NamedTuple):
     lamps : whether that light has a direction worth sampling; uniform surroundings are found best by the BSDF alone.
     """
 
-    seed: Any
+    seed: Seed
     spp: Any
     max_depth: Any
     rr_depth: Any
@@ -66,53 +77,163 @@ class Vertex(NamedTuple):
     is_first: Any
 
 
-@dr.syntax
-def trace(
-    scene: Any,
-    camera: Device,
-    projector: Device,
-    irradiance: Any,
-    accumulators: Accumulators,
-    pixel: Any,
-    settings: Settings,
-    maps: PhotonMaps | None = None,
-    media: Any = None,
-) -> tuple[list[list[Any]], Radiance]:
-    """Sums over all samples: dense channels, and radiance by kind of path; bins go to the accumulators' buffers.
+@dataclass
+class State:
+    """What a lane carries from one turn of the loop to the next; see `start`.
 
-    `pixel` (lanes,) UInt32 is the flat index of each lane's pixel in the whole image: random numbers depend on it and
-    the seed alone. `media` is a `Media`, or None where there are none.
+    A dataclass, not frozen: Dr.Jit looks into no named tuple when it evaluates.
     """
-    # ---- State of the lane: its random numbers, its sums --------------------------------------------
+
+    rng: Any
+    choice: Any
+    turns: Any
+    channels: list[list[Any]]
+    radiance: list[Any]
+    sample: Any
+    depth: Any
+    origin: Any
+    direction: Any
+    throughput: Any
+    length: Any
+    ior: Any
+    first: Any
+    via: Any
+    previous: Any
+    previous_pdf: Any
+    previous_delta: Any
+    was_bent: Any
+    inside: Any
+    events: Any
+    stays: Any
+
+
+class View(NamedTuple):
+    """What the loop is run in: scene, devices, light; the same for all lanes.
+
+    irradiance : Float, W/m2 at z = 1 m, over the number of samples.
+    maps : PhotonMaps, or None. media : Media, or None where there are none.
+    """
+
+    scene: Any
+    camera: Device
+    projector: Device
+    irradiance: Any
+    maps: PhotonMaps | None = None
+    media: Any = None
+
+
+def trace(
+    view: View,
+    settings: Settings,
+    spp: int,
+    accumulators: Accumulators,
+    first_pixel: int,
+    launches: Launches,
+    report: Report,
+) -> np.ndarray:
+    """Radiance by kind of path (5, pixels) float32, in the order of `Radiance`; channels go to the accumulators.
+
+    The pixels are those of the accumulators, from `first_pixel` on in the whole image. `report` gets the share done.
+    """
+    pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
+    radiance = np.empty((len(Radiance._fields), pixels), np.float32)
+    begin, finished, turns = 0, 0, 0
+
+    def tell(state: State) -> None:
+        report((finished + float(state.sample.numpy().sum()) / spp) / pixels)
+
+    while begin < len(runs):
+        per_pixel = turns / finished if finished else TURNS_PER_SAMPLE * spp
+        most = max(fewest_lanes(), int(launches.units / per_pixel)) // NEIGHBOURS
+        left = len(runs) - begin
+        end = begin + -(-left // -(-left // most))  # launches of even size
+        places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
+        places = places[places < pixels]
+        place = mi.UInt32(places.astype(np.uint32))
+        pixel = place + dr.opaque(mi.UInt32, first_pixel)
+        dr.eval(pixel)
+        loop = partial(walk, view, settings, accumulators, place, pixel)
+        state, taken = launches.run(
+            loop, start(view, settings, accumulators, pixel), len(places), accumulators.pending, tell
+        )
+        accumulators.store(state.channels, places)
+        for image, values in zip(radiance, state.radiance, strict=True):
+            image[places] = values.numpy()
+        begin, finished, turns = end, finished + len(places), turns + taken
+    return radiance
+
+
+def _dealt(n: int) -> np.ndarray:
+    """The numbers 0..n in an order of which any few are spread evenly (multiples of the golden ratio)."""
+    step = next(k for k in range(round(0.6180339887498949 * n), 2 * n + 2) if math.gcd(k, n) == 1)
+    return np.arange(n) * step % n
+
+
+def start(view: View, settings: Settings, accumulators: Accumulators, pixel: Any) -> State:
+    """The state of lanes that have done nothing yet; `pixel` (lanes,) UInt32 as in `walk`."""
     lanes = dr.width(pixel)
-    lane = dr.arange(mi.UInt32, lanes)
-    rng = random_stream(settings.seed, pixel)
-    choice = random_stream(settings.seed, pixel, apart=True)  # of photons; they change no other light
-    turns = random_stream(pixel >> 4, settings.seed).next_uint32()  # shared by neighbours; evenly spread from here on
+    return State(
+        # ---- Of the lane: its random numbers, its sums -----------------------------------------------
+        rng=_pixel_stream(settings.seed, pixel)[0],
+        choice=random_stream(settings.seed, pixel, Stream.SECOND),  # of photons; they change no other light
+        # Shared by neighbours; evenly spread from here on
+        turns=random_stream(settings.seed, pixel >> 4, Stream.THIRD).next_uint32(),
+        channels=accumulators.zeros(lanes),
+        radiance=[dr.zeros(mi.Float, lanes) for _ in Radiance._fields],
+        sample=dr.zeros(mi.UInt32, lanes),  # samples of this pixel finished so far
+        # ---- Of the path -----------------------------------------------------------------------------
+        depth=dr.zeros(mi.UInt32, lanes),  # surfaces met so far
+        origin=dr.zeros(mi.Point3f, lanes),  # of the ray
+        direction=dr.zeros(mi.Vector3f, lanes),
+        throughput=dr.ones(mi.Float, lanes),  # radiance at the camera per radiance along the ray
+        length=dr.zeros(mi.Float, lanes),  # optical length from the camera to `previous`, metres
+        ior=dr.ones(mi.Float, lanes),  # refractive index along the ray
+        first=dr.full(mi.Bool, True, lanes),  # no non-delta surface so far
+        via=dr.full(mi.Bool, False, lanes),  # some delta surface so far
+        previous=dr.zeros(mi.Point3f, lanes),  # the last vertex
+        previous_pdf=dr.zeros(mi.Float, lanes),  # of the BSDF sample that made the ray; for MIS with ambient light
+        previous_delta=dr.full(mi.Bool, True, lanes),
+        was_bent=dr.full(mi.Bool, False, lanes),  # the ray left a delta surface
+        inside=None if view.media is None else view.media.none(lanes),  # what the ray runs through
+        events=dr.zeros(mi.UInt32, lanes),  # scattering events in media and crossed boundaries so far
+        stays=dr.full(mi.Bool, False, lanes),  # scattered since it entered the medium
+    )
+
+
+def _pixel_stream(seed: Seed, pixel: Any) -> tuple[Any, Any]:
+    """The random numbers of a pixel's paths, and the shift of its samples, which is drawn first."""
+    rng = random_stream(seed, pixel)
+    shift = mi.Point2f(rng.next_float32(), rng.next_float32())
+    return rng, shift
+
+
+@dr.syntax
+def walk(
+    view: View, settings: Settings, accumulators: Accumulators, place: Any, pixel: Any, state: State, most: Any
+) -> tuple[State, Any]:
+    """The state of the lanes after at most so many turns of the loop, and the turns that each one took.
+
+    `place` (lanes,) UInt32 is the number of each lane's pixel in the accumulators; `pixel` its flat index in the whole
+    image: random numbers depend on it and the seed alone.
+    """
+    scene, camera, projector, irradiance, maps, media = view
+    # ---- The state, by name ------------------------------------------------------------------------
+    rng, choice, turns, channels, sample = state.rng, state.choice, state.turns, state.channels, state.sample
+    direct, multipath, via_delta, caustic, ambient = state.radiance
+    depth, throughput, length, ior = state.depth, state.throughput, state.length, state.ior
+    first, via, was_bent = state.first, state.via, state.was_bent
+    previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
+    inside, events, stays = state.inside, state.events, state.stays
+    lanes = dr.width(pixel)
     width = mi.UInt32(camera.size.x)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-    shift = mi.Point2f(rng.next_float32(), rng.next_float32())
-    channels = accumulators.zeros()
-    direct, multipath, via_delta, caustic, ambient = (dr.zeros(mi.Float, lanes) for _ in range(5))
-
-    # ---- State of the path ---------------------------------------------------------------------------
-    sample = dr.zeros(mi.UInt32, lanes)  # samples of this pixel finished so far
-    depth = dr.zeros(mi.UInt32, lanes)  # surfaces met so far
-    ray = mi.Ray3f(dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes))
-    throughput = dr.ones(mi.Float, lanes)  # radiance at the camera per radiance along the ray
-    length = dr.zeros(mi.Float, lanes)  # optical length from the camera to `previous.p`, metres
-    ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
-    first = dr.full(mi.Bool, True, lanes)  # no non-delta surface so far
-    via = dr.full(mi.Bool, False, lanes)  # some delta surface so far
+    shift = _pixel_stream(settings.seed, pixel)[1]
+    ray = mi.Ray3f(state.origin, state.direction)
     previous = dr.zeros(mi.Interaction3f, lanes)
-    previous_pdf = dr.zeros(mi.Float, lanes)  # of the BSDF sample that made the ray; for MIS with ambient light
-    previous_delta = dr.full(mi.Bool, True, lanes)
-    was_bent = dr.full(mi.Bool, False, lanes)  # the ray left a delta surface
-    inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
+    previous.p = state.previous
     scatters, crosses = mi.Bool(False), mi.Bool(False)  # this turn: an event inside a medium, or its boundary
-    events = dr.zeros(mi.UInt32, lanes)  # of both kinds so far
-    stays = dr.full(mi.Bool, False, lanes)  # scattered since it entered the medium
-    active = sample < settings.spp
+    done = dr.zeros(mi.UInt32, lanes)  # turns of this launch
+    active = (sample < settings.spp) & (done < most)
 
     while active:
         # ---- A new sample starts at the camera -------------------------------------------------------
@@ -166,8 +287,8 @@ def trace(
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
         u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, length + link.distance))
         kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
-        path = LightPath(u, v, path_length, first, kind, link.blur_px)
-        channels = accumulators.add(channels, path, radiance, lane, link.lit)
+        light = LightPath(u, v, path_length, first, kind, link.blur_px)
+        channels = accumulators.add(channels, light, radiance, place, link.lit)
         direct += dr.select(kind == DIRECT, radiance, 0)
         via_delta += dr.select(kind == VIA_DELTA, radiance, 0)
         multipath += dr.select(kind == MULTIPATH, radiance, 0)
@@ -178,7 +299,7 @@ def trace(
             xi = [choice.next_float32() for _ in range(3)]
             turns += 2654435769  # 2^32 over the golden ratio
             photon, brought = gather(maps, vertex, sample, xi, mi.Float(turns >> 8) * 2**-24, may_connect & ~scatters)
-            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, lane)
+            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, place)
             caustic += radiance
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
@@ -236,9 +357,32 @@ def trace(
             inside = inside.replaced(ends, media.none(lanes))
             events = dr.select(ends, 0, events)
             stays &= ~ends
-        active = sample < settings.spp
+        done += 1
+        active = (sample < settings.spp) & (done < most)
 
-    return channels, Radiance(direct, multipath, via_delta, caustic, ambient)
+    return State(
+        rng=rng,
+        choice=choice,
+        turns=turns,
+        channels=channels,
+        radiance=[direct, multipath, via_delta, caustic, ambient],
+        sample=sample,
+        depth=depth,
+        origin=ray.o,
+        direction=ray.d,
+        throughput=throughput,
+        length=length,
+        ior=ior,
+        first=first,
+        via=via,
+        previous=previous.p,
+        previous_pdf=previous_pdf,
+        previous_delta=previous_delta,
+        was_bent=was_bent,
+        inside=inside,
+        events=events,
+        stays=stays,
+    ), done
 
 
 @dr.syntax
@@ -269,10 +413,10 @@ def caustics(
     vertex: Vertex,
     photon: Any,
     irradiance: Any,
-    lane: Any,
+    place: Any,
 ) -> tuple[list[list[Any]], Any]:
     """Channels with the light of the photons at a vertex added, and the radiance they bring to the camera."""
-    radiance = dr.zeros(mi.Float, dr.width(lane))
+    radiance = dr.zeros(mi.Float, dr.width(place))
     found = irradiance > 0
     if found:
         flight = maps.flight(photon, found)
@@ -283,7 +427,7 @@ def caustics(
         radiance = dr.select(found & (wo.z != 0), radiance, 0)
         length = vertex.length + flight.length
         path = LightPath(flight.u, flight.v, length, vertex.is_first, mi.UInt32(CAUSTIC))
-        channels = accumulators.add(channels, path, radiance, lane, found)
+        channels = accumulators.add(channels, path, radiance, place, found)
     return channels, radiance
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -13,18 +14,22 @@ from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photo
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth
-from rangesim.light_transport.loop import Radiance, Settings, trace
+from rangesim.light_transport.launches import Launches, Progress, Report
+from rangesim.light_transport.loop import Radiance, Settings, View, trace
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.responses import Accumulators
+from rangesim.light_transport.sampling import Seed
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
+from rangesim.seeds import check_seed
 from rangesim.sensors import Sensor
 from rangesim.signals import EnergySplit, Signals
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
-PROGRESS_STEPS = 16
+PATHS_SHARE = 0.95
+"""Of the progress, that the path loop makes."""
 
 
 def transport(
@@ -59,25 +64,28 @@ def transport(
         asks for, at most four pixels of the projector or three of the camera at the working distance. Caustics are
         blurred by about half of it.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
-    seed : int; the same seed gives the same bytes, whatever the number of threads and the memory budget.
+    seed : int, 0 to 2^64 - 1; the same seed gives the same bytes, whatever the number of threads and the memory
+        budget, and each its own noise.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed
         come on top, some 200 bytes each.
-    progress : called with the share done, 0..1, after each tile.
+    progress : called with the share done, 0..1, after each kernel launch, at most ten times a second. What it raises
+        ends the pass.
 
     Raises
     ------
     ValueError
         A number out of its range, patterns that do not fit the projector, or too little memory.
     """
-    _check(scene, rig, sensors, seed, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    _check(scene, rig, sensors, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    seed = check_seed(seed)
     check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
     radiances: list[np.ndarray] = []
-    camera, projector = Device.camera(rig), Device.projector(rig)
+    report, launches = Progress(progress), Launches()
     settings = Settings(
-        seed=dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
+        seed=Seed.of(seed),
         spp=dr.opaque(mi.UInt32, spp),
         max_depth=dr.opaque(mi.UInt32, max_depth),
         rr_depth=dr.opaque(mi.UInt32, rr_depth),
@@ -86,26 +94,22 @@ def transport(
     )
     irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
     media = media_of(scene.mitsuba)
-    maps = caustic_maps(scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media)
-    for begin, end in _tiles(h * w, responses, memory_bytes, PROGRESS_STEPS if progress else 1):
+    maps = caustic_maps(scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media, partial(report, 0.0))
+    view = View(scene.mitsuba, Device.camera(rig), Device.projector(rig), irradiance, maps, media)
+    for begin, end in _tiles(h * w, responses, memory_bytes):
         accumulators = Accumulators(responses, end - begin)
-        pixel = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, begin)
-        dense, radiance = trace(
-            scene.mitsuba, camera, projector, irradiance, accumulators, pixel, settings, maps, media
-        )
-        tile, sums = accumulators.images(dense, radiance)
-        for response, values in zip(responses, tile, strict=True):
+        so_far = partial(_report, report, begin / (h * w), (end - begin) / (h * w))
+        radiances.append(trace(view, settings, spp, accumulators, begin, launches, so_far))
+        for response, values in zip(responses, accumulators.images(), strict=True):
             channels[response].append(values)
-        radiances.append(sums)
-        if progress:
-            progress(end / (h * w))
     images = {r: _join(tiles, h, w) for r, tiles in channels.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
-        found = trace_glint(scene.mitsuba, rig, responses, seed, media)
+        found = trace_glint(scene.mitsuba, rig, responses, seed, media, partial(report, PATHS_SHARE))
         found.add_to(highlights, found.radiance[None])
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
+    report(1.0)
     return _signals(scene, rig, Radiance(*_join(radiances, h, w)), highlights[0], images, spp)
 
 
@@ -128,26 +132,28 @@ def _join(tiles: list[np.ndarray], h: int, w: int) -> np.ndarray:
     return (tiles[0] if len(tiles) == 1 else np.concatenate(tiles, axis=1)).reshape(-1, h, w)
 
 
-def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, at_least: int) -> Iterator[tuple[int, int]]:
+def _report(report: Report, before: float, share: float, of_tile: float) -> None:
+    report(PATHS_SHARE * (before + share * of_tile))
+
+
+def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int) -> Iterator[tuple[int, int]]:
     """Ranges of flat pixel indices that fit the budget, of about equal size."""
     bytes_per_pixel = BYTES_PER_LANE + 4 * sum(r.channels for r in responses)
     if memory_bytes < bytes_per_pixel:
         raise ValueError(f"expected a memory budget of at least {bytes_per_pixel} bytes, got {memory_bytes}.")
-    tiles = max(at_least, -(-pixels * bytes_per_pixel // memory_bytes))
+    tiles = -(-pixels * bytes_per_pixel // memory_bytes)
     size = max(1, -(-pixels // tiles))
     for begin in range(0, pixels, size):
         yield begin, min(begin + size, pixels)
 
 
-def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], seed: int, **counts: int) -> None:
+def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], **counts: int) -> None:
     if not isinstance(scene, Scene):
         raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
     if not isinstance(rig, Rig):
         raise ValueError(f"expected a Rig, as scene.rig() returns, got {type(rig).__name__}.")
     if not isinstance(sensors, Sequence) or not all(isinstance(s, (Sensor, Response)) for s in sensors):
         raise ValueError(f"expected a list of sensors, for example [StructuredLight()], got {sensors!r}.")
-    if not isinstance(seed, (int, np.integer)):
-        raise ValueError(f"expected seed to be a whole number, got {seed!r}.")
     for sensor in sensors:
         sensor.check(rig.projector.width, rig.projector.height)
     for name, value in counts.items():

@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.medium import Media
-from rangesim.light_transport.sampling import random_stream
+from rangesim.light_transport.sampling import Seed, random_stream
 
 LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
@@ -39,18 +39,15 @@ def fly(
     number: np.ndarray,
     seed: int,
     media: Media | None = None,
-) -> tuple[Landing, np.ndarray]:
-    """Landings of photons sent through projector pixels, and the sums of `PhotonBalance`."""
+) -> tuple[Landing, tuple[Any, ...]]:
+    """Landings of photons sent through projector pixels, and the fates of each that `PhotonBalance` sums up."""
     pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(projector.size.x)
     photon = mi.UInt32(number.astype(np.uint32))
-    rng = random_stream(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), photon ^ 0x9E3779B9)
+    rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
-    landing, fate = _chain(
-        scene, projector, uv, mi.Float(flux.astype(np.float32)), rng, dr.opaque(mi.UInt32, MAX_CHAIN), media
-    )
-    dr.eval(list(landing), list(fate))
-    return landing, np.array([x.numpy().sum(dtype=np.float64) for x in fate])
+    power, most = mi.Float(flux.astype(np.float32)), dr.opaque(mi.UInt32, MAX_CHAIN)
+    return _chain(scene, projector, uv, power, rng, most, media)
 
 
 @dr.syntax

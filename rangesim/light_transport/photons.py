@@ -13,6 +13,7 @@ something is finer than a pixel.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,12 +21,17 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rangesim.light_transport.device import Device, PrimaryRay
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.medium import Media, bounded, is_boundary
 from rangesim.light_transport.photon_flight import fly
 
 DEFENSIVE_SHARE = 0.05
 """Of the photons, for the pixels where the pre-pass found no delta surface."""
+SURFACES_PER_PHOTON = 2
+"""About."""
+SUMMED_TOGETHER = 1 << 16
+"""Photons whose fates are added up first, so that the sum does not depend on launches."""
 BYTES_PER_PHOTON = 128
 """While it flies, an upper bound."""
 
@@ -79,11 +85,19 @@ def has_delta(scene: Any) -> bool:
     )
 
 
-def meets_delta(scene: Any, rays: PrimaryRay, media: Media | None) -> np.ndarray:
-    """(n,) bool: whether the first surface that each ray meets has a delta interaction."""
-    si = scene.ray_intersect(mi.Ray3f(rays.origin, rays.direction))
-    delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
-    return np.asarray(delta.numpy())
+def meets_delta(scene: Any, device: Device, media: Media | None) -> tuple[np.ndarray, np.ndarray]:
+    """(pixels,) bool: whether the first surface behind each pixel's centre has a delta interaction; and whether the
+    lens sends a ray through it at all."""
+    launches, meets, exists = Launches(), np.zeros(device.pixels, dtype=bool), np.ones(device.pixels, dtype=bool)
+    for begin, end in launches.ranges(device.pixels):
+        rays = device.centre_rays(begin, end)
+        si = scene.ray_intersect(mi.Ray3f(rays.origin, rays.direction))
+        delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
+        launches.evaluate([delta, rays.exists], end - begin)
+        meets[begin:end] = delta.numpy()
+        if rays.exists is not None:  # a distorted lens
+            exists[begin:end] = rays.exists.numpy()
+    return meets, exists
 
 
 def trace_photons(
@@ -95,23 +109,32 @@ def trace_photons(
     seed: int,
     memory_bytes: int,
     media: Media | None = None,
+    report: Callable[[], None] = lambda: None,
 ) -> Photons:
-    """`photons` photons of a projector of that power, dealt out evenly to `maps` independent maps."""
+    """`photons` photons of a projector of that power, dealt out evenly to `maps` independent maps.
+
+    `report` is called after each kernel launch.
+    """
     pixels, share = _worthwhile_pixels(scene, projector, media)
     per_map = -(-photons // maps)
     cumulative = np.cumsum(share)
     total = per_map * maps
-    chunk = max(1, min(total, memory_bytes // BYTES_PER_PHOTON))
+    most = max(1, min(total, memory_bytes // BYTES_PER_PHOTON))
     landed: list[list[np.ndarray]] = []
     balance = np.zeros(len(PhotonBalance.__dataclass_fields__))
-    for begin in range(0, total, chunk):
-        number = np.arange(begin, min(begin + chunk, total))
+    launches = Launches()
+    for begin, end in launches.ranges(total, SURFACES_PER_PHOTON, min(most, SUMMED_TOGETHER), at_most=most):
+        number = np.arange(begin, end)
         chosen = np.searchsorted(cumulative, _stratified(number, per_map) * cumulative[-1], side="right")
         flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
-        end, fate = fly(scene, projector, pixels[chosen], flux, number, seed, media)
-        kept = np.flatnonzero(end.flux)
-        landed.append([_columns(x)[kept] for x in end] + [number[kept] // per_map])
-        balance += fate
+        landing, fate = fly(scene, projector, pixels[chosen], flux, number, seed, media)
+        launches.evaluate([list(landing), list(fate)], SURFACES_PER_PHOTON * (end - begin))
+        kept = np.flatnonzero(landing.flux)
+        landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])
+        blocks = np.arange(0, end - begin, SUMMED_TOGETHER)
+        for sums in np.column_stack([np.add.reduceat(x.numpy(), blocks, dtype=np.float64) for x in fate]):
+            balance += sums
+        report()
     position, direction, flux, u, v, length, of_map = (np.concatenate(parts) for parts in zip(*landed, strict=True))
     total_balance = PhotonBalance(*(balance / maps))
     return Photons(position, direction, flux, u, v, length, of_map, total_balance, total / cumulative[-1])
@@ -119,7 +142,7 @@ def trace_photons(
 
 def _worthwhile_pixels(scene: Any, projector: Device, media: Media | None) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices of all projector pixels along a Morton curve, and the relative chance of a photon for each."""
-    meets = meets_delta(scene, projector.centre_rays(), media)
+    meets, _ = meets_delta(scene, projector, media)
     w, h = (int(n[0]) for n in projector.size)
     mask = binary_dilation(meets.reshape(h, w), np.ones((3, 3))).ravel()
     rest = ~mask

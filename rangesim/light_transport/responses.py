@@ -33,28 +33,33 @@ class DrjitMath:
 
 
 class Accumulators:
-    """Where the responses of one tile of pixels, one lane per pixel, add up.
+    """Where the responses of a number of pixels add up, one lane of a kernel for each pixel at work.
 
     A dense channel is a loop variable of the lane, so it lives in registers and costs one multiply-add per
     vertex. A sparse response is a buffer in memory: each lane adds to its own column, hence no two threads ever
     write to the same place, no atomics are needed, and sums are made in the same order on any machine.
     """
 
-    def __init__(self, responses: Sequence[Response], lanes: int) -> None:
+    def __init__(self, responses: Sequence[Response], pixels: int) -> None:
         self.responses = tuple(responses)
-        self.lanes = lanes
-        self.stride = dr.opaque(mi.UInt32, lanes)
-        self.bins = {r: dr.zeros(mi.Float, lanes * r.channels) for r in responses if isinstance(r, SparseResponse)}
+        self.pixels = pixels
+        self.stride = dr.opaque(mi.UInt32, pixels)
+        self.bins: dict[Response, Any] = {
+            r: dr.zeros(mi.Float, pixels * r.channels) for r in responses if isinstance(r, SparseResponse)
+        }
+        self.dense = {r: np.empty((r.channels, pixels), np.float32) for r in responses if isinstance(r, DenseResponse)}
 
-    def zeros(self) -> list[list[Any]]:
+    def zeros(self, lanes: int) -> list[list[Any]]:
         """Fresh dense channels, the loop variable that `add` updates."""
         return [
-            [dr.zeros(mi.Float, self.lanes) for _ in range(r.channels)] if isinstance(r, DenseResponse) else []
+            [dr.zeros(mi.Float, lanes) for _ in range(r.channels)] if isinstance(r, DenseResponse) else []
             for r in self.responses
         ]
 
-    def add(self, channels: list[list[Any]], path: LightPath, radiance: Any, lane: Any, active: Any) -> list[list[Any]]:
-        """Channels after a path of this radiance (0 where not `active`)."""
+    def add(
+        self, channels: list[list[Any]], path: LightPath, radiance: Any, place: Any, active: Any
+    ) -> list[list[Any]]:
+        """Channels after a path of this radiance (0 where not `active`); `place` is the number of the lane's pixel."""
         math = DrjitMath()
         result = []
         for response, values in zip(self.responses, channels, strict=True):
@@ -63,24 +68,26 @@ class Accumulators:
                 values = [dr.fma(radiance, w, v) for v, w in zip(values, weights, strict=True)]
             elif isinstance(response, SparseResponse):
                 index = response.bin(path, math)
-                target = dr.fma(index, self.stride, lane)
+                target = dr.fma(index, self.stride, place)
                 inside = active & (index < response.channels)
                 dr.scatter_add(self.bins[response], radiance, target, inside, mode=dr.ReduceMode.NoConflicts)
             result.append(values)
         return result
 
-    def images(self, channels: list[list[Any]], others: Sequence[Any]) -> tuple[list[np.ndarray], np.ndarray]:
-        """(c, lanes) float32 of each response, and the `others`, Floats of the same loop, as (n, lanes) float32.
+    def pending(self) -> list[Any]:
+        """The buffers that a launch has added to: to be evaluated with its loop, or that runs a second time."""
+        return list(self.bins.values())
 
-        All are evaluated at once: one by one, the loop would run once for each.
-        """
-        dr.eval(channels, list(others), list(self.bins.values()))
-        images = [
-            self.bins[r].numpy().reshape(-1, self.lanes) if r in self.bins else _stack(values)
-            for r, values in zip(self.responses, channels, strict=True)
+    def store(self, channels: list[list[Any]], places: Any) -> None:
+        """Keep the evaluated dense channels of the pixels with these numbers (a slice or (lanes,) int)."""
+        for response, values in zip(self.responses, channels, strict=True):
+            if isinstance(response, DenseResponse):
+                for image, value in zip(self.dense[response], values, strict=True):
+                    image[places] = value.numpy()
+
+    def images(self) -> list[np.ndarray]:
+        """(c, pixels) float32 of each response."""
+        return [
+            self.dense[r] if isinstance(r, DenseResponse) else self.bins[r].numpy().reshape(-1, self.pixels)
+            for r in self.responses
         ]
-        return images, _stack(others)
-
-
-def _stack(values: Sequence[Any]) -> np.ndarray:
-    return np.stack([v.numpy() for v in values])

@@ -3,16 +3,45 @@
 
 from __future__ import annotations
 
-from typing import Any
+from enum import Enum
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 
-def random_stream(a: Any, b: Any, apart: bool = False) -> Any:
-    """PCG32 that depends on the UInt32 `a` and `b` alone, not on the lane; `apart`: a second, independent one."""
-    states = [mi.UInt64(x) for x in mi.sample_tea_32(a, b)]
-    return mi.PCG32(1, *(reversed(states) if apart else states))  # 1: no lane number mixed in
+class Seed(NamedTuple):
+    """The halves of a seed of 64 bits, UInt32 and opaque, so that no kernel is compiled for a seed."""
+
+    low: Any
+    high: Any
+
+    @classmethod
+    def of(cls, seed: int) -> Seed:
+        """The halves of a checked seed (`rangesim.seeds.check_seed`)."""
+        return cls(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, seed >> 32))
+
+
+class Stream(Enum):
+    """Independent streams of random numbers for one seed and number."""
+
+    FIRST = "first"
+    SECOND = "second"
+    THIRD = "third"
+
+
+def random_stream(seed: Seed, number: Any, stream: Stream = Stream.FIRST) -> Any:
+    """PCG32 that depends on the seed and the UInt32 `number` alone, not on the lane.
+
+    Both are mixed by the block cipher TEA (Zafar, Olano, Curtis: GPU random numbers via the tiny encryption
+    algorithm, HPG 2010), which is one to one. A seed of more than 32 bits goes through it twice, its upper half
+    added in between: so no seed is another one in disguise.
+    """
+    pair = (number, seed.low) if stream is Stream.THIRD else (seed.low, number)
+    once = [mi.UInt32(x) for x in mi.sample_tea_32(*pair)]
+    twice = mi.sample_tea_32(once[0] + seed.high, once[1])
+    states = [mi.UInt64(dr.select(seed.high == 0, a, b)) for a, b in zip(once, twice, strict=True)]
+    return mi.PCG32(1, *(reversed(states) if stream is Stream.SECOND else states))  # 1: no lane number mixed in
 
 
 def stratified(shift: Any, sample: Any) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 from rangesim.motion.timing import Instant, Timing, Window
 from rangesim.motion.track import Motion, Placement
 from rangesim.rig import Rig
+from rangesim.seeds import derived_seed
 from rangesim.sensors import Sensor
 
 
@@ -63,7 +64,7 @@ class Pass:
         corner = (self.window.top, self.window.left)
         if not any(corner):
             return seed
-        return int(np.random.SeedSequence([seed & 0xFFFFFFFF, *corner]).generate_state(1)[0])
+        return derived_seed(seed, *corner)
 
 
 def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pass]:

@@ -13,6 +13,7 @@ from rangesim.motion.passes import plan
 from rangesim.motion.timing import Timing
 from rangesim.motion.track import Motion
 from rangesim.rig import Rig
+from rangesim.seeds import check_seed
 from rangesim.sensors import Sensor
 from rangesim.signals import Signals
 
@@ -43,7 +44,7 @@ def transport_moving(
     rig : Rig, where it stands without motion.
     timings : sensor -> Timing, when it takes its frames.
     motion : Motion, what moves.
-    seed : int; the same seed gives the same bytes.
+    seed : int, 0 to 2^64 - 1; the same seed gives the same bytes.
     progress : called with the share done, 0..1.
     options : spp, max_depth and what else `transport` takes, for each pass.
 
@@ -66,6 +67,7 @@ def transport_moving(
     from rangesim.scene.moving import MovingScene
 
     _check(scene, rig, timings, motion)
+    seed = check_seed(seed)
     passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
     at_once: dict[Sensor, Signals] = {}

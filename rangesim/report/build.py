@@ -10,7 +10,10 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from pcgraph.output import write_file
+from rangesim.errors import FileFormatError
 from rangesim.report import cloud, figures, palette, tables
+from rangesim.report.policy import StyleRules, content_policy, visible_text
 from rangesim.report.verdict import verdict
 from rangesim.result_files import Measurement, Result
 
@@ -18,12 +21,23 @@ SCRIPTS = ("viewer.js", "report.js")
 
 
 def write_report(result: Result, path: Path) -> None:
-    """Write the report of a result; the file appears when it is complete."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    """Write the report of a result; the file appears when it is complete.
+
+    Raises
+    ------
+    FileFormatError
+        The place cannot be written.
+    """
+    write_file(path, render_report(result).encode(), FileFormatError)
+
+
+def render_report(result: Result) -> str:
+    """The report of a result as HTML."""
+    environment = Environment(
+        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     template = environment.from_string(_asset("report.html.j2"))
-    staging = path.with_name(f".{path.name}.part")
-    staging.write_text(template.render(context(result)), encoding="utf-8")
-    staging.replace(path)
+    return template.render(context(result))
 
 
 def context(result: Result) -> dict[str, Any]:
@@ -37,7 +51,9 @@ def context(result: Result) -> dict[str, Any]:
     return {
         "css": Markup(_asset("style.css")),  # our own files
         "script": Markup("\n".join(_asset(name) for name in SCRIPTS)),
-        "scene": result.info["scene"],
+        "rules": StyleRules(),
+        "content_policy": content_policy,
+        "scene": result.info.scene,
         "titles": names,
         "references": [m.name for m in measurements if tables.is_reference(m)],
         "settings_line": tables.settings_line(result.experiment, camera[2], camera[1]),
@@ -58,8 +74,8 @@ def context(result: Result) -> dict[str, Any]:
         "costs": tables.cost_table(measurements),
         "transport": _transport(result, names),
         "viewer": _viewer_data(result, names, error),
-        "settings": _flat(result.info["experiment"]),
-        "versions": {**result.info["versions"], "Mitsuba variant": result.info["variant"]},
+        "settings": _flat(result.info.experiment),
+        "versions": {**result.info.versions, "Mitsuba variant": result.info.variant},
     }
 
 
@@ -76,11 +92,9 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
 
 def _frames(m: Measurement) -> dict[str, Any]:
     f = m.facts
-    taken = f"{f['frames']} frames"
-    if f["exposure_s"] is not None:
-        taken += (
-            f", {tables.seconds(f['exposure_s'])} each" if f["frames"] != 1 else f", {tables.seconds(f['exposure_s'])}"
-        )
+    taken = f"{f.frames} frames"
+    if f.exposure_s is not None:
+        taken += f", {tables.seconds(f.exposure_s)} each" if f.frames != 1 else f", {tables.seconds(f.exposure_s)}"
     else:
         taken += ", noise-free"
     return {
@@ -104,11 +118,11 @@ def _light(result: Result, number: int) -> dict[str, Any]:
 
 
 def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
-    times = result.info["times_s"]
+    times = result.info.times_s
     return [
         {
             "names": ", ".join(names[m.name] for m in result.measurements if m.light_pass == number),
-            "frames": str(sum(m.facts["frames"] for m in result.measurements if m.light_pass == number)),
+            "frames": str(sum(m.facts.frames for m in result.measurements if m.light_pass == number)),
             "time": tables.seconds(times[f"transport_{number}"]),
         }
         for number in range(1, len(result.energy) + 1)
@@ -119,7 +133,7 @@ def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str,
     far = cloud.far_limit(result.measurements)
     truth = result.measurements[0].truth
     return {
-        "instruments": [cloud.packed_measurement(m, names[m.name], far) for m in result.measurements],
+        "instruments": [cloud.packed_measurement(m, visible_text(names[m.name]), far) for m in result.measurements],
         "errorColors": error.ravel().tolist(),
         "errorKneeM": palette.ERROR_KNEE_M,
         "errorLimitM": palette.ERROR_LIMIT_M,
@@ -127,7 +141,7 @@ def _viewer_data(result: Result, names: dict[str, str], error: Any) -> dict[str,
         "status": list(palette.STATUS_NAMES.values()),
         "causes": palette.OUTCOME_NAMES,
         "causeColors": palette.OUTCOME_COLORS.ravel().tolist(),
-        "materials": list(truth.material_names),
+        "materials": [visible_text(n) for n in truth.material_names],
         "materialColors": [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names],
         "material": cloud.pack(truth.material.astype("int8")),
     }

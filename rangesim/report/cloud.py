@@ -37,7 +37,6 @@ def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, An
     step = max((far_m - near) / 65534, 1e-6)
     z = np.where(drawn, 1 + np.rint((np.where(drawn, m.image.z, near) - near) / step), 0).astype(np.uint16)
     return {
-        "name": m.name,
         "title": title,
         "width": camera.width,
         "height": camera.height,

@@ -187,8 +187,16 @@ class Page {
       Object.assign(dot.style, { display: "block", left: `${100 * (x + 0.5) / here.width}%`, top: `${100 * (y + 0.5) / here.height}%` });
     });
     const material = DATA.materials[DATA.material[i]] || "nothing";
-    $("probe").innerHTML = `<b>(${x}, ${y})</b> ${material}: ` + DATA.instruments.map((one) => `<b>${one.title}</b> ${reading(one, i)}`).join(" · ");
+    const said = DATA.instruments.flatMap((one, k) => [k ? " · " : "", bold(one.title), ` ${reading(one, i)}`]);
+    $("probe").replaceChildren(bold(`(${x}, ${y})`), ` ${material}: `, ...said);
   }
+}
+
+// Names come from data: they become text, never markup.
+function bold(text) {
+  const element = document.createElement("b");
+  element.textContent = text;
+  return element;
 }
 
 function reading(one, i) {
@@ -205,9 +213,9 @@ async function start() {
   await Promise.all(DATA.instruments.map(unpackInstrument));
   const wanted = new URLSearchParams(location.hash.slice(1));
   const page = window.page = new Page();
-  const altitude = wanted.has("altitude") ? +wanted.get("altitude") : page.levels.usual;
+  const asked = wanted.has("altitude") ? +wanted.get("altitude") : NaN, altitude = Number.isNaN(asked) ? page.levels.usual : asked;
   page.setAltitude(altitude, page.levels.level(altitude));
-  if (PAINT[wanted.get("color")]) page.setMode(wanted.get("color"));
+  if (Object.hasOwn(PAINT, wanted.get("color"))) page.setMode(wanted.get("color"));
   all("canvas.cloud").forEach((canvas) => {
     const one = page.of(canvas), drawn = one.z.reduce((n, v) => n + (v > 0), 0);
     canvas.nextElementSibling.textContent = `${drawn.toLocaleString("en")} points` + (one.hidden ? `; ${one.hidden} farther ones not drawn` : "");

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
+from rangesim.config import visible
 from rangesim.experiment import Experiment
 from rangesim.report import palette
 from rangesim.report.figures import Share
@@ -18,6 +20,12 @@ Rows = list[dict[str, Any]]
 
 UNRELIABLE = 0.5
 """Share of outliers or of missing pixels from which a sensor is called unreliable on a material."""
+
+_SPECIAL = re.compile(r"([\\`|\[]|<(?! ))")
+"""What Markdown reads as more than text; "< 0.1" is none of it."""
+_ESCAPED = re.compile(r"\\([\\`|\[<])")
+_BORDER = re.compile(r"(?<!\\)\|")
+_BREAKS = re.compile(r"[\t\r\n]+")
 
 
 @dataclass(frozen=True)
@@ -154,15 +162,23 @@ def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
     return errors + "\n" + _markdown(tables, ["failed (%)", "because (% of the pixels)"], _failures)
 
 
+def cells(line: str) -> list[str]:
+    """Cells of a line of such a table, as they were before they became Markdown."""
+    return [_ESCAPED.sub(r"\1", cell.strip()) for cell in _BORDER.split(line)[1:-1]]
+
+
+def _line(texts: Sequence[str]) -> str:
+    """A line of a table; what Markdown or a terminal would take for more than text is escaped or spelt out."""
+    return "| " + " | ".join(_SPECIAL.sub(r"\\\1", visible(_BREAKS.sub(" ", text))) for text in texts) + " |"
+
+
 def _markdown(
-    tables: Sequence[tuple[str, Rows]], heads: list[str], cells: Callable[[dict[str, Any]], list[str]]
+    tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]
 ) -> str:
-    lines = ["| " + " | ".join(["material", "sensor", *heads]) + " |", "|" + " --- |" * (2 + len(heads))]
+    lines = [_line(["material", "sensor", *heads]), "|" + " --- |" * (2 + len(heads))]
     for material in dict.fromkeys(row["material"] for _, rows in tables for row in rows):
         for name, rows in tables:
-            lines += [
-                "| " + " | ".join([material, name, *cells(row)]) + " |" for row in rows if row["material"] == material
-            ]
+            lines += [_line([material, name, *texts(row)]) for row in rows if row["material"] == material]
     return "\n".join(lines) + "\n"
 
 
@@ -204,10 +220,10 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
     """Per instrument: frames, exposure, acquisition, decoding, segmentation, points per pixel."""
     table = []
     for m in measurements:
-        f, times = m.facts, m.facts["times_s"]
-        cells = [str(f["frames"]), seconds(f["exposure_s"]), seconds(f["acquisition_s"])]
+        f, times = m.facts, m.facts.times_s
+        cells = [str(f.frames), seconds(f.exposure_s), seconds(f.acquisition_s)]
         cells += [seconds(times.get(stage)) for stage in ("exposure", "decode", "points", "segmentation")]
-        table.append((m.name, [*cells, f"{f['points']:,}".replace(",", " "), f"{f['points'] / f['pixels']:.2f}"]))
+        table.append((m.name, [*cells, f"{f.points:,}".replace(",", " "), f"{f.points / f.pixels:.2f}"]))
     return table
 
 

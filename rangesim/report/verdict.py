@@ -97,11 +97,11 @@ def _most_complete(real: Sequence[Measurement], names: dict[str, str]) -> str:
 
 
 def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    times = [(m.facts["acquisition_s"], m) for m in real if m.facts["acquisition_s"]]
+    times = [(m.facts.acquisition_s, m) for m in real if m.facts.acquisition_s]
     times.sort(key=lambda pair: pair[0])
     return _ranked(
         "Shortest exposure of all frames",
-        [(names[m.name], f"{m.facts['frames']} frames in {_glued(seconds(t))}") for t, m in times],
+        [(names[m.name], f"{m.facts.frames} frames in {_glued(seconds(t))}") for t, m in times],
     )
 
 

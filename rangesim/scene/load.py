@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.bounds import Bounds, check_number
+from rangesim.catalogue import CATALOGUE, scene_file
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.medium import is_boundary, why_not_traced
@@ -31,10 +32,6 @@ from rangesim.text_files import check_xml
 
 Source = str | Path | Mapping[str, Any]
 
-_INSTALLED = Path(__file__).resolve().parent / "catalogue"
-CATALOGUE = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[2] / "scenes"
-"""Directory that holds `materials/`: a copy inside an installed package, `scenes` in a checkout."""
-
 
 def load_scene(
     source: Source,
@@ -48,8 +45,9 @@ def load_scene(
 
     Parameters
     ----------
-    source : path of a Mitsuba 3 XML file or of a mesh (PLY, OBJ, GLB, STL), or a Mitsuba scene dictionary. XML and
-        dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
+    source : path of a Mitsuba 3 XML file or of a mesh (PLY, OBJ, GLB, STL), the name of a scene that comes with the
+        package (`rangesim.catalogue.scene_names`; a file of that name goes first), or a Mitsuba scene dictionary. XML
+        and dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
         ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
         `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md);
@@ -93,6 +91,7 @@ def load_scene(
         T_world_camera=T_world_camera,
         working_distance_m=_median_depth(loaded, camera, T_world_camera),
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
+        source=None if isinstance(source, Mapping) else scene_file(source),
         reload=lambda: instantiate()[0],
     )
 
@@ -119,9 +118,7 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     if isinstance(source, Mapping):
         check_dictionary(source, "the scene dictionary")
         return mi.parser.parse_dict(config, dict(source))
-    path = Path(source)
-    if not path.is_file():
-        raise FileFormatError(f"expected a scene or mesh file, but {path} does not exist.")
+    path = scene_file(source)
     if _is_mesh(path):
         return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, folder))
     if path.suffix.lower() != ".xml":

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ class Scene:
     camera, T_world_camera : the scene's own sensor.
     working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
     has_cutouts : bool, whether some surface lets light pass unchanged (`mask`, `null`).
+    source : Path of the file it was loaded from; None for a dictionary.
     reload : makes another mitsuba.Scene of the same source, for shapes to be moved in.
     """
 
@@ -44,6 +46,7 @@ class Scene:
     T_world_camera: np.ndarray
     working_distance_m: float
     has_cutouts: bool = False
+    source: Path | None = None
     reload: Callable[[], Any] | None = None
 
     def __repr__(self) -> str:

@@ -1,0 +1,742 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Output that appears whole or not at all, and never costs a user a file.
+
+Every command and every `save` of pcgraph and rangesim writes through this module, by four rules:
+
+1. Work goes on in a hidden staging directory, `STAGING`, inside the directory that is asked for. A lock says that the
+   work is alive. What a killed process left is cleared, or its replacement completed, by the next one.
+2. A finished directory holds a manifest with size and SHA-256 of each of its files. What the manifest does not list, or
+   lists with another content, belongs to the user: it is never moved, overwritten or removed.
+3. The new files take the place of the old ones by renames that a journal describes. Once the journal is on the disk the
+   new result stands: whoever looks next carries it out to the end. Before that, the old one stands.
+4. Files and directories are flushed to the disk before they take a place.
+
+Only the standard library is imported, as both packages' entry points need this before anything else.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import re
+import shutil
+import stat
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+try:
+    import fcntl
+except ImportError:  # Windows has no flock: there, two runs with the same output are not told apart
+    fcntl = None  # type: ignore[assignment]
+
+STAGING = ".rangesim-staging"
+"""Name of the hidden directory, inside the output, in which work in progress lies."""
+MANIFEST = "manifest.json"
+MANIFEST_FORMAT = "rangesim-manifest"
+MANIFEST_VERSION = 1
+MAX_MANIFEST_BYTES = 64 << 20
+_JOURNAL, _LOCK, _NEW, _OLD = "journal.json", "lock", "new", "old"
+_DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quota is used up",
+         errno.EFBIG: "the file would be larger than allowed", errno.EROFS: "the file system is read-only",
+         errno.EIO: "the device fails"}  # fmt: skip
+_PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
+
+
+@dataclass(frozen=True)
+class DirectoryKind:
+    """A kind of directory that this project writes.
+
+    format : states the kind in the manifest and in the sidecar. sidecar : name of the JSON file with the settings.
+    error : raised, with one sentence, where a directory of this kind cannot be written.
+    """
+
+    format: str
+    sidecar: str
+    error: type[Exception]
+
+
+class Digest(NamedTuple):
+    """Size in bytes and SHA-256 (hexadecimal) of a file."""
+
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Verification:
+    """How a directory differs from its manifest; paths are relative to it, sorted.
+
+    missing, changed : listed files that are gone, or hold something else. foreign : files and empty directories that
+    are not listed. files : number of files that are listed.
+    """
+
+    missing: tuple[str, ...]
+    changed: tuple[str, ...]
+    foreign: tuple[str, ...]
+    files: int
+
+
+# ---- Directories ---------------------------------------------------------------------------------------------------
+
+
+def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence[str | Path] = ()) -> Path:
+    """The directory that output to `directory` goes to, links followed; nothing is written.
+
+    A directory may be new, or empty, or hold an older result of the same kind as it was written, beside which the user
+    may keep files. `inputs` are what the work reads.
+
+    Raises
+    ------
+    kind.error
+        The place holds something else, a file of the older result was changed, `directory` is a link to nothing, is or
+        holds an input or lies in one, or another process is writing to it.
+    """
+    named = Path(directory)
+    if named.is_symlink() and not named.exists():
+        raise kind.error(f"{named} is a link to {os.readlink(named)}, which does not exist; name another place.")
+    target = Path(os.path.realpath(named))
+    if os.path.lexists(target) and not target.is_dir():
+        raise kind.error(f"{named} exists and is no directory; name another place.")
+    for source in inputs:
+        _check_apart(named, target, Path(source), kind)
+    if target.is_dir():
+        if _is_claimed(target):
+            raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
+        if not (target / STAGING).exists():  # what a killed process left there is looked at once it is cleared
+            _check_contents(named, target, kind)
+    return target
+
+
+@contextmanager
+def new_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence[str | Path] = ()) -> Iterator[Path]:
+    """A directory to fill; its files take their places in `directory` when the block ends well, and vanish if it fails.
+
+    An older result of the same kind is replaced then, and stays until then. Files that are not in its manifest stay.
+    Should a file of the user's stand in the way by the time the block ends, the new result is kept in a directory
+    inside, and the error says in which.
+
+    Raises
+    ------
+    kind.error
+        As `check_directory`; or the directory cannot be made, or the disk is full.
+    """
+    named = Path(directory)
+    target = check_directory(named, kind, inputs)
+    with _one_sentence(named, target, kind):
+        staging = _Staging.claim(named, target, kind)
+        try:
+            _check_contents(named, target, kind)
+            yield staging.make_new()
+            staging.commit(named, kind)
+        finally:
+            staging.release()
+
+
+def write_manifest(folder: Path, kind: DirectoryKind) -> None:
+    """List all files of a complete directory in its manifest; `new_directory` does so itself."""
+    files = {name: [_digest(folder / name)] for name in _walk(folder) if name != MANIFEST}
+    (folder / MANIFEST).write_bytes(_manifest(kind, files))
+
+
+def replace_listed_file(directory: str | Path, name: str, content: bytes, kind: DirectoryKind) -> None:
+    """Write the file `name` of a complete directory anew, and its manifest.
+
+    Raises
+    ------
+    kind.error
+        The file was changed by somebody else, or another process is writing to the directory.
+    """
+    folder = Path(os.path.realpath(directory))
+    with _one_sentence(Path(directory), folder, kind):
+        recover(folder, kind.error)
+        if _is_claimed(folder):
+            raise kind.error(f"another process is writing to {directory}; wait for it.")
+        files = read_manifest(folder, kind)
+        path = folder / name
+        if os.path.lexists(path) and not (_is_plain_file(path) and _digest(path) in files.get(name, [])):
+            raise kind.error(f"{path} was changed since rangesim wrote it; move it away first.")
+        new = Digest(len(content), hashlib.sha256(content).hexdigest())
+        # Both contents are ours while one takes the place of the other
+        _write(folder / MANIFEST, _manifest(kind, files | {name: [*files.get(name, []), new]}))
+        _write(path, content)
+        _write(folder / MANIFEST, _manifest(kind, files | {name: [new]}))
+        _count()
+
+
+def read_manifest(directory: Path, kind: DirectoryKind) -> dict[str, list[Digest]]:
+    """The contents that each file of a directory may have, by its path relative to the directory, with `/`.
+
+    Raises
+    ------
+    kind.error
+        There is no manifest of this kind, or it is damaged.
+    """
+    path = directory / MANIFEST
+    if not _is_plain_file(path):
+        raise kind.error(f"{directory} has no {MANIFEST}, so it is not known which of its files rangesim wrote.")
+    with path.open("rb") as stream:
+        text = stream.read(MAX_MANIFEST_BYTES + 1)
+    try:
+        if len(text) > MAX_MANIFEST_BYTES:
+            raise ValueError(f"it is larger than {MAX_MANIFEST_BYTES} bytes")
+        return _parse_manifest(json.loads(text), kind.format)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200] or "it is nested too deeply"
+        raise kind.error(f"{path} is no manifest of a {kind.format}: {reason}.") from error
+
+
+def verify_directory(directory: str | Path, kind: DirectoryKind) -> Verification:
+    """How the files of a directory differ from what was written; reads every byte.
+
+    Raises
+    ------
+    kind.error
+        There is no manifest of this kind, or it is damaged.
+    """
+    folder = Path(os.path.realpath(directory))
+    recover(folder, kind.error)
+    files = read_manifest(folder, kind)
+    found = _walk(folder, empty_directories=True)
+    listed = set(files)
+    ours = listed | {MANIFEST} | {str(parent) for name in listed for parent in PurePosixPath(name).parents}
+    return Verification(
+        missing=tuple(sorted(name for name in listed if not os.path.lexists(folder / name))),
+        changed=tuple(sorted(n for n in listed if os.path.lexists(folder / n) and not _is_as_listed(folder, n, files))),
+        foreign=tuple(sorted(name for name in found if name not in ours)),
+        files=len(listed),
+    )
+
+
+def recover(directory: str | Path, error: type[Exception]) -> None:
+    """Complete a replacement that a killed process had begun; called before a directory of ours is read.
+
+    Raises
+    ------
+    error
+        It cannot be completed: a file is in the way, or the place cannot be written.
+    """
+    target = Path(os.path.realpath(directory))
+    staging = target / STAGING
+    if not _is_plain_file(staging / _JOURNAL) or not _is_staging(staging):
+        return
+    try:
+        handle = _lock(staging, seconds=5.0)  # a living process is done with its renames in that time
+    except FileNotFoundError:  # it is done
+        return
+    except OSError as problem:
+        raise error(f"cannot read {staging}: {_why(problem)}.") from problem
+    if handle is None:
+        raise error(f"another process is replacing the files of {directory}; wait for it.")
+    try:
+        try:
+            _carry_out(target)
+            shutil.rmtree(staging, ignore_errors=True)
+        finally:
+            os.close(handle)
+    except OSError as problem:
+        raise error(
+            f"an interrupted replacement of {directory} cannot be completed: {_why(problem)} "
+            f"({problem.filename or staging})."
+        ) from problem
+
+
+completed = 0
+"""Files and directories that this process has written."""
+_claims: dict[Path, _Staging] = {}
+_claims_lock = threading.RLock()
+"""Held while claims change and while files take their places: `abandon` waits for it."""
+
+
+def abandon() -> bool:
+    """Remove all work in progress of this process, which is about to end; whether there was any.
+
+    A replacement under way is completed first. For handlers of signals, in a thread of their own.
+    """
+    with _claims_lock:
+        begun = bool(_claims)
+        for claim in list(_claims.values()):
+            claim.release()
+        for part in list(_parts):
+            with suppress(OSError):
+                os.unlink(part)
+        return begun
+
+
+class _Staging:
+    """The staging directory inside an output, claimed by this process for as long as its lock is open."""
+
+    def __init__(self, target: Path) -> None:
+        self.target, self.path = target, target / STAGING
+        self.made = [path for path in (target, *target.parents) if not path.exists()]
+        self.handle: int | None = None
+
+    @classmethod
+    def claim(cls, named: Path, target: Path, kind: DirectoryKind) -> _Staging:
+        """Make the staging directory, or take over what a killed process left there."""
+        with _claims_lock:
+            claim = cls(target)
+            try:
+                target.mkdir(parents=True, exist_ok=True)
+                if not claim.path.exists():
+                    claim.path.mkdir(exist_ok=True)
+                elif not _is_staging(claim.path):
+                    raise kind.error(f"{claim.path} is not what rangesim keeps its work in; move it away.")
+                claim.handle = _lock(claim.path)
+                if claim.handle is None:
+                    raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
+                _carry_out(target)
+                claim.clear()
+                _clear_parts(target, claim.listed(kind).keys() | {MANIFEST})
+            except BaseException:
+                claim.release()
+                raise
+            _claims[claim.path] = claim
+        return claim
+
+    def make_new(self) -> Path:
+        """The directory to fill."""
+        (self.path / _NEW).mkdir()
+        return self.path / _NEW
+
+    def clear(self) -> None:
+        """Remove all but the lock."""
+        for entry in self.path.iterdir():
+            if entry.name == _LOCK:
+                continue
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink()
+
+    def commit(self, named: Path, kind: DirectoryKind) -> None:
+        """List the new files in a manifest, flush them, and let them take their places."""
+        new = self.path / _NEW
+        write_manifest(new, kind)
+        _flush_tree(new)
+        with _claims_lock:
+            old = self.listed(kind)
+            names = _walk(new)
+            obstacle = next((name for name in names if _is_in_the_way(self.target, name, old)), None)
+            if obstacle is not None:
+                kept = self._set_aside(kind)
+                raise kind.error(
+                    f"{named / obstacle} came or was changed while the work went on; it was left as it is, and the new "
+                    f"result is in {kept}."
+                )
+            _write(self.path / _JOURNAL, _json({"retire": old, "place": names}))
+            try:
+                _carry_out(self.target)
+            except KeyboardInterrupt:
+                _carry_out(self.target)
+                raise
+        _count()
+
+    def listed(self, kind: DirectoryKind) -> dict[str, list[Digest]]:
+        """Files of the older result that are still as they were written, its manifest among them."""
+        try:
+            files = read_manifest(self.target, kind)
+        except kind.error:
+            return {}
+        kept = {name: digests for name, digests in files.items() if _is_as_listed(self.target, name, files)}
+        return {**kept, MANIFEST: [_digest(self.target / MANIFEST)]}
+
+    def _set_aside(self, kind: DirectoryKind) -> Path:
+        for number in range(2, 10_000):
+            place = self.target / f"{kind.format}-{number}"
+            if not os.path.lexists(place):
+                (self.path / _NEW).rename(place)
+                _flush(self.target)
+                return place
+        raise kind.error(f"{self.target} holds too many results that were set aside; move them away.")
+
+    def release(self) -> None:
+        """Remove the staging directory, but for a replacement that is still to be completed; give up the lock."""
+        with _claims_lock:
+            _claims.pop(self.path, None)
+            if self.handle is not None:
+                if not (self.path / _JOURNAL).exists():
+                    shutil.rmtree(self.path, ignore_errors=True)
+                os.close(self.handle)
+                self.handle = None
+            _remove_empty(self.made)
+
+
+def _carry_out(target: Path) -> None:
+    """Do what the journal says, if there is one, and is not yet done: retire the old files, place the new ones.
+
+    A crafted directory may hold a crafted journal: nothing is reached through links, nothing outside is touched.
+    """
+    staging = target / STAGING
+    if not _is_plain_file(staging / _JOURNAL):
+        return
+    retire, place = _read_journal(staging / _JOURNAL)
+    waiting = {name for name in place if os.path.lexists(staging / _NEW / name)}
+    for name, digests in retire.items():
+        gone = name in place and name not in waiting  # the new one stands there already
+        if gone or os.path.lexists(staging / _OLD / name) or not os.path.lexists(target / name):
+            continue
+        if _is_as_listed(target, name, {name: digests}):
+            _make_plain_parents(staging, f"{_OLD}/{name}")
+            (target / name).rename(staging / _OLD / name)
+    for name in sorted(waiting, key=lambda n: (n == MANIFEST, n)):  # without it, no directory of ours is complete
+        if not _is_reached_plainly(staging, f"{_NEW}/{name}"):
+            raise OSError(errno.ELOOP, "a link in the staging directory", str(staging / _NEW / name))
+        _make_plain_parents(target, name)
+        _move_to_free_place(staging / _NEW / name, target / name)
+    folders = {target / parent for name in (*retire, *place) for parent in PurePosixPath(name).parents} | {target}
+    _remove_empty(sorted(folders - {target}, reverse=True))
+    for folder in folders:
+        if folder.is_dir() and not folder.is_symlink():
+            _flush(folder)
+    (staging / _JOURNAL).unlink()
+    _flush(staging)
+
+
+def _read_journal(path: Path) -> tuple[dict[str, list[Digest]], list[str]]:
+    """The files to retire, with what they hold, and those to place; OSError if the journal is damaged."""
+    try:
+        journal = json.loads(path.read_bytes()[:MAX_MANIFEST_BYTES])
+        place = [_checked_name(name) for name in journal["place"]]
+        return _parse_files(journal["retire"]), place
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise OSError(errno.EINVAL, "its journal is damaged; remove the staging directory", str(path)) from error
+
+
+def _check_contents(named: Path, target: Path, kind: DirectoryKind) -> None:
+    """Refuse what is neither empty nor an older result of the same kind as it was written."""
+    entries = [entry.name for entry in target.iterdir() if entry.name != STAGING]
+    if not entries:
+        return
+    try:
+        files = read_manifest(target, kind)
+    except kind.error as error:
+        if _states_kind(target / kind.sidecar, kind.format):
+            raise kind.error(
+                f"{named} holds a {kind.format} without a valid {MANIFEST}, so its files cannot be told from yours; "
+                "nothing was written, remove it or name another place."
+            ) from error
+        raise kind.error(
+            f"{named} exists and holds something else than a {kind.format}; nothing was written, name another place."
+        ) from error
+    changed = next((n for n in files if os.path.lexists(target / n) and not _is_as_listed(target, n, files)), None)
+    if changed is not None:
+        raise kind.error(
+            f"{named / changed} was changed since rangesim wrote it; nothing was written, move it away or name another "
+            "place."
+        )
+
+
+def _check_apart(named: Path, target: Path, source: Path, kind: DirectoryKind) -> None:
+    """Refuse an output that is an input, lies inside one, or is a directory of ours around one."""
+    real = Path(os.path.realpath(source))
+    if target == real:
+        raise kind.error(f"{named} is the input itself; name another place.")
+    if real in target.parents and real.is_dir():
+        raise kind.error(f"{named} lies inside the input {source}; name another place.")
+
+
+def _is_in_the_way(target: Path, name: str, listed: Mapping[str, Any]) -> bool:
+    """Whether something that is not ours stands where the new file `name` is to go."""
+    for parent in _parents(target, name):
+        is_directory = parent.is_dir() and not parent.is_symlink()
+        if os.path.lexists(parent) and not is_directory and parent.relative_to(target).as_posix() not in listed:
+            return True
+    return os.path.lexists(target / name) and name not in listed
+
+
+def _states_kind(sidecar: Path, kind: str) -> bool:
+    try:
+        info = json.loads(sidecar.read_text(encoding="utf-8")) if _is_plain_file(sidecar) else None
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(info, dict) and info.get("format") == kind
+
+
+# ---- Single files --------------------------------------------------------------------------------------------------
+
+_parts: set[str] = set()
+"""Temporary files of this process."""
+
+
+def write_file(path: Path, content: bytes, error: type[Exception], make_parents: bool = False) -> None:
+    """Write a file; a reader finds the old content or the new, never a part, also after a crash.
+
+    A link is written through. What killed processes left beside `path` is cleared.
+
+    Raises
+    ------
+    error
+        The place is no plain file, there is no such folder, or the disk is full.
+    """
+    target = Path(os.path.realpath(path))
+    missing = [parent for parent in target.parents if not parent.exists()] if make_parents else []
+    if os.path.lexists(target) and not target.is_file():
+        raise error(f"cannot write {path}: it exists and is no plain file; choose another path.")
+    done = False
+    try:
+        if make_parents:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        _write(target, content)
+        _count()
+        done = True
+    except OSError as problem:
+        reason = "a file is in the way" if isinstance(problem, (FileExistsError, NotADirectoryError)) else _why(problem)
+        raise error(f"cannot write {path}: {reason}; choose another path.") from problem
+    finally:
+        if not done:
+            _remove_empty(missing)
+
+
+def _write(target: Path, content: bytes) -> None:
+    """Put `content` in place of a plain file, or of nothing, by a temporary file beside it, flushed."""
+    _clear_parts(target.parent, {target.name})
+    part = target.with_name(f".{target.name}.{os.urandom(8).hex()}.part")
+    _parts.add(str(part))
+    try:
+        handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        with os.fdopen(handle, "wb") as stream:
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            stream.write(content)
+            stream.flush()
+            os.fsync(handle)
+            if target.exists():
+                os.chmod(part, stat.S_IMODE(target.stat().st_mode))
+            os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
+        _parts.discard(str(part))
+    _flush(target.parent)
+
+
+def _clear_parts(folder: Path, names: Set[str]) -> None:
+    """Remove temporary files for those of the names whose writer is gone."""
+    if fcntl is None:
+        return
+    for entry in folder.iterdir():
+        match = _PART.fullmatch(entry.name)
+        if match is None or match["name"] not in names or not _is_plain_file(entry):
+            continue
+        with suppress(OSError):
+            handle = os.open(entry, os.O_RDONLY)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                entry.unlink()
+            finally:
+                os.close(handle)
+
+
+# ---- What both rest on ---------------------------------------------------------------------------------------------
+
+
+def _count() -> None:
+    global completed
+    completed += 1
+
+
+def _why(problem: OSError) -> str:
+    return _DISK.get(problem.errno or 0) or problem.strerror or str(problem)
+
+
+@contextmanager
+def _one_sentence(named: Path, target: Path, kind: DirectoryKind) -> Iterator[None]:
+    """Turn an OSError of the directory that is written to, or of those around it, into a sentence that names it."""
+    try:
+        yield
+    except (OSError, kind.error) as error:
+        problem = error if isinstance(error, OSError) else error.__cause__
+        if not isinstance(problem, OSError):
+            raise
+        where = None if problem.filename is None else Path(os.path.abspath(os.fsdecode(problem.filename)))
+        ours = where is not None and (where == target or where in target.parents or target in where.parents)
+        if problem.errno in _DISK and (ours or where is None):
+            raise kind.error(
+                f"cannot write {named}: {_why(problem)}; nothing was written, make room or name another place."
+            ) from problem
+        if not ours:
+            raise
+        in_the_way = isinstance(problem, (FileExistsError, NotADirectoryError))
+        reason = "a file is in the way" if in_the_way else _why(problem)
+        raise kind.error(f"cannot create the directory {named}: {reason}; name another place.") from problem
+
+
+def _walk(folder: Path, empty_directories: bool = False) -> list[str]:
+    """Relative paths of all files and links in a directory but for the staging; on demand, of empty directories too."""
+    found: list[str] = []
+    pending = [""]
+    while pending:
+        prefix = pending.pop()
+        with os.scandir(folder / prefix) as entries:
+            names = [(e.name, e.is_dir(follow_symlinks=False)) for e in entries if prefix or e.name != STAGING]
+        if prefix and not names and empty_directories:
+            found.append(prefix.rstrip("/"))
+        pending += [f"{prefix}{name}/" for name, is_directory in names if is_directory]
+        found += [f"{prefix}{name}" for name, is_directory in names if not is_directory]
+    return sorted(found)
+
+
+def _is_as_listed(folder: Path, name: str, files: Mapping[str, Sequence[Digest]]) -> bool:
+    """Whether a file stands where it was written, with no link on the way, and holds what the manifest says."""
+    path = folder / name
+    if not _is_reached_plainly(folder, name) or not _is_plain_file(path):
+        return False
+    size = path.lstat().st_size
+    return any(size == digest.size for digest in files[name]) and _digest(path) in files[name]
+
+
+def _parents(folder: Path, name: str) -> list[Path]:
+    """Directories between `folder` and its file `name`, the outermost first."""
+    return [folder / parent for parent in PurePosixPath(name).parents if parent != PurePosixPath()][::-1]
+
+
+def _is_reached_plainly(folder: Path, name: str) -> bool:
+    """Whether there is no link on the way."""
+    return all(parent.is_dir() and not parent.is_symlink() for parent in _parents(folder, name))
+
+
+def _make_plain_parents(folder: Path, name: str) -> None:
+    for parent in _parents(folder, name):
+        if not parent.is_dir() or parent.is_symlink():
+            parent.mkdir()  # FileExistsError if something else is there
+
+
+def _is_staging(path: Path) -> bool:
+    """Whether a directory of the staging's name is one: it holds its lock, or nothing."""
+    if path.is_symlink() or not path.is_dir():
+        return False
+    return _is_plain_file(path / _LOCK) or not any(path.iterdir())
+
+
+def _is_plain_file(path: Path) -> bool:
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except OSError:
+        return False
+
+
+def _digest(path: Path) -> Digest:
+    with path.open("rb") as stream:
+        sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        return Digest(stream.tell(), sha256)
+
+
+def _manifest(kind: DirectoryKind, files: Mapping[str, Sequence[Digest]]) -> bytes:
+    info = {"format": MANIFEST_FORMAT, "format_version": MANIFEST_VERSION, "of": kind.format, "files": files}
+    return _json(info)
+
+
+def _json(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
+
+
+def _parse_manifest(info: Any, kind: str) -> dict[str, list[Digest]]:
+    if not isinstance(info, dict) or info.get("format") != MANIFEST_FORMAT or info.get("of") != kind:
+        raise ValueError(f"it does not state the format {MANIFEST_FORMAT!r} of a {kind!r}")
+    if info.get("format_version") != MANIFEST_VERSION:
+        raise ValueError(f"expected format version {MANIFEST_VERSION}, got {str(info.get('format_version'))[:40]}")
+    return _parse_files(info["files"])
+
+
+def _parse_files(files: Any) -> dict[str, list[Digest]]:
+    parsed = {}
+    for name, digests in files.items():
+        parsed[_checked_name(name)] = [Digest(size, sha256) for size, sha256 in digests]
+        for digest in parsed[name]:
+            if type(digest.size) is not int or not re.fullmatch("[0-9a-f]{64}", digest.sha256):
+                raise ValueError(f"expected size and SHA-256 of {name[:100]!r}")
+    return parsed
+
+
+def _checked_name(name: str) -> str:
+    """`name`, a relative path that stays inside its directory; ValueError otherwise."""
+    parts = PurePosixPath(name).parts
+    plain = parts and not name.startswith("/") and ".." not in parts and PurePosixPath(name).as_posix() == name
+    if not plain or "\0" in name or parts[0] == STAGING or name == ".":
+        raise ValueError(f"expected a path inside the directory, got {name[:100]!r}")
+    return name
+
+
+def _move_to_free_place(source: Path, place: Path) -> None:
+    """Move a file to where nothing is; FileExistsError if something is there after all."""
+    try:
+        os.link(source, place, follow_symlinks=False)
+    except FileExistsError:
+        if not os.path.samefile(source, place):  # the same: killed between the two calls
+            raise
+    except OSError:  # a file system without hard links
+        if os.path.lexists(place):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(place)) from None
+        source.rename(place)
+        return
+    source.unlink()
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _flush_tree(folder: Path) -> None:
+    for directory, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            _flush(Path(directory) / name)
+        _flush(Path(directory))
+
+
+def _remove_empty(directories: Iterable[Path]) -> None:
+    """Remove those of the directories, the innermost first, that are empty."""
+    for directory in directories:
+        with suppress(OSError):  # never made, or somebody else put something there meanwhile
+            directory.rmdir()
+
+
+def _lock(staging: Path, seconds: float = 0.0) -> int | None:
+    """An open handle that holds the lock of a staging directory; None if a living process has it for so long.
+
+    FileNotFoundError if the directory goes meanwhile.
+    """
+    until = time.monotonic() + seconds
+    while True:
+        handle = os.open(staging / _LOCK, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        try:
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.stat(staging / _LOCK).st_ino == os.fstat(handle).st_ino:
+                return handle
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                os.close(handle)
+                return None
+            time.sleep(0.02)
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)  # its holder still works, or has just removed it
+
+
+def _is_claimed(target: Path) -> bool:
+    """Whether a living process writes to a directory; this looks without making anything."""
+    path = target / STAGING / _LOCK
+    if fcntl is None or not path.exists():
+        return False
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(handle)
+    return False

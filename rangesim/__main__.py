@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m rangesim`, and the script `rangesim`: signals are taken care of before anything else is imported."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Run the command line."""
+    from pcgraph.interrupts import end_on_signals
+
+    end_on_signals("rangesim", writes=bool({"run", "decode", "report"} & set(sys.argv[1:3])))
+    from rangesim.cli import main as run
+
+    run()
+
+
+if __name__ == "__main__":
+    main()

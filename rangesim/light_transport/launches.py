@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel launches of bounded time.
+
+A running kernel cannot be stopped, and Python handles a signal (Ctrl-C) only after it: so work is cut into launches of
+less than a second, and each is waited for. The time they take says where the work is cut and nothing else; all that
+is cut here has the same bytes however it is cut.
+
+Compiling a kernel is one more stretch without signals: a tenth of a second to a few seconds, once per machine.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+LAUNCH_S = 0.7
+"""What a launch should take, seconds."""
+LONGEST_S = 1.2
+"""After which a launch of a loop should end, its lanes finished or not."""
+FIRST_UNITS = 1 << 20
+"""Work of a first launch: as many turns of a loop, rays or photons."""
+STEEPEST = 8.0
+"""Growth of the work from one launch to the next, at most."""
+MOST_TURNS = 1 << 31
+"""Of a launch, so that they can be counted."""
+REPORT_S = 0.1
+"""Between two reports of progress, seconds, at least."""
+
+State = TypeVar("State")
+Report = Callable[[float], None]
+"""Called with the share done, 0..1, after each launch."""
+
+
+class Launches:
+    """Launches of one kind of work, each as large as the time of the earlier ones suggests.
+
+    units : int, the work that the next launch should do.
+    """
+
+    def __init__(self, first: int | None = None) -> None:
+        self.units = first or FIRST_UNITS
+
+    def evaluate(self, arrays: Any, units: int) -> None:
+        """Compute Dr.Jit arrays that are so many units of work, and wait for them."""
+        self.learn(units, evaluate(arrays))
+
+    def learn(self, units: int, seconds: float) -> None:
+        """Fit the next launch to the time that this one took."""
+        fits = units * LAUNCH_S / max(seconds, 1e-6)
+        if fits > self.units:
+            self.units = int(min(fits, STEEPEST * self.units))
+        elif seconds > LAUNCH_S / 2:  # a shorter launch says how long its overhead takes
+            self.units = max(1, int(fits))
+
+    def run(
+        self,
+        loop: Callable[[State, Any], tuple[State, Any]],
+        state: State,
+        lanes: int,
+        pending: Callable[[], Any] = list,
+        report: Callable[[State], None] = lambda state: None,
+    ) -> tuple[State, int]:
+        """The state of the lanes when all of them are finished, and the turns of the loop that they took together.
+
+        Parameters
+        ----------
+        loop : makes of a state and the most turns allowed (UInt32) the next state and the turns (lanes,) that were
+            taken: fewer than allowed by a lane that is finished.
+        pending : the buffers that it scatters to.
+        report : called with the state after each launch.
+        """
+        dr.make_opaque(state)  # like the state of later launches, so that they share a kernel
+        total, left = 0, True
+        while left:
+            most = min(max(1, int(self.units * LONGEST_S / LAUNCH_S) // lanes), MOST_TURNS)
+            state, taken = loop(state, dr.opaque(mi.UInt32, most))
+            seconds = evaluate([state, taken, pending()])
+            turns = taken.numpy()
+            self.learn(int(turns.sum()), seconds)
+            total += int(turns.sum())
+            left = bool((turns == most).any())
+            report(state)
+        return state, total
+
+    def ranges(
+        self, count: int, per_item: float = 1, multiple_of: int = 1, *, at_least: int = 1, at_most: int = 1 << 32
+    ) -> Iterator[tuple[int, int]]:
+        """Ranges that cut 0..count, one for each launch, where an item is so many units of work."""
+        begin = 0
+        while begin < count:
+            left = -(-(count - begin) // multiple_of)
+            most = max(1, min(max(at_least, int(self.units / per_item)), at_most) // multiple_of)
+            end = min(count, begin + -(-left // -(-left // most)) * multiple_of)  # of even size
+            yield begin, end
+            begin = end
+
+
+def evaluate(arrays: Any) -> float:
+    """Compute Dr.Jit arrays and wait for them; the seconds that the kernels took, once they were compiled."""
+    try:
+        dr.eval(arrays)  # returns when the last kernel is compiled and under way
+        start = time.perf_counter()
+    finally:
+        dr.sync_thread()  # also if a signal came: no kernel is left behind
+    return time.perf_counter() - start
+
+
+def fewest_lanes() -> int:
+    """Lanes that keep all of the device busy."""
+    return 1 << 18 if mi.variant().startswith("cuda") else max(4096, 512 * dr.thread_count())
+
+
+class Progress:
+    """Reports to a caller who may not want any, at most ten times a second; the last report is always made."""
+
+    def __init__(self, call: Report | None) -> None:
+        self.call = call
+        self.last_s = -REPORT_S
+
+    def __call__(self, share: float) -> None:
+        now = time.monotonic()
+        if self.call is not None and (share >= 1 or now - self.last_s >= REPORT_S):
+            self.last_s = now
+            self.call(share)

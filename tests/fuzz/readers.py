@@ -1,0 +1,439 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The readers that are fuzzed. One entry declares one: what it is called with, its seeds, and what is made by hand."""
+
+from __future__ import annotations
+
+import fnmatch
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from fuzz import hostile, seeds
+from fuzz.cloud_files import lies
+from fuzz.hostile import Made
+from fuzz.inputs import Input
+from fuzz.mutation import MAX_BYTES, mutate, mutate_arguments
+
+Arguments = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A function that reads what may come from anywhere.
+
+    Parameters
+    ----------
+    name : names it in tables, and its directory in the corpus.
+    read : called with the path of the input and its arguments; for a command, its entry point `main`.
+    seeds : makes valid inputs by name.
+    targets : patterns of the files that are mutated.
+    by_hand : makes hostile inputs of a seed and one of its targets.
+    share : tries of this reader for each try of a cheap one.
+    command : name of the program if `read` is a command line, which ends in exit status 0, 1 and a line, or 2.
+    refuses : names of the exceptions by which it refuses; not subclasses of ValueError, for those have escaped.
+    check : looks at what `read` returned; an AssertionError is a failure.
+    names_file : whether a refusal must name the file.
+    may_write : patterns of paths that it may leave in the folder of the input.
+    mutates_arguments : whether it is the command line that is mutated, not files.
+    """
+
+    name: str
+    read: Callable[[Path, Arguments], Any]
+    seeds: Callable[[], seeds.Seeds]
+    targets: tuple[str, ...] = ("*",)
+    by_hand: tuple[Callable[[Input, str], Made], ...] = ()
+    share: float = 1.0
+    command: str = ""
+    refuses: tuple[str, ...] = ("ValueError", "FileFormatError")
+    check: Callable[[Any], None] = field(default=lambda result: None)
+    names_file: bool = True
+    may_write: tuple[str, ...] = ()
+    mutates_arguments: bool = False
+
+    def made_by_hand(self, known: Mapping[str, Input]) -> Made:
+        """Hostile inputs by name: the seeds themselves, those of any file, those of this kind."""
+        made: Made = {f"seed {name}": partial(_itself, seed) for name, seed in known.items()}
+        if self.mutates_arguments:
+            return made
+        first = next(iter(known.values()))
+        suffixes: dict[str, str] = {}
+        for target in self.targets_of(first):
+            suffixes.setdefault(target.rpartition(".")[2], target)
+        for target in suffixes.values():
+            made |= hostile.any_file(first, target)
+            for by_hand in self.by_hand:
+                made |= by_hand(first, target)
+        return made | hostile.any_name(first)
+
+    def targets_of(self, one: Input) -> list[str]:
+        """Files of an input that are mutated."""
+        return [n for n in one.files if any(fnmatch.fnmatch(n, t) for t in self.targets)]
+
+
+class Cases:
+    """The inputs of one reader by number: those made by hand come first."""
+
+    def __init__(self, reader: Reader, known: Mapping[str, Input]) -> None:
+        self.reader = reader
+        self.seeds = known
+        self.by_hand = reader.made_by_hand(known)
+        self._makers = list(self.by_hand.values())
+
+    def __call__(self, seed: int, number: int) -> Input:
+        """Input `number` of the stream `seed`; always the same bytes."""
+        if number < len(self._makers):
+            return self._makers[number]()
+        rng = Random(zlib.crc32(f"{self.reader.name} {seed} {number}".encode()))
+        one = self.seeds[rng.choice(list(self.seeds))]
+        if self.reader.mutates_arguments:
+            return Input(one.files, one.entry, mutate_arguments(one.arguments, rng))
+        for _ in range(rng.choice((1, 1, 1, 1, 2, 3))):
+            target = rng.choice(self.reader.targets_of(one))
+            content = one.files[target]
+            assert isinstance(content, bytes)
+            if len(content) < MAX_BYTES:
+                one = one.with_file(target, mutate(target, content, rng))
+        return one
+
+    def name(self, number: int) -> str:
+        """What a case is called: what was made by hand has a name."""
+        names = list(self.by_hand)
+        return names[number] if number < len(names) else f"case {number}"
+
+
+def _itself(one: Input) -> Input:
+    return one
+
+
+# --- what they are called with ----------------------------------------------------------------------------------------
+
+
+def _cloud(path: Path, _: Arguments) -> Any:
+    import pcgraph
+
+    return pcgraph.read_cloud(path)
+
+
+def _edge_model(path: Path, _: Arguments) -> Any:
+    from pcgraph.tree.edge_model import EdgeModel
+
+    return EdgeModel.load(path)
+
+
+def _scene(path: Path, _: Arguments) -> Any:
+    import rangesim
+
+    return rangesim.load_scene(path)
+
+
+def _image(path: Path, _: Arguments) -> Any:
+    from rangesim.image_files import read_grey
+
+    return read_grey(path)
+
+
+def _image_folder(path: Path, _: Arguments) -> Any:
+    import rangesim
+
+    return rangesim.import_capture(path, rangesim.StructuredLight(8, 8, code="gray", axes=("columns", "rows")))
+
+
+def _capture(path: Path, _: Arguments) -> Any:
+    import rangesim
+
+    return rangesim.load_capture(path)
+
+
+def _decoded(path: Path, _: Arguments) -> Any:
+    import rangesim
+
+    return rangesim.decode(rangesim.load_capture(path))
+
+
+def _experiment(path: Path, _: Arguments) -> Any:
+    from rangesim.experiment import load_experiment
+
+    return load_experiment(path)
+
+
+def _calibration(path: Path, _: Arguments) -> Any:
+    import rangesim
+
+    return rangesim.load_calibration(path, (32, 48) if path.suffix == ".xml" else None)
+
+
+def _result(path: Path, _: Arguments) -> Any:
+    from rangesim.result_files import load_result
+
+    return load_result(path)
+
+
+def _rangesim(path: Path, arguments: Arguments) -> Any:
+    from rangesim.cli import main
+
+    return main()
+
+
+def _pcgraph(path: Path, arguments: Arguments) -> Any:
+    from pcgraph.cli import main
+
+    return main()
+
+
+# --- what must hold of what they return -------------------------------------------------------------------------------
+
+
+def _arrays_agree(cloud: Any) -> None:
+    import numpy as np
+
+    shape = cloud.points.shape[:-1]
+    assert cloud.points.dtype in (np.float32, np.float64)
+    assert cloud.points.shape == (*shape, 3)
+    assert len(shape) in (1, 2)
+    if cloud.colors is not None:
+        assert (cloud.colors.dtype, cloud.colors.shape) == (np.uint8, (*shape, 3))
+    if cloud.normals is not None:
+        assert cloud.normals.shape == (*shape, 3)
+    if cloud.labels is not None:
+        assert (cloud.labels.dtype, cloud.labels.shape) == (np.int32, shape)
+    if cloud.viewpoint is not None:
+        assert np.isfinite(cloud.viewpoint).all()
+
+
+def _is_grey(image: Any) -> None:
+    assert image.ndim == 2
+    assert image.dtype.name in ("uint8", "uint16", "float32")
+
+
+def _has_a_camera(scene: Any) -> None:
+    import numpy as np
+
+    assert scene.instances
+    assert np.isfinite(scene.T_world_camera).all()
+    assert 0 < scene.working_distance_m < np.inf
+
+
+def _rig_is_finite(rig: Any) -> None:
+    import numpy as np
+
+    assert np.isfinite(rig.T_camera_projector).all()
+    assert np.isfinite(rig.camera.directions([0.5, 0.5])[..., 2]).all()
+
+
+# --- the list ---------------------------------------------------------------------------------------------------------
+
+
+def _lies(kind: str) -> Callable[[Input, str], Made]:
+    def made(seed: Input, target: str) -> Made:
+        return {name: partial(seed.with_file, target, content) for name, content in lies() if name.startswith(kind)}
+
+    return made
+
+
+def _sidecar_trees(seed: Input, target: str) -> Made:
+    return hostile.json_trees(seed, target) if target.endswith(".json") else {}
+
+
+def _settings_to_run(seed: Input, target: str) -> Made:
+    """Settings that can be run soon, or must be refused."""
+    return {n: make for n, make in hostile.toml_files(seed, target).items() if n != "2000 instruments"}
+
+
+def _by_suffix(seed: Input, target: str) -> Made:
+    """What is made by hand of a file in a result, by its suffix; of one file of each kind."""
+    if target.endswith(".json"):
+        return hostile.json_trees(seed, target)
+    if target.endswith(".npz"):
+        return hostile.npz_files(seed, target)
+    return hostile.images(seed, target) if target.endswith(".png") else {}
+
+
+def _with_arguments(make: Callable[[], seeds.Seeds], *lines: str) -> Callable[[], seeds.Seeds]:
+    """Seeds called with command lines."""
+
+    def called() -> seeds.Seeds:
+        return {
+            f"{name}, {line}": Input(one.files, one.entry, tuple(line.split()))
+            for name, one in make().items()
+            for line in lines
+        }
+
+    return called
+
+
+def _beside_a_plane() -> seeds.Seeds:
+    """A scene of a plane, to be run."""
+    return {"plane": seeds.of_file("plane.xml", (seeds.SCENES / "plane.xml").read_bytes())}
+
+
+def _small_experiment() -> seeds.Seeds:
+    """An experiment on a plane, to be run; its command line makes it small."""
+    plane = (seeds.SCENES / "plane.xml").read_bytes()
+    text = b"""scene = "plane.xml"
+seed = 1
+max_depth = 3
+[[instrument]]
+name = "gray"
+[instrument.sensor]
+type = "structured-light"
+projector_width = 32
+projector_height = 24
+code = "gray-phase"
+period_px = 8.0
+steps = 4
+[[instrument]]
+name = "spad"
+power_w = 0.5
+[instrument.sensor]
+type = "direct-tof"
+bins = 64
+bin_s = 400e-12
+pulse_fwhm_s = 1e-9
+[[instrument]]
+name = "amcw"
+baseline_m = 0.03
+[instrument.sensor]
+type = "amcw-tof"
+modulation_hz = [20e6, 100e6]
+"""
+    return {"small": seeds.of_file("experiment.toml", text, **{"plane.xml": plane})}
+
+
+def _calibrated_captures() -> seeds.Seeds:
+    """A capture, and calibrations beside it."""
+    capture = seeds.captures()["lines"]
+    others = {"rig.json": seeds.rig_files()["pinhole"].files["rig.json"]}
+    others |= {"calibration.xml": seeds.opencv_files()["procam"].files["calibration.xml"]}
+    return {"capture": Input({**capture.files, **others}, "capture")}
+
+
+def _bare_images() -> seeds.Seeds:
+    """A folder of bare images."""
+    return {"images": seeds.image_folders()["png"]}
+
+
+def _one_cloud() -> seeds.Seeds:
+    """A cloud of a plane and a box."""
+    import numpy as np
+
+    from pcgraph.io.ply import encode_ply
+
+    x, y = np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 30))
+    z = np.where((x > 0.4) & (y > 0.4), 0.8, 1.0)
+    columns = {"x": x.ravel(), "y": y.ravel(), "z": z.ravel()}
+    return {"box": seeds.of_file("cloud.ply", encode_ply(columns))}
+
+
+_RESULT_PARTS = {
+    "settings": ("result/experiment.json", "result/*manifest*"),
+    "passes": ("result/pass_*.npz",),
+    "range": ("result/*/range.npz",),
+    "causes": ("result/*/causes.npz",),
+    "segmentation": ("result/*/segmentation.npz",),
+    "tables": ("result/*/comparison.json", "result/*/measurement.json"),
+    "captures": ("result/*/capture/*",),
+}
+_CLOUD = ("CloudReadError",)
+_IMAGES = {"png": "png", "tif": "tiff", "bmp": "bmp", "jpg": "jpeg", "pgm": "pgm"}
+_RUN = "run {entry} --out {out} --width 16 --height 12 --spp 1 --photons 1000"
+_DECODE = "decode {entry} --out {out} --code gray --projector 8x8 --axes columns,rows --bits 8"
+_MORE = "--sensor ideal-tof --seed 1 --baseline 0.2 --max-depth 3"
+_PLAIN = "decode {entry} --out {out}"
+_CALIBRATED = "decode {entry} --out {out} --calibration"
+
+READERS = {
+    reader.name: reader
+    for reader in (
+        *(
+            Reader(
+                suffix, _cloud, partial(seeds.cloud_files, suffix), by_hand=(_lies(suffix),), refuses=_CLOUD,
+                check=_arrays_agree,
+            )
+            for suffix in ("ply", "pcd")
+        ),
+        Reader(
+            "edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,),
+            refuses=("ValueError", *_CLOUD),
+        ),
+        *(
+            Reader(
+                f"mesh-{suffix}", _scene, partial(seeds.mesh_files, suffix), by_hand=(hostile.meshes,), share=0.5,
+                check=_has_a_camera,
+            )
+            for suffix in ("ply", "obj", "stl", "off", "glb", "gltf")
+        ),
+        Reader(
+            "scene", _scene, seeds.scene_files, ("*.xml", "*.png", "*.ply", "*.obj"), (hostile.xml_files,), share=0.5,
+            check=_has_a_camera,
+        ),
+        *(
+            Reader(name, _image, partial(seeds.image_files, suffix), by_hand=(hostile.images,), check=_is_grey)
+            for suffix, name in _IMAGES.items()
+        ),
+        Reader("exr", _image, partial(seeds.image_files, "exr"), by_hand=(hostile.exr_files,), check=_is_grey),
+        Reader("image-folder", _image_folder, seeds.image_folders, share=0.5),
+        Reader("capture", _capture, seeds.captures, ("*.json", "*.json", "*/00*.*"), (_sidecar_trees,)),
+        Reader("capture-decoded", _decoded, seeds.captures, ("*.json",), (_sidecar_trees,), share=0.5),
+        Reader("experiment", _experiment, seeds.experiments, by_hand=(hostile.toml_files,)),
+        Reader("calibration-json", _calibration, seeds.rig_files, by_hand=(hostile.json_trees,), check=_rig_is_finite),
+        Reader(
+            "calibration-xml", _calibration, seeds.opencv_files, by_hand=(hostile.opencv_calibrations,),
+            check=_rig_is_finite,
+        ),
+        *(
+            Reader(f"result-{part}", _result, seeds.results, targets, (_by_suffix,), share=0.3)
+            for part, targets in _RESULT_PARTS.items()
+        ),
+        Reader(
+            "report", _rangesim, _with_arguments(seeds.results, "report {entry}"),
+            ("result/*.json", "result/*.npz", "result/*/capture/00*"), (_by_suffix,), share=0.2, command="rangesim",
+            may_write=("result/report.html",),
+        ),
+        Reader(
+            "compare", _rangesim, _with_arguments(seeds.results, "compare {entry}"),
+            ("result/experiment.json", "result/*/comparison.json"), (_by_suffix,), share=0.2, command="rangesim",
+        ),
+        Reader(
+            "decode", _rangesim,
+            _with_arguments(
+                _calibrated_captures, f"{_CALIBRATED} rig.json", f"{_CALIBRATED} calibration.xml", _PLAIN
+            ),
+            ("*.json", "*.xml", "*/00*.png"), share=0.2, command="rangesim", may_write=("out*",),
+        ),
+        Reader(
+            "run-experiment", _rangesim, _with_arguments(_small_experiment, f"run --config {_RUN[4:]}"), ("*.toml",),
+            (_settings_to_run,), share=0.05, command="rangesim", may_write=("out*",),
+        ),
+        Reader(
+            "options-decode", _rangesim, _with_arguments(_bare_images, _DECODE), share=0.2, command="rangesim",
+            names_file=False, may_write=("*",), mutates_arguments=True,
+        ),
+        Reader(
+            "options-run", _rangesim, _with_arguments(_beside_a_plane, f"{_RUN} --sensor gray", f"{_RUN} {_MORE}"),
+            share=0.05, command="rangesim", names_file=False, may_write=("*",), mutates_arguments=True,
+        ),
+        Reader(
+            "options-segment", _pcgraph,
+            _with_arguments(
+                _one_cloud,
+                "segment {entry} --out {out} --voxel-size 0.05 --seed-size 0.3 --objects 2 --viewpoint 0 0 0",
+                "segment {entry} --out {out} --method vccs --range-growth 0.5 --voxel-size 0.05",
+            ),
+            share=0.1, command="pcgraph", names_file=False, may_write=("*",), mutates_arguments=True,
+        ),
+    )
+}  # fmt: skip
+
+
+def _execute(path: Path, _: Arguments) -> None:
+    _KEPT["path"] = path
+    exec(path.read_text(), _KEPT)
+
+
+_KEPT: dict[str, Any] = {}
+SELF_TEST = Reader("self-test", _execute, lambda: {"pass": seeds.of_file("code.py", b"pass")})
+"""Not a reader: runs a Python file, so that tests of the harness can be as broken as a reader may be."""

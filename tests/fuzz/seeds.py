@@ -1,0 +1,367 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Valid small files, made by the package's own writers where it has them; the same ones at every call."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from fuzz.inputs import Input
+
+Seeds = dict[str, Input]
+ROOT = Path(__file__).resolve().parents[2]
+SCENES = ROOT / "scenes"
+
+
+def of_file(name: str, content: bytes, **others: bytes) -> Input:
+    """Input of one file, and what it refers to."""
+    return Input({name: content, **others}, name)
+
+
+def written(name: str, write: Callable[[Path], object]) -> bytes:
+    """Bytes of what a writer writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        write(path)
+        return path.read_bytes()
+
+
+def directory(folder: Path, under: str) -> dict[str, bytes]:
+    """All files of a directory, by their path below `under`."""
+    paths = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {f"{under}/{p.relative_to(folder).as_posix()}": p.read_bytes() for p in paths}
+
+
+# --- results and captures ---------------------------------------------------------------------------------------------
+
+
+@cache
+def result_files() -> dict[str, bytes]:
+    """Files of a small result, under `result/`: structured light and an ideal ranger before a plane."""
+    from rangesim.experiment import Experiment
+    from rangesim.instrument import Instrument
+    from rangesim.pipeline import run
+    from rangesim.sensors import AmcwToF, IdealToF, StructuredLight
+
+    instruments = (
+        Instrument("lines", StructuredLight(32, 24, period_px=8)),
+        Instrument("amcw", AmcwToF()),
+        Instrument("ideal", IdealToF()),
+    )
+    experiment = Experiment(
+        str(SCENES / "plane.xml"), width=32, height=24, spp=1, photons=1000, instruments=instruments
+    )
+    with tempfile.TemporaryDirectory() as folder, mock.patch("time.monotonic", itertools.count(0.0, 0.01).__next__):
+        run(experiment, Path(folder) / "result")  # times of a clock of our own: the same bytes at every call
+        return directory(Path(folder) / "result", "result")
+
+
+def results() -> Seeds:
+    """A result directory."""
+    return {"result": Input(result_files(), "result")}
+
+
+def captures() -> Seeds:
+    """Capture directories: digital numbers in PNG, radiance in EXR."""
+    seeds: Seeds = {}
+    for name in ("lines", "amcw", "ideal"):
+        start = f"result/{name}/capture/"
+        files = {f"capture/{p.removeprefix(start)}": c for p, c in result_files().items() if p.startswith(start)}
+        seeds[name] = Input(files, "capture")
+    return seeds
+
+
+def experiments() -> Seeds:
+    """Experiment files: the examples, and one with every kind of sensor."""
+    seeds = {p.stem: of_file("experiment.toml", p.read_bytes()) for p in sorted((ROOT / "examples").glob("*.toml"))}
+    every = """scene = "plane.xml"
+width = 16
+height = 12
+spp = 2
+photons = 1000
+[ambient]
+illuminant = "sun"
+illuminance_lux = 50e3
+scene_irradiance_w_m2 = 0.94
+[[instrument]]
+name = "gray"
+baseline_m = 0.2
+exposure_s = 0.005
+[instrument.sensor]
+type = "structured-light"
+projector_width = 64
+projector_height = 48
+code = "gray"
+axes = ["columns", "rows"]
+[instrument.optics]
+camera_focus_m = 1.0
+[[instrument]]
+name = "spad"
+power_w = 0.5
+[instrument.sensor]
+type = "direct-tof"
+bins = 64
+bin_s = 400e-12
+pulse_fwhm_s = 1e-9
+[[instrument]]
+name = "amcw"
+[instrument.sensor]
+type = "amcw-tof"
+modulation_hz = [20e6, 100e6]
+[[instrument]]
+name = "ideal"
+sensor = "ideal-tof"
+"""
+    return seeds | {"every sensor": of_file("experiment.toml", every.encode())}
+
+
+# --- calibrations and models ------------------------------------------------------------------------------------------
+
+
+def rig_files() -> Seeds:
+    """Calibrations as JSON."""
+    from synthetic import stereo_rig
+
+    from rangesim.calibration_files import save_calibration
+    from rangesim.rig import Intrinsics
+
+    seeds = {}
+    projector = Intrinsics.from_fov(32, 24, 60)
+    lens = Intrinsics(32, 24, 30.0, 31.0, 16.0, 12.0, (-0.1, 0.01, 1e-3, 1e-3, 0.0))
+    rigs = {
+        "pinhole": stereo_rig(32, 24, projector=projector),
+        "lens": stereo_rig(32, 24, projector=projector, camera=lens),
+    }
+    for name, rig in rigs.items():
+        seeds[name] = of_file("rig.json", written("rig.json", lambda path, rig=rig: save_calibration(rig, path)))  # type: ignore[misc]
+    return seeds
+
+
+def opencv_files() -> Seeds:
+    """A calibration as procam-calibration writes it."""
+    matrices = {
+        "img_shape": ("24 32", 2, 1), "rms": ("0.3", 1, 1), "cam_int": ("30. 0. 16. 0. 31. 12. 0. 0. 1.", 3, 3),
+        "cam_dist": ("-0.1 0.01 1e-3 1e-3 0.", 1, 5), "proj_int": ("40. 0. 16. 0. 40. 24. 0. 0. 1.", 3, 3),
+        "proj_dist": ("0. 0. 0. 0. 0.", 1, 5), "roration": ("1. 0. 0. 0. 1. 0. 0. 0. 1.", 3, 3),
+        "translation": ("-200. 0. 0.", 3, 1),
+    }  # fmt: skip
+    body = "".join(
+        f'<{name} type_id="opencv-matrix">\n  <rows>{rows}</rows>\n  <cols>{columns}</cols>\n  <dt>d</dt>\n'
+        f"  <data>\n    {values}</data></{name}>\n"
+        for name, (values, rows, columns) in matrices.items()
+    )
+    text = f'<?xml version="1.0"?>\n<opencv_storage>\n{body}</opencv_storage>\n'
+    return {"procam": of_file("calibration.xml", text.encode())}
+
+
+def edge_models() -> Seeds:
+    """A model of edges as `EdgeModel.save` writes it."""
+    from pcgraph.tree.edge_model import EdgeModel
+
+    model = EdgeModel(("concavity", "normal_angle"), (0.1, 0.2), (1.0, 0.5), (2.0, 3.0), -1.0, 0.5)
+    return {"model": of_file("model.json", written("model.json", model.save))}
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+
+def image_files(suffix: str) -> Seeds:
+    """Images of all kinds that `rangesim.image_files` reads under this suffix, 24 x 16 pixels."""
+    from PIL import Image
+
+    from rangesim.image_files import write_grey
+
+    rng = np.random.default_rng(1)
+    eight = rng.integers(0, 255, (16, 24), dtype=np.uint8)
+    sixteen = rng.integers(0, 65535, (16, 24), dtype=np.uint16)
+    color = rng.integers(0, 255, (16, 24, 3), dtype=np.uint8)
+    name = f"image.{suffix}"
+    if suffix == "exr":
+        radiance = rng.random((16, 24)).astype(np.float32)
+        return {"grey": of_file(name, written(name, lambda path: write_grey(path, radiance)))} | _color_exr(radiance)
+
+    def saved(image: Image.Image, **options: object) -> Input:
+        return of_file(name, written(name, lambda path: image.save(path, **options)))
+
+    seeds = {"grey": saved(Image.fromarray(eight)), "color": saved(Image.fromarray(color))}
+    if suffix == "png":
+        seeds["own"] = of_file(name, written(name, lambda path: write_grey(path, sixteen)))
+        seeds["bits"] = saved(Image.fromarray(eight).convert("1"))
+        seeds["palette"] = saved(Image.fromarray(color).quantize(16))
+        seeds["alpha"] = saved(Image.fromarray(color).convert("RGBA"))
+    if suffix == "tif":
+        seeds["16 bits"] = saved(Image.fromarray(sixteen))
+        seeds["float"] = saved(Image.fromarray(eight.astype(np.float32)))
+        seeds["32 bits"] = saved(Image.fromarray(eight.astype(np.int32)))
+        for compression in ("tiff_lzw", "tiff_adobe_deflate", "packbits", "jpeg"):
+            seeds[compression] = saved(Image.fromarray(eight), compression=compression)
+    if suffix == "jpg":
+        seeds["progressive"] = saved(Image.fromarray(color), progressive=True)
+        seeds["cmyk"] = saved(Image.fromarray(color).convert("CMYK"))
+    if suffix == "bmp":
+        seeds["bits"] = saved(Image.fromarray(eight).convert("1"))
+    if suffix == "pgm":
+        seeds["16 bits"] = saved(Image.fromarray(sixteen))
+        text = "P2\n# made by hand\n4 3 255\n0 1 2 3\n4 5 6 7\n8 9 10 255\n"
+        seeds["text"] = of_file(name, text.encode())
+    return seeds
+
+
+def _color_exr(radiance: np.ndarray) -> Seeds:
+    import OpenEXR
+
+    seeds = {}
+    for compression in ("NO", "RLE", "ZIP", "PIZ", "PXR24", "B44", "DWAA"):
+        header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage}
+        channels = {c: radiance.astype(np.float16) for c in "RGB"}
+        content = written("image.exr", lambda path, h=header, c=channels: OpenEXR.File(h, c).write(str(path)))  # type: ignore[misc]
+        seeds[compression] = of_file("image.exr", content)
+    return seeds
+
+
+def image_folders() -> Seeds:
+    """Folders of bare images of a Gray code, in several formats."""
+    from PIL import Image
+
+    rng = np.random.default_rng(2)
+    seeds = {}
+    for suffix in ("png", "tif", "jpg", "bmp"):
+        files = {}
+        for i in range(BARE_FRAMES):
+            image = Image.fromarray(rng.integers(0, 255, (6, 8), dtype=np.uint8))
+            files[f"images/{i:02d}.{suffix}"] = written(f"x.{suffix}", image.save)
+        seeds[suffix] = Input(files, "images")
+    return seeds
+
+
+BARE_FRAMES = 14
+"""Of a Gray code of 8 x 8 projector pixels along columns and rows: 3 bits and inverses twice, white and black."""
+
+
+# --- clouds and meshes ------------------------------------------------------------------------------------------------
+
+
+def cloud_files(suffix: str) -> Seeds:
+    """Clouds of all codings, by hand and by the package's writers."""
+    from fuzz.cloud_files import CORPUS
+    from pcgraph.io.ply import encode_ply
+    from rangesim.point_cloud import PointCloud
+    from rangesim.point_cloud_files import save_point_cloud
+
+    name = f"cloud.{suffix}"
+    seeds = {key: of_file(name, content) for key, content in CORPUS.items() if key.startswith(suffix)}
+    rng = np.random.default_rng(4)
+    points = rng.random((3, 4, 3)).astype(np.float32)
+    cloud = PointCloud(points, normals=points, colors=np.zeros((3, 4, 3), dtype=np.uint8))
+    seeds["rangesim"] = of_file(name, written(name, lambda path: save_point_cloud(cloud, path)))
+    if suffix == "ply":
+        columns = {axis: rng.random(20) for axis in "xyz"} | {"labels": np.arange(20, dtype=np.int32)}
+        seeds["pcgraph"] = of_file(name, encode_ply(columns))
+    return seeds
+
+
+def mesh_files(suffix: str) -> Seeds:
+    """Meshes: a box, with normals and colours where the format has them."""
+    import trimesh
+
+    name = f"mesh.{suffix}"
+    box = trimesh.creation.box((1, 2, 3))
+    if suffix == "gltf":
+        parts = dict(box.export(file_type="gltf"))
+        main = parts.pop("model.gltf")
+        return {"box": Input({name: main, **parts}, name)}
+
+    def exported(kind: str, mesh: trimesh.Trimesh = box) -> Input:
+        content = mesh.export(file_type=kind)
+        return of_file(name, content.encode() if isinstance(content, str) else content)
+
+    seeds = {"box": exported(suffix)}
+    if suffix == "ply":
+        seeds["text"] = of_file(name, trimesh.exchange.ply.export_ply(box, encoding="ascii"))
+    if suffix == "stl":
+        seeds["text"] = exported("stl_ascii")
+    if suffix == "obj":
+        text = b"mtllib mesh.mtl\no a\nv 0 0 0\nv 1 0 0 1\nv 1 1 0 0.5 0.5 0.5\nv 0 1 1\nvt 0 0\nvt 1 0\nvn 0 0 1\n"
+        text += b"usemtl red\ns off\nf 1/1/1 2/2/1 3/1/1 4/2/1\ng b\nf -1 -2 -3\nl 1 2\n"
+        library = b"newmtl red\nKd 1 0 0\nmap_Kd texture.png\n"
+        seeds["materials"] = Input({name: text, "mesh.mtl": library, "texture.png": _texture()}, name)
+    if suffix == "glb":
+        colored = trimesh.creation.icosphere(subdivisions=1)
+        colored.visual.vertex_colors = np.full((len(colored.vertices), 4), 100, dtype=np.uint8)
+        seeds["colors"] = exported("glb", colored)
+        seeds["scene"] = of_file(name, trimesh.Scene([box, colored]).export(file_type="glb"))
+    return seeds
+
+
+def _texture() -> bytes:
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+_CAMERA = """<sensor type="perspective"><float name="fov" value="40"/>
+    <transform name="to_world"><lookat origin="0,-3,0" target="0,0,0" up="0,0,1"/></transform>
+    <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/></film></sensor>"""
+
+_RICH = f"""<?xml version="1.0" encoding="utf-8"?>
+<scene version="3.0.0">
+<default name="bright" value="0.5"/>
+{_CAMERA}
+<include filename="materials/silver.xml"/>
+<include filename="more.xml"/>
+<bsdf type="twosided" id="paint"><bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.2, 0.1"/></bsdf></bsdf>
+<bsdf type="diffuse" id="printed"><texture type="bitmap" name="reflectance">
+    <string name="filename" value="texture.png"/><boolean name="raw" value="true"/></texture></bsdf>
+<shape type="sphere" id="ball"><point name="center" x="0" y="0.5" z="0.2"/><float name="radius" value="0.3"/>
+    <ref id="paint"/></shape>
+<shape type="rectangle" id="wall"><transform name="to_world"><scale value="2"/><rotate x="1" angle="90"/>
+    <translate y="1"/></transform><ref id="printed"/><string name="material_class" value="matte"/></shape>
+<shape type="ply" id="box"><string name="filename" value="box.ply"/><transform name="to_world"><matrix
+    value="0.1 0 0 0 0 0.1 0 0 0 0 0.1 0 0 0 0 1"/></transform>
+    <bsdf type="roughconductor"><spectrum name="eta" value="2.9"/><spectrum name="k" value="3.3"/>
+    <float name="alpha" value="0.25"/></bsdf></shape>
+<shape type="obj" id="triangle"><string name="filename" value="triangle.obj"/>
+    <bsdf type="dielectric"><string name="int_ior" value="bk7"/></bsdf></shape>
+<shape type="cube" id="wax"><transform name="to_world"><scale value="0.1"/></transform><bsdf type="null"/>
+    <medium type="homogeneous" name="interior"><rgb name="albedo" value="0.9,0.9,0.9"/>
+    <float name="sigma_t" value="100"/><phase type="hg"><float name="g" value="0.8"/></phase></medium></shape>
+<shape type="disk" id="sign"><bsdf type="retroreflector"><bsdf type="diffuse"/></bsdf></shape>
+<emitter type="constant"><spectrum name="radiance" value="$bright"/></emitter>
+<emitter type="point"><point name="position" x="0" y="-1" z="1"/><rgb name="intensity" value="1"/></emitter>
+</scene>
+"""
+
+_MORE = """<scene version="3.0.0"><bsdf type="roughplastic" id="plastic"><float name="alpha" value="0.1"/>
+<spectrum name="diffuse_reflectance" value="400:0.2, 700:0.6"/></bsdf>
+<shape type="cylinder" id="can"><point name="p0" x="0.3" y="0" z="0"/><point name="p1" x="0.3" y="0" z="0.2"/>
+<float name="radius" value="0.05"/><ref id="plastic"/></shape></scene>
+"""
+
+
+def scene_files() -> Seeds:
+    """Scenes: a plain one, one with everything a scene may refer to, and shipped ones."""
+    import trimesh
+
+    plain = f"""<scene version="3.0.0">{_CAMERA}
+<shape type="rectangle" id="wall"><transform name="to_world"><rotate x="1" angle="90"/></transform>
+<bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf></bsdf></shape></scene>"""
+    others = {
+        "more.xml": _MORE.encode(),
+        "texture.png": _texture(),
+        "box.ply": trimesh.creation.box((1, 1, 1)).export(file_type="ply"),
+        "triangle.obj": b"v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n",
+    }
+    shipped = {name: of_file("scene.xml", (SCENES / f"{name}.xml").read_bytes()) for name in ("matte", "cornell")}
+    rich = Input({"scene.xml": _RICH.encode(), **others}, "scene.xml")
+    return {"plain": of_file("scene.xml", plain.encode()), "rich": rich, "rich again": rich, **shipped}

@@ -1,0 +1,522 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No file of the user's is ever lost, and output is whole or not there: the laws of `pcgraph.output`."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pcgraph import output
+from pcgraph.output import (
+    MANIFEST,
+    STAGING,
+    DirectoryKind,
+    check_directory,
+    new_directory,
+    recover,
+    replace_listed_file,
+    verify_directory,
+    write_file,
+)
+
+
+class Refused(Exception):
+    """Of the kind below."""
+
+
+KIND = DirectoryKind("test-kind", "sidecar.json", Refused)
+OTHER = DirectoryKind("another-kind", "sidecar.json", Refused)
+
+OLD = {"a.txt": "old a", "deep/b.txt": "old b", "gone/c.txt": "old c"}
+NEW = {"a.txt": "new a", "deep/b.txt": "new b", "fresh/d.txt": "new d"}
+MINE = {"NOTES.md": "mine", "mydata/x.csv": "1,2", "deep/mine.txt": "mine too"}
+
+
+def write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def publish(target: Path, files: dict[str, str], kind: DirectoryKind = KIND) -> None:
+    with new_directory(target, kind) as folder:
+        write(folder, {"sidecar.json": json.dumps({"format": kind.format}), **files})
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """What is there, the bookkeeping left out."""
+    found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file() or p.is_symlink()}
+    return {name: p.read_text() for name, p in found.items() if name not in (MANIFEST, "sidecar.json")}
+
+
+def is_whole(folder: Path) -> bool:
+    found = verify_directory(folder, KIND)
+    return not found.missing and not found.changed
+
+
+# ---- What is the user's stays ---------------------------------------------------------------------------------------
+
+
+def test_a_result_is_replaced_and_the_users_files_stay(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+    write(tmp_path / "n", MINE)
+    (tmp_path / "n" / "empty").mkdir()
+    (tmp_path / "n" / "link").symlink_to("/nowhere")
+    before = {name: (tmp_path / "n" / name).stat() for name in MINE}
+    publish(tmp_path / "n", NEW)
+    assert (
+        contents(tmp_path / "n").items() >= {**NEW, **MINE}.items()
+        if not (tmp_path / "n" / "link").is_symlink()
+        else True
+    )
+    (tmp_path / "n" / "link").unlink()
+    assert contents(tmp_path / "n") == {**NEW, **MINE}
+    assert (tmp_path / "n" / "empty").is_dir()
+    assert not (tmp_path / "n" / "gone").exists()
+    for name, stat in before.items():  # not even touched
+        now = (tmp_path / "n" / name).stat()
+        assert (now.st_ino, now.st_mtime_ns, now.st_ctime_ns) == (stat.st_ino, stat.st_mtime_ns, stat.st_ctime_ns)
+    assert verify_directory(tmp_path / "n", KIND).foreign == ("NOTES.md", "deep/mine.txt", "empty", "mydata/x.csv")
+
+
+def test_what_appears_while_the_work_goes_on_stays(tmp_path: Path) -> None:
+    for name in ("new", "empty", "old"):
+        target = tmp_path / name
+        if name == "empty":
+            target.mkdir()
+        if name == "old":
+            publish(target, OLD)
+        with new_directory(target, KIND) as folder:
+            write(folder, NEW)
+            write(target, MINE)
+        assert contents(target) == {**NEW, **MINE}, name
+
+
+@pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
+def test_what_appeared_stays_when_the_work_fails(tmp_path: Path, failure: type[BaseException]) -> None:
+    def fail(target: Path) -> None:
+        with new_directory(target, KIND) as folder:
+            write(folder, NEW)
+            write(target, MINE)
+            raise failure
+
+    with pytest.raises(failure):
+        fail(tmp_path / "n")
+    assert contents(tmp_path / "n") == MINE
+    assert not (tmp_path / "n" / STAGING).exists()
+
+
+def test_a_file_in_the_way_is_left_and_the_new_result_is_kept_beside_it(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+
+    def collide(name: str, text: str) -> None:
+        with new_directory(tmp_path / "n", KIND) as folder:
+            write(folder, NEW)
+            (tmp_path / "n" / name).parent.mkdir(exist_ok=True)
+            (tmp_path / "n" / name).write_text(text)
+
+    with pytest.raises(Refused, match=r"a\.txt came or was changed .* the new result is in .*test-kind-2"):
+        collide("a.txt", "edited by hand")
+    assert contents(tmp_path / "n") == {
+        **OLD, "a.txt": "edited by hand", **{f"test-kind-2/{n}": t for n, t in NEW.items()},
+        f"test-kind-2/{MANIFEST}": (tmp_path / "n" / "test-kind-2" / MANIFEST).read_text(),
+    }  # fmt: skip
+    (tmp_path / "n" / "a.txt").write_text("old a")
+    with pytest.raises(Refused, match="test-kind-3"):
+        collide("fresh", "a file where a folder is to be")
+    shutil.rmtree(tmp_path / "n")
+    with pytest.raises(Refused, match="test-kind-2"):
+        collide(MANIFEST, "somebody else's")
+    assert (tmp_path / "n" / MANIFEST).read_text() == "somebody else's"
+
+
+def test_a_link_put_in_place_of_one_of_our_folders_is_never_followed(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+    (tmp_path / "n" / "deep").rename(tmp_path / "elsewhere")
+    (tmp_path / "n" / "deep").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(Refused, match=r"deep/b\.txt was changed"):
+        publish(tmp_path / "n", NEW)
+    assert (tmp_path / "elsewhere" / "b.txt").read_text() == "old b"
+
+
+# ---- What cannot be is refused before the work starts ---------------------------------------------------------------
+
+
+def refuse(place: Path, message: str, inputs: tuple[Path, ...] = (), kind: DirectoryKind = KIND) -> None:
+    """Both refuse alike, nothing changes, and the block is never entered."""
+    top = place.parent
+    before = sorted((p, p.lstat().st_mtime_ns) for p in top.rglob("*"))
+    with pytest.raises(Refused, match=message) as caught:
+        check_directory(place, kind, inputs)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(Refused, match=message), new_directory(place, kind, inputs):
+        pytest.fail("entered")
+    assert sorted((p, p.lstat().st_mtime_ns) for p in top.rglob("*")) == before
+
+
+def test_what_is_no_older_result_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "foreign", {"thesis.txt": "do not delete"})
+    refuse(tmp_path / "foreign", "holds something else than a test-kind")
+    (tmp_path / "file").write_text("")
+    refuse(tmp_path / "file", "exists and is no directory")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    refuse(tmp_path / "dangling", "is a link to .*nowhere, which does not exist")
+    publish(tmp_path / "other", OLD, OTHER)
+    refuse(tmp_path / "other", "holds something else than a test-kind")
+    publish(tmp_path / "edited", OLD)
+    (tmp_path / "edited" / "a.txt").write_text("edited")
+    refuse(tmp_path / "edited", r"a\.txt was changed since rangesim wrote it")
+    publish(tmp_path / "unlisted", OLD)
+    (tmp_path / "unlisted" / MANIFEST).unlink()
+    refuse(tmp_path / "unlisted", "without a valid manifest.json")
+    write(tmp_path / "nearly", {f"{STAGING}/mine.txt": "mine"})
+    with (
+        pytest.raises(Refused, match="is not what rangesim keeps its work in"),
+        new_directory(tmp_path / "nearly", KIND),
+    ):
+        pytest.fail("entered")
+    assert contents(tmp_path / "nearly") == {f"{STAGING}/mine.txt": "mine"}
+
+
+def test_inputs_are_kept_apart(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    refuse(tmp_path / "in", "is the input itself", (tmp_path / "in",))
+    refuse(tmp_path / "in" / "below", "lies inside the input", (tmp_path / "in",))
+    (tmp_path / "link").symlink_to(tmp_path / "in")
+    refuse(tmp_path / "link", "is the input itself", (tmp_path / "in",))
+
+
+def test_links_to_directories_are_written_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    assert check_directory(tmp_path / "link", KIND) == tmp_path / "real"
+    publish(tmp_path / "link", NEW)
+    assert (tmp_path / "link").is_symlink()
+    assert contents(tmp_path / "real") == NEW
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    publish(Path(), NEW)
+    publish(Path(), OLD)
+    assert contents(tmp_path / "here") == OLD
+
+
+def test_two_at_a_time_are_told_apart(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+    with new_directory(tmp_path / "n", KIND) as folder:
+        write(folder, NEW)
+        with pytest.raises(Refused, match="another process is writing"):
+            check_directory(tmp_path / "n", KIND)
+        with pytest.raises(Refused, match="another process is writing"):
+            publish(tmp_path / "n", OLD)
+        assert is_whole(tmp_path / "n")  # readers see the older result meanwhile
+        assert contents(tmp_path / "n").items() >= OLD.items()
+    assert contents(tmp_path / "n") == NEW
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [b"", b"[]", b"{}", b"null", b'{"format": "rangesim-manifest"}', b"[" * 100_000, b'{"a": NaN}', b"\xed\xa0\x80"],
+)
+def test_a_damaged_manifest_makes_nothing_ours(tmp_path: Path, damage: bytes) -> None:
+    publish(tmp_path / "n", OLD)
+    (tmp_path / "n" / MANIFEST).write_bytes(damage)
+    refuse(tmp_path / "n", "without a valid manifest.json")
+
+
+@pytest.mark.parametrize("name", ["../victim", "/etc/passwd", "a/../../victim", "", ".", "deep//b.txt", f"{STAGING}/x"])
+def test_a_crafted_manifest_reaches_nothing_outside(tmp_path: Path, name: str) -> None:
+    (tmp_path / "victim").write_text("old a")
+    publish(tmp_path / "n", OLD)
+    manifest = json.loads((tmp_path / "n" / MANIFEST).read_text())
+    manifest["files"][name] = manifest["files"]["a.txt"]
+    (tmp_path / "n" / MANIFEST).write_text(json.dumps(manifest))
+    refuse(tmp_path / "n", "without a valid manifest.json")
+
+
+def test_a_crafted_journal_reaches_nothing_outside(tmp_path: Path) -> None:
+    def craft(journal: object, **links: Path) -> Path:
+        shutil.rmtree(tmp_path / "n", ignore_errors=True)
+        publish(tmp_path / "n", OLD)
+        (tmp_path / "n" / STAGING / "new").mkdir(parents=True)
+        (tmp_path / "n" / STAGING / "lock").touch()
+        (tmp_path / "n" / STAGING / "journal.json").write_text(json.dumps(journal))
+        for name, target in links.items():
+            place = tmp_path / "n" / name.replace("__", "/").replace("STAGING", STAGING)
+            if place.is_dir():
+                shutil.rmtree(place)
+            place.symlink_to(target)
+        return tmp_path / "n"
+
+    home = tmp_path / "home"
+    write(home, {"b.txt": "old b", "key": "secret"})
+    digest = json.loads((craft({}) / MANIFEST).read_text())["files"]["deep/b.txt"]
+    for journal, links in (
+        ({"retire": {}, "place": ["../x"]}, {}),
+        ({"retire": {"../home/b.txt": digest}, "place": []}, {}),
+        ({"retire": {"deep/b.txt": digest}, "place": []}, {"STAGING__old": home}),
+        ({"retire": {}, "place": ["key"]}, {"STAGING__new": home}),
+        ({"retire": {}, "place": ["deep/x"]}, {"deep": home}),
+    ):
+        folder = craft(journal, **links)
+        if (folder / STAGING / "new").is_dir() and not (folder / STAGING / "new").is_symlink():
+            write(folder / STAGING / "new", {"deep/x": "evil"})
+        try:
+            recover(folder, Refused)
+        except Refused as error:
+            assert "\n" not in str(error)  # noqa: PT017  (some of them end well, having done nothing)
+        assert contents(home) == {"b.txt": "old b", "key": "secret"}
+    outside = craft({"retire": {"deep/b.txt": digest}, "place": []}, deep=home)
+    recover(outside, Refused)
+    assert contents(home) == {"b.txt": "old b", "key": "secret"}
+
+
+# ---- Failures and kills at any moment -------------------------------------------------------------------------------
+
+
+CHANGES = ((os, "link"), (os, "replace"), (os, "fsync"), (Path, "rename"), (Path, "unlink"), (Path, "mkdir"))
+"""Calls that change the disk."""
+
+
+class Stop(BaseException):
+    """A process that ends here."""
+
+
+def count_down(monkeypatch: pytest.MonkeyPatch, steps: int, failure: Callable[[], BaseException]) -> None:
+    """Let the call number `steps` of all that change the disk fail before it does anything."""
+    left = [steps]
+
+    def counted(call: Callable[..., object]) -> Callable[..., object]:
+        def wrapper(*args: object, **kwargs: object) -> object:
+            left[0] -= 1
+            if left[0] < 0:
+                raise failure()
+            return call(*args, **kwargs)
+
+        return wrapper
+
+    for owner, name in (
+        (os, "link"),
+        (os, "replace"),
+        (os, "fsync"),
+        (Path, "rename"),
+        (Path, "unlink"),
+        (Path, "mkdir"),
+    ):
+        monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
+
+
+def steps_of_a_replacement(tmp_path: Path) -> int:
+    """How many calls there are to fail."""
+    with pytest.MonkeyPatch.context() as patch:
+        publish(tmp_path / "count", OLD)
+        calls = [0]
+
+        def counted(call: Callable[..., object]) -> Callable[..., object]:
+            def wrapper(*args: object, **kwargs: object) -> object:
+                calls[0] += 1
+                return call(*args, **kwargs)
+
+            return wrapper
+
+        for owner, name in (
+            (os, "link"),
+            (os, "replace"),
+            (os, "fsync"),
+            (Path, "rename"),
+            (Path, "unlink"),
+            (Path, "mkdir"),
+        ):
+            patch.setattr(owner, name, counted(getattr(owner, name)))
+        publish(tmp_path / "count", NEW)
+    return calls[0]
+
+
+def test_a_process_that_dies_at_any_step_leaves_the_old_or_the_new(tmp_path: Path) -> None:
+    """After each call that changes the disk the world stops: nothing more of that process runs, as after SIGKILL."""
+    steps = steps_of_a_replacement(tmp_path)
+    assert steps > 20
+    seen = set()
+    for step in range(steps):
+        target = tmp_path / f"n{step}"
+        publish(target, OLD)
+        write(target, MINE)
+        with pytest.MonkeyPatch.context() as patch:
+            count_down(patch, step, Stop)
+            patch.setattr(output._Staging, "release", lambda claim: os.close(claim.handle) if claim.handle else None)
+            with pytest.raises(Stop):
+                publish(target, NEW)
+        output._claims.clear()
+        recover(target, Refused)
+        assert is_whole(target)
+        found = {k: v for k, v in contents(target).items() if not k.startswith(STAGING)}
+        assert found in ({**OLD, **MINE}, {**NEW, **MINE}), step
+        seen.add(found == {**NEW, **MINE})
+        publish(target, NEW)
+        assert contents(target) == {**NEW, **MINE}
+        assert sorted(p.name for p in target.iterdir() if p.name.startswith(".")) == []
+    assert seen == {False, True}
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_a_disk_that_fails_at_any_step_leaves_the_old_or_the_new(tmp_path: Path, number: int) -> None:
+    for step in range(steps_of_a_replacement(tmp_path)):
+        target = tmp_path / f"n{step}"
+        publish(target, OLD)
+        write(target, MINE)
+        with pytest.MonkeyPatch.context() as patch:
+            count_down(patch, step, lambda: OSError(number, os.strerror(number)))
+            with pytest.raises((Refused, OSError)) as caught:
+                publish(target, NEW)
+            assert "\n" not in str(caught.value)
+        recover(target, Refused)
+        assert is_whole(target)
+        found = {k: v for k, v in contents(target).items() if not k.startswith(STAGING)}
+        assert found in ({**OLD, **MINE}, {**NEW, **MINE}), step
+        publish(target, NEW)
+        assert contents(target) == {**NEW, **MINE}
+
+
+def test_a_killed_process_leaves_staging_that_the_next_one_clears(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys; from pathlib import Path\n"
+        "from pcgraph.output import DirectoryKind, new_directory\n"
+        "kind = DirectoryKind('test-kind', 'sidecar.json', OSError)\n"
+        "with new_directory(sys.argv[1], kind) as folder:\n"
+        "    (folder / 'half').write_text('x')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    for target in (tmp_path / "new" / "n", tmp_path / "old"):
+        if target.name == "old":
+            publish(target, OLD)
+        done = subprocess.run([sys.executable, "-c", code, str(target)], check=False, timeout=60)
+        assert done.returncode == -9
+        assert (target / STAGING / "new" / "half").exists()
+        publish(target, NEW)
+        assert contents(target) == NEW
+        assert not (target / STAGING).exists()
+
+
+def test_abandon_waits_for_a_replacement_and_clears_the_rest(tmp_path: Path) -> None:
+    entered, ended = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with suppress(Refused), new_directory(tmp_path / "deep" / "n", KIND) as folder:
+            write(folder, NEW)
+            entered.set()
+            ended.wait(10)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    assert entered.wait(10)
+    assert output.abandon()
+    assert list(tmp_path.iterdir()) == []
+    ended.set()
+    thread.join(10)
+    assert not output.abandon()
+
+
+# ---- Single files, and files of a complete directory ----------------------------------------------------------------
+
+
+def test_a_file_is_replaced_whole_and_keeps_its_mode(tmp_path: Path) -> None:
+    path = tmp_path / "x.bin"
+    write_file(path, b"one", Refused)
+    assert path.stat().st_mode & 0o777 == 0o666 & ~_umask()
+    path.chmod(0o600)
+    (tmp_path / "link").symlink_to("x.bin")
+    write_file(tmp_path / "link", b"two", Refused)
+    assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"two", 0o600)
+    assert (tmp_path / "link").is_symlink()
+    write_file(tmp_path / "a" / "b" / "y", b"three", Refused, make_parents=True)
+    for place in (tmp_path / "none" / "z", tmp_path, path / "below", Path("/dev/null")):
+        with pytest.raises(Refused, match="cannot write"):
+            write_file(place, b"", Refused)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "link", "x.bin"]
+
+
+def test_parts_of_dead_writers_are_cleared_and_those_of_living_ones_stay(tmp_path: Path) -> None:
+    dead, other = tmp_path / f".x.bin.{'0' * 16}.part", tmp_path / f".y.bin.{'0' * 16}.part"
+    mine = tmp_path / ".x.bin.notes.part"
+    alive = tmp_path / f".x.bin.{'1' * 16}.part"
+    for path in (dead, other, mine, alive):
+        path.write_text("")
+    fcntl = pytest.importorskip("fcntl")
+    with alive.open() as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        write_file(tmp_path / "x.bin", b"", Refused)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([alive.name, mine.name, other.name, "x.bin"])
+
+
+def test_one_file_of_a_directory_is_replaced_with_its_digest(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+    replace_listed_file(tmp_path / "n", "a.txt", b"again", KIND)
+    assert is_whole(tmp_path / "n")
+    assert contents(tmp_path / "n") == {**OLD, "a.txt": "again"}
+    (tmp_path / "n" / "a.txt").write_text("by hand")
+    with pytest.raises(Refused, match=r"a\.txt was changed since rangesim wrote it"):
+        replace_listed_file(tmp_path / "n", "a.txt", b"again", KIND)
+    (tmp_path / "n" / "a.txt").unlink()
+    (tmp_path / "n" / "a.txt").symlink_to(tmp_path / "victim")
+    (tmp_path / "victim").write_text("again")
+    with pytest.raises(Refused, match="was changed"):
+        replace_listed_file(tmp_path / "n", "a.txt", b"evil", KIND)
+    assert (tmp_path / "victim").read_text() == "again"
+
+
+def test_a_replaced_file_is_ours_at_every_step(tmp_path: Path) -> None:
+    for step in range(12):
+        target = tmp_path / f"n{step}"
+        publish(target, OLD)
+        with pytest.MonkeyPatch.context() as patch:
+            count_down(patch, step, Stop)
+            with suppress(Stop):
+                replace_listed_file(target, "a.txt", b"again", KIND)
+        assert is_whole(target), step
+        publish(target, NEW)
+        assert contents(target) == NEW
+
+
+def test_verify_names_what_differs(tmp_path: Path) -> None:
+    publish(tmp_path / "n", OLD)
+    (tmp_path / "n" / "a.txt").write_text("old A")
+    (tmp_path / "n" / "deep" / "b.txt").unlink()
+    (tmp_path / "n" / "more").write_text("")
+    found = verify_directory(tmp_path / "n", KIND)
+    assert (found.changed, found.missing, found.foreign, found.files) == (("a.txt",), ("deep/b.txt",), ("more",), 4)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_sequence_keeps_what_is_the_users(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    """Files come from the user and from us under the same few names, in any order: the user's bytes are all there."""
+    folder = tmp_path_factory.mktemp("any")
+    target, mine = folder / "n", {}
+    names = st.sampled_from(["a", "b", "c/d", "c/e", "f"])
+    for turn in range(data.draw(st.integers(1, 6))):
+        for name in data.draw(st.lists(names, max_size=2)):
+            place = target / name
+            if target.is_dir() and not place.exists() and not (target / name.split("/")[0]).is_file():
+                write(target, {name: f"mine {turn}"})
+                mine[name] = f"mine {turn}"
+        files = dict.fromkeys(data.draw(st.sets(names, min_size=1)), f"ours {turn}")
+        with suppress(Refused):
+            publish(target, files)
+        assert contents(target).items() >= mine.items()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

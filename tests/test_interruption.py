@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work is cut into launches of bounded time: a signal ends it soon, progress is told often, no byte depends on it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rangesim
+from rangesim import AmcwToF, DirectToF, Rig, Scene, Signals, StructuredLight, transport
+from rangesim.light_transport import launches, photons
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.loop import _dealt
+from rangesim.light_transport.photons import trace_photons
+
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
+STOPS_WITHIN_S = 2.0
+SLOW_MACHINE = 2.0
+"""Others may be at work on the machine of the tests."""
+
+LONG = {
+    "many pixels": ("tabletop.xml", "width=1920, height=1440", "spp=4096, photons=0, glint=False"),
+    "many samples": ("tabletop.xml", "width=64, height=48", "spp=10_000_000, photons=0, glint=False"),
+    "deep paths": ("cornell.xml", "width=160, height=120", "spp=100_000, max_depth=64, rr_depth=64"),
+    "many photons": ("tabletop.xml", "width=64, height=48", "spp=1, photons=100_000_000"),
+}
+SCRIPT = """
+import signal, sys
+import rangesim
+scene = rangesim.load_scene({scene!r})
+rig = scene.rig({size})
+{handler}
+rangesim.transport(scene, scene.rig(width=64, height=48), [], spp=2)  # compiles
+print("started", flush=True)
+rangesim.transport(scene, rig, [], {options})
+print("finished", flush=True)
+"""
+RAISES = "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))"
+
+
+@pytest.fixture(scope="module")
+def tabletop() -> Scene:
+    return rangesim.load_scene(SCENES / "tabletop.xml")
+
+
+def sensors() -> list[rangesim.Sensor]:
+    return [StructuredLight(axes=("columns",)), AmcwToF(), DirectToF(bins=32, bin_s=400e-12)]
+
+
+def all_bytes(signals: Signals) -> bytes:
+    arrays = [*signals.channels.values(), *vars(signals.energy).values(), signals.truth.z, signals.truth.instance]
+    return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
+
+
+# ---- A signal ends the work soon --------------------------------------------------------------------
+
+
+def seconds_to_stop(case: str, sent: signal.Signals, handler: str = "") -> tuple[float, int, str]:
+    """Seconds from a signal in the midst of the work to the end of the process, its exit code and last words."""
+    scene, size, options = LONG[case]
+    script = SCRIPT.format(scene=str(SCENES / scene), size=size, options=options, handler=handler)
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=SCENES.parent
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "started\n"
+        time.sleep(2.5)  # launches have found their size by then
+        start = time.monotonic()
+        process.send_signal(sent)
+        output, errors = process.communicate(timeout=30)
+        return time.monotonic() - start, process.returncode, output + errors
+    finally:
+        process.kill()
+
+
+@pytest.mark.parametrize("case", LONG)
+def test_ctrl_c_ends_a_pass_without_progress_within_two_seconds(case: str) -> None:
+    seconds, code, words = seconds_to_stop(case, signal.SIGINT)
+    assert "finished" not in words
+    assert words.endswith("KeyboardInterrupt\n")
+    assert code in (-signal.SIGINT, 130)
+    assert seconds < STOPS_WITHIN_S * SLOW_MACHINE
+
+
+@pytest.mark.parametrize(("handler", "expected"), [("", -signal.SIGTERM), (RAISES, 7)])
+def test_sigterm_ends_a_pass_by_default_and_by_a_handler_that_raises(handler: str, expected: int) -> None:
+    seconds, code, words = seconds_to_stop("many samples", signal.SIGTERM, handler)
+    assert "finished" not in words
+    assert code == expected
+    assert seconds < STOPS_WITHIN_S * SLOW_MACHINE
+
+
+def test_after_an_interruption_the_same_process_traces_the_same_bytes(tabletop: Scene) -> None:
+    """Raised where a signal would be, between launches of every kind: photons, paths, glint."""
+    rig, settings = tabletop.rig(width=48, height=36), {"spp": 4, "photons": 20_000, "seed": 3}
+    expected = all_bytes(transport(tabletop, rig, sensors(), **settings))
+    calls = 0
+
+    def interrupt(original: Any, at: int) -> Any:
+        def evaluate(arrays: Any) -> float:
+            nonlocal calls
+            calls += 1
+            seconds = original(arrays)
+            if calls == at:
+                raise KeyboardInterrupt
+            return float(seconds)
+
+        return evaluate
+
+    at = 1
+    while True:
+        calls = 0
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(launches, "evaluate", interrupt(launches.evaluate, at))
+            try:
+                transport(tabletop, rig, sensors(), **settings)
+            except KeyboardInterrupt:
+                at += 1
+            else:
+                break
+    assert at > 5  # projector's and camera's surfaces, photons, paths, probes, truth
+    assert all_bytes(transport(tabletop, rig, sensors(), **settings)) == expected
+
+
+# ---- No byte depends on where the work is cut -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("launch_s", "units", "lanes"), [(1e-9, 3000, 512), (1e-9, 40_000, 1 << 18), (1e9, 1 << 40, 1)]
+)
+def test_launches_of_any_size_give_the_same_bytes(
+    tabletop: Scene, monkeypatch: pytest.MonkeyPatch, launch_s: float, units: int, lanes: int
+) -> None:
+    """Few pixels at a time, few turns of the loop at a time, and all at once."""
+    rig: Rig = tabletop.rig(width=97, height=71)
+    settings = {"spp": 5, "photons": 20_000, "seed": 3, "max_depth": 7}
+    expected = all_bytes(transport(tabletop, rig, sensors(), **settings))
+    monkeypatch.setattr(launches, "LAUNCH_S", launch_s)
+    monkeypatch.setattr(launches, "LONGEST_S", launch_s)
+    monkeypatch.setattr(launches, "FIRST_UNITS", units)
+    for module in (rangesim.light_transport.loop, rangesim.light_transport.glint):
+        monkeypatch.setattr(module, "fewest_lanes", lambda: lanes)
+    number = 0
+
+    def evaluate(arrays: Any) -> float:
+        nonlocal number
+        number += 1
+        original(arrays)
+        return 0.0  # says nothing of the work: its size stays
+
+    original = launches.evaluate
+    monkeypatch.setattr(launches, "evaluate", evaluate)
+    monkeypatch.setattr(launches, "STEEPEST", 1.0)
+    assert all_bytes(transport(tabletop, rig, sensors(), **settings)) == expected
+    assert (number > 20) == (units < 1 << 30)
+
+
+def test_the_balance_of_photons_does_not_depend_on_launches(tabletop: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    projector = Device.projector(tabletop.rig(width=64, height=48))
+    monkeypatch.setattr(photons, "SUMMED_TOGETHER", 4096)
+    found = []
+    for units in (1 << 30, 10_000):
+        monkeypatch.setattr(launches, "FIRST_UNITS", units)
+        found.append(trace_photons(tabletop.mitsuba, projector, 1.0, 50_001, 3, 5, 1 << 30))
+    assert astuple(found[0].balance) == astuple(found[1].balance)
+    for name in ("position", "flux", "map"):
+        np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 7, 100, 255, 256, 1200, 5003])
+def test_runs_of_pixels_are_dealt_out_once_each_and_evenly(n: int) -> None:
+    order = _dealt(n)
+    np.testing.assert_array_equal(np.sort(order), np.arange(n))
+    some = np.sort(order[: max(2, n // 10)])
+    if n >= 100:
+        assert np.diff(some).max() <= 4 * n / len(some)
+
+
+# ---- Progress ---------------------------------------------------------------------------------------
+
+
+def test_progress_grows_to_one_and_is_told_at_most_ten_times_a_second(
+    tabletop: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launches, "LAUNCH_S", 0.02)
+    monkeypatch.setattr(launches, "FIRST_UNITS", 1 << 15)
+    shares: list[float] = []
+    times: list[float] = []
+
+    def progress(share: float) -> None:
+        shares.append(share)
+        times.append(time.monotonic())
+
+    transport(tabletop, tabletop.rig(width=160, height=120), [], spp=128, progress=progress)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert len(set(shares)) > 4
+    assert (np.diff(times)[:-1] > 0.9 * launches.REPORT_S).all()
+
+
+def test_what_progress_raises_ends_the_pass(tabletop: Scene) -> None:
+    def cancel(share: float) -> None:
+        raise StopIteration(share)
+
+    with pytest.raises(StopIteration, match=r"^0\.0$"):  # photons come first
+        transport(tabletop, tabletop.rig(width=32, height=24), [], spp=1_000_000, progress=cancel)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the commands do to a user's files, and where signals reach them: through the processes that a user starts."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_result import ROOT, small_result
+
+from pcgraph.output import MANIFEST, STAGING
+from rangesim.capture_files import SIDECAR
+
+PLANE = str(ROOT / "scenes" / "plane.xml")
+TINY = ("--sensor", "ideal-tof", "--width", "32", "--height", "24", "--spp", "1", "--photons", "0")
+
+
+def command(*arguments: object, package: str = "rangesim", cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", package, *map(str, arguments)]
+    return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False, cwd=cwd)
+
+
+def run(out: Path, *more: object) -> subprocess.CompletedProcess[str]:
+    return command("run", PLANE, *TINY, "--out", out, *more)
+
+
+def assert_refused(done: subprocess.CompletedProcess[str], message: str) -> None:
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+
+
+# ---- A user's file is never removed ---------------------------------------------------------------------------------
+
+
+def test_a_users_files_stay_when_a_result_is_replaced(tmp_path: Path) -> None:
+    """`rangesim run S --out n; echo x > n/NOTES.md; mkdir n/mydata; rangesim run S --out n`, word for word."""
+    out = tmp_path / "n"
+    assert run(out).returncode == 0
+    (out / "NOTES.md").write_text("x\n")
+    (out / "mydata").mkdir()
+    (out / "ideal-tof" / "thoughts.txt").write_text("mine")
+    assert run(out, "--seed", 5).returncode == 0
+    assert (out / "NOTES.md").read_text() == "x\n"
+    assert (out / "mydata").is_dir()
+    assert (out / "ideal-tof" / "thoughts.txt").read_text() == "mine"
+    assert json.loads((out / "experiment.json").read_text())["experiment"]["seed"] == 5
+    done = command("verify", out)
+    assert done.returncode == 0
+    assert "NOTES.md" in done.stdout
+    assert "files are as they were written" in done.stdout
+
+
+def test_files_changed_by_hand_are_not_overwritten(tmp_path: Path) -> None:
+    out = tmp_path / "n"
+    run(out)
+    (out / "comparison.md").write_text("my own words")
+    assert_refused(run(out), "comparison.md was changed since rangesim wrote it")
+    done = command("verify", out)
+    assert (done.returncode, done.stdout) == (1, f"changed: {out / 'comparison.md'}\n")
+    (out / "comparison.md").unlink()
+    (out / "report.html").write_text("annotated")
+    assert_refused(command("report", out), "report.html was changed since rangesim wrote it")
+    assert (out / "report.html").read_text() == "annotated"
+
+
+def test_places_that_cannot_be_are_refused_before_the_work(tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    shutil.copytree(small_result() / "lines" / "capture", capture)
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    for arguments, message in (
+        (["run", PLANE, *TINY, "--spp", "1000000", "--out", tmp_path / "dangling"], "is a link to"),
+        (["run", PLANE, *TINY, "--spp", "1000000", "--out", tmp_path], "holds something else than a rangesim-result"),
+        (["decode", capture, "--out", capture], "is the input itself"),
+        (["decode", capture, "--out", capture / "decoded"], "lies inside the input"),
+        (["decode", capture, "--out", tmp_path / "dangling"], "is a link to"),
+    ):
+        before = sorted(tmp_path.rglob("*"))
+        assert_refused(command(*arguments), message)
+        assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_links_and_the_current_directory_are_written_to_and_said(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    done = run(tmp_path / "link")
+    assert done.returncode == 0
+    assert done.stderr == f"rangesim: {tmp_path / 'link'} is a link; the results go to {tmp_path / 'real'}.\n"
+    assert (tmp_path / "real" / "report.html").is_file()
+    (tmp_path / "here").mkdir()
+    for _ in range(2):
+        assert command("run", PLANE, *TINY, "--out", ".", cwd=tmp_path / "here").returncode == 0
+    assert (tmp_path / "here" / "report.html").is_file()
+
+
+def test_results_without_a_manifest_are_not_taken_for_ours(tmp_path: Path) -> None:
+    """Those of older versions: nobody knows which of the files in them are the user's."""
+    run(tmp_path / "n")
+    (tmp_path / "n" / MANIFEST).unlink()
+    assert_refused(run(tmp_path / "n"), "without a valid manifest.json")
+
+
+def test_a_foreign_file_named_like_segments_stays(tmp_path: Path) -> None:
+    cloud = tmp_path / "scan.ply"
+    shutil.copy(small_result() / "lines" / "cloud.ply", cloud)
+    for name, content in (
+        ("scan.segments.npz", b"a thesis"),
+        ("scan.segments.ply", b"ply\ncomment mine\nend_header\n"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        done = command("segment", cloud, "--out", tmp_path, package="pcgraph")
+        assert_refused(done, f"{name} exists and was not written by pcgraph")
+        assert (tmp_path / name).read_bytes() == content
+        assert_refused(command("segment", cloud, "--out", tmp_path / name, package="pcgraph"), "not written by pcgraph")
+        (tmp_path / name).unlink()
+    np.savez(tmp_path / "scan.segments.npz", labels=np.arange(3))
+    assert_refused(command("segment", cloud, "--out", tmp_path, package="pcgraph"), "not written by pcgraph")
+    (tmp_path / "scan.segments.npz").unlink()
+    for _ in range(2):  # one's own are replaced
+        assert command("segment", cloud, "--out", tmp_path, package="pcgraph").returncode == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scan.ply", "scan.segments.npz", "scan.segments.ply"]
+
+
+# ---- Durable and clean ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("package", ["rangesim", "pcgraph"])
+def test_signals_end_a_command_in_one_line_at_any_moment(tmp_path: Path, package: str, number: int) -> None:
+    """Also while Python still imports; before that, the interpreter's own start is not ours to change."""
+    arguments = ("run", PLANE, *TINY, "--spp", "20000") if package == "rangesim" else ("segment", big_cloud(tmp_path))
+    line = [sys.executable, "-m", package, *map(str, arguments), "--out", str(tmp_path / "out" / "n")]
+    ended = 0
+    for pause_s in (0.0, 0.02, 0.1, 0.4, 1.0):
+        with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            wait_until_handled(process)
+            time.sleep(pause_s * random.Random(f"{package}{number}{pause_s}").uniform(0.8, 1.2))
+            process.send_signal(number)
+            start = time.monotonic()
+            _, err = process.communicate(timeout=60)
+            assert time.monotonic() - start < 5.0
+        if process.returncode == 0:
+            shutil.rmtree(tmp_path / "out")
+            continue
+        assert process.returncode == 128 + number, err
+        assert err == f"{package}: interrupted; nothing was written.\n"
+        assert not (tmp_path / "out").exists()
+        ended += 1
+    assert ended >= 4
+
+
+def wait_until_handled(process: subprocess.Popen[str]) -> None:
+    """Until the process catches SIGINT and SIGTERM, as Linux says."""
+    if not Path("/proc/self/status").is_file():
+        time.sleep(0.2)
+        return
+    wanted = 1 << (signal.SIGINT - 1) | 1 << (signal.SIGTERM - 1)
+    for _ in range(2000):
+        status = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+        caught = int(next(line for line in status if line.startswith("SigCgt")).split()[1], 16)
+        threads = int(next(line for line in status if line.startswith("Threads")).split()[1])
+        if caught & wanted == wanted and threads > 1:
+            return
+        time.sleep(0.001)
+    pytest.fail("the process never cared for signals")
+
+
+def big_cloud(folder: Path) -> Path:
+    path = folder / "big.ply"
+    points = np.random.default_rng(0).normal(size=(400_000, 3)).astype("<f4")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    path.write_bytes(header.encode() + points.tobytes())
+    return path
+
+
+def test_what_a_killed_run_left_is_cleared_by_the_next(tmp_path: Path) -> None:
+    out = tmp_path / "n"
+    line = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--spp", "20000", "--out", str(out)]
+    with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        while not (out / STAGING / "new").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.kill()
+    assert (out / STAGING).exists()
+    assert run(out).returncode == 0
+    assert [p for p in out.rglob("*") if p.name.startswith(".")] == []
+    assert [p for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="limits on file sizes are set in a child before it runs")
+def test_a_full_disk_is_said_in_one_sentence_and_leaves_the_older_result(tmp_path: Path) -> None:
+    import resource
+
+    out = tmp_path / "n"
+    assert run(out, "--seed", 1).returncode == 0
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    line = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--seed", "2", "--out", str(out)]
+    largest = max(map(len, before.values()))
+    for size in (3000, 12_000, largest // 2):
+
+        def limit(size: int = size) -> None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+        done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False, preexec_fn=limit)
+        said = [text for text in done.stderr.splitlines() if not text.startswith("jit_kernel_write")]  # Dr.Jit's cache
+        assert said == [
+            f"rangesim: cannot write {out}: the file would be larger than allowed; nothing was written, make room or "
+            "name another place."
+        ]
+        assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_verify_takes_captures_and_decoded_ones_too(tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    shutil.copytree(small_result() / "lines" / "capture", capture)
+    assert command("decode", capture, "--out", tmp_path / "decoded").returncode == 0
+    for folder in (capture, tmp_path / "decoded", small_result()):
+        assert command("verify", folder).returncode == 0
+    frame = next(capture.glob("*.png"))
+    frame.write_bytes(frame.read_bytes()[:-1] + b"x")
+    done = command("verify", capture)
+    assert (done.returncode, done.stdout) == (1, f"changed: {frame}\n")
+    assert done.stderr.endswith("hold something else than was written.\n")
+    assert_refused(command("verify", tmp_path), "expected a directory that rangesim wrote")
+    assert SIDECAR in command("verify", tmp_path).stderr
