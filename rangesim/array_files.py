@@ -14,7 +14,7 @@ import numpy as np
 
 from pcgraph.plain_files import check_file
 from rangesim import limits
-from rangesim.config import shown
+from rangesim.config import brief, shown
 from rangesim.errors import FileFormatError
 
 KINDS = "biufcSU"
@@ -55,10 +55,10 @@ def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[st
             limits.check("bytes", total, f"bytes in {path}, decompressed", FileFormatError)
             return {name: _read(archive, members[name], f"{path}: array {shown(name)}") for name in wanted}
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError) as error:
-        reason = getattr(error, "strerror", None) or str(error) or "it ends early"
+        reason = getattr(error, "strerror", None) or brief(error) or "it ends early"
         raise FileFormatError(f"{path} cannot be read as .npz: {reason}.") from error
     except (NotImplementedError, RuntimeError, ValueError, OverflowError) as error:  # of odd entries in the directory
-        raise FileFormatError(f"{path} cannot be read as .npz: {error}.") from error
+        raise FileFormatError(f"{path} cannot be read as .npz: {brief(error)}.") from error
 
 
 def _members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
@@ -103,7 +103,7 @@ def _header(file: IO[bytes], place: str) -> tuple[tuple[int, ...], bool, np.dtyp
             raise ValueError(f"version {version} is unknown")
         shape, fortran_order, dtype = _HEADERS[version](file)
     except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError) as error:
-        raise FileFormatError(f"{place}: its header is broken: {' '.join(str(error).split())[:200]}.") from error
+        raise FileFormatError(f"{place}: its header is broken: {brief(error)}.") from error
     if dtype.kind not in KINDS or dtype.itemsize == 0 or len(shape) > 8 or any(n < 0 for n in shape):
         raise FileFormatError(f"{place}: expected numbers or text, got {shown(dtype)} of shape {shown(shape)}.")
     return shape, fortran_order, dtype

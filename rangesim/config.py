@@ -85,6 +85,15 @@ _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxarray = 8
 _SHORT.maxlevel = 3
 
 
+def brief(error: BaseException) -> str:
+    """What an error of a library says, in one line of readable length."""
+    return " ".join(str(error).split())[:LONGEST_REASON]
+
+
+LONGEST_REASON = 200
+"""Characters."""
+
+
 def visible(text: str) -> str:
     """Text whose control characters are spelt out, as `\\u202e`.
 
@@ -124,7 +133,7 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     if not choices:
         return cls
     tag = values.pop("type", own)
-    if tag not in choices:
+    if not isinstance(tag, str) or tag not in choices:
         raise ValueError(
             f"{place}: expected 'type' to be one of {', '.join(choices)}, got {shown(tag)}{nearest(str(tag), choices)}."
         )

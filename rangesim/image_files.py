@@ -17,6 +17,7 @@ import numpy as np
 
 from pcgraph.plain_files import check_file
 from rangesim import limits
+from rangesim.config import brief
 from rangesim.errors import FileFormatError
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".exr")
@@ -56,8 +57,7 @@ def read_grey(path: Path) -> np.ndarray:
     except FileFormatError:
         raise
     except _BROKEN as error:
-        reason = " ".join(str(error).split())[:200] or "it is damaged"
-        raise FileFormatError(f"{path} cannot be read as an image: {reason}.") from error
+        raise FileFormatError(f"{path} cannot be read as an image: {brief(error)}.") from error
 
 
 def check_size(path: Path) -> None:
@@ -147,7 +147,10 @@ def _read_exr(path: Path) -> np.ndarray:
     import OpenEXR
 
     _open_exr(path)
-    channels = {name: c.pixels for name, c in OpenEXR.File(str(path), separate_channels=True).channels().items()}
+    file = OpenEXR.File(str(path), separate_channels=True)
+    if not file.parts:
+        raise FileFormatError(f"{path} cannot be read as an image: its pixels are damaged or missing.")
+    channels = {name: c.pixels for name, c in file.channels().items()}
     if "Y" in channels:
         return np.asarray(channels["Y"], dtype=np.float32)
     r, g, b = (np.asarray(channels[c], dtype=np.float32) for c in "RGB")

@@ -16,6 +16,7 @@ from xml.parsers import expat
 
 from pcgraph.plain_files import check_file
 from rangesim import limits
+from rangesim.config import brief
 from rangesim.errors import FileFormatError
 
 _LONG_KEY = r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){%d}"""
@@ -43,7 +44,7 @@ def read_json(path: str | Path) -> Any:
     except RecursionError:
         raise _too_deep(path) from None
     except ValueError as error:  # also of a number of more digits than Python converts
-        raise FileFormatError(f"{path} is no valid JSON: {error}.") from error
+        raise FileFormatError(f"{path} is no valid JSON: {brief(error)}.") from error
     if is_nested_deeper(data, limits.current().nesting):
         raise _too_deep(path)
     return data
@@ -60,7 +61,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     except RecursionError:
         raise _too_deep(path) from None
     except ValueError as error:
-        raise FileFormatError(f"{path} is no valid TOML: {error}.") from error
+        raise FileFormatError(f"{path} is no valid TOML: {brief(error)}.") from error
     if is_nested_deeper(data, deepest):
         raise _too_deep(path)
     return data
@@ -137,7 +138,7 @@ class _Xml:
         try:
             parser.Parse(data, True)
         except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: of an unknown encoding
-            raise FileFormatError(f"{path} is no valid XML: {error}.") from error
+            raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
 
 
 def _too_deep(path: str | Path) -> FileFormatError:

@@ -97,6 +97,14 @@ def test_no_image_runs_postscript(tmp_path: Path) -> None:
         read_grey(path)
 
 
+def test_an_image_cut_short_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    whole = exr_of(5, 3)
+    path.write_bytes(whole[:-5])
+    with pytest.raises(FileFormatError, match="its pixels are damaged or missing"):
+        read_grey(path)
+
+
 def npz(path: Path, **members: bytes) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():
@@ -275,6 +283,8 @@ def test_deep_toml_is_refused(tmp_path: Path, text: str) -> None:
         'scene = "a"\nunit_m = 1' + "0" * 400,
         'scene = "a"\nspp = "' + "x" * 10**6 + '"',
         "x" * 10**6 + " = 1",
+        'scene = "a"\n[[instrument]]\nname = "a"\nsensor = {type = []}',
+        'scene = "a"\n[[instrument]]\nsensor = "amcw"\ndetector = {type = {}}',
         'scene = "a"\nwidth = true',
         'scene = "a"\n[[instrument]]\nsensor = "' + "x" * 10**6 + '"',
         'scene = "a"\n[[instrument]]\nsensor = "amcw"\nbaseline_m = nan',
