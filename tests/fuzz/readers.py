@@ -57,9 +57,11 @@ class Reader:
     def made_by_hand(self, known: Mapping[str, Input]) -> Made:
         """Hostile inputs by name: the seeds themselves, those of any file, those of this kind."""
         made: Made = {f"seed {name}": partial(_itself, seed) for name, seed in known.items()}
-        if self.mutates_arguments:
-            return made
         first = next(iter(known.values()))
+        if self.mutates_arguments:
+            for by_hand in self.by_hand:
+                made |= by_hand(first, "")
+            return made
         suffixes: dict[str, str] = {}
         for target in self.targets_of(first):
             suffixes.setdefault(target.rpartition(".")[2], target)
@@ -243,6 +245,27 @@ def _settings_to_run(seed: Input, target: str) -> Made:
     return {n: make for n, make in hostile.toml_files(seed, target).items() if n != "2000 instruments"}
 
 
+def _options(*words: str) -> Callable[[Input, str], Made]:
+    """Command lines of the seed in which the value of one option is another, or to which one is added."""
+
+    def made(seed: Input, target: str) -> Made:
+        lines: Made = {}
+        for word in words:
+            (option, value), start = word.removeprefix(hostile.NONSENSE).split(" ", 1), list(seed.arguments)
+            if option in start:
+                start[start.index(option) + 1] = value
+            else:
+                start += [option, value]
+            lines[word] = partial(_itself, Input(seed.files, seed.entry, tuple(start)))
+        return lines
+
+    return made
+
+
+def _nonsense(*words: str) -> tuple[str, ...]:
+    return tuple(f"{hostile.NONSENSE}{word}" for word in words)
+
+
 def _by_suffix(seed: Input, target: str) -> Made:
     """What is made by hand of a file in a result, by its suffix; of one file of each kind."""
     if target.endswith(".json"):
@@ -341,6 +364,82 @@ _CLOUD = ("CloudReadError",)
 _IMAGES = {"png": "png", "tif": "tiff", "bmp": "bmp", "jpg": "jpeg", "pgm": "pgm"}
 _RUN = "run {entry} --out {out} --width 16 --height 12 --spp 1 --photons 1000"
 _DECODE = "decode {entry} --out {out} --code gray --projector 8x8 --axes columns,rows --bits 8"
+_OF_RUN = (
+    *_nonsense(
+        "--width 1000000000",
+        "--height 1000000000",
+        "--width 0",
+        "--width -5",
+        "--width nan",
+        "--spp 0",
+        "--spp -1",
+        f"--spp {10**30}",
+        "--photons -1",
+        f"--photons {10**15}",
+        "--max-depth 0",
+        f"--max-depth {10**12}",
+        "--seed -1",
+        f"--seed {2**70}",
+        "--baseline nan",
+        "--baseline inf",
+        "--baseline 1e300",
+        "--sensor x",
+        "--unit-m 0",
+        "--material glossy",
+    ),
+    "--baseline -1",
+    "--baseline 0",
+    "--seed 18446744073709551615",
+)
+_OF_DECODE = (
+    *_nonsense(
+        "--projector 0x0",
+        "--projector 8",
+        "--projector 8x",
+        "--projector 1000000x1000000",
+        f"--projector {'9' * 5000}x8",
+        "--projector \u0661\u0662x8",
+        "--projector -8x8",
+        "--axes columns,columns",
+        "--axes ,",
+        "--axes rows,columns",
+        "--bits 0",
+        "--bits 99",
+        f"--bits {10**30}",
+        "--code x",
+    ),
+    "--period nan",
+    "--period inf",
+    "--period 1e-300",
+    f"--steps {10**30}",
+    "--steps 1000000000",
+    "--steps 0",
+)
+_OF_SEGMENT = (
+    *_nonsense(
+        "--voxel-size nan",
+        "--voxel-size inf",
+        "--voxel-size 0",
+        "--voxel-size -1",
+        "--voxel-size 1e300",
+        "--voxel-size 1e-300",
+        "--seed-size nan",
+        "--seed-size 0",
+        "--seed-size 1e300",
+        "--objects 0",
+        "--objects -1",
+        f"--objects {10**30}",
+        "--method x",
+        "--range-growth nan",
+        "--range-growth -1",
+        "--range-growth 1e300",
+        "--viewpoint nan",
+        "--viewpoint inf",
+    ),
+    "--voxel-size 1e-6",
+    "--seed-size 1e-9",
+    "--objects 1000000000",
+)
 _MORE = "--sensor ideal-tof --seed 1 --baseline 0.2 --max-depth 3"
 _PLAIN = "decode {entry} --out {out}"
 _CALIBRATED = "decode {entry} --out {out} --calibration"
@@ -414,11 +513,12 @@ READERS = {
         ),
         Reader(
             "options-decode", _rangesim, _with_arguments(_bare_images, _DECODE), share=0.2, command="rangesim",
-            names_file=False, may_write=("*",), mutates_arguments=True,
+            by_hand=(_options(*_OF_DECODE),), names_file=False, may_write=("*",), mutates_arguments=True,
         ),
         Reader(
             "options-run", _rangesim, _with_arguments(_beside_a_plane, f"{_RUN} --sensor gray", f"{_RUN} {_MORE}"),
-            share=0.05, command="rangesim", names_file=False, may_write=("*",), mutates_arguments=True,
+            share=0.1, command="rangesim", by_hand=(_options(*_OF_RUN),),
+            names_file=False, may_write=("*",), mutates_arguments=True,
         ),
         Reader(
             "options-segment", _pcgraph,
@@ -427,7 +527,8 @@ READERS = {
                 "segment {entry} --out {out} --voxel-size 0.05 --seed-size 0.3 --objects 2 --viewpoint 0 0 0",
                 "segment {entry} --out {out} --method vccs --range-growth 0.5 --voxel-size 0.05",
             ),
-            share=0.1, command="pcgraph", names_file=False, may_write=("*",), mutates_arguments=True,
+            share=0.1, command="pcgraph", by_hand=(_options(*_OF_SEGMENT),),
+            names_file=False, may_write=("*",), mutates_arguments=True,
         ),
     )
 }  # fmt: skip

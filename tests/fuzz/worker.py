@@ -257,9 +257,10 @@ def _short(filename: str, line: int) -> str:
 
 
 def _pattern(text: str, path: Path) -> str:
-    """What the first line of a text has in common with others of its kind: no path, no numbers."""
+    """What the first line of a text has in common with others of its kind: an error code, or two words."""
     line = next((line.strip() for line in text.replace(str(path), "FILE").splitlines() if line.strip()), "")
-    return re.sub(r"\d+", "N", line)[:60]
+    code = re.search(r"\b[A-Z]+_ERR_[A-Z_]+\b", line)
+    return code[0] if code else " ".join(re.findall(r"[A-Za-z_]+", line)[:2])
 
 
 def _open_files() -> int:
