@@ -78,7 +78,7 @@ def trace_glint(
     camera, projector = Device.camera(rig), Device.projector(rig)
     h, w = rig.camera.height, rig.camera.width
     view = View(scene, camera, media, Seed.of(seed))
-    worth_probing = _worth_probing(scene, camera, projector, h, w, media)
+    worth_probing = _worth_probing(scene, camera, projector, h, w)
     pixel, radius_m = _near_the_lens(view, rig, projector, worth_probing, report)
     total = np.zeros(len(pixel), np.float32)
     if len(pixel) == 0:
@@ -201,9 +201,9 @@ class Lens:
         return across, t, (slope > 0) & (t > 0) & (t < si.t)
 
 
-def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int, media: Media | None) -> np.ndarray:
+def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int) -> np.ndarray:
     """Flat indices of the pixels around whose centre there is a delta surface, or the lens in plain view."""
-    meets, exists = meets_delta(scene, camera, media)
+    meets, exists = meets_delta(scene, camera)
     mask = meets.reshape(h, w)
     uv, z = camera.project(mi.Point3f(projector.centre))
     u, v = float(uv.x[0]), float(uv.y[0])

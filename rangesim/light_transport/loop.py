@@ -153,9 +153,8 @@ def trace(
         pixel = place + dr.opaque(mi.UInt32, first_pixel)
         dr.eval(pixel)
         loop = partial(walk, view, settings, accumulators, place, pixel)
-        state, taken = launches.run(
-            loop, start(view, settings, accumulators, pixel), len(places), accumulators.pending, tell
-        )
+        state = start(view, settings, accumulators, pixel)
+        state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
         accumulators.store(state.channels, places)
         for image, values in zip(radiance, state.radiance, strict=True):
             image[places] = values.numpy()
