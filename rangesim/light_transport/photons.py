@@ -124,7 +124,7 @@ def trace_photons(
     per_map = -(-photons // maps)
     cumulative = np.cumsum(share)
     total = per_map * maps
-    most = max(1, min(total, memory_bytes // BYTES_PER_PHOTON))
+    most = max(1, memory_bytes // BYTES_PER_PHOTON)
     landed: list[list[np.ndarray]] = []
     balance = np.zeros(len(PhotonBalance.__dataclass_fields__))
     launches = Launches()
