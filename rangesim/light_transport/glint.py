@@ -28,7 +28,7 @@ from rangesim.light_transport.medium import Media, bounded
 from rangesim.light_transport.photon_flight import MAX_CHAIN
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import Seed, random_stream, stratified
+from rangesim.light_transport.sampling import Continued, Seed, random_stream, stratified
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
@@ -78,7 +78,7 @@ def trace_glint(
     camera, projector = Device.camera(rig), Device.projector(rig)
     h, w = rig.camera.height, rig.camera.width
     view = View(scene, camera, media, Seed.of(seed))
-    worth_probing = _worth_probing(scene, camera, projector, h, w, media)
+    worth_probing = _worth_probing(scene, camera, projector, h, w)
     pixel, radius_m = _near_the_lens(view, rig, projector, worth_probing, report)
     total = np.zeros(len(pixel), np.float32)
     if len(pixel) == 0:
@@ -89,9 +89,7 @@ def trace_glint(
     for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=fewest_lanes()):
         some, n = slice(begin, end), end - begin
         lens = Lens(rig, projector, radius_m[some], radiance[some])
-        lanes = Lanes(view, pixel[some], paths)
-        place = dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, begin)
-        dr.eval(place)
+        lanes = Lanes(view, pixel[some], paths, begin)
         state = PathState(
             chain=lanes.start(),
             throughput=dr.ones(mi.Float, n),
@@ -101,7 +99,7 @@ def trace_glint(
             channels=accumulators.zeros(n),
             total=dr.zeros(mi.Float, n),
         )
-        loop = partial(_paths_to_the_lens, lanes, lens, accumulators, place)
+        loop = partial(_paths_to_the_lens, lanes, lens, accumulators)
         state, _ = launches.run(loop, state, n, accumulators.pending, lambda state: report())
         accumulators.store(state.channels, some)
         total[some] = state.total.numpy()
@@ -121,10 +119,11 @@ class View(NamedTuple):
 class Chain:
     """Where a lane is in the delta chains of its pixel.
 
-    rng : PCG32. k : UInt32, chains finished. length : UInt32, surfaces of this one so far. origin, direction : the ray.
+    random : UInt64, state of the random numbers. k : UInt32, chains finished. length : UInt32, surfaces of this one so
+    far. origin, direction : the ray.
     """
 
-    rng: Any
+    random: Any
     k: Any
     length: Any
     origin: Any
@@ -139,13 +138,16 @@ class Lanes:
     view : View
     pixel : (lanes,) int, flat indices.
     paths : int, for each pixel.
+    first_place : int, the number of the first pixel in the accumulators.
     """
 
-    def __init__(self, view: View, pixel: np.ndarray, paths: int) -> None:
+    def __init__(self, view: View, pixel: np.ndarray, paths: int, first_place: int = 0) -> None:
         self.scene, self.camera, self.media, seed = view
         self.pixel, self.paths = mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, paths)
-        self.rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
-        self.shift = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+        self.place = dr.arange(mi.UInt32, len(pixel)) + dr.opaque(mi.UInt32, first_place)
+        rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
+        self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())
+        self.random = Continued(rng)
         width = mi.UInt32(self.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
 
@@ -153,7 +155,7 @@ class Lanes:
         """The lanes before their first path."""
         zero = dr.zeros(mi.UInt32, dr.width(self.pixel))
         nowhere = dr.zeros(mi.Vector3f, dr.width(self.pixel))
-        return Chain(mi.PCG32(self.rng), zero, mi.UInt32(zero), mi.Point3f(nowhere), nowhere)
+        return Chain(mi.UInt64(self.random.rng.state), zero, mi.UInt32(zero), mi.Point3f(nowhere), nowhere)
 
 
 @dataclass
@@ -201,9 +203,9 @@ class Lens:
         return across, t, (slope > 0) & (t > 0) & (t < si.t)
 
 
-def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int, media: Media | None) -> np.ndarray:
+def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int) -> np.ndarray:
     """Flat indices of the pixels around whose centre there is a delta surface, or the lens in plain view."""
-    meets, exists = meets_delta(scene, camera, media)
+    meets, exists = meets_delta(scene, camera)
     mask = meets.reshape(h, w)
     uv, z = camera.project(mi.Point3f(projector.centre))
     u, v = float(uv.x[0]), float(uv.y[0])
@@ -240,16 +242,18 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
     Where light splits into reflection and refraction, probes take both alike, however faint one is.
     """
     scene, camera, media = lanes.scene, lanes.camera, lanes.media
-    corner, shift, paths = lanes.corner, lanes.shift, lanes.paths
-    rng, k, chain = state.chain.rng, state.chain.k, state.chain.length
-    ray = mi.Ray3f(state.chain.origin, state.chain.direction)
+    random, k, chain = state.chain.random, state.chain.k, state.chain.length
+    origin, direction = state.chain.origin, state.chain.direction
     nearest, spread, before = state.nearest, state.spread, state.before  # where the last one crossed
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
-    done = dr.zeros(mi.UInt32, dr.width(k))
-    while (k < paths) & (done < most):
-        primary = camera.centre_ray(corner + stratified(shift, k))
-        ray.o, ray.d = dr.select(chain == 0, primary.origin, ray.o), dr.select(chain == 0, primary.direction, ray.d)
+    left = most + dr.zeros(mi.UInt32, dr.width(k))  # turns
+    while (k < lanes.paths) & (left > 0):
+        rng = lanes.random.at(random)
+        primary = camera.centre_ray(lanes.corner + stratified(lanes.shift, k))
+        ray = mi.Ray3f(
+            dr.select(chain == 0, primary.origin, origin), dr.select(chain == 0, primary.direction, direction)
+        )
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
         across, _, crosses = lens.offset(ray, si)
         nearest = dr.select(crosses, dr.minimum(nearest, dr.norm(across)), nearest)
@@ -264,33 +268,34 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (mono(weight) <= 0) | (chain >= MAX_CHAIN)
         chain = dr.select(ends, 0, chain)
         k = dr.select(ends, k + 1, k)
-        done += 1
-    return ProbeState(Chain(rng, k, chain, ray.o, ray.d), nearest, spread, before), done
+        random, origin, direction = rng.state, ray.o, ray.d
+        left -= 1
+    return ProbeState(Chain(random, k, chain, origin, direction), nearest, spread, before), most - left
 
 
 @dr.syntax
 def _paths_to_the_lens(
-    lanes: Lanes, lens: Lens, accumulators: Accumulators, place: Any, state: PathState, most: Any
+    lanes: Lanes, lens: Lens, accumulators: Accumulators, state: PathState, most: Any
 ) -> tuple[PathState, Any]:
     """The state after at most so many turns of the loop, and the turns taken: dense channels and radiance of the delta
-    paths from each pixel to the lens; bins go to the accumulators, where the pixel has the number `place`."""
+    paths from each pixel to the lens; bins go to the accumulators."""
     scene, camera, media = lanes.scene, lanes.camera, lanes.media
-    corner, shift, paths = lanes.corner, lanes.shift, lanes.paths
-    rng, k, chain = state.chain.rng, state.chain.k, state.chain.length
-    ray = mi.Ray3f(state.chain.origin, state.chain.direction)
+    random, k, chain = state.chain.random, state.chain.k, state.chain.length
+    origin, direction = state.chain.origin, state.chain.direction
     throughput, length, ior, previous = state.throughput, state.length, state.ior, state.previous
     channels, total = state.channels, state.total
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
-    done = dr.zeros(mi.UInt32, dr.width(k))
-    while (k < paths) & (done < most):
+    left = most + dr.zeros(mi.UInt32, dr.width(k))  # turns
+    while (k < lanes.paths) & (left > 0):
+        rng = lanes.random.at(random)
         # ---- The next path starts at the camera ------------------------------------------------------
         starts = chain == 0
         on_lens = (
             mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(camera.has_lens, mode="scalar") else None
         )
-        primary = camera.sample_ray(corner + stratified(shift, k), on_lens)
-        ray.o, ray.d = dr.select(starts, primary.origin, ray.o), dr.select(starts, primary.direction, ray.d)
+        primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, k), on_lens)
+        ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, direction))
         previous, length = dr.select(starts, primary.origin, previous), dr.select(starts, primary.lead, length)
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
 
@@ -308,7 +313,7 @@ def _paths_to_the_lens(
         radiance = dr.select(meets, radiance * lens.projector.pixel_density(-ray.d), 0)
         u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, dr.fma(ior, way, length)))
         path = LightPath(u, v, path_length, dr.full(mi.Bool, False, dr.width(k)), mi.UInt32(GLINT))
-        channels = accumulators.add(channels, path, radiance, place, meets)
+        channels = accumulators.add(channels, path, radiance, lanes.place, meets)
         total += radiance
 
         # ---- On through delta interactions, or the next path -----------------------------------------
@@ -325,6 +330,7 @@ def _paths_to_the_lens(
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)
         throughput, ior = dr.select(ends, 1, throughput), dr.select(ends, 1, ior)
-        done += 1
-    at = Chain(rng, k, chain, ray.o, ray.d)
-    return PathState(at, throughput, length, ior, previous, channels, total), done
+        random, origin, direction = rng.state, ray.o, ray.d
+        left -= 1
+    at = Chain(random, k, chain, origin, direction)
+    return PathState(at, throughput, length, ior, previous, channels, total), most - left

@@ -12,6 +12,7 @@ import numpy as np
 from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.loop import mono
+from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
@@ -25,10 +26,13 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
     h, w = rig.camera.height, rig.camera.width
     camera, projector = Device.camera(rig), Device.projector(rig)
-    launches, table = Launches(), _index_of_shape(scene)
+    launches, shapes = Launches(), scene.mitsuba.shapes()
+    index_of = mi.Int32(table_of(scene.mitsuba, np.arange(len(shapes), dtype=np.int32)))
+    transmits = [bool(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission)) for s in shapes]
+    transmits_of = mi.Bool(table_of(scene.mitsuba, transmits))
     parts = []
     for begin, end in launches.ranges(h * w):
-        part = _truth(scene, camera, projector, table, begin, end)
+        part = _truth(scene, camera, projector, index_of, transmits_of, begin, end)
         launches.evaluate(part, end - begin)
         parts.append([np.asarray(x.numpy()) for x in part])
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -49,7 +53,9 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     )
 
 
-def _truth(scene: Scene, camera: Device, projector: Device, table: Any, begin: int, end: int) -> list[Any]:
+def _truth(
+    scene: Scene, camera: Device, projector: Device, index_of: Any, transmits_of: Any, begin: int, end: int
+) -> list[Any]:
     """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of the normal."""
     ray = camera.centre_rays(begin, end)
     si = _first_surface(scene, mi.Ray3f(ray.origin, ray.direction))
@@ -58,16 +64,18 @@ def _truth(scene: Scene, camera: Device, projector: Device, table: Any, begin: i
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
     link = connect(scene.mitsuba, projector, si, hit)
     uv = link.uv
-    transmits = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
+    shape = number_of(si.shape)
+    transmits = dr.gather(mi.Bool, transmits_of, shape, hit)
     visible = link.lit & (transmits | (dr.dot(normal, link.direction) > 0))
     z, distance = -dr.dot(to_camera, camera.z), dr.norm(to_camera)
-    index = dr.gather(mi.Int32, table, dr.reinterpret_array(mi.UInt32, si.shape), hit)
+    index = dr.gather(mi.Int32, index_of, shape, hit)
     return [hit, index, z, distance, visible, uv.x, uv.y, normal.x, normal.y, normal.z]
 
 
 def _first_surface(scene: Scene, ray: Any) -> Any:
     """Where the ray meets the first surface that lets less than half of the light pass unchanged."""
-    si = scene.mitsuba.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    flags = mi.RayFlags.All if scene.has_cutouts else mi.RayFlags.Minimal
+    si = scene.mitsuba.ray_intersect(ray, flags, coherent=True)
     for _ in range(MOST_CUTOUTS if scene.has_cutouts else 0):
         bsdf = si.bsdf()
         is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
@@ -76,11 +84,3 @@ def _first_surface(scene: Scene, ray: Any) -> Any:
         behind = scene.mitsuba.ray_intersect(si.spawn_ray(ray.d), mi.RayFlags.All, coherent=True, active=passes)
         si = dr.select(passes, behind, si)
     return si
-
-
-def _index_of_shape(scene: Scene) -> Any:
-    """Table from Mitsuba's registry ids to positions in `scene.instances`."""
-    ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0]) for s in scene.mitsuba.shapes()]
-    table = np.full(max(ids) + 1, -1, dtype=np.int32)
-    table[ids] = np.arange(len(ids))
-    return mi.Int32(table)

@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 LAUNCH_S = 0.7
 """What a launch should take, seconds."""
@@ -23,6 +25,10 @@ LONGEST_S = 1.2
 """After which a launch of a loop should end, its lanes finished or not."""
 FIRST_UNITS = 1 << 20
 """Work of a first launch: as many turns of a loop, rays or photons."""
+LONGER_WHERE_PREPARED_LONG = 2.0
+"""Times as long, at most, where it takes long to make the kernel (thousands of shapes)."""
+LANES_TOGETHER = 16
+FEWEST_AT_WORK = 256
 STEEPEST = 8.0
 """Growth of the work from one launch to the next, at most."""
 MOST_TURNS = 1 << 31
@@ -48,12 +54,13 @@ class Launches:
         """Compute Dr.Jit arrays that are so many units of work, and wait for them."""
         self.learn(units, evaluate(arrays))
 
-    def learn(self, units: int, seconds: float) -> None:
-        """Fit the next launch to the time that this one took."""
-        fits = units * LAUNCH_S / max(seconds, 1e-6)
+    def learn(self, units: int, seconds: float, prepared_s: float = 0.0) -> None:
+        """Fit the next launch to the time that this one took, and took to be prepared."""
+        launch_s = LAUNCH_S * min(max(prepared_s / LAUNCH_S, 1), LONGER_WHERE_PREPARED_LONG)
+        fits = units * launch_s / max(seconds, 1e-6)
         if fits > self.units:
             self.units = int(min(fits, STEEPEST * self.units))
-        elif seconds > LAUNCH_S / 2:  # a shorter launch says how long its overhead takes
+        elif seconds > launch_s / 2:  # a shorter launch says how long its overhead takes
             self.units = max(1, int(fits))
 
     def run(
@@ -74,15 +81,18 @@ class Launches:
         report : called with the state after each launch.
         """
         dr.make_opaque(state)  # like the state of later launches, so that they share a kernel
-        total, left = 0, True
-        while left:
-            most = min(max(1, int(self.units * LONGEST_S / LAUNCH_S) // lanes), MOST_TURNS)
+        total, at_work = 0, lanes
+        while at_work:
+            most = min(max(1, int(self.units * LONGEST_S / LAUNCH_S) // at_work), MOST_TURNS)
+            start = time.perf_counter()
             state, taken = loop(state, dr.opaque(mi.UInt32, most))
             seconds = evaluate([state, taken, pending()])
             turns = taken.numpy()
-            self.learn(int(turns.sum()), seconds)
+            self.learn(int(turns.sum()), seconds, time.perf_counter() - start - seconds)
             total += int(turns.sum())
-            left = bool((turns == most).any())
+            # Neighbours are at work together, and a few lanes take as long as many
+            groups = np.logical_or.reduceat(turns == most, np.arange(0, lanes, LANES_TOGETHER))
+            at_work = max(FEWEST_AT_WORK, LANES_TOGETHER * int(groups.sum())) if groups.any() else 0
             report(state)
         return state, total
 
@@ -97,6 +107,21 @@ class Launches:
             end = min(count, begin + -(-left // -(-left // most)) * multiple_of)  # of even size
             yield begin, end
             begin = end
+
+
+@contextmanager
+def raised_as_it_is() -> Iterator[None]:
+    """Let through what was raised while Dr.Jit traced a loop, by the handler of a signal for example: Dr.Jit makes a
+    RuntimeError of it."""
+    try:
+        yield
+    except RuntimeError as error:
+        root: BaseException = error
+        while root.__cause__ is not None:
+            root = root.__cause__
+        if root is error:
+            raise
+        raise root from None
 
 
 def evaluate(arrays: Any) -> float:

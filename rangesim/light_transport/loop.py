@@ -32,7 +32,7 @@ from rangesim.light_transport.launches import Launches, Report, fewest_lanes
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import Seed, Stream, random_stream, stratified
+from rangesim.light_transport.sampling import Continued, Seed, Stream, random_stream, stratified
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
 NEIGHBOURS = 256
@@ -81,10 +81,11 @@ class Vertex(NamedTuple):
 class State:
     """What a lane carries from one turn of the loop to the next; see `start`.
 
-    A dataclass, not frozen: Dr.Jit looks into no named tuple when it evaluates.
+    A dataclass, not frozen: Dr.Jit looks into no named tuple when it evaluates. What never changes is not in it (None
+    instead), or Dr.Jit would trace the loop twice.
     """
 
-    rng: Any
+    random: Any
     choice: Any
     turns: Any
     channels: list[list[Any]]
@@ -149,16 +150,12 @@ def trace(
         end = begin + -(-left // -(-left // most))  # launches of even size
         places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
         places = places[places < pixels]
-        place = mi.UInt32(places.astype(np.uint32))
-        pixel = place + dr.opaque(mi.UInt32, first_pixel)
-        dr.eval(pixel)
-        loop = partial(walk, view, settings, accumulators, place, pixel)
-        state, taken = launches.run(
-            loop, start(view, settings, accumulators, pixel), len(places), accumulators.pending, tell
-        )
+        lanes = Lanes(view, settings, places, first_pixel)
+        loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
+        state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
         accumulators.store(state.channels, places)
         for image, values in zip(radiance, state.radiance, strict=True):
-            image[places] = values.numpy()
+            image[places] = 0 if values is None else values.numpy()
         begin, finished, turns = end, finished + len(places), turns + taken
     return radiance
 
@@ -169,17 +166,41 @@ def _dealt(n: int) -> np.ndarray:
     return np.arange(n) * step % n
 
 
-def start(view: View, settings: Settings, accumulators: Accumulators, pixel: Any) -> State:
-    """The state of lanes that have done nothing yet; `pixel` (lanes,) UInt32 as in `walk`."""
-    lanes = dr.width(pixel)
+class Lanes:
+    """Pixels at work, a lane for each: what of a lane never changes.
+
+    Parameters
+    ----------
+    view, settings : View and Settings.
+    places : (lanes,) int, numbers of the pixels in the accumulators.
+    first_pixel : int, flat index in the whole image of the first pixel of the accumulators. Random numbers depend on a
+        pixel's flat index in the whole image and the seed alone.
+    """
+
+    def __init__(self, view: View, settings: Settings, places: np.ndarray, first_pixel: int) -> None:
+        self.place = mi.UInt32(places.astype(np.uint32))
+        self.pixel = self.place + dr.opaque(mi.UInt32, first_pixel)
+        dr.eval(self.pixel)
+        width = mi.UInt32(view.camera.size.x)
+        self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
+        rng = random_stream(settings.seed, self.pixel)
+        self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the samples in the pixel
+        self.random = Continued(rng)
+        self.choice = Continued(random_stream(settings.seed, self.pixel, Stream.SECOND))
+
+
+def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes) -> State:
+    """The state of lanes that have done nothing yet."""
+    lanes, gathers, in_media = dr.width(at.pixel), view.maps is not None, view.media is not None
+    shines = [True, True, True, gathers, settings.ambient]
     return State(
         # ---- Of the lane: its random numbers, its sums -----------------------------------------------
-        rng=_pixel_stream(settings.seed, pixel)[0],
-        choice=random_stream(settings.seed, pixel, Stream.SECOND),  # of photons; they change no other light
+        random=mi.UInt64(at.random.rng.state),
+        choice=mi.UInt64(at.choice.rng.state) if gathers else None,  # of photons; they change no other light
         # Shared by neighbours; evenly spread from here on
-        turns=random_stream(settings.seed, pixel >> 4, Stream.THIRD).next_uint32(),
+        turns=random_stream(settings.seed, at.pixel >> 4, Stream.THIRD).next_uint32() if gathers else None,
         channels=accumulators.zeros(lanes),
-        radiance=[dr.zeros(mi.Float, lanes) for _ in Radiance._fields],
+        radiance=[dr.zeros(mi.Float, lanes) if any_of_it else None for any_of_it in shines],
         sample=dr.zeros(mi.UInt32, lanes),  # samples of this pixel finished so far
         # ---- Of the path -----------------------------------------------------------------------------
         depth=dr.zeros(mi.UInt32, lanes),  # surfaces met so far
@@ -194,57 +215,44 @@ def start(view: View, settings: Settings, accumulators: Accumulators, pixel: Any
         previous_pdf=dr.zeros(mi.Float, lanes),  # of the BSDF sample that made the ray; for MIS with ambient light
         previous_delta=dr.full(mi.Bool, True, lanes),
         was_bent=dr.full(mi.Bool, False, lanes),  # the ray left a delta surface
-        inside=None if view.media is None else view.media.none(lanes),  # what the ray runs through
-        events=dr.zeros(mi.UInt32, lanes),  # scattering events in media and crossed boundaries so far
-        stays=dr.full(mi.Bool, False, lanes),  # scattered since it entered the medium
+        inside=view.media.none(lanes) if in_media else None,  # what the ray runs through
+        events=dr.zeros(mi.UInt32, lanes) if in_media else None,  # scatterings in media and crossed boundaries so far
+        stays=dr.full(mi.Bool, False, lanes) if in_media else None,  # scattered since it entered the medium
     )
-
-
-def _pixel_stream(seed: Seed, pixel: Any) -> tuple[Any, Any]:
-    """The random numbers of a pixel's paths, and the shift of its samples, which is drawn first."""
-    rng = random_stream(seed, pixel)
-    shift = mi.Point2f(rng.next_float32(), rng.next_float32())
-    return rng, shift
 
 
 @dr.syntax
 def walk(
-    view: View, settings: Settings, accumulators: Accumulators, place: Any, pixel: Any, state: State, most: Any
+    view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
-    """The state of the lanes after at most so many turns of the loop, and the turns that each one took.
-
-    `place` (lanes,) UInt32 is the number of each lane's pixel in the accumulators; `pixel` its flat index in the whole
-    image: random numbers depend on it and the seed alone.
-    """
-    scene, camera, projector, irradiance, maps, media = view
+    """The state of the lanes after at most so many turns of the loop, and the turns that each one took."""
+    scene, camera, projector, _, maps, media = view
     # ---- The state, by name ------------------------------------------------------------------------
-    rng, choice, turns, channels, sample = state.rng, state.choice, state.turns, state.channels, state.sample
+    random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
+    origin, towards, previous = state.origin, state.direction, state.previous
     direct, multipath, via_delta, caustic, ambient = state.radiance
     depth, throughput, length, ior = state.depth, state.throughput, state.length, state.ior
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
     inside, events, stays = state.inside, state.events, state.stays
-    lanes = dr.width(pixel)
-    width = mi.UInt32(camera.size.x)
-    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-    shift = _pixel_stream(settings.seed, pixel)[1]
-    ray = mi.Ray3f(state.origin, state.direction)
-    previous = dr.zeros(mi.Interaction3f, lanes)
-    previous.p = state.previous
-    scatters, crosses = mi.Bool(False), mi.Bool(False)  # this turn: an event inside a medium, or its boundary
-    done = dr.zeros(mi.UInt32, lanes)  # turns of this launch
-    active = (sample < settings.spp) & (done < most)
+    lanes = dr.width(sample)
+    left = most + dr.zeros(mi.UInt32, lanes)  # turns
+    active = (sample < settings.spp) & (left > 0)
 
     while active:
+        rng = at.random.at(random)
+        scatters, crosses = mi.Bool(False), mi.Bool(False)  # this turn: an event inside a medium, or its boundary
+
         # ---- A new sample starts at the camera -------------------------------------------------------
-        starts = (depth == 0) & (events == 0)
-        jitter = stratified(shift, sample)
+        starts = depth == 0
+        if dr.hint(media is not None, mode="scalar"):
+            starts &= events == 0
+        jitter = stratified(at.shift, sample)
         lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(camera.has_lens, mode="scalar") else None
-        primary = camera.sample_ray(corner + jitter, lens)
-        ray.o = dr.select(starts, primary.origin, ray.o)
-        ray.d = dr.select(starts, primary.direction, ray.d)
+        primary = camera.sample_ray(at.corner + jitter, lens)
+        ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
         length = dr.select(starts, primary.lead, length)
-        previous.p = dr.select(starts, primary.origin, previous.p)
+        previous = dr.select(starts, primary.origin, previous)
         if dr.hint(camera.distortion is not None, mode="scalar"):
             throughput = dr.select(starts & ~primary.exists, 0, throughput)  # no ray, no light
 
@@ -252,17 +260,20 @@ def walk(
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
-        si.p = dr.select(was_bent, on_its_line(si, previous.p, ray.d), met)
+        si.p = dr.select(was_bent, on_its_line(si, previous, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
             flight = inside.free_flight(rng.next_float32())
-            scatters = hit & (flight < dr.norm(si.p - previous.p))
+            scatters = hit & (flight < dr.norm(si.p - previous))
             crosses = hit & ~scatters & media.bounded_by(si, hit)
-            si.p = dr.select(scatters, dr.fma(ray.d, flight, previous.p), si.p)
+            si.p = dr.select(scatters, dr.fma(ray.d, flight, previous), si.p)
             si.n = dr.select(scatters, 0, si.n)  # so that rays start at the event itself
         at_surface = hit & ~scatters
-        depth += dr.select(crosses | (scatters & stays), mi.UInt32(0), mi.UInt32(1))
+        if dr.hint(media is not None, mode="scalar"):
+            depth += dr.select(crosses | (scatters & stays), mi.UInt32(0), mi.UInt32(1))
+        else:
+            depth += 1
         # Not si.t: spawned rays start a little off the surface
-        length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous.p), length), length)
+        length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
         bsdf = si.bsdf(ray)
         may_connect = hit & (depth < settings.max_depth) & (scatters | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
 
@@ -283,12 +294,12 @@ def walk(
             bs_weight = dr.select(scatters, inside.albedo, bs_weight)
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
             wo = dr.select(scatters, inside.scattered(ray.d, xi), wo)
-        radiance = dr.select(link.lit, throughput * value * link.geometry * irradiance, 0)
+        radiance = dr.select(link.lit, throughput * value * link.geometry * view.irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
         u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, length + link.distance))
         kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
         light = LightPath(u, v, path_length, first, kind, link.blur_px)
-        channels = accumulators.add(channels, light, radiance, place, link.lit)
+        channels = accumulators.add(channels, light, radiance, at.place, link.lit)
         direct += dr.select(kind == DIRECT, radiance, 0)
         via_delta += dr.select(kind == VIA_DELTA, radiance, 0)
         multipath += dr.select(kind == MULTIPATH, radiance, 0)
@@ -296,16 +307,20 @@ def walk(
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
             vertex = Vertex(si, bsdf, throughput / mi.Float(settings.spp), length, first & ~link.lit)
-            xi = [choice.next_float32() for _ in range(3)]
+            chosen = at.choice.at(choice)
+            xi = [chosen.next_float32() for _ in range(3)]
+            choice = chosen.state
             turns += 2654435769  # 2^32 over the golden ratio
             photon, brought = gather(maps, vertex, sample, xi, mi.Float(turns >> 8) * 2**-24, may_connect & ~scatters)
-            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, place)
+            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, at.place)
             caustic += radiance
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
             alone = previous_delta | (not settings.lamps)  # no other strategy finds this light
-            ambient += throughput * emission(scene, si, previous, previous_pdf, alone, active & ~scatters)
+            before = dr.zeros(mi.Interaction3f, lanes)
+            before.p = previous
+            ambient += throughput * emission(scene, si, before, previous_pdf, alone, active & ~scatters)
             if dr.hint(settings.lamps, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
                 if dr.hint(media is None, mode="scalar"):
@@ -328,7 +343,7 @@ def walk(
         passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) & ~is_glass  # through a hole, as if nothing were there
         first &= ~scatters & (passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         via |= is_delta & ~passes
-        previous = mi.Interaction3f(si)
+        previous = mi.Point3f(si.p)
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
@@ -342,7 +357,9 @@ def walk(
         # ---- Or next sample --------------------------------------------------------------------------
         # The last surface can only be seen to emit, so it is needed for ambient light alone
         last = settings.max_depth if settings.ambient else settings.max_depth - 1
-        goes_on = (depth < last) | ((scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS))
+        goes_on = depth < last
+        if dr.hint(media is not None, mode="scalar"):
+            goes_on |= (scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS)
         ends = ~(hit & survives & (throughput > 0) & goes_on)
         sample = dr.select(ends, sample + 1, sample)
         depth = dr.select(ends, 0, depth)
@@ -357,32 +374,33 @@ def walk(
             inside = inside.replaced(ends, media.none(lanes))
             events = dr.select(ends, 0, events)
             stays &= ~ends
-        done += 1
-        active = (sample < settings.spp) & (done < most)
+        random, origin, towards = rng.state, ray.o, ray.d
+        left -= 1
+        active = (sample < settings.spp) & (left > 0)
 
     return State(
-        rng=rng,
+        random=random,
         choice=choice,
         turns=turns,
         channels=channels,
         radiance=[direct, multipath, via_delta, caustic, ambient],
         sample=sample,
         depth=depth,
-        origin=ray.o,
-        direction=ray.d,
+        origin=origin,
+        direction=towards,
         throughput=throughput,
         length=length,
         ior=ior,
         first=first,
         via=via,
-        previous=previous.p,
+        previous=previous,
         previous_pdf=previous_pdf,
         previous_delta=previous_delta,
         was_bent=was_bent,
         inside=inside,
         events=events,
         stays=stays,
-    ), done
+    ), most - left
 
 
 @dr.syntax

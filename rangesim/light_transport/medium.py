@@ -16,6 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.shapes import number_of, table_of
+
 MAX_EVENTS = 1 << 14
 """Scattering events and crossed boundaries of a path, after which it is cut off; apart from `max_depth`."""
 FAINT = 0.2
@@ -72,11 +74,9 @@ class Media:
     """
 
     def __init__(self, scene: Any) -> None:
-        ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0]) for s in scene.shapes()]
-        table = np.zeros((max(ids) + 1, len(fields(Medium))), np.float32)
-        for index, shape in zip(ids, scene.shapes(), strict=True):
-            if is_boundary(shape):
-                table[index] = medium_numbers(shape.interior_medium())
+        none = (0.0,) * len(fields(Medium))
+        media = [medium_numbers(s.interior_medium()) if is_boundary(s) else none for s in scene.shapes()]
+        table = table_of(scene, np.array(media, np.float32))
         self.table = tuple(mi.Float(np.ascontiguousarray(column)) for column in table.T)
 
     def none(self, lanes: int) -> Medium:
@@ -85,12 +85,12 @@ class Media:
 
     def bounded_by(self, si: Any, active: Any) -> Any:
         """Whether the surface is the boundary of a medium."""
-        return dr.gather(mi.Float, self.table[0], dr.reinterpret_array(mi.UInt32, si.shape), active) > 0
+        return dr.gather(mi.Float, self.table[0], number_of(si.shape), active) > 0
 
     def beyond(self, si: Any, direction: Any, active: Any) -> Medium:
         """The medium that light enters in a direction across the boundary `si`."""
         enters = active & (dr.dot(direction, si.n) < 0)
-        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+        shape = number_of(si.shape)
         return Medium(*(dr.gather(mi.Float, column, shape, enters) for column in self.table))
 
     @dr.syntax

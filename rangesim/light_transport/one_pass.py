@@ -14,7 +14,7 @@ from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photo
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth
-from rangesim.light_transport.launches import Launches, Progress, Report
+from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Radiance, Settings, View, trace
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.responses import Accumulators
@@ -32,6 +32,7 @@ PATHS_SHARE = 0.95
 """Of the progress, that the path loop makes."""
 
 
+@raised_as_it_is()
 def transport(
     scene: Scene,
     rig: Rig,

@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.medium import Media
-from rangesim.light_transport.sampling import Seed, random_stream
+from rangesim.light_transport.sampling import Continued, Seed, random_stream
 
 LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
@@ -58,7 +58,6 @@ def _chain(
     lanes = dr.width(power)
     lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(projector.has_lens, mode="scalar") else None
     primary = projector.sample_ray(uv, lens)
-    ray = mi.Ray3f(primary.origin, primary.direction)
     flux = power * projector.relative_illumination(primary.direction)
     if dr.hint(primary.exists is not None, mode="scalar"):
         flux = dr.select(primary.exists, flux, 0)
@@ -67,7 +66,7 @@ def _chain(
     ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
     chain = dr.zeros(mi.UInt32, lanes)  # delta interactions so far
     inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
-    crosses, crossed = mi.Bool(False), dr.zeros(mi.UInt32, lanes)  # boundaries of media: this one, those so far
+    left = max_chain + dr.zeros(mi.UInt32, lanes)  # surfaces and boundaries of media that may still be met
     previous = mi.Point3f(primary.origin)
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
     direct, stored, absorbed, escaped, truncated = (dr.zeros(mi.Float, lanes) for _ in range(5))
@@ -75,7 +74,12 @@ def _chain(
     context.type_mask = mi.BSDFFlags.Delta
     active = emitted > 0
 
+    random, numbers = mi.UInt64(rng.state), Continued(rng)
+    origin, towards = primary.origin, primary.direction
+
     while active:
+        rng, ray = numbers.at(random), mi.Ray3f(origin, towards)
+        crosses = mi.Bool(False)  # the boundary of a medium
         # ---- Next surface ----------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
@@ -117,9 +121,10 @@ def _chain(
         ray = spawn_close(si, si.p, si.to_world(bs.wo))
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
-            crossed += dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
-        truncated += dr.select(goes_on & (chain + crossed >= max_chain), flux, 0)
-        active = goes_on & (chain + crossed < max_chain)
+        left -= dr.select(goes_on | crosses, mi.UInt32(1), mi.UInt32(0))
+        truncated += dr.select(goes_on & (left == 0), flux, 0)
+        active = goes_on & (left > 0)
+        random, origin, towards = rng.state, ray.o, ray.d
 
     landing = Landing(position, direction, stored, uv.x, uv.y, length)
     return landing, (emitted, direct, stored, absorbed, escaped, truncated)

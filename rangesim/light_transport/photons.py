@@ -17,14 +17,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.launches import Launches
-from rangesim.light_transport.medium import Media, bounded, is_boundary
+from rangesim.light_transport.medium import Media, is_boundary
 from rangesim.light_transport.photon_flight import fly
+from rangesim.light_transport.shapes import number_of, table_of
 
 DEFENSIVE_SHARE = 0.05
 """Of the photons, for the pixels where the pre-pass found no delta surface."""
@@ -79,20 +81,23 @@ class Photons:
 
 def has_delta(scene: Any) -> bool:
     """Whether some surface of a mitsuba.Scene has a delta interaction: without one there is nothing to trace."""
-    return any(
-        bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
-        for shape in scene.shapes()
-    )
+    return any(map(_is_delta, scene.shapes()))
 
 
-def meets_delta(scene: Any, device: Device, media: Media | None) -> tuple[np.ndarray, np.ndarray]:
+def _is_delta(shape: Any) -> bool:
+    """Whether the surface of a shape has a delta interaction, and is not the boundary of a medium."""
+    return bool(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta)) and not is_boundary(shape)
+
+
+def meets_delta(scene: Any, device: Device) -> tuple[np.ndarray, np.ndarray]:
     """(pixels,) bool: whether the first surface behind each pixel's centre has a delta interaction; and whether the
     lens sends a ray through it at all."""
     launches, meets, exists = Launches(), np.zeros(device.pixels, dtype=bool), np.ones(device.pixels, dtype=bool)
+    table = mi.Bool(table_of(scene, list(map(_is_delta, scene.shapes()))))
     for begin, end in launches.ranges(device.pixels):
         rays = device.centre_rays(begin, end)
-        si = scene.ray_intersect(mi.Ray3f(rays.origin, rays.direction))
-        delta = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) & ~bounded(media, si)
+        found = scene.ray_intersect_preliminary(mi.Ray3f(rays.origin, rays.direction))
+        delta = dr.gather(mi.Bool, table, number_of(found.shape), found.is_valid())
         launches.evaluate([delta, rays.exists], end - begin)
         meets[begin:end] = delta.numpy()
         if rays.exists is not None:  # a distorted lens
@@ -115,11 +120,11 @@ def trace_photons(
 
     `report` is called after each kernel launch.
     """
-    pixels, share = _worthwhile_pixels(scene, projector, media)
+    pixels, share = _worthwhile_pixels(scene, projector)
     per_map = -(-photons // maps)
     cumulative = np.cumsum(share)
     total = per_map * maps
-    most = max(1, min(total, memory_bytes // BYTES_PER_PHOTON))
+    most = max(1, memory_bytes // BYTES_PER_PHOTON)
     landed: list[list[np.ndarray]] = []
     balance = np.zeros(len(PhotonBalance.__dataclass_fields__))
     launches = Launches()
@@ -140,9 +145,9 @@ def trace_photons(
     return Photons(position, direction, flux, u, v, length, of_map, total_balance, total / cumulative[-1])
 
 
-def _worthwhile_pixels(scene: Any, projector: Device, media: Media | None) -> tuple[np.ndarray, np.ndarray]:
+def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices of all projector pixels along a Morton curve, and the relative chance of a photon for each."""
-    meets, _ = meets_delta(scene, projector, media)
+    meets, _ = meets_delta(scene, projector)
     w, h = (int(n[0]) for n in projector.size)
     mask = binary_dilation(meets.reshape(h, w), np.ones((3, 3))).ravel()
     rest = ~mask

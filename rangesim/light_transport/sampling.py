@@ -44,6 +44,23 @@ def random_stream(seed: Seed, number: Any, stream: Stream = Stream.FIRST) -> Any
     return mi.PCG32(1, *(reversed(states) if stream is Stream.SECOND else states))  # 1: no lane number mixed in
 
 
+class Continued:
+    """A stream of which a loop carries the state alone.
+
+    What a loop carries and never changes, like the increment, makes Dr.Jit trace it twice: that takes seconds where
+    there are thousands of shapes. This class hides it, and whatever else is held by an object that is no array.
+    """
+
+    def __init__(self, rng: Any) -> None:
+        self.rng = rng
+
+    def at(self, state: Any) -> Any:
+        """The PCG32 in that state (UInt64)."""
+        rng = mi.PCG32(self.rng)
+        rng.state = state
+        return rng
+
+
 def stratified(shift: Any, sample: Any) -> Any:
     """Place of a sample within its pixel: the R2 sequence (Roberts 2018), shifted per pixel; fills the pixel evenly."""
     n = mi.Float(sample)
