@@ -13,7 +13,7 @@ import numpy as np
 from pcgraph.plain_files import check_file
 from rangesim import limits
 from rangesim.bounds import FARTHEST_M
-from rangesim.config import nearest
+from rangesim.config import brief, nearest
 from rangesim.errors import FileFormatError
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
@@ -95,7 +95,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except FileFormatError:
         raise
     except Exception as error:  # each of trimesh's parsers fails in its own way
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = brief(error) or type(error).__name__
         raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {reason}.") from error
     vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))
     if len(faces) == 0:
