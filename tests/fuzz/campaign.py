@@ -44,8 +44,8 @@ _START_S = 300.0
 class Watch:
     """A worker that is watched: it is ended when it is late, and started again when it is gone."""
 
-    def __init__(self, store: Path) -> None:
-        self._store = store
+    def __init__(self, store: Path, limit_s: float = LIMIT_S) -> None:
+        self._store, self._limit_s = store, limit_s
         self._folder = Path(tempfile.mkdtemp(prefix="rangesim-fuzz-"))
         self._process: subprocess.Popen[bytes] | None = None
         self._buffer = b""
@@ -76,18 +76,18 @@ class Watch:
             if self._exchange({"warm": request["reader"]}, _START_S) != b"warm":
                 raise RuntimeError(f"the seeds of {request['reader']} cannot be read: see {self._folder}/trace")
         start = time.monotonic()
-        line = self._exchange(request, LIMIT_S + _GRACE_S)
+        line = self._exchange(request, self._limit_s + _GRACE_S)
         if line:
             return Answer(**json.loads(line))
         seconds = time.monotonic() - start
         trace = (self._folder / "trace").read_text("utf-8", "replace")
         said = (self._folder / "output").read_text("utf-8", "replace")[-1000:]
-        late = seconds > LIMIT_S
+        late = seconds > self._limit_s
         if not late:
             process.wait(_START_S)  # it is ending
         self._end()
         if late:
-            return Answer("failed", "late", "no answer", _place(trace), f"no answer in {LIMIT_S:g} s", seconds)
+            return Answer("failed", "late", "no answer", _place(trace), f"no answer in {self._limit_s:g} s", seconds)
         if process.returncode == 1 and "fuzz/worker.py" in said:
             raise RuntimeError(f"the harness itself failed on {request['reader']}, seed {request['seed']}: {said}")
         signal = f"signal {-process.returncode}" if process.returncode < 0 else f"exit {process.returncode}"
@@ -98,7 +98,7 @@ class Watch:
         if self._process is None:
             paths = [str(ROOT), str(ROOT / "tests"), *filter(None, [os.environ.get("PYTHONPATH")])]
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "PYTHONHASHSEED": "0"}
-            command = [sys.executable, "-m", "fuzz.worker", str(self._folder), str(self._store)]
+            command = [sys.executable, "-m", "fuzz.worker", str(self._folder), str(self._store), str(self._limit_s)]
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
             self._buffer, self._warm = b"", set[str]()
             if self._line(_START_S) != b"ready":

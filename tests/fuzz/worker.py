@@ -66,7 +66,7 @@ class Answer:
 class Worker:
     """Folders, captured output and seeds of this process."""
 
-    def __init__(self, folder: Path, seeds: dict[str, dict[str, Input]]) -> None:
+    def __init__(self, folder: Path, seeds: dict[str, dict[str, Input]], limit_s: float) -> None:
         self.inputs, self.temporary = folder / "case", folder / "tmp"
         self.inputs.mkdir(exist_ok=True)
         self.temporary.mkdir(exist_ok=True)
@@ -79,6 +79,7 @@ class Worker:
         self.trace = open(folder / "trace", "w+b", buffering=0)  # noqa: SIM115
         faulthandler.enable(self.trace)
         self.seeds = seeds
+        self.limit_s = limit_s
         self.cases: dict[str, Cases] = {}
 
     def cases_of(self, name: str) -> Cases:
@@ -119,7 +120,7 @@ class Worker:
         arguments = tuple(places.get(word, word) for word in one.arguments)
         if limited:
             _limit(size + LIMIT_BYTES)
-            faulthandler.dump_traceback_later(LIMIT_S - 0.2, file=self.trace)
+            faulthandler.dump_traceback_later(0.9 * self.limit_s, file=self.trace)
         seen: list[warnings.WarningMessage] = []
         start = time.perf_counter()
         try:
@@ -134,7 +135,7 @@ class Worker:
         fault = found if found.outcome == "failed" else None
         fault = fault or self._said(reader, found, path, one) or _warned(seen)
         fault = fault or self._left(reader, before, files_before)
-        if fault is None and limited and seconds > LIMIT_S:
+        if fault is None and limited and seconds > self.limit_s:
             fault = Answer("failed", "late", found.error, found.place, found.message)
         return Answer(**(asdict(fault or found) | {"seconds": seconds, "peak_mb": peak_mb}))
 
@@ -308,7 +309,7 @@ def main() -> None:
         partial = store.with_suffix(".part")
         partial.write_bytes(pickle.dumps(made))
         partial.rename(store)
-    worker = Worker(folder, pickle.loads(store.read_bytes()))
+    worker = Worker(folder, pickle.loads(store.read_bytes()), float(sys.argv[3]))
     answers.write("ready\n")
     answers.flush()
     for line in requests:
