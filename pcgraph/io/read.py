@@ -12,6 +12,8 @@ from pcgraph.io.pcd import read_pcd
 from pcgraph.io.ply import read_ply
 from pcgraph.plain_files import read_file
 
+MAX_REASON = 300
+"""Characters of what is wrong with a file, that a damaged file may make as long as it likes."""
 _READERS = {".pcd": read_pcd, ".ply": read_ply}
 
 
@@ -38,4 +40,5 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     try:
         return reader(content)
     except CloudReadError as error:
-        raise CloudReadError(f"{path}: {error}") from None
+        said = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))  # names of fields may be anything
+        raise CloudReadError(f"{path}: {said[:MAX_REASON]}") from None

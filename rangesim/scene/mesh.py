@@ -92,8 +92,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         with np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(path, process=False, resolver=Beside(str(path)))
-    except FileFormatError:
-        raise
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} refers to a file beside it: {error}") from error
     except Exception as error:  # each of trimesh's parsers fails in its own way
         reason = brief(error) or type(error).__name__
         raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {reason}.") from error

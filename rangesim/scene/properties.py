@@ -29,6 +29,7 @@ POSITIVE = Bounds("positive and finite", 1e-12, 1e12)
 LENGTH = Bounds("positive and finite", 1e-12, FARTHEST_M)
 NOT_NEGATIVE = Bounds("0 or positive, and finite", 0, 1e12)
 FRACTION = Bounds("a fraction", 0, 1)
+WAVELENGTHS_NM = Bounds("nanometres", 1, 1e7)
 
 PROPERTIES: dict[str, dict[str, Bounds]] = {
     "Shape": {"radius": LENGTH, "center": PLACE, "p0": PLACE, "p1": PLACE},
@@ -166,6 +167,9 @@ class _Property:
             return self._problem_of_image(Path(str(mi.file_resolver().resolve(value))), key)
         if key in ("width", "height") and isinstance(value, float):
             return f"expected {key} to be {self.bounds}, got {shown(value)}"
+        for number in getattr(value, "wavelengths", ()):
+            if number not in WAVELENGTHS_NM:
+                return f"expected the wavelengths of {key} to be {WAVELENGTHS_NM}, got {shown(number)}"
         for number in _numbers(value):
             if number not in self.bounds:
                 return f"expected {key} to be {self.bounds}, got {shown(number)}"
@@ -202,7 +206,7 @@ def _numbers(value: Any) -> Iterable[float]:
     if isinstance(value, (int, float)):
         return (value,)
     if hasattr(value, "is_uniform"):
-        return (*value.values, *value.wavelengths)
+        return tuple(value.values)
     if isinstance(value, dr.ArrayBase):
         return _extremes(np.array(value, dtype=np.float64))
     if isinstance(value, mi.Bitmap):
