@@ -42,6 +42,8 @@ def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[st
         The file is missing, broken, too large, lacks one of `names`, or holds objects.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise FileFormatError(f"cannot read {path}: it is no regular file.")
     try:
         with zipfile.ZipFile(path) as archive:
             members = _members(archive, path)
@@ -80,7 +82,10 @@ def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: str) -> np.nd
         size = math.prod(shape) * dtype.itemsize
         if size != entry.file_size - file.tell():
             raise FileFormatError(f"{place}: expected {size} bytes as its header says, got another number.")
-        array: np.ndarray = np.empty(math.prod(shape), dtype=dtype)
+        try:
+            array: np.ndarray = np.empty(math.prod(shape), dtype=dtype)
+        except MemoryError as error:
+            raise FileFormatError(f"{place} takes {size / 1e9:.1f} GB, which this machine has not free.") from error
         view, filled = array.view(np.uint8).data, 0
         while filled < size:
             count = file.readinto(view[filled:])  # type: ignore[attr-defined]

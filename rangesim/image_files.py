@@ -47,6 +47,8 @@ def read_grey(path: Path) -> np.ndarray:
     FileFormatError
         The file cannot be read, or its pixels are none of these types.
     """
+    if path.exists() and not path.is_file():
+        raise FileFormatError(f"{path} cannot be read as an image: it is no regular file.")
     try:
         return _read_exr(path) if path.suffix.lower() == ".exr" else _read_raster(path)
     except FileFormatError:
@@ -87,7 +89,13 @@ def read_stack(paths: list[Path]) -> np.ndarray:
         image = read_grey(path)
         if first is None:
             first = image
-            frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
+            try:
+                frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
+            except MemoryError as error:
+                size = len(paths) * image.nbytes / 1e9
+                raise FileFormatError(
+                    f"{path}: {len(paths)} images of that size take {size:.1f} GB, which this machine has not free."
+                ) from error
         if image.shape != first.shape or image.dtype != first.dtype:
             raise FileFormatError(
                 f"{path}: expected {first.shape[1]} x {first.shape[0]} {first.dtype} as {paths[0].name}, "

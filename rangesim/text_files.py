@@ -25,6 +25,7 @@ _PARAMETER = re.compile(r"\$(\w+)")
 def read_text(path: str | Path) -> str:
     """Contents of a UTF-8 file; FileFormatError if it is missing, too large or no text."""
     path = Path(path)
+    _check_regular(path)
     try:
         limits.check("text", path.stat().st_size, f"bytes in {path}", FileFormatError)
         return path.read_text(encoding="utf-8")
@@ -101,6 +102,7 @@ class _Xml:
         """Check a file that stands `depth` levels deep inside the files `within`."""
         if path in within:
             raise FileFormatError(f"{path} includes itself.")
+        _check_regular(path)
         try:
             self.size += path.stat().st_size
             limits.check("text", self.size, f"bytes in {path} and what it includes", FileFormatError)
@@ -136,6 +138,12 @@ class _Xml:
             parser.Parse(data, True)
         except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: of an unknown encoding
             raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
+
+
+def _check_regular(path: Path) -> None:
+    """Raise FileFormatError for pipes and devices, which may have no end."""
+    if path.exists() and not path.is_file():
+        raise FileFormatError(f"cannot read {path}: it is no regular file.")
 
 
 def _too_deep(path: str | Path) -> FileFormatError:
