@@ -17,6 +17,7 @@ import numpy as np
 
 from rangesim.bounds import Bounds, check_number
 from rangesim.catalogue import CATALOGUE, scene_file
+from rangesim.config import visible
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.medium import is_boundary, why_not_traced
@@ -105,12 +106,12 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
             state = _parse(config, source, material, unit_m, Path(folder))
             check_depth(state, label)
             mi.parser.transform_all(config, state)
-            ids, classes = ids_of_shapes(state, label), take_material_classes(state)
+            ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
             check_properties(state, label)
             loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, TypeError, OverflowError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))[:400]
-        raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
+        raise FileFormatError(f"{label} is no scene Mitsuba can load: {visible(reason)}") from error
     return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
 
 

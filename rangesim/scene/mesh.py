@@ -78,7 +78,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        with np.errstate(all="ignore"):  # of vertices that are not finite, which are refused below
+            mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # each of trimesh's parsers fails in its own way
         raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {error}.") from error
     vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))

@@ -55,7 +55,7 @@ def _check_media(state: Any, node: Any, place: str) -> None:
             raise FileFormatError(f'{place} refers to a medium without saying where: add name="interior".')
 
 
-def take_material_classes(state: Any) -> dict[str, str]:
+def take_material_classes(state: Any, label: str) -> dict[str, str]:
     """Shape id -> class, where the shape or its BSDF states one; removes the entries, which Mitsuba does not know."""
     stated: dict[int, str] = {}
     for index, node in enumerate(state.nodes):
@@ -64,7 +64,7 @@ def take_material_classes(state: Any) -> dict[str, str]:
             if value not in MATERIAL_CLASSES:
                 hint = nearest(value, MATERIAL_CLASSES)
                 raise FileFormatError(
-                    f"expected {CLASS_KEY} to be one of {', '.join(MATERIAL_CLASSES)}, got {value!r}{hint}."
+                    f"{label}: expected {CLASS_KEY} to be one of {', '.join(MATERIAL_CLASSES)}, got {value!r}{hint}."
                 )
             stated[index] = value
             del node.props[CLASS_KEY]

@@ -202,7 +202,7 @@ def _numbers(value: Any) -> Iterable[float]:
     if isinstance(value, (int, float)):
         return (value,)
     if hasattr(value, "is_uniform"):
-        return (*value.values, *value.wavelengths)
+        return tuple(value.values)
     if isinstance(value, dr.ArrayBase):
         return _extremes(np.array(value, dtype=np.float64))
     if isinstance(value, mi.Bitmap):
