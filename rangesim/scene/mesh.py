@@ -11,7 +11,7 @@ import numpy as np
 
 from rangesim import limits
 from rangesim.bounds import FARTHEST_M
-from rangesim.config import nearest
+from rangesim.config import brief, nearest
 from rangesim.errors import FileFormatError
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
@@ -81,7 +81,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         with np.errstate(all="ignore"):  # of vertices that are not finite, which are refused below
             mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # each of trimesh's parsers fails in its own way
-        raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {error}.") from error
+        raise FileFormatError(f"expected a mesh in {path}, but it cannot be read: {brief(error)}.") from error
     vertices, faces = np.asarray(mesh.vertices), np.asarray(getattr(mesh, "faces", ()))
     if len(faces) == 0:
         raise FileFormatError(f"expected a triangle mesh in {path}, which has no faces.")
