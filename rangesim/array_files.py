@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
+from tokenize import TokenError
 from typing import IO, Any
 
 import numpy as np
@@ -84,8 +85,8 @@ def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: str) -> np.nd
             raise FileFormatError(f"{place}: expected {size} bytes as its header says, got another number.")
         try:
             array: np.ndarray = np.empty(math.prod(shape), dtype=dtype)
-        except MemoryError:
-            raise FileFormatError(f"{place}: its {size} bytes do not fit into memory.") from None
+        except MemoryError as error:
+            raise FileFormatError(f"{place} takes {size / 1e9:.1f} GB, which this machine has not free.") from error
         view, filled = array.view(np.uint8).data, 0
         while filled < size:
             count = file.readinto(view[filled:])  # type: ignore[attr-defined]
@@ -102,7 +103,7 @@ def _header(file: IO[bytes], place: str) -> tuple[tuple[int, ...], bool, np.dtyp
         if version not in _HEADERS:
             raise ValueError(f"version {version} is unknown")
         shape, fortran_order, dtype = _HEADERS[version](file)
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError) as error:
+    except (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError, EOFError) as error:
         raise FileFormatError(f"{place}: its header is broken: {brief(error)}.") from error
     if dtype.kind not in KINDS or dtype.itemsize == 0 or len(shape) > 8 or any(n < 0 for n in shape):
         raise FileFormatError(f"{place}: expected numbers or text, got {shown(dtype)} of shape {shown(shape)}.")

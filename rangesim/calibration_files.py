@@ -105,7 +105,9 @@ def _read_opencv(path: Path) -> dict[str, np.ndarray]:
         except ValueError as error:
             raise FileFormatError(f"{path}: matrix {name!r} does not hold numbers.") from error
         if not (np.abs(values[name]) < LARGEST).all():
-            raise FileFormatError(f"{path}: expected numbers below {LARGEST:g} in {name!r}, got {shown(text.split())}.")
+            raise FileFormatError(
+                f"{path}: expected numbers below {LARGEST:g} in {name!r}, got {shown(values[name].tolist())}."
+            )
         if values[name].size != size:
             raise FileFormatError(f"{path}: expected {size} numbers in {name!r}, got {values[name].size}.")
     return values

@@ -107,6 +107,8 @@ def estimate_cost(
     photons = photons if has_delta(scene.mitsuba) else 0
     pixels, count = 0, 0
     for rig, instruments in passes:
+        size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # read back for the report
+        limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
         pixels, count = pixels + traced, count + n
     paths, all_photons = pixels * experiment.spp, photons * count

@@ -12,7 +12,7 @@ from rangesim import limits
 from rangesim.ambient import Ambient
 from rangesim.bounds import Metres, check_fields, whole
 from rangesim.catalogue import scene_names
-from rangesim.config import check_keys, from_dict, to_dict
+from rangesim.config import check_keys, from_dict, shown, to_dict
 from rangesim.errors import FileFormatError
 from rangesim.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.motion import Motion
@@ -58,8 +58,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if not self.scene:
-            raise ValueError("expected scene to be the path of a scene or a mesh, got an empty one.")
+        if not self.scene or "\0" in self.scene:
+            raise ValueError(f"expected scene to be the path of a scene or a mesh, got {shown(self.scene)}.")
         limits.check("pixels", (self.width or 1) * (self.height or 1), f"pixels, not {self.width} x {self.height}")
         limits.check("instruments", len(self.instruments), "instruments")
         object.__setattr__(self, "seed", check_seed(self.seed))

@@ -6,10 +6,11 @@ from __future__ import annotations
 import math
 import os
 import struct
+import sys
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,10 +97,11 @@ def read_stack(paths: list[Path]) -> np.ndarray:
             first = image
             try:
                 frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
-            except MemoryError:
+            except MemoryError as error:
+                size = len(paths) * image.nbytes / 1e9
                 raise FileFormatError(
-                    f"{path}: {len(paths)} frames of {image.shape[1]} x {image.shape[0]} do not fit into memory."
-                ) from None
+                    f"{path}: {len(paths)} images of that size take {size:.1f} GB, which this machine has not free."
+                ) from error
         if image.shape != first.shape or image.dtype != first.dtype:
             raise FileFormatError(
                 f"{path}: expected {first.shape[1]} x {first.shape[0]} {first.dtype} as {paths[0].name}, "
@@ -111,23 +113,21 @@ def read_stack(paths: list[Path]) -> np.ndarray:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep libraries from printing: OpenEXR and libtiff write to stderr what they also raise, Pillow warns of metadata
-    that nobody here reads."""
-    with warnings.catch_warnings():
+    """Keep libraries from printing: OpenEXR and libtiff print what they also raise, Pillow warns of metadata that nobody
+    here reads."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with warnings.catch_warnings(), ExitStack() as kept:
         warnings.simplefilter("ignore")
-        try:
-            kept = os.dup(2)
-        except OSError:  # stderr is closed
-            yield
-            return
-        try:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, 2)
-            os.close(nowhere)
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        kept.callback(os.close, nowhere)
+        for stream in (1, 2):
+            with suppress(OSError):  # it is closed
+                before = os.dup(stream)
+                kept.callback(os.close, before)
+                kept.callback(os.dup2, before, stream)
+                os.dup2(nowhere, stream)
+        yield
 
 
 def _open_exr(path: Path) -> None:
@@ -175,7 +175,8 @@ def _open_raster(path: Path) -> Iterator[Any]:
 
     plugins = (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
                PpmImagePlugin.PpmImageFile, TiffImagePlugin.TiffImageFile)  # fmt: skip
-    with path.open("rb") as file:
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of damaged tags, which the pixels do not need
         start = file.read(16)
         for plugin in plugins:
             factory, accepts = Image.OPEN[plugin.format]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import tempfile
 import time
@@ -356,6 +357,14 @@ def test_deep_xml_and_entities_are_refused(tmp_path: Path) -> None:
     path.write_text('<!DOCTYPE a [<!ENTITY b "bbbb"><!ENTITY c "&b;&b;">]><a>&c;</a>')
     with pytest.raises(FileFormatError, match="expected no entities"):
         load_calibration(path, (640, 480))
+
+
+def test_devices_and_pipes_are_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    for path in (tmp_path / "pipe.json", Path("/dev/zero")):
+        for read in (read_json, read_arrays, read_grey):
+            with pytest.raises(FileFormatError, match="no regular file"):
+                read(path)
 
 
 def test_text_files_have_a_limit(tmp_path: Path) -> None:

@@ -164,6 +164,13 @@ def test_nonsense_in_a_file_is_one_sentence(tmp_path: Path, body: str, message: 
     assert len(str(caught.value)) < 600
 
 
+def test_a_reflectance_may_be_a_spectrum(tmp_path: Path) -> None:
+    paint = '<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.5, 500:0.7"/></bsdf>'
+    body = f'<shape type="sphere" id="ball">{paint}</shape>'
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}{body}</scene>')
+    assert load_scene(tmp_path / "a.xml").instances[0].name == "ball"
+
+
 def mesh(tmp_path: Path, name: str, text: bytes) -> Path:
     (tmp_path / name).write_bytes(text)
     kind = name.rpartition(".")[2]

@@ -109,9 +109,9 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
             ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
             check_properties(state, label)
             loaded = mi.parser.instantiate(config, state)
-    except (RuntimeError, TypeError, OverflowError) as error:
-        reason = visible(re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))[:400])
-        raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
+    except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
+        reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))[:400]
+        raise FileFormatError(f"{label} is no scene Mitsuba can load: {visible(reason)}") from error
     return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
 
 
