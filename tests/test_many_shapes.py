@@ -13,6 +13,7 @@ from many_shapes import balls
 from rangesim import Scene, load_scene, transport
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import meets_delta
+from rangesim.response import FirstReturn
 
 MANY = 3000
 
@@ -44,6 +45,23 @@ def test_what_meets_a_delta_surface_is_found_without_asking_each_shape(crowd: Sc
         min(seconds(call) for _ in range(3)) for call in (lambda: meets_delta(crowd.mitsuba, camera), ask_each_shape)
     )
     assert looked_up < 0.5 * asked
+
+
+@pytest.mark.parametrize("materials", ["one", "glass"])
+def test_loops_are_traced_once(materials: str) -> None:
+    """Each time costs a virtual call for each shape: 10 000 of them take a second."""
+    traced = 0
+
+    class Counted(FirstReturn):
+        def weights(self, path: Any, m: Any) -> list[Any]:
+            nonlocal traced
+            traced += 1
+            return super().weights(path, m)
+
+    scene = load_scene(balls(20, materials))
+    rig = scene.rig(width=16, height=12)
+    transport(scene, rig, [Counted()], spp=1, photons=20_000, glint=False)
+    assert traced == {"one": 1, "glass": 2}[materials]  # at the vertices of paths, and where photons are gathered
 
 
 def test_the_pixels_before_glass_are_those_of_the_shapes_that_are_glass() -> None:

@@ -56,7 +56,7 @@ class Launches:
 
     def learn(self, units: int, seconds: float, prepared_s: float = 0.0) -> None:
         """Fit the next launch to the time that this one took, and took to be prepared."""
-        launch_s = LAUNCH_S * min(max(prepared_s / LAUNCH_S, 1), LONGER_WHERE_PREPARED_LONG)
+        launch_s = LAUNCH_S * min(max(2 * prepared_s / LAUNCH_S, 1), LONGER_WHERE_PREPARED_LONG)
         fits = units * launch_s / max(seconds, 1e-6)
         if fits > self.units:
             self.units = int(min(fits, STEEPEST * self.units))

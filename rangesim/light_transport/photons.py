@@ -34,6 +34,8 @@ SURFACES_PER_PHOTON = 2
 """About."""
 SUMMED_TOGETHER = 1 << 16
 """Photons whose fates are added up first, so that the sum does not depend on launches."""
+MOST_AT_ONCE = 1 << 20
+"""Photons of a launch, so that what NumPy does with them is short as well."""
 BYTES_PER_PHOTON = 128
 """While it flies, an upper bound."""
 
@@ -124,7 +126,7 @@ def trace_photons(
     per_map = -(-photons // maps)
     cumulative = np.cumsum(share)
     total = per_map * maps
-    most = max(1, memory_bytes // BYTES_PER_PHOTON)
+    most = max(1, min(memory_bytes // BYTES_PER_PHOTON, MOST_AT_ONCE))
     landed: list[list[np.ndarray]] = []
     balance = np.zeros(len(PhotonBalance.__dataclass_fields__))
     launches = Launches()
