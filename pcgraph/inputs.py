@@ -92,10 +92,11 @@ def _excerpt(values: NDArray[np.float64]) -> str:
 
 
 def positive(name: str, value: float) -> float:
-    """The value as float, if it is a finite number of metres above zero, at most 1e100; ValueError otherwise."""
+    """The value as float, if it is a number of metres from 1e-100 to 1e100; ValueError otherwise."""
     number = _number(value)
-    if not 0.0 < number <= _LARGEST:
-        raise ValueError(f"expected a finite {name} above 0 metres, got {value!r}; at most {_LARGEST:g} works")
+    if not 1.0 / _LARGEST <= number <= _LARGEST:
+        most = f"{1.0 / _LARGEST:g} to {_LARGEST:g} works"
+        raise ValueError(f"expected a finite {name} above 0 metres, got {value!r}; {most}")
     return number
 
 

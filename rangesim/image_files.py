@@ -113,8 +113,7 @@ def read_stack(paths: list[Path]) -> np.ndarray:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep libraries from printing: OpenEXR and libtiff print what they also raise, Pillow warns of metadata that nobody
-    here reads."""
+    """Keep libraries from printing: OpenEXR and libtiff print what they also raise, Pillow warns of metadata."""
     sys.stdout.flush()
     sys.stderr.flush()
     with warnings.catch_warnings(), ExitStack() as kept:

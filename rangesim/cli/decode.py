@@ -135,14 +135,14 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
 
 
 def _sensor(code: str, projector: str, axes: str, period: float, steps: int) -> StructuredLight:
-    from rangesim.config import nearest
+    from rangesim.config import nearest, shown
     from rangesim.sensors import StructuredLight
 
     if code not in CODES:
         raise ValueError(f"expected a code out of {', '.join(CODES)}, got {code!r}{nearest(code, CODES)}.")
     size = re.fullmatch(r"(\d+)[x×](\d+)", projector)
     if not size:
-        raise ValueError(f"expected --projector as WIDTHxHEIGHT in pixels, such as 1024x768, got {projector!r}.")
+        raise ValueError(f"expected --projector as WIDTHxHEIGHT in pixels, such as 1024x768, got {shown(projector)}.")
     return StructuredLight(
         projector_width=int(size[1]),
         projector_height=int(size[2]),

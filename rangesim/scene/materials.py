@@ -57,7 +57,11 @@ def _has(bsdf: Any, *lobes: str) -> bool:
 def _numbers(bsdf: Any) -> dict[str, float]:
     """Parameters that hold one number, by their last name: `nested_bsdf.alpha.value` is `alpha`."""
     result: dict[str, float] = {}
-    for key, value in mi.traverse(bsdf):
+    try:
+        parameters = mi.traverse(bsdf)
+    except TypeError:  # Mitsuba 3.9 cannot list those of `hair` in a variant of one wavelength
+        return result
+    for key, value in parameters:
         array = np.array(value, dtype=np.float64).ravel() if isinstance(value, (float, mi.Float)) else np.empty(0)
         if array.size == 1:
             result[key.removesuffix(".value").rsplit(".", 1)[-1]] = float(array[0])

@@ -37,6 +37,7 @@ class Reader:
     refuses : names of the exceptions by which it refuses; not subclasses of ValueError, for those have escaped.
     check : looks at what `read` returned; an AssertionError is a failure.
     names_file : whether a refusal must name the file.
+    lists : whether a command lists what is wrong, line by line, before the line that says so.
     may_write : patterns of paths that it may leave in the folder of the input.
     mutates_arguments : whether it is the command line that is mutated, not files.
     """
@@ -51,6 +52,7 @@ class Reader:
     refuses: tuple[str, ...] = ("ValueError", "FileFormatError")
     check: Callable[[Any], None] = field(default=lambda result: None)
     names_file: bool = True
+    lists: bool = False
     may_write: tuple[str, ...] = ()
     mutates_arguments: bool = False
 
@@ -495,6 +497,7 @@ READERS = {
         Reader(
             "verify", _rangesim, _with_arguments(seeds.results, "verify {entry}"), ("result/manifest.json",),
             (_by_suffix,), share=0.5, command="rangesim",
+            lists=True,
         ),
         Reader(
             "compare", _rangesim, _with_arguments(seeds.results, "compare {entry}"),

@@ -151,6 +151,8 @@ class Worker:
                 if found.error == "2":
                     return None  # a usage message of several lines
                 message = text.removesuffix("\n")
+                if reader.lists:
+                    message = message.rpartition("\n")[2]
                 if not message.startswith(f"{reader.command}: "):
                     return Answer("failed", "message", "exit 1", "no line of ours", text[:2000])
             problem = _fault_of_message(message, path, one, reader.names_file, bool(reader.command))
