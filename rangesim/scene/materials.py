@@ -58,7 +58,7 @@ def _numbers(bsdf: Any) -> dict[str, float]:
     """Parameters that hold one number, by their last name: `nested_bsdf.alpha.value` is `alpha`."""
     result: dict[str, float] = {}
     try:
-        parameters = mi.traverse(bsdf)
+        parameters = list(mi.traverse(bsdf))
     except TypeError:  # Mitsuba 3.9 cannot list those of `hair` in a variant of one wavelength
         return result
     for key, value in parameters:
