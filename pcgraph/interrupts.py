@@ -19,6 +19,8 @@ import sys
 import threading
 import time
 
+handled = False
+"""Whether a thread of this module ends the process on a signal, whatever the others do."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 
@@ -37,6 +39,8 @@ def end_on_signals(program: str, writes: bool) -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup and the like
             signal.signal(number, lambda *_: None)
     atexit.register(_stay)
+    global handled
+    handled = True
     threading.Thread(target=_wait, args=(reader, program, writes), name="interrupts", daemon=True).start()
 
 

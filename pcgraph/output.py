@@ -756,9 +756,27 @@ def _is_plain_file(path: Path) -> bool:
 
 
 def _digest(path: Path) -> Digest:
+    """Size and SHA-256 of a file; of one that was hashed before and has the same change time since, from memory."""
     with path.open("rb") as stream:
+        state = os.fstat(stream.fileno())
+        key = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+        known = _hashed.get(key)
+        if known is not None:
+            return known
+        settled = time.time_ns() - state.st_ctime_ns > SETTLED_NS
         sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-        return Digest(stream.tell(), sha256)
+        digest = Digest(stream.tell(), sha256)
+    if settled and digest.size == state.st_size:
+        if len(_hashed) >= MAX_HASHED:
+            _hashed.clear()
+        _hashed[key] = digest
+    return digest
+
+
+_hashed: dict[tuple[int, ...], Digest] = {}
+SETTLED_NS = 2_000_000_000
+"""A file that changed so long ago gets another change time when it changes again: clocks of file systems are coarse."""
+MAX_HASHED = 10_000
 
 
 def _manifest(kind: DirectoryKind, files: Mapping[str, Sequence[Digest]]) -> bytes:

@@ -79,7 +79,7 @@ def run(
     from pcgraph.warmup import compile_kernels
     from rangesim.report import write_report
 
-    say = progress or (lambda stage, share: None)
+    say = progress or _unwatched
     with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
         times: dict[str, float] = {}
         say("Loading the scene", 0.0)
@@ -218,6 +218,10 @@ def acquisition(
     )
 
 
+def _unwatched(stage: str, share: float) -> None:
+    """Tell nobody how far the work is."""
+
+
 @contextmanager
 def timed(times: dict[str, float], stage: str) -> Iterator[None]:
     """Add the seconds that the block takes to `times[stage]`."""
@@ -243,7 +247,7 @@ def _trace(
         "max_depth": experiment.max_depth,
         "glint": experiment.glint,
         "seed": experiment.seed,
-        "progress": lambda share: say(stage, _share(number, passes, share)),
+        "progress": None if say is _unwatched else lambda share: say(stage, _share(number, passes, share)),
     }
     if experiment.photons is not None:
         settings["photons"] = experiment.photons

@@ -156,7 +156,7 @@ def test_launches_of_any_size_give_the_same_bytes(
     settings = {"spp": 5, "photons": 20_000, "seed": 3, "max_depth": 7}
     expected = all_bytes(transport(tabletop, rig, sensors(), **settings))
     monkeypatch.setattr(launches, "LAUNCH_S", launch_s)
-    monkeypatch.setattr(launches, "LONGEST_S", launch_s)
+    monkeypatch.setattr(launches, "LONGEST", 1.0)
     monkeypatch.setattr(launches, "FIRST_UNITS", units)
     for module in (rangesim.light_transport.loop, rangesim.light_transport.glint):
         monkeypatch.setattr(module, "fewest_lanes", lambda: lanes)

@@ -19,11 +19,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-LAUNCH_S = 0.7
+LAUNCH_S = 1.0
 """What a launch should take, seconds."""
-LONGEST_S = 1.2
+UNWATCHED_LAUNCH_S = 20.0
+"""The same where nobody waits: no report of progress, and signals that end the process from a thread of their own."""
+LONGEST = 1.5
 """After which a launch of a loop should end, its lanes finished or not."""
-FIRST_UNITS = 1 << 20
+FIRST_UNITS = 1 << 21
 """Work of a first launch: as many turns of a loop, rays or photons."""
 LONGER_WHERE_PREPARED_LONG = 2.0
 """Times as long, at most, where it takes long to make the kernel (thousands of shapes)."""
@@ -44,11 +46,13 @@ Report = Callable[[float], None]
 class Launches:
     """Launches of one kind of work, each as large as the time of the earlier ones suggests.
 
+    is_waited_for : whether somebody waits for reports or signals between the launches; else they may be long.
     units : int, the work that the next launch should do.
     """
 
-    def __init__(self, first: int | None = None) -> None:
-        self.units = first or FIRST_UNITS
+    def __init__(self, is_waited_for: bool = True) -> None:
+        self.launch_s = LAUNCH_S if is_waited_for else UNWATCHED_LAUNCH_S
+        self.units = int(FIRST_UNITS * self.launch_s / LAUNCH_S)
 
     def evaluate(self, arrays: Any, units: int) -> None:
         """Compute Dr.Jit arrays that are so many units of work, and wait for them."""
@@ -56,7 +60,7 @@ class Launches:
 
     def learn(self, units: int, seconds: float, prepared_s: float = 0.0) -> None:
         """Fit the next launch to the time that this one took, and took to be prepared."""
-        launch_s = LAUNCH_S * min(max(2 * prepared_s / LAUNCH_S, 1), LONGER_WHERE_PREPARED_LONG)
+        launch_s = self.launch_s * min(max(2 * prepared_s / self.launch_s, 1), LONGER_WHERE_PREPARED_LONG)
         fits = units * launch_s / max(seconds, 1e-6)
         if fits > self.units:
             self.units = int(min(fits, STEEPEST * self.units))
@@ -83,7 +87,7 @@ class Launches:
         dr.make_opaque(state)  # like the state of later launches, so that they share a kernel
         total, at_work = 0, lanes
         while at_work:
-            most = min(max(1, int(self.units * LONGEST_S / LAUNCH_S) // at_work), MOST_TURNS)
+            most = min(max(1, int(self.units * LONGEST) // at_work), MOST_TURNS)
             start = time.perf_counter()
             state, taken = loop(state, dr.opaque(mi.UInt32, most))
             seconds = evaluate([state, taken, pending()])

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from pcgraph import interrupts
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
@@ -84,7 +85,8 @@ def transport(
     h, w = rig.camera.height, rig.camera.width
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
     radiances: list[np.ndarray] = []
-    report, launches = Progress(progress), Launches()
+    report = Progress(progress)
+    launches = Launches(is_waited_for=progress is not None or not interrupts.handled)
     settings = Settings(
         seed=Seed.of(seed),
         spp=dr.opaque(mi.UInt32, spp),
