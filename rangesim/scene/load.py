@@ -19,7 +19,7 @@ from rangesim.bounds import Bounds, check_number
 from rangesim.catalogue import CATALOGUE, scene_file
 from rangesim.config import visible
 from rangesim.errors import FileFormatError
-from rangesim.light_transport.backend import select_variant
+from rangesim.light_transport.backend import one_thread, select_variant
 from rangesim.light_transport.medium import is_boundary, why_not_traced
 from rangesim.rig import Intrinsics
 from rangesim.scene import retroreflector
@@ -108,7 +108,8 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
             mi.parser.transform_all(config, state)
             ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
             check_properties(state, label)
-            loaded = mi.parser.instantiate(config, state)
+            with one_thread():
+                loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))[:400]
         raise FileFormatError(f"{label} is no scene Mitsuba can load: {visible(reason)}") from error
