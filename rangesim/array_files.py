@@ -6,7 +6,8 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -18,6 +19,7 @@ from rangesim import limits
 from rangesim.config import brief, shown
 from rangesim.errors import FileFormatError
 
+Check = Callable[[str, str, tuple[int, ...], "np.dtype[Any]"], None]
 KINDS = "biufcSU"
 """Kinds of NumPy types that are read: numbers and text of fixed size, no objects."""
 MAX_ARRAYS = 1000
@@ -28,7 +30,9 @@ _HEADERS = {
 }
 
 
-def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: str | Path, names: Iterable[str] | None = None, check: Check | None = None
+) -> dict[str, np.ndarray]:
     """Arrays of a .npz file by name, as `numpy.savez` and `numpy.savez_compressed` write it.
 
     Nothing is unpickled. Their sizes, as the file states them, are checked against the limit `bytes` first, and hold:
@@ -37,6 +41,7 @@ def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[st
     Parameters
     ----------
     names : those to read; None: all.
+    check : called with the place (for messages), name, shape and dtype of each, before memory is allocated for it.
 
     Raises
     ------
@@ -54,7 +59,12 @@ def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[st
                 raise FileFormatError(f"{path}: expected an array {missing[0]!r}, found none of that name.")
             total = sum(members[name].file_size for name in wanted)
             limits.check("bytes", total, f"bytes in {path}, decompressed", FileFormatError)
-            return {name: _read(archive, members[name], f"{path}: array {shown(name)}") for name in wanted}
+            return {
+                name: _read(
+                    archive, members[name], f"{path}: array {shown(name)}", partial(check, name) if check else None
+                )
+                for name in wanted
+            }
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError) as error:
         reason = getattr(error, "strerror", None) or brief(error) or "it ends early"
         raise FileFormatError(f"{path} cannot be read as .npz: {reason}.") from error
@@ -77,9 +87,13 @@ def _members(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]
     return members
 
 
-def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: str) -> np.ndarray:
+def _read(
+    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, place: str, check: Callable[..., None] | None
+) -> np.ndarray:
     with archive.open(entry) as file:
         shape, fortran_order, dtype = _header(file, place)
+        if check is not None:
+            check(place, shape, dtype)
         size = math.prod(shape) * dtype.itemsize
         if size != entry.file_size - file.tell():
             raise FileFormatError(f"{place}: expected {size} bytes as its header says, got another number.")

@@ -108,7 +108,8 @@ def load_capture(directory: str | Path) -> Capture:
         light = settings.get("ambient")
         ambient = from_dict(Ambient, light, "ambient") if light is not None else None
         exposure = settings.get("exposure_s")
-        frames = _read_frames(sidecar, settings, sensor)
+        size = (rig.camera.width, rig.camera.height) if rig else None
+        frames = _read_frames(sidecar, settings, sensor, size)
         return Capture(frames, sensor, rig, detector, math.nan if exposure is None else float(exposure), ambient)
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{sidecar}: {str(error).removeprefix(f'{sidecar}: ')}") from error
@@ -167,7 +168,7 @@ def _sidecar(capture: Capture, names: list[str]) -> dict[str, Any]:
     }
 
 
-def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor) -> np.ndarray:
+def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor, size: tuple[int, int] | None) -> np.ndarray:
     names, dtype = settings.get("frames"), settings.get("dtype")
     if dtype not in DTYPES:
         raise ValueError(f"expected dtype to be one of {', '.join(DTYPES)}, got {dtype!r}.")
@@ -176,7 +177,7 @@ def _read_frames(sidecar: Path, settings: dict[str, Any], sensor: Sensor) -> np.
     for name in names:
         if not isinstance(name, str) or Path(name).name != name:
             raise ValueError(f"expected plain file names under frames, got {name!r}.")
-    frames = read_stack([sidecar.parent / name for name in names])
+    frames = read_stack([sidecar.parent / name for name in names], size)
     stored = "uint16" if dtype == "uint32" else dtype
     if frames.dtype.name != stored:
         raise ValueError(f"expected frames of type {stored}, got {frames.dtype.name}.")

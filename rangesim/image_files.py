@@ -80,8 +80,10 @@ def check_size(path: Path) -> None:
         return  # whoever decodes it says so
 
 
-def read_stack(paths: list[Path]) -> np.ndarray:
+def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.ndarray:
     """(k, h, w) uint8, uint16 or float32 images of files.
+
+    size : (w, h) that they must have, if it is known; then it is asked before memory is allocated for all of them.
 
     Raises
     ------
@@ -95,12 +97,16 @@ def read_stack(paths: list[Path]) -> np.ndarray:
         image = read_grey(path)
         if first is None:
             first = image
+            if size is not None and image.shape != size[::-1]:
+                raise FileFormatError(
+                    f"{path}: expected {size[0]} x {size[1]} pixels, got {image.shape[1]} x {image.shape[0]}."
+                )
             try:
                 frames = np.empty((len(paths), *image.shape), dtype=image.dtype)
             except MemoryError as error:
-                size = len(paths) * image.nbytes / 1e9
+                gigabytes = len(paths) * image.nbytes / 1e9
                 raise FileFormatError(
-                    f"{path}: {len(paths)} images of that size take {size:.1f} GB, which this machine has not free."
+                    f"{path}: {len(paths)} images of that size take {gigabytes:.1f} GB, more than is free."
                 ) from error
         if image.shape != first.shape or image.dtype != first.dtype:
             raise FileFormatError(

@@ -28,10 +28,11 @@ from rangesim.capture import Capture
 from rangesim.capture_files import load_capture
 from rangesim.causes import Cause, CauseMap
 from rangesim.comparison import ALL
-from rangesim.config import shown
+from rangesim.config import from_dict, shown
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.range_image import RangeImage
+from rangesim.rig import Rig
 from rangesim.schema import (
     ArraySpec,
     Count,
@@ -167,8 +168,8 @@ _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpe
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
     "labels": ArraySpec("int32", low=-1),
-    "parents": ArraySpec("int32", ("nodes",), low=0),
-    "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True),
+    "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
+    "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
 }
 
 
@@ -264,7 +265,7 @@ def load_result(directory: str | Path) -> Result:
         raise FileFormatError(f"{folder / SETTINGS}: expected each of {info.passes} passes to serve an instrument.")
     if missing := [f"transport_{n}" for n in range(1, info.passes + 1) if f"transport_{n}" not in info.times_s]:
         raise FileFormatError(f"{folder / SETTINGS}: expected the time {missing[0]} in times_s.")
-    sizes: dict[str, int] = {}
+    sizes = _image_size(info, folder / SETTINGS)
     passes = [_load_pass(folder / f"pass_{n}.npz", sizes) for n in range(1, info.passes + 1)]
     measurements = tuple(
         _load_measurement(folder / entry.name, passes[entry.light_pass - 1][1], entry.light_pass, sizes)
@@ -297,10 +298,21 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     return [msgspec.to_builtins(row) for row in record.rows]
 
 
+def _image_size(info: ResultRecord, path: Path) -> dict[str, int]:
+    """Height and width of the camera that all instruments share."""
+    try:
+        cameras = [from_dict(Rig, entry.rig, f"rig of {entry.name}").camera for entry in info.instruments]
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1:
+        raise FileFormatError(f"{path}: expected instruments whose cameras have one size, got {shown(sorted(sizes))}.")
+    ((h, w),) = sizes
+    return {"h": h, "w": w}
+
+
 def _load_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
-    own = dict(sizes)  # passes may see other instances
-    data = read_checked_arrays(path, _PASS, own)
-    sizes |= {name: own[name] for name in ("h", "w")}
+    data = read_checked_arrays(path, _PASS, dict(sizes))  # passes may see other instances
     for ids in ("instance", "material"):
         if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
             raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")

@@ -9,6 +9,7 @@ file and place.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 import numpy as np
 
+from rangesim import limits
 from rangesim.array_files import read_arrays
 from rangesim.config import shown
 from rangesim.errors import FileFormatError
@@ -84,7 +86,8 @@ class ArraySpec:
     """What an array of a file has to be.
 
     dtype : name of the NumPy type; "str" for text. shape : numbers, or letters that stand for the same number wherever
-    they occur. low, high : bounds of its finite values. nan, inf : whether it may hold these. required : whether the
+    they occur. low, high : bounds of its finite values. per_pixel : how many values there are at most for each of h x w
+    pixels; 0: no bound. nan, inf : whether it may hold these. required : whether the
     file has to have it.
     """
 
@@ -95,12 +98,14 @@ class ArraySpec:
     nan: bool = False
     inf: bool = False
     required: bool = True
+    per_pixel: int = 0
 
 
 def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[str, int]) -> dict[str, np.ndarray]:
     """Arrays of an .npz file by name.
 
-    sizes : numbers that letters in shapes stand for; completed by those that occur here for the first time.
+    sizes : numbers that letters in shapes stand for, h and w among them; completed by those that occur here for the
+        first time. Types and shapes are checked before memory is allocated.
 
     Raises
     ------
@@ -109,29 +114,46 @@ def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is missing.")
-    arrays = read_arrays(path)
-    for name in arrays:
+
+    def check(name: str, place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if name not in specs:
             raise FileFormatError(f"{path}: expected the arrays {', '.join(specs)}, got {shown(name)} as well.")
+        _check_header(shape, dtype, specs[name], sizes, place)
+
+    arrays = read_arrays(path, check=check)
     for name, spec in specs.items():
         if name in arrays:
-            _check_array(arrays[name], spec, sizes, f"{path}: array {name}")
+            _check_values(arrays[name], spec, f"{path}: array {name!r}")
         elif spec.required:
             raise FileFormatError(f"{path}: expected an array {name!r}, found none of that name.")
     return arrays
 
 
-def _check_array(array: np.ndarray, spec: ArraySpec, sizes: dict[str, int], place: str) -> None:
-    is_text = spec.dtype == "str" and array.dtype.kind == "U"
-    if not is_text and array.dtype != np.dtype(spec.dtype if spec.dtype != "str" else object):
-        raise FileFormatError(f"{place}: expected {spec.dtype}, got {array.dtype}.")
+MAX_TEXT = 1000
+"""Characters of a name in an array of text."""
+
+
+def _check_header(
+    shape: tuple[int, ...], dtype: np.dtype[Any], spec: ArraySpec, sizes: dict[str, int], place: str
+) -> None:
+    """Check what is known before memory is allocated; completes `sizes`."""
+    is_text = spec.dtype == "str" and dtype.kind == "U" and dtype.itemsize <= 4 * MAX_TEXT
+    if not is_text and dtype != np.dtype(spec.dtype if spec.dtype != "str" else object):
+        raise FileFormatError(f"{place}: expected {spec.dtype}, got {str(dtype)[:100]}.")
     known = tuple(sizes.get(n, -1) if isinstance(n, str) else n for n in spec.shape)
-    if array.ndim != len(known) or any(k not in (-1, n) for k, n in zip(known, array.shape, strict=True)):
+    if len(shape) != len(known) or any(k not in (-1, n) for k, n in zip(known, shape, strict=True)):
         words = " x ".join("any" if k == -1 else str(k) for k in known) or "a single value"
-        raise FileFormatError(f"{place}: expected shape {words}, got {' x '.join(map(str, array.shape)) or 'a value'}.")
-    for letter, n in zip(spec.shape, array.shape, strict=True):
+        raise FileFormatError(f"{place}: expected shape {words}, got {' x '.join(map(str, shape)) or 'a value'}.")
+    for letter, n in zip(spec.shape, shape, strict=True):
         if isinstance(letter, str):
             sizes[letter] = n
+    if spec.per_pixel and math.prod(shape) > spec.per_pixel * sizes["h"] * sizes["w"]:
+        raise FileFormatError(f"{place}: expected at most {spec.per_pixel} values per pixel, got {math.prod(shape)}.")
+    if is_text:
+        limits.check("shapes", math.prod(shape), f"names in {place}", FileFormatError)
+
+
+def _check_values(array: np.ndarray, spec: ArraySpec, place: str) -> None:
     if array.dtype.kind not in "iuf" or array.size == 0:
         return
     if array.dtype.kind == "f":

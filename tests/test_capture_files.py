@@ -120,7 +120,7 @@ FIRST = "000_columns_bit2.png"
         (_edit(lambda s: s["sensor"].update(type="structured-ligth")), "did you mean 'structured-light'"),
         (_edit(lambda s: s["sensor"].pop("type")), "expected 'type'"),
         (_edit(lambda s: s.pop("sensor")), "expected a table"),
-        (_edit(lambda s: s["rig"]["camera"].update(width=33)), "expected frames of 33 x 24"),
+        (_edit(lambda s: s["rig"]["camera"].update(width=33)), "expected 33 x 24 pixels"),
         (_edit(lambda s: s["detector"].update(bits=40)), "number of bits, 1 to 16"),
         (_edit(lambda s: s.update(format_version=99)), "format version 1, got 99"),
         (_edit(lambda s: s.update(exposure_s="long")), "long"),

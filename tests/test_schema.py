@@ -86,7 +86,7 @@ JSON_DAMAGES: list[tuple[str, Edit, str]] = [
 ARRAY_DAMAGES: list[tuple[str, Edit, str]] = [
     ("pass_1.npz", drop("truth_z"), r"expected an array 'truth_z'"),
     ("pass_1.npz", put("more", np.zeros(3)), r"got 'more' as well"),
-    ("pass_1.npz", put("truth_z", np.zeros((90, 120), np.float64)), r"truth_z: expected float32, got float64"),
+    ("pass_1.npz", put("truth_z", np.zeros((90, 120), np.float64)), r"'truth_z': expected float32, got float64"),
     ("pass_1.npz", put("truth_z", np.ones((9, 12), np.float32)), r"expected shape 90 x 120, got 9 x 12"),
     ("pass_2.npz", put("energy_direct", np.ones((9, 12), np.float32)), r"expected shape 90 x 120, got 9 x 12"),
     ("pass_1.npz", put("energy_direct", np.full((90, 120), np.nan, np.float32)), r"expected numbers, got NaN"),
