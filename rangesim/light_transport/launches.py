@@ -19,6 +19,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from pcgraph import interrupts
+
 LAUNCH_S = 1.0
 """What a launch should take, seconds."""
 UNWATCHED_LAUNCH_S = 20.0
@@ -46,12 +48,13 @@ Report = Callable[[float], None]
 class Launches:
     """Launches of one kind of work, each as large as the time of the earlier ones suggests.
 
-    is_waited_for : whether somebody waits for reports or signals between the launches; else they may be long.
+    is_watched : whether somebody waits for reports between launches. If not, and if signals end the process from a
+        thread of their own, launches may be long.
     units : int, the work that the next launch should do.
     """
 
-    def __init__(self, is_waited_for: bool = True) -> None:
-        self.launch_s = LAUNCH_S if is_waited_for else UNWATCHED_LAUNCH_S
+    def __init__(self, is_watched: bool = False) -> None:
+        self.launch_s = LAUNCH_S if is_watched or not interrupts.handled else UNWATCHED_LAUNCH_S
         self.units = int(FIRST_UNITS * self.launch_s / LAUNCH_S)
 
     def evaluate(self, arrays: Any, units: int) -> None:

@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pcgraph import interrupts
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
@@ -86,7 +85,7 @@ def transport(
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
     radiances: list[np.ndarray] = []
     report = Progress(progress)
-    launches = Launches(is_waited_for=progress is not None or not interrupts.handled)
+    launches = Launches(is_watched=progress is not None)
     settings = Settings(
         seed=Seed.of(seed),
         spp=dr.opaque(mi.UInt32, spp),
