@@ -41,7 +41,7 @@ def end_on_signals(program: str, writes: bool) -> None:
     atexit.register(_stay)
     global handled
     handled = True
-    threading.Thread(target=_wait, args=(reader, program, writes), name="interrupts", daemon=True).start()
+    threading.Thread(target=_wait, args=(reader, os.dup(2), program, writes), name="interrupts", daemon=True).start()
 
 
 def _open_standard_streams() -> None:
@@ -66,20 +66,21 @@ def _stay() -> None:
         time.sleep(1.0)
 
 
-def _wait(reader: int, program: str, writes: bool) -> None:
+def _wait(reader: int, screen: int, program: str, writes: bool) -> None:
     while True:
         number = os.read(reader, 1)[0]
         if number in SIGNALS:
-            _end(number, program, writes)
+            _end(number, screen, program, writes)
 
 
-def _end(number: int, program: str, writes: bool) -> None:
+def _end(number: int, screen: int, program: str, writes: bool) -> None:
+    """End the process. `screen` is what stderr was at the start: another may stand there to keep libraries quiet."""
     try:
         _ending.set()
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
-        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
-        screen = _last_words()
+        clear = "\r\x1b[2K\x1b[?25h" if os.isatty(screen) else ""  # a progress bar hides the cursor
+        _silence_others()
         output = sys.modules.get("pcgraph.output")  # not loaded: nothing was begun
         began = bool(output.abandon()) if output is not None and hasattr(output, "abandon") else False
         done = output is not None and getattr(output, "completed", 0) > 0
@@ -90,10 +91,8 @@ def _end(number: int, program: str, writes: bool) -> None:
         os._exit(128 + number)
 
 
-def _last_words() -> int:
-    """A handle to what was stderr; from now on nobody else's words come through."""
-    screen = os.dup(2)
+def _silence_others() -> None:
+    """Let nobody else's words come through: the main thread may fail, as its work is taken away."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
-    return screen

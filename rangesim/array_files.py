@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
@@ -116,7 +117,9 @@ def _header(file: IO[bytes], place: str) -> tuple[tuple[int, ...], bool, np.dtyp
         version = np.lib.format.read_magic(file)
         if version not in _HEADERS:
             raise ValueError(f"version {version} is unknown")
-        shape, fortran_order, dtype = _HEADERS[version](file)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
+            shape, fortran_order, dtype = _HEADERS[version](file)
     except (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError, EOFError) as error:
         raise FileFormatError(f"{place}: its header is broken: {brief(error)}.") from error
     if dtype.kind not in KINDS or dtype.itemsize == 0 or len(shape) > 8 or any(n < 0 for n in shape):

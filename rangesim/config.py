@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import re
 import reprlib
 import types
 import typing
@@ -92,18 +91,6 @@ def brief(error: BaseException) -> str:
 
 LONGEST_REASON = 200
 """Characters."""
-
-
-def visible(text: str) -> str:
-    """Text whose control characters are spelt out, as `\\u202e`.
-
-    They would turn round, break or hide the text beside them, or give orders to a terminal; and half a surrogate pair
-    cannot be written at all.
-    """
-    return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
-
-
-_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
 
 
 def check_keys(given: Mapping[str, Any], valid: typing.Iterable[str], place: str) -> None:

@@ -7,11 +7,19 @@ command line prints it as it stands.
 
 from __future__ import annotations
 
-__all__ = ["EnvironmentProblem", "FileFormatError", "RangesimError"]
+import re
+
+__all__ = ["EnvironmentProblem", "FileFormatError", "RangesimError", "sentence", "visible"]
+
+MAX_SENTENCE = 480
+"""Characters of a message. Files may hold names of a megabyte."""
 
 
 class RangesimError(Exception):
     """Base of every error that rangesim raises itself, except ValueError for bad arguments."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(sentence(message))
 
 
 class FileFormatError(RangesimError):
@@ -20,3 +28,23 @@ class FileFormatError(RangesimError):
 
 class EnvironmentProblem(RangesimError):
     """This machine lacks something that rangesim needs, such as a new enough LLVM."""
+
+
+def sentence(message: str) -> str:
+    """A message on one printable line, without its middle if it is too long to read."""
+    line = visible(" ".join(message.split()))
+    if len(line) <= MAX_SENTENCE:
+        return line
+    return f"{line[: 2 * MAX_SENTENCE // 3]} ... {line[5 - MAX_SENTENCE // 3 :]}"
+
+
+def visible(text: str) -> str:
+    """Text whose control characters are spelt out, as `\\u202e`.
+
+    They would turn round, break or hide the text beside them, or give orders to a terminal; and half a surrogate pair
+    cannot be written at all.
+    """
+    return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")

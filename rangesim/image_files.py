@@ -30,6 +30,10 @@ _BROKEN = (
 """What Pillow and OpenEXR raise on a file that is no image, or broken."""
 
 
+class _OtherFormatError(OSError):
+    """A file begins like none of the formats that are read here."""
+
+
 def write_grey(path: Path, image: np.ndarray) -> None:
     """Write (h, w) uint8 or uint16 as PNG, or float32 as OpenEXR with one channel Y, by the suffix of `path`."""
     if path.suffix == ".exr":
@@ -61,10 +65,11 @@ def read_grey(path: Path) -> np.ndarray:
         raise FileFormatError(f"{path} cannot be read as an image: {brief(error)}.") from error
 
 
-def check_size(path: Path) -> None:
-    """Raise FileFormatError if the header of an image file states more pixels, or bytes, than the limits allow.
+def check_pixels(path: Path) -> None:
+    """Raise FileFormatError if an image file states more pixels, or bytes, than the limits allow, or is damaged.
 
-    Nothing is decoded. A file that is no image, or of another format than those of `read_grey`, passes.
+    For files that others will decode: Mitsuba's libpng crashed on some. A file of another format than those of
+    `read_grey` passes.
     """
     check_file(path, FileFormatError)
     try:
@@ -72,12 +77,14 @@ def check_size(path: Path) -> None:
             if path.suffix.lower() == ".exr":
                 _open_exr(path)
             else:
-                with _open_raster(path):
-                    pass
+                with _open_raster(path) as image:
+                    image.load()
+    except _OtherFormatError:
+        return
     except FileFormatError:
         raise
-    except _BROKEN:
-        return  # whoever decodes it says so
+    except _BROKEN as error:
+        raise FileFormatError(f"{path} cannot be read as an image: {brief(error)}.") from error
 
 
 def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.ndarray:
@@ -92,7 +99,7 @@ def read_stack(paths: list[Path], size: tuple[int, int] | None = None) -> np.nda
     """
     first: np.ndarray | None = None
     for i, path in enumerate(paths):
-        if not path.is_file():
+        if not os.path.lexists(path):  # unlike Path.exists, also of names that cannot be
             raise FileFormatError(f"frame {path} is missing.")
         image = read_grey(path)
         if first is None:
@@ -175,7 +182,6 @@ def _open_raster(path: Path) -> Iterator[Any]:
         PngImagePlugin,
         PpmImagePlugin,
         TiffImagePlugin,
-        UnidentifiedImageError,
     )
 
     plugins = (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
@@ -192,7 +198,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
                 limits.check("pixels", image.width * image.height, f"pixels in {path}", FileFormatError)
                 yield image
             return
-    raise UnidentifiedImageError(f"it is none of {', '.join(p.format for p in plugins)} or OpenEXR")
+    raise _OtherFormatError(f"it is none of {', '.join(p.format for p in plugins)} or OpenEXR")
 
 
 def _read_raster(path: Path) -> np.ndarray:

@@ -371,4 +371,6 @@ def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None
     for name in ("supervoxels", "labels"):
         if data[name].max(initial=-1) >= leaves:
             raise FileFormatError(f"{path}: array {name}: expected indices below the number of leaves, {leaves}.")
+    if not np.bincount(data["supervoxels"][data["supervoxels"] >= 0], minlength=leaves).all():
+        raise FileFormatError(f"{path}: array supervoxels: expected a pixel in each of {leaves} leaves.")
     return Segmentation(**data)

@@ -138,7 +138,7 @@ class EdgeModel:
 
 def _numbers(values: object) -> tuple[float, ...]:
     if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
-        raise ValueError(f"expected numbers in a model, got {str(values)[:100]}; write it with EdgeModel.save")
+        raise ValueError(f"expected numbers in a model, got {ascii(values)[:100]}; write it with EdgeModel.save")
     try:
         return tuple(float(value) for value in values)
     except OverflowError:

@@ -13,7 +13,7 @@ from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
 from rangesim.doctor import doctor_command
-from rangesim.errors import RangesimError
+from rangesim.errors import RangesimError, sentence
 
 app = typer.Typer(
     name="rangesim", no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False
@@ -54,7 +54,5 @@ def main() -> None:
     except (RangesimError, ValueError, OSError) as error:
         if "--debug" in sys.argv:
             raise
-        from rangesim.config import visible  # names in files give a terminal no orders
-
-        typer.echo(f"rangesim: {visible(' '.join(str(error).split()))}", err=True)
+        typer.echo(f"rangesim: {sentence(str(error))}", err=True)
         sys.exit(1)

@@ -69,8 +69,7 @@ def verify_command(
     from pcgraph.output import verify_directory
     from rangesim.capture_files import CAPTURE
     from rangesim.cli.decoded_files import DECODED
-    from rangesim.config import visible
-    from rangesim.errors import FileFormatError
+    from rangesim.errors import FileFormatError, visible
     from rangesim.result_files import RESULT
 
     kinds = (RESULT, CAPTURE, DECODED)

@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import mitsuba as mi
 
 from rangesim.llvm import ensure_llvm
@@ -38,23 +35,6 @@ def select_variant(variant: str | None = None) -> str:
         mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
     return variant
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let Embree build its trees in one thread, so that they are the same every time.
-
-    Built in parallel they differ from one load of a large mesh to the next, and with them, in the last digit, where
-    rays meet surfaces. It takes a fifth longer for a million triangles.
-    """
-    import drjit as dr
-
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(threads)
 
 
 def cuda_available() -> bool:

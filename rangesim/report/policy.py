@@ -16,7 +16,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from rangesim.config import visible
+from rangesim.errors import visible
 
 _DECLARATIONS = re.compile(r"[a-z]+:[-#%.,() a-z0-9]+(;[a-z]+:[-#%.,() a-z0-9]+)*")
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
-from rangesim.config import visible
+from rangesim.errors import visible
 from rangesim.experiment import Experiment
 from rangesim.report import palette
 from rangesim.report.figures import Share

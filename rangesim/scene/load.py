@@ -17,9 +17,8 @@ import numpy as np
 
 from rangesim.bounds import Bounds, check_number
 from rangesim.catalogue import CATALOGUE, scene_file
-from rangesim.config import visible
 from rangesim.errors import FileFormatError
-from rangesim.light_transport.backend import one_thread, select_variant
+from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.medium import is_boundary, why_not_traced
 from rangesim.rig import Intrinsics
 from rangesim.scene import retroreflector
@@ -108,11 +107,13 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
             mi.parser.transform_all(config, state)
             ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
             check_properties(state, label)
-            with one_thread():
-                loaded = mi.parser.instantiate(config, state)
+            loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
-        reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))[:400]
-        raise FileFormatError(f"{label} is no scene Mitsuba can load: {visible(reason)}") from error
+        reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
+        reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)[
+            :400
+        ]  # of a BSDF in Python
+        raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
 
 

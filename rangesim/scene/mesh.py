@@ -91,7 +91,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     try:
         with np.errstate(all="ignore"):
-            mesh = trimesh.load_mesh(path, process=False, resolver=Beside(str(path)))
+            mesh = trimesh.load_mesh(path, process=False, skip_materials=True, resolver=Beside(str(path)))
     except FileFormatError as error:
         raise FileFormatError(f"{path} refers to a file beside it: {error}") from error
     except Exception as error:  # each of trimesh's parsers fails in its own way

@@ -10,7 +10,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.backend import one_thread
 from rangesim.scene.scene import Scene
 
 
@@ -63,14 +62,12 @@ class MovingScene:
             points = self._rest[f"{name}.vertex_positions"] @ T[:3, :3].T + T[:3, 3]
             self._parameters[f"{name}.vertex_positions"] = mi.Float(np.float32(points).ravel())
             normals[f"{name}.vertex_normals"] = self._rest[f"{name}.vertex_normals"] @ T[:3, :3].T
-        with one_thread():
-            self._parameters.update()
+        self._parameters.update()
         # Mitsuba has just made new normals of the vertices; those of the file were perhaps smoother
         for key, directions in normals.items():
             if directions.size:
                 self._parameters[key] = mi.Float(np.float32(directions).ravel())
-        with one_thread():
-            self._parameters.update()
+        self._parameters.update()
         return moved
 
     def _load(self) -> Scene:

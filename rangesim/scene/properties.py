@@ -20,7 +20,7 @@ from rangesim import limits
 from rangesim.bounds import FARTHEST_M, Bounds
 from rangesim.config import shown
 from rangesim.errors import FileFormatError
-from rangesim.image_files import check_size
+from rangesim.image_files import check_pixels
 from rangesim.text_files import is_nested_deeper
 
 ANY = Bounds("finite", -1e30, 1e30)
@@ -188,7 +188,9 @@ class _Property:
     def _problem_of_image(self, path: Path, key: str) -> str:
         if not path.is_file():
             return ""  # Mitsuba says so
-        check_size(path)
+        if path.stat().st_size == 0:
+            return f"expected {key} to name a file with contents, but {path.name} is empty"
+        check_pixels(path)
         if self.bounds is ANY or path.suffix.lower() not in FLOAT_IMAGES:
             return ""
         values = np.array(mi.Bitmap(str(path)), dtype=np.float64)
