@@ -100,6 +100,9 @@ def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence
         holds an input or lies in one, or another process is writing to it.
     """
     named = Path(directory)
+    if named.parts[:1] == ("~",) or named.name.startswith("--"):
+        kind_of_name = "an option" if named.name.startswith("--") else "a home directory, which the shell alone expands"
+        raise kind.error(f"{named} looks like {kind_of_name}; name another place, or ./{named}.")
     try:
         if named.is_symlink() and not named.exists():
             raise kind.error(f"{named} is a link to {os.readlink(named)}, which does not exist; name another place.")

@@ -191,6 +191,17 @@ def test_what_is_no_older_result_is_refused(tmp_path: Path) -> None:
     assert contents(tmp_path / "nearly") == {f"{STAGING}/mine.txt": "mine"}
 
 
+@pytest.mark.parametrize("name", ["~", "~/results", "--noise-free", "deep/--noise-free"])
+def test_names_that_mean_something_else_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """A directory of the name `~` invites `rm -rf ~`."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(Refused, match="looks like"), new_directory(name, KIND):
+        pytest.fail("entered")
+    assert list(tmp_path.iterdir()) == []
+    publish(Path("./x/~"), NEW)
+    assert contents(tmp_path / "x" / "~") == NEW
+
+
 def test_inputs_are_kept_apart(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     refuse(tmp_path / "in", "is the input itself", (tmp_path / "in",))
