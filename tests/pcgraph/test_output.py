@@ -305,56 +305,41 @@ class Stop(BaseException):
     """A process that ends here."""
 
 
-def count_down(monkeypatch: pytest.MonkeyPatch, steps: int, failure: Callable[[], BaseException]) -> None:
-    """Let the call number `steps` of all that change the disk fail before it does anything."""
-    left = [steps]
+def before_each_change(monkeypatch: pytest.MonkeyPatch, act: Callable[[], None]) -> None:
+    """Call `act` before every call that changes the disk."""
 
-    def counted(call: Callable[..., object]) -> Callable[..., object]:
+    def acting(call: Callable[..., object]) -> Callable[..., object]:
         def wrapper(*args: object, **kwargs: object) -> object:
-            left[0] -= 1
-            if left[0] < 0:
-                raise failure()
+            act()
             return call(*args, **kwargs)
 
         return wrapper
 
-    for owner, name in (
-        (os, "link"),
-        (os, "replace"),
-        (os, "fsync"),
-        (Path, "rename"),
-        (Path, "unlink"),
-        (Path, "mkdir"),
-    ):
-        monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
+    for owner, name in CHANGES:
+        monkeypatch.setattr(owner, name, acting(getattr(owner, name)))
+
+
+def count_down(monkeypatch: pytest.MonkeyPatch, steps: int, failure: Callable[[], BaseException]) -> None:
+    """Let the call number `steps` of all that change the disk fail before it does anything, and all after it."""
+    left = iter(range(steps))
+
+    def act() -> None:
+        if next(left, None) is None:
+            raise failure()
+
+    before_each_change(monkeypatch, act)
 
 
 def steps_of_a_replacement(tmp_path: Path) -> int:
     """How many calls there are to fail."""
+    calls: list[None] = []
     with pytest.MonkeyPatch.context() as patch:
         publish(tmp_path / "count", OLD)
-        calls = [0]
-
-        def counted(call: Callable[..., object]) -> Callable[..., object]:
-            def wrapper(*args: object, **kwargs: object) -> object:
-                calls[0] += 1
-                return call(*args, **kwargs)
-
-            return wrapper
-
-        for owner, name in (
-            (os, "link"),
-            (os, "replace"),
-            (os, "fsync"),
-            (Path, "rename"),
-            (Path, "unlink"),
-            (Path, "mkdir"),
-        ):
-            patch.setattr(owner, name, counted(getattr(owner, name)))
+        before_each_change(patch, lambda: calls.append(None))
         patch.setattr(output._Staging, "release", end_of_process)
         publish(tmp_path / "count", NEW)
     output._claims.clear()
-    return calls[0]
+    return len(calls)
 
 
 def end_of_process(claim: output._Staging) -> None:
