@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.voxels.bounds import bounding_box
 
+_SMALLEST = 1e-250
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow
 
 
@@ -92,10 +93,10 @@ def _excerpt(values: NDArray[np.float64]) -> str:
 
 
 def positive(name: str, value: float) -> float:
-    """The value as float, if it is a number of metres from 1e-100 to 1e100; ValueError otherwise."""
+    """The value as float, if it is a number of metres from 1e-250 to 1e100; ValueError otherwise."""
     number = _number(value)
-    if not 1.0 / _LARGEST <= number <= _LARGEST:
-        most = f"{1.0 / _LARGEST:g} to {_LARGEST:g} works"
+    if not _SMALLEST <= number <= _LARGEST:
+        most = f"{_SMALLEST:g} to {_LARGEST:g} works"
         raise ValueError(f"expected a finite {name} above 0 metres, got {value!r}; {most}")
     return number
 

@@ -739,16 +739,20 @@ def _make_plain_parents(folder: Path, name: str) -> None:
 def _is_staging(path: Path) -> bool:
     """Whether a directory of the staging's name is one: it holds its lock, or nothing.
 
-    Its owner may make or remove it meanwhile; the lock comes first and goes last.
+    Its owner may make or remove it meanwhile, and the next one come: it takes several looks to find a foreign one.
     """
-    if path.is_symlink() or not path.is_dir():
-        return False
-    try:
-        names = os.listdir(path)
-    except FileNotFoundError:
-        return False
     lock = path / _LOCK
-    return not names or (_LOCK in names and (_is_plain_file(lock) or not os.path.lexists(lock)))
+    for _ in range(5):
+        if path.is_symlink() or not path.is_dir():
+            return False
+        try:
+            names = os.listdir(path)
+        except FileNotFoundError:
+            return False
+        if not names or (_LOCK in names and (_is_plain_file(lock) or not os.path.lexists(lock))):
+            return True
+        time.sleep(0.002)
+    return False
 
 
 def _is_plain_file(path: Path) -> bool:
