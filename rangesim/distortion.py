@@ -65,6 +65,10 @@ def undistort(coefficients: Sequence[Any], x: Any, y: Any) -> tuple[Any, Any]:
     return u, v
 
 
+NEGLIGIBLE = 1e-100
+"""Coefficients below bend no ray, and their inverse is infinite."""
+
+
 def fold_radius2(coefficients: Sequence[float]) -> float:
     """Square of the image-plane radius at which the radial polynomial turns round; infinite if it does not.
 
@@ -72,6 +76,7 @@ def fold_radius2(coefficients: Sequence[float]) -> float:
     image: what lies beyond would appear where nearer points are already.
     """
     k1, k2, _, _, k3 = coefficients
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
+    roots = np.roots(np.where(np.abs(slope) < NEGLIGIBLE, 0.0, slope))
     turns = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(turns.min(initial=np.inf))

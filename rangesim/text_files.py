@@ -7,6 +7,7 @@ Parsers of all three recurse, and Mitsuba's crashes the process where the stack 
 from __future__ import annotations
 
 import json
+import os
 import re
 import tomllib
 from collections.abc import Callable, Mapping
@@ -123,7 +124,7 @@ class _Xml:
             if name == "include" and self.resolve is not None:
                 place = _PARAMETER.sub(lambda m: self.defaults.get(m[1], m[0]), attributes.get("filename", ""))
                 found = self.resolve(place)
-                if found.is_file():  # if not, whoever includes it says so
+                if os.path.isfile(found):  # also of names that cannot be; if not, whoever includes it says so
                     self.read(found.resolve(), level, (*within, path))
 
         def end(_: str) -> None:

@@ -65,3 +65,9 @@ def test_projector_pixels_without_a_ray_are_out_of_range(axes: tuple[str, ...]) 
     lost = np.abs(column - projector.cx) > reach
     assert lost.mean() > 0.02
     assert (image.status[lost] == Status.OUT_OF_RANGE).all()
+
+
+def test_a_distortion_too_small_to_bend_a_ray_is_none() -> None:
+    assert Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0, (-0.1, 5e-324, 0.0, 0.0, 5e-324)).fold_radius2 == pytest.approx(
+        1 / 0.3
+    )

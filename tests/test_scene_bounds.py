@@ -333,3 +333,14 @@ def test_an_envmap_may_be_bright_but_not_nan(tmp_path: Path) -> None:
         else:
             with pytest.raises(FileFormatError, match=r"sky\.exr to be 0 or positive, and finite"):
                 load_scene(ball() | {"light": light})
+
+
+def test_a_bitmap_without_a_file_is_refused() -> None:
+    """Mitsuba 3.9 crashes on it; found by fuzzing."""
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective"},
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "raw": True}}},
+    }
+    with pytest.raises(FileFormatError, match="expected a filename, found none"):
+        load_scene(scene)

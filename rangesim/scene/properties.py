@@ -59,6 +59,8 @@ COLOURS = ("value", "color", "color0", "color1", "filename", "bitmap", "data")
 """Properties of a texture that hold what the property it stands for may be."""
 ENTRIES_PER_SHAPE = 20
 """Of a scene dictionary, at most, on average; one that holds the same dictionary again and again has more."""
+BITMAP_SOURCES = ("filename", "bitmap", "data")
+"""What a bitmap texture may be made of; without any, Mitsuba 3.9 crashes."""
 FLOAT_IMAGES = (".exr", ".pfm", ".hdr", ".rgbe")
 """Texture files whose values may lie outside 0..1."""
 
@@ -119,6 +121,8 @@ def check_properties(state: Any, label: str) -> None:
             problem = checked.problem(value)
             if problem:
                 raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
+        if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
+            raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
