@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from rangesim.llvm import ensure_llvm
 
 with suppress(EnvironmentProblem):  # tests that render say it again; those of decoders need no LLVM
     ensure_llvm()
+
+# A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
