@@ -154,16 +154,12 @@ def _segmentation(
 
 
 def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:
-    from pcgraph.io import write_segmentation
+    from pcgraph.io.write import encode_segmentation
+    from pcgraph.plain_files import write_files
 
-    folder = targets[0].parent
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CloudWriteError(f"cannot create the folder {folder}: {error.strerror}; choose another --out") from None
+    contents = {target: encode_segmentation(target.name, cloud, result, labels) for target in targets}
     _check_targets(targets)  # the segmentation took its time
-    for target in targets:
-        write_segmentation(target, cloud, result, labels)
+    write_files(contents, CloudWriteError, make_parents=True)
 
 
 def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: list[Path], seconds: float) -> None:

@@ -18,9 +18,12 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 
 handled = False
 """Whether a thread of this module ends the process on a signal, whatever the others do."""
+removers: list[Callable[[], bool]] = []
+"""Of work in progress, called before the process ends, the last one first: each says whether there was any."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 
@@ -58,6 +61,24 @@ def _open_standard_streams() -> None:
 
 
 _ending = threading.Event()
+_written = 0
+
+
+def count() -> None:
+    """Say that a file or a directory has been written."""
+    global _written
+    _written += 1
+
+
+@contextlib.contextmanager
+def holding(lock: threading.RLock) -> Iterator[None]:
+    """Hold a lock; for ever if the process is about to end, so that nobody begins anything any more."""
+    lock.acquire()
+    try:
+        yield
+    finally:
+        if not _ending.is_set():
+            lock.release()
 
 
 def _stay() -> None:
@@ -81,10 +102,8 @@ def _end(number: int, screen: int, program: str, writes: bool) -> None:
             sys.stdout.flush()
         clear = "\r\x1b[2K\x1b[?25h" if os.isatty(screen) else ""  # a progress bar hides the cursor
         _silence_others()
-        output = sys.modules.get("pcgraph.output")  # not loaded: nothing was begun
-        began = bool(output.abandon()) if output is not None and hasattr(output, "abandon") else False
-        done = output is not None and getattr(output, "completed", 0) > 0
-        text = "; nothing was written" if writes and (began or not done) else ""
+        began = sum(remove() for remove in reversed(removers))
+        text = "; nothing was written" if writes and (began or not _written) else ""
         with contextlib.suppress(OSError):
             os.write(screen, f"{clear}{program}: interrupted{text}.\n".encode())
     finally:

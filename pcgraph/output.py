@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output that appears whole or not at all, and never costs a user a file.
+"""Directories that appear whole or not at all, and never cost a user a file.
 
-Every command and every `save` of pcgraph and rangesim writes through this module, by four rules:
+Every command and every `save` of pcgraph and rangesim that writes a directory does so here, by four rules; those that
+write single files, in `pcgraph.plain_files`.
 
 1. Work goes on in a hidden staging directory, `STAGING`, inside the directory that is asked for. A lock says that the
    work is alive. What a killed process left is cleared, or its replacement completed, by the next one.
@@ -25,11 +26,14 @@ import shutil
 import stat
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
+
+from pcgraph import interrupts
+from pcgraph.plain_files import DISK, clear_parts, flush, is_plain_file, remove_empty, replace_file, why
 
 try:
     import fcntl
@@ -43,11 +47,6 @@ MANIFEST_FORMAT = "rangesim-manifest"
 MANIFEST_VERSION = 1
 MAX_MANIFEST_BYTES = 64 << 20
 _JOURNAL, _LOCK, _WORK, _NEW, _OLD = "journal.json", "lock", "work", "new", "old"
-_DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quota is used up",
-         errno.EFBIG: "the file would be larger than allowed", errno.EROFS: "the file system is read-only",
-         errno.EIO: "the device fails"}  # fmt: skip
-_LONGEST_NAME = 255
-_PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def check_directory(directory: str | Path, kind: DirectoryKind, inputs: Sequence
                 _check_contents(named, target, kind, inputs)
     except OSError as problem:
         place = f" ({os.fsdecode(problem.filename)})" if problem.filename else ""
-        raise kind.error(f"cannot write to {named}: {_why(problem)}{place}; name another place.") from problem
+        raise kind.error(f"cannot write to {named}: {why(problem)}{place}; name another place.") from problem
     return target
 
 
@@ -176,14 +175,14 @@ def replace_listed_file(directory: str | Path, name: str, make: Callable[[], byt
             content = make()
             files = read_manifest(folder, kind)
             path = folder / name
-            if os.path.lexists(path) and not (_is_plain_file(path) and _digest(path) in files.get(name, [])):
+            if os.path.lexists(path) and not (is_plain_file(path) and _digest(path) in files.get(name, [])):
                 raise kind.error(f"{path} was changed since rangesim wrote it; move it away first.")
             new = Digest(len(content), hashlib.sha256(content).hexdigest())
             # Both contents are ours while one takes the place of the other
-            _write(folder / MANIFEST, _manifest(kind, files | {name: [*files.get(name, []), new]}))
-            _write(path, content)
-            _write(folder / MANIFEST, _manifest(kind, files | {name: [new]}))
-            _count()
+            replace_file(folder / MANIFEST, _manifest(kind, files | {name: [*files.get(name, []), new]}))
+            replace_file(path, content)
+            replace_file(folder / MANIFEST, _manifest(kind, files | {name: [new]}))
+            interrupts.count()
         finally:
             staging.release()
 
@@ -197,7 +196,7 @@ def read_manifest(directory: Path, kind: DirectoryKind) -> dict[str, list[Digest
         There is no manifest of this kind, or it is damaged.
     """
     path = directory / MANIFEST
-    if not _is_plain_file(path):
+    if not is_plain_file(path):
         raise kind.error(f"{directory} has no {MANIFEST}, so it is not known which of its files rangesim wrote.")
     with path.open("rb") as stream:
         text = stream.read(MAX_MANIFEST_BYTES + 1)
@@ -242,14 +241,14 @@ def recover(directory: str | Path, error: type[Exception]) -> None:
     """
     target = Path(os.path.realpath(directory))
     staging = target / STAGING
-    if not _is_plain_file(staging / _JOURNAL) or not _is_staging(staging):
+    if not is_plain_file(staging / _JOURNAL) or not _is_staging(staging):
         return
     try:
         handle = _lock(staging, seconds=5.0)  # a living process is done with its renames in that time
     except FileNotFoundError:  # it is done
         return
     except OSError as problem:
-        raise error(f"cannot read {staging}: {_why(problem)}.") from problem
+        raise error(f"cannot read {staging}: {why(problem)}.") from problem
     if handle is None:
         raise error(f"another process is replacing the files of {directory}; wait for it.")
     try:
@@ -260,13 +259,11 @@ def recover(directory: str | Path, error: type[Exception]) -> None:
             os.close(handle)
     except OSError as problem:
         raise error(
-            f"an interrupted replacement of {directory} cannot be completed: {_why(problem)} "
+            f"an interrupted replacement of {directory} cannot be completed: {why(problem)} "
             f"({problem.filename or staging})."
         ) from problem
 
 
-completed = 0
-"""Files and directories that this process has written."""
 _claims: dict[Path, _Staging] = {}
 _claims_lock = threading.RLock()
 """Held while claims change and while files take their places: `abandon` waits for it."""
@@ -277,13 +274,10 @@ def abandon() -> bool:
 
     A replacement under way is completed first. For handlers of signals, in a thread of their own.
     """
-    with _claims_lock:
+    with interrupts.holding(_claims_lock):
         begun = bool(_claims)
         for claim in list(_claims.values()):
             claim.release()
-        for part in list(_parts):
-            with suppress(OSError):
-                os.unlink(part)
         return begun
 
 
@@ -310,9 +304,9 @@ class _Staging:
                     raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
                 _carry_out(target)
                 _clear(claim.path)
-                if _is_plain_file(target / MANIFEST):
+                if is_plain_file(target / MANIFEST):
                     claim.manifest = _digest(target / MANIFEST)
-                _clear_parts(target, _listed_names(target, kind) | {MANIFEST})
+                clear_parts(target, _listed_names(target, kind) | {MANIFEST})
             except BaseException:
                 claim.release()
                 raise
@@ -377,13 +371,13 @@ class _Staging:
                 )
             for name in old:  # what may fail, fails before
                 _make_plain_parents(self.path, f"{_OLD}/{name}")
-            _write(self.path / _JOURNAL, _json({"retire": old, "place": names}))
+            replace_file(self.path / _JOURNAL, _json({"retire": old, "place": names}))
             try:
                 _carry_out(self.target)
             except KeyboardInterrupt:
                 _carry_out(self.target)
                 raise
-        _count()
+        interrupts.count()
 
     def listed(self, kind: DirectoryKind) -> dict[str, list[Digest]]:
         """Files of the older result that are still as they were written, its manifest among them.
@@ -404,7 +398,7 @@ class _Staging:
             place = self.target / f"{kind.format}-{number}"
             if not os.path.lexists(place):
                 (self.path / _NEW).rename(place)
-                _flush(self.target)
+                flush(self.target)
                 return place
         raise kind.error(f"{self.target} holds too many results that were set aside; move them away.")
 
@@ -421,7 +415,7 @@ class _Staging:
                 if handle is not None:
                     os.close(handle)
             if self.process == os.getpid():
-                _remove_empty(self.made)
+                remove_empty(self.made)
 
 
 def _moved(named: Path) -> str:
@@ -456,9 +450,9 @@ def _forget_claims() -> None:
             os.close(claim.handle)
             claim.handle = None
     _claims.clear()
-    _parts.clear()
 
 
+interrupts.removers.append(abandon)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_claims)
 
@@ -469,7 +463,7 @@ def _carry_out(target: Path) -> None:
     A crafted directory may hold a crafted journal: nothing is reached through links, nothing outside is touched.
     """
     staging = target / STAGING
-    if not _is_plain_file(staging / _JOURNAL):
+    if not is_plain_file(staging / _JOURNAL):
         return
     retire, place = _read_journal(staging / _JOURNAL)
     waiting = {name for name in place if os.path.lexists(staging / _NEW / name)}
@@ -491,12 +485,12 @@ def _carry_out(target: Path) -> None:
         _make_plain_parents(target, name)
         _move_to_free_place(staging / _NEW / name, target / name)
     folders = {target / parent for name in (*retire, *place) for parent in PurePosixPath(name).parents} | {target}
-    _remove_empty(sorted(folders - {target}, reverse=True))
+    remove_empty(sorted(folders - {target}, reverse=True))
     for folder in folders:
         if folder.is_dir() and not folder.is_symlink():
-            _flush(folder)
+            flush(folder)
     (staging / _JOURNAL).unlink()
-    _flush(staging)
+    flush(staging)
 
 
 def _read_journal(path: Path) -> tuple[dict[str, list[Digest]], list[str]]:
@@ -578,100 +572,13 @@ def _listed_names(target: Path, kind: DirectoryKind) -> set[str]:
 
 def _states_kind(sidecar: Path, kind: str) -> bool:
     try:
-        info = json.loads(sidecar.read_text(encoding="utf-8")) if _is_plain_file(sidecar) else None
+        info = json.loads(sidecar.read_text(encoding="utf-8")) if is_plain_file(sidecar) else None
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(info, dict) and info.get("format") == kind
 
 
-# ---- Single files --------------------------------------------------------------------------------------------------
-
-_parts: set[str] = set()
-"""Temporary files of this process."""
-
-
-def write_file(path: Path, content: bytes, error: type[Exception], make_parents: bool = False) -> None:
-    """Write a file; a reader finds the old content or the new, never a part, also after a crash.
-
-    A link is written through. What killed processes left beside `path` is cleared.
-
-    Raises
-    ------
-    error
-        The place is no plain file, there is no such folder, or the disk is full.
-    """
-    target = Path(os.path.realpath(path))
-    missing = [parent for parent in target.parents if not parent.exists()] if make_parents else []
-    if os.path.lexists(target) and not target.is_file():
-        raise error(f"cannot write {path}: it exists and is no plain file; choose another path.")
-    if os.path.lexists(target) and not os.access(target, os.W_OK):
-        raise error(f"cannot write {path}: it is read-only; choose another path.")
-    done = False
-    try:
-        if make_parents:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        _write(target, content)
-        _count()
-        done = True
-    except OSError as problem:
-        reason = "a file is in the way" if isinstance(problem, (FileExistsError, NotADirectoryError)) else _why(problem)
-        raise error(f"cannot write {path}: {reason}; choose another path.") from problem
-    finally:
-        if not done:
-            _remove_empty(missing)
-
-
-def _write(target: Path, content: bytes) -> None:
-    """Put `content` in place of a plain file, or of nothing, by a temporary file beside it, flushed."""
-    _clear_parts(target.parent, {target.name, hashlib.sha256(os.fsencode(target.name)).hexdigest()})
-    part = target.with_name(f".{target.name}.{os.urandom(8).hex()}.part")
-    if len(os.fsencode(part.name)) > _LONGEST_NAME:
-        part = target.with_name(f".{hashlib.sha256(os.fsencode(target.name)).hexdigest()}.{os.urandom(8).hex()}.part")
-    _parts.add(str(part))
-    try:
-        handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-        with os.fdopen(handle, "wb") as stream:
-            if fcntl is not None:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            stream.write(content)
-            stream.flush()
-            os.fsync(handle)
-            if target.exists():
-                os.chmod(part, stat.S_IMODE(target.stat().st_mode))
-            os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
-        _parts.discard(str(part))
-    _flush(target.parent)
-
-
-def _clear_parts(folder: Path, names: Set[str]) -> None:
-    """Remove temporary files for those of the names whose writer is gone."""
-    if fcntl is None:
-        return
-    for entry in folder.iterdir():
-        match = _PART.fullmatch(entry.name)
-        if match is None or match["name"] not in names or not _is_plain_file(entry):
-            continue
-        with suppress(OSError):
-            handle = os.open(entry, os.O_RDONLY)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                entry.unlink()
-            finally:
-                os.close(handle)
-
-
-# ---- What both rest on ---------------------------------------------------------------------------------------------
-
-
-def _count() -> None:
-    global completed
-    completed += 1
-
-
-def _why(problem: OSError) -> str:
-    return _DISK.get(problem.errno or 0) or problem.strerror or str(problem)
+# ---- What they rest on ----------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -685,14 +592,14 @@ def _one_sentence(named: Path, target: Path, kind: DirectoryKind) -> Iterator[No
             raise
         where = None if problem.filename is None else Path(os.path.abspath(os.fsdecode(problem.filename)))
         ours = where is not None and (where == target or where in target.parents or target in where.parents)
-        if problem.errno in _DISK and (ours or where is None):
+        if problem.errno in DISK and (ours or where is None):
             raise kind.error(
-                f"cannot write {named}: {_why(problem)}; nothing was written, make room or name another place."
+                f"cannot write {named}: {why(problem)}; nothing was written, make room or name another place."
             ) from problem
         if not ours:
             raise
         in_the_way = isinstance(problem, (FileExistsError, NotADirectoryError))
-        reason = "a file is in the way" if in_the_way else _why(problem)
+        reason = "a file is in the way" if in_the_way else why(problem)
         raise kind.error(f"cannot create the directory {named}: {reason}; name another place.") from problem
 
 
@@ -714,7 +621,7 @@ def _walk(folder: Path, empty_directories: bool = False) -> list[str]:
 def _is_as_listed(folder: Path, name: str, files: Mapping[str, Sequence[Digest]]) -> bool:
     """Whether a file stands where it was written, with no link on the way, and holds what the manifest says."""
     path = folder / name
-    if not _is_reached_plainly(folder, name) or not _is_plain_file(path):
+    if not _is_reached_plainly(folder, name) or not is_plain_file(path):
         return False
     size = path.lstat().st_size
     return any(size == digest.size for digest in files[name]) and _digest(path) in files[name]
@@ -749,17 +656,10 @@ def _is_staging(path: Path) -> bool:
             names = os.listdir(path)
         except FileNotFoundError:
             return False
-        if not names or (_LOCK in names and (_is_plain_file(lock) or not os.path.lexists(lock))):
+        if not names or (_LOCK in names and (is_plain_file(lock) or not os.path.lexists(lock))):
             return True
         time.sleep(0.002)
     return False
-
-
-def _is_plain_file(path: Path) -> bool:
-    try:
-        return stat.S_ISREG(path.lstat().st_mode)
-    except OSError:
-        return False
 
 
 def _digest(path: Path) -> Digest:
@@ -835,34 +735,19 @@ def _move_to_free_place(source: Path, place: Path) -> None:
         try:
             source.rename(place)
         except OSError as problem:
-            if problem.errno != errno.EXDEV or not _is_plain_file(source):
+            if problem.errno != errno.EXDEV or not is_plain_file(source):
                 raise
-            _write(place, source.read_bytes())  # something is mounted below the target
+            replace_file(place, source.read_bytes())  # something is mounted below the target
             source.unlink()
         return
     source.unlink()
 
 
-def _flush(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 def _flush_tree(folder: Path) -> None:
     for directory, _, names in os.walk(folder, topdown=False):
         for name in names:
-            _flush(Path(directory) / name)
-        _flush(Path(directory))
-
-
-def _remove_empty(directories: Iterable[Path]) -> None:
-    """Remove those of the directories, the innermost first, that are empty."""
-    for directory in directories:
-        with suppress(OSError):  # never made, or somebody else put something there meanwhile
-            directory.rmdir()
+            flush(Path(directory) / name)
+        flush(Path(directory))
 
 
 def _lock(staging: Path, seconds: float = 0.0) -> int | None:
@@ -892,7 +777,7 @@ def _lock(staging: Path, seconds: float = 0.0) -> int | None:
 def _is_claimed(target: Path) -> bool:
     """Whether a living process writes to a directory; this looks without making anything."""
     path = target / STAGING / _LOCK
-    if fcntl is None or not _is_plain_file(path):
+    if fcntl is None or not is_plain_file(path):
         return False
     try:
         handle = os.open(path, os.O_RDONLY)

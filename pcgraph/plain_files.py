@@ -1,9 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file has to be before anybody reads it."""
+"""Single files: read only if they are plain, written whole or not at all.
+
+Only the standard library is imported, as in `pcgraph.output`.
+"""
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import os
+import re
+import stat
+import threading
+from collections.abc import Iterable, Mapping, Set
+from contextlib import suppress
 from pathlib import Path
+
+from pcgraph import interrupts
+
+try:
+    import fcntl
+except ImportError:  # Windows has no flock: there, what killed processes left is not cleared
+    fcntl = None  # type: ignore[assignment]
+
+DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quota is used up",
+        errno.EFBIG: "the file would be larger than allowed", errno.EROFS: "the file system is read-only",
+        errno.EIO: "the device fails"}  # fmt: skip
+"""Why a disk takes no more, by error number."""
+_LONGEST_NAME = 255
+_PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
+
+
+# ---- Reading -------------------------------------------------------------------------------------------------------
 
 
 def check_file(path: str | Path, error: type[Exception]) -> None:
@@ -27,3 +55,181 @@ def read_file(path: str | Path, error: type[Exception]) -> bytes:
         raise error(f"cannot read {path}: {problem.strerror or problem}.") from problem
     except MemoryError:
         raise error(f"cannot read {path}: it does not fit into memory.") from None
+
+
+def is_plain_file(path: Path) -> bool:
+    """Whether `path` is a file and no link to one."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except OSError:
+        return False
+
+
+# ---- Writing -------------------------------------------------------------------------------------------------------
+
+
+def write_file(path: Path, content: bytes, error: type[Exception], make_parents: bool = False) -> None:
+    """Write a file; as `write_files`."""
+    write_files({path: content}, error, make_parents)
+
+
+def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_parents: bool = False) -> None:
+    """Write files; a reader finds the old content of each or the new, never a part, also after a crash.
+
+    None is replaced before all are on the disk, and a signal leaves all or none. Links are written through. What
+    killed processes left beside them is cleared.
+
+    Raises
+    ------
+    error
+        A place is no plain file, there is no such directory, or the disk is full.
+    """
+    for path in contents:
+        target = Path(os.path.realpath(path))
+        if os.path.lexists(target) and not target.is_file():
+            raise error(f"cannot write {path}: it exists and is no plain file; choose another path.")
+        if os.path.lexists(target) and not os.access(target, os.W_OK):
+            raise error(f"cannot write {path}: it is read-only; choose another path.")
+    parts: list[_Part] = []
+    done = False
+    try:
+        for path, content in contents.items():
+            parts.append(_Part(path))
+            parts[-1].write(content, make_parents)
+        with _lock:
+            for part in parts:
+                path = part.named
+                part.place()
+                interrupts.count()
+        done = True
+    except OSError as problem:
+        reason = "a file is in the way" if isinstance(problem, (FileExistsError, NotADirectoryError)) else why(problem)
+        raise error(f"cannot write {path}: {reason}; choose another path.") from problem
+    finally:
+        for part in reversed(parts):
+            part.remove(and_directories=not done)
+
+
+def replace_file(target: Path, content: bytes) -> None:
+    """Put `content` in place of a plain file, or of nothing, whole or not at all; OSError if that fails."""
+    part = _Part(target)
+    try:
+        part.write(content)
+        part.place()
+    finally:
+        part.remove()
+
+
+class _Part:
+    """The temporary file beside its place that holds what is to come there; known by its lock while it is written."""
+
+    def __init__(self, named: Path) -> None:
+        self.named, target = named, Path(os.path.realpath(named))
+        digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
+        self.names = {target.name, digest}  # of parts that killed processes may have left
+        self.target = target
+        self.path = target.with_name(f".{target.name}.{os.urandom(8).hex()}.part")
+        if len(os.fsencode(self.path.name)) > _LONGEST_NAME:
+            self.path = target.with_name(f".{digest}.{os.urandom(8).hex()}.part")
+        self.made: list[Path] = []
+
+    def write(self, content: bytes, make_parents: bool = False) -> None:
+        """Write and flush the file; its directory is made if need be."""
+        with _lock:
+            if make_parents:
+                self.made = [parent for parent in self.target.parents if not parent.exists()]
+            _parts.append(self)
+            if make_parents:
+                self.target.parent.mkdir(parents=True, exist_ok=True)
+            clear_parts(self.target.parent, self.names)
+            handle = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        with os.fdopen(handle, "wb") as stream:
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            stream.write(content)
+            stream.flush()
+            os.fsync(handle)
+        if self.target.exists():
+            os.chmod(self.path, stat.S_IMODE(self.target.stat().st_mode))
+
+    def place(self) -> None:
+        """Let the file take its place."""
+        os.replace(self.path, self.target)
+        flush(self.target.parent)
+
+    def remove(self, and_directories: bool = False) -> None:
+        """Remove the file, if it is there still, and the directories made for it that are empty."""
+        with _lock:
+            if self in _parts:
+                _parts.remove(self)
+            with suppress(OSError):  # it took its place, was never made, or its directory is gone
+                self.path.unlink()
+            if and_directories:
+                remove_empty(self.made)
+
+
+_parts: list[_Part] = []
+"""Those of this process."""
+_lock = threading.RLock()
+"""Held while temporary files come, take their places and go: `_abandon` waits for it."""
+
+
+def _abandon() -> bool:
+    """Remove the temporary files of this process, which is about to end; whether there were any."""
+    with interrupts.holding(_lock):
+        begun = bool(_parts)
+        for part in reversed(_parts.copy()):
+            part.remove(and_directories=True)
+        return begun
+
+
+def _forget_parts() -> None:
+    """In a child of a process: what its parent has begun is none of its business."""
+    global _lock
+    _lock = threading.RLock()
+    _parts.clear()
+
+
+interrupts.removers.append(_abandon)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_parts)
+
+
+def clear_parts(folder: Path, names: Set[str]) -> None:
+    """Remove temporary files for those of the names whose writer is gone."""
+    if fcntl is None:
+        return
+    for entry in folder.iterdir():
+        match = _PART.fullmatch(entry.name)
+        if match is None or match["name"] not in names or not is_plain_file(entry):
+            continue
+        if any(part.path == entry for part in _parts):
+            continue
+        with suppress(OSError):
+            handle = os.open(entry, os.O_RDONLY)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                entry.unlink()
+            finally:
+                os.close(handle)
+
+
+def why(problem: OSError) -> str:
+    """What an operating system's error says, in words."""
+    return DISK.get(problem.errno or 0) or problem.strerror or str(problem)
+
+
+def flush(path: Path) -> None:
+    """Flush a file, or the entries of a directory, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def remove_empty(directories: Iterable[Path]) -> None:
+    """Remove those of the directories, the innermost first, that are empty."""
+    for directory in directories:
+        with suppress(OSError):  # never made, or somebody else put something there meanwhile
+            directory.rmdir()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcgraph.output import write_file
+from pcgraph.plain_files import write_file
 from rangesim.bounds import Bounds, check_number, whole
 from rangesim.config import from_dict, shown, to_dict
 from rangesim.errors import FileFormatError

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcgraph.output import write_file
+from pcgraph.plain_files import write_file
 from rangesim.errors import FileFormatError
 from rangesim.point_cloud import PointCloud
 

@@ -44,9 +44,9 @@ def test_pcgraph_never_imports_rangesim_or_a_renderer(path: Path) -> None:
 
 STOREYS = [
     "errors",
-    "output",
-    "plain_files",
     "interrupts",
+    "plain_files",
+    "output",
     "cloud",
     "parallel",
     "voxels",

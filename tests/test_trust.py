@@ -172,7 +172,9 @@ def test_signals_end_a_command_in_one_line_at_any_moment(tmp_path: Path, package
             start = time.monotonic()
             _, err = process.communicate(timeout=60)
             assert time.monotonic() - start < 5.0
-        if process.returncode == 0:
+        if process.returncode in (0, -number):  # done before the signal; Python gives up its handlers when it ends
+            written = {path.name for path in (tmp_path / "out" / "n").iterdir()}
+            assert written >= ({"report.html"} if package == "rangesim" else {"big.segments.ply", "big.segments.npz"})
             shutil.rmtree(tmp_path / "out")
             continue
         assert process.returncode == 128 + number, err

@@ -180,6 +180,6 @@ class AdjacencyGraph:
         """
         from pcgraph.errors import CloudWriteError
         from pcgraph.graph.export import graphml
-        from pcgraph.output import write_file
+        from pcgraph.plain_files import write_file
 
         write_file(Path(path), graphml(self, occlusions), CloudWriteError)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
 from pcgraph.io.ply import encode_ply
-from pcgraph.output import write_file
+from pcgraph.plain_files import write_file
 
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
@@ -86,11 +86,18 @@ def write_segmentation(
         Another extension, or the place cannot be written.
     """
     path = Path(path)
+    write_file(path, encode_segmentation(path.name, cloud, segmentation, labels), CloudWriteError)
+
+
+def encode_segmentation(
+    name: str, cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32] | None = None
+) -> bytes:
+    """What `write_segmentation` writes to a file of such a name."""
     encoders = {".ply": _ply, ".npz": _npz}
-    encode = encoders.get(path.suffix.lower())
+    encode = encoders.get(Path(name).suffix.lower())
     if encode is None:
-        raise CloudWriteError(f"expected an output file ending in {' or '.join(encoders)}, got {path.name!r}")
-    write_file(path, encode(cloud, segmentation, segmentation.labels if labels is None else labels), CloudWriteError)
+        raise CloudWriteError(f"expected an output file ending in {' or '.join(encoders)}, got {name!r}")
+    return encode(cloud, segmentation, segmentation.labels if labels is None else labels)
 
 
 def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:

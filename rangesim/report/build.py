@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from pcgraph.output import write_file
+from pcgraph.plain_files import write_file
 from rangesim.errors import FileFormatError
 from rangesim.report import cloud, figures, palette, tables
 from rangesim.report.policy import StyleRules, content_policy, visible_text

@@ -29,8 +29,8 @@ from pcgraph.output import (
     recover,
     replace_listed_file,
     verify_directory,
-    write_file,
 )
+from pcgraph.plain_files import write_file
 
 
 class Refused(Exception):
@@ -432,36 +432,7 @@ def test_abandon_waits_for_a_replacement_and_clears_the_rest(tmp_path: Path) -> 
     assert not output.abandon()
 
 
-# ---- Single files, and files of a complete directory ----------------------------------------------------------------
-
-
-def test_a_file_is_replaced_whole_and_keeps_its_mode(tmp_path: Path) -> None:
-    path = tmp_path / "x.bin"
-    write_file(path, b"one", Refused)
-    assert path.stat().st_mode & 0o777 == 0o666 & ~_umask()
-    path.chmod(0o600)
-    (tmp_path / "link").symlink_to("x.bin")
-    write_file(tmp_path / "link", b"two", Refused)
-    assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"two", 0o600)
-    assert (tmp_path / "link").is_symlink()
-    write_file(tmp_path / "a" / "b" / "y", b"three", Refused, make_parents=True)
-    for place in (tmp_path / "none" / "z", tmp_path, path / "below", Path("/dev/null")):
-        with pytest.raises(Refused, match="cannot write"):
-            write_file(place, b"", Refused)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "link", "x.bin"]
-
-
-def test_parts_of_dead_writers_are_cleared_and_those_of_living_ones_stay(tmp_path: Path) -> None:
-    dead, other = tmp_path / f".x.bin.{'0' * 16}.part", tmp_path / f".y.bin.{'0' * 16}.part"
-    mine = tmp_path / ".x.bin.notes.part"
-    alive = tmp_path / f".x.bin.{'1' * 16}.part"
-    for path in (dead, other, mine, alive):
-        path.write_text("")
-    fcntl = pytest.importorskip("fcntl")
-    with alive.open() as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        write_file(tmp_path / "x.bin", b"", Refused)
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([alive.name, mine.name, other.name, "x.bin"])
+# ---- Files of a complete directory ----------------------------------------------------------------------------------
 
 
 def test_one_file_of_a_directory_is_replaced_with_its_digest(tmp_path: Path) -> None:
@@ -519,12 +490,6 @@ def test_any_sequence_keeps_what_is_the_users(tmp_path_factory: pytest.TempPathF
         with suppress(Refused):
             publish(target, files)
         assert contents(target).items() >= mine.items()
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 # ---- Found by attack ------------------------------------------------------------------------------------------------

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Single files are written whole or not at all, and none is lost: the laws of `pcgraph.plain_files`."""
+
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from pcgraph import plain_files
+from pcgraph.plain_files import write_file, write_files
+
+
+class Refused(Exception):
+    """What the writer is told to raise."""
+
+
+def test_a_file_is_replaced_whole_and_keeps_its_mode(tmp_path: Path) -> None:
+    path = tmp_path / "x.bin"
+    write_file(path, b"one", Refused)
+    assert path.stat().st_mode & 0o777 == 0o666 & ~_umask()
+    path.chmod(0o600)
+    (tmp_path / "link").symlink_to("x.bin")
+    write_file(tmp_path / "link", b"two", Refused)
+    assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"two", 0o600)
+    assert (tmp_path / "link").is_symlink()
+    write_file(tmp_path / "a" / "b" / "y", b"three", Refused, make_parents=True)
+    for place in (tmp_path / "none" / "z", tmp_path, path / "below", Path("/dev/null")):
+        with pytest.raises(Refused, match="cannot write"):
+            write_file(place, b"", Refused)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "link", "x.bin"]
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_parts_of_dead_writers_are_cleared_and_those_of_living_ones_stay(tmp_path: Path) -> None:
+    dead, other = tmp_path / f".x.bin.{'0' * 16}.part", tmp_path / f".y.bin.{'0' * 16}.part"
+    mine = tmp_path / ".x.bin.notes.part"
+    alive = tmp_path / f".x.bin.{'1' * 16}.part"
+    for path in (dead, other, mine, alive):
+        path.write_text("")
+    fcntl = pytest.importorskip("fcntl")
+    with alive.open() as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        write_file(tmp_path / "x.bin", b"", Refused)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([alive.name, mine.name, other.name, "x.bin"])
+
+
+@pytest.mark.parametrize("failing", ["open", "fsync", "replace"])
+def test_files_that_belong_together_come_together_or_not_at_all(
+    tmp_path: Path, failing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    real = getattr(os, failing)
+
+    def full(*arguments: object, **options: object) -> object:
+        calls.append(arguments)
+        if len(calls) == 2 or failing == "replace":
+            raise OSError(28, "No space left on device")
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(os, failing, full)
+    with pytest.raises(Refused, match="no space left on the device"):
+        write_files({tmp_path / "a" / "x": b"1", tmp_path / "a" / "b" / "y": b"2"}, Refused, make_parents=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("held", ["open", "fsync"])
+def test_a_signal_takes_what_is_half_written_and_its_directories_away(
+    tmp_path: Path, held: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `pcgraph segment --out new/directory` stopped between the making of the directory and the end of its files."""
+    entered, go_on = threading.Event(), threading.Event()
+    real = getattr(os, held)
+
+    def slow(*arguments: object, **options: object) -> object:
+        done = real(*arguments, **options)
+        if threading.current_thread() is worker and not entered.is_set():
+            entered.set()
+            go_on.wait(10)
+        return done
+
+    def work() -> None:
+        with suppress(Refused):
+            write_files({tmp_path / "n" / "a": b"1", tmp_path / "n" / "b": b"2"}, Refused, make_parents=True)
+
+    worker = threading.Thread(target=work)
+    monkeypatch.setattr(os, held, slow)
+    worker.start()
+    assert entered.wait(10)
+    threading.Timer(0.2, go_on.set).start() if held == "open" else None  # held under the lock, which is waited for
+    assert plain_files._abandon()
+    assert list(tmp_path.iterdir()) == []
+    go_on.set()
+    worker.join(10)
+    assert list(tmp_path.iterdir()) == []
+    assert not plain_files._abandon()
