@@ -102,11 +102,15 @@ def command(
 def test_an_estimate_writes_nothing(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    size = ("--width", "64", "--height", "48", "--spp", "4", "--out", str(tmp_path / "out"))
-    code, out, err = command(capsys, monkeypatch, MATTE, *size, "--estimate")
-    assert (code, err) == (0, "")
-    assert out.startswith("about 24.6 k light paths of up to 5 segments in 2 passes, 0.4 GB, ")
+    size = ("--width", "64", "--height", "48", "--spp", "4")
+    for place in (("--out", str(tmp_path / "out")), ()):
+        code, out, err = command(capsys, monkeypatch, MATTE, *size, *place, "--estimate")
+        assert (code, err) == (0, "")
+        assert out.startswith("about 24.6 k light paths of up to 5 segments in 2 passes, 0.4 GB, ")
     assert not list(tmp_path.iterdir())
+    code, _, err = command(capsys, monkeypatch, MATTE, *size)
+    assert code == 2
+    assert "expected --out DIRECTORY" in err
 
 
 def test_sizes_without_measure_are_one_sentence_at_once(

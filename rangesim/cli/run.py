@@ -32,8 +32,9 @@ def run_command(
         ),
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Directory for the results; an older result is replaced.")
-    ] = ...,  # type: ignore[assignment]
+        Path | None,
+        typer.Option("--out", "-o", help="Directory for the results; an older result is replaced. (required)"),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Experiment file (.toml); other options override it.")
     ] = None,
@@ -88,6 +89,8 @@ def run_command(
 
       rangesim run --config examples/tabletop.toml --spp 16 --width 320 --height 240 --out out/quick
     """
+    if out is None and not estimate:
+        raise typer.BadParameter("expected --out DIRECTORY, unless --estimate is given.", param_hint="--out")
     given: dict[str, Any] = {"width": width, "height": height, "spp": spp, "max_depth": max_depth, "seed": seed}
     given |= {"material": material, "unit_m": unit_m, "photons": photons}
     experiment = _experiment(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
@@ -101,7 +104,7 @@ def run_command(
     from rangesim import pipeline
     from rangesim.result_files import RESULT
 
-    if estimate:
+    if estimate or out is None:
         cost = pipeline.estimate(experiment)
         typer.echo(cost)
         cost.check_memory()

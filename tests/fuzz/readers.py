@@ -17,6 +17,7 @@ from fuzz.cloud_files import lies
 from fuzz.hostile import Made
 from fuzz.inputs import Input
 from fuzz.mutation import MAX_BYTES, mutate, mutate_arguments
+from rangesim import limits
 
 Arguments = tuple[str, ...]
 
@@ -182,6 +183,12 @@ def _rangesim(path: Path, arguments: Arguments) -> Any:
     return main()
 
 
+def _run(path: Path, arguments: Arguments) -> Any:
+    """`rangesim run` where more than a few seconds of honest work is refused as too large."""
+    with limits.raised(memory=500_000_000, spp=64, photons=100_000):
+        return _rangesim(path, arguments)
+
+
 def _pcgraph(path: Path, arguments: Arguments) -> Any:
     from pcgraph.cli import main
 
@@ -311,21 +318,13 @@ code = "gray-phase"
 period_px = 8.0
 steps = 4
 [[instrument]]
-name = "spad"
-power_w = 0.5
-[instrument.sensor]
-type = "direct-tof"
-bins = 64
-bin_s = 400e-12
-pulse_fwhm_s = 1e-9
-[[instrument]]
 name = "amcw"
 baseline_m = 0.03
 [instrument.sensor]
 type = "amcw-tof"
 modulation_hz = [20e6, 100e6]
 """
-    return {"small": seeds.of_file("experiment.toml", text, **{"plane.xml": plane})}
+    return {"small": seeds.of_file("experiment.toml", text + seeds.SPAD.encode(), **{"plane.xml": plane})}
 
 
 def _calibrated_captures() -> seeds.Seeds:
@@ -511,7 +510,7 @@ READERS = {
             ("*.json", "*.xml", "*/00*.png"), share=0.2, command="rangesim", may_write=("out*",),
         ),
         Reader(
-            "run-experiment", _rangesim, _with_arguments(_small_experiment, f"run --config {_RUN[4:]}"), ("*.toml",),
+            "run-experiment", _run, _with_arguments(_small_experiment, f"run --config {_RUN[4:]}"), ("*.toml",),
             (_settings_to_run,), share=0.05, command="rangesim", may_write=("out*",),
         ),
         Reader(
@@ -519,7 +518,7 @@ READERS = {
             by_hand=(_options(*_OF_DECODE),), names_file=False, may_write=("*",), mutates_arguments=True,
         ),
         Reader(
-            "options-run", _rangesim, _with_arguments(_beside_a_plane, f"{_RUN} --sensor gray", f"{_RUN} {_MORE}"),
+            "options-run", _run, _with_arguments(_beside_a_plane, f"{_RUN} --sensor gray", f"{_RUN} {_MORE}"),
             share=0.1, command="rangesim", by_hand=(_options(*_OF_RUN),),
             names_file=False, may_write=("*",), mutates_arguments=True,
         ),

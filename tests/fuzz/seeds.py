@@ -18,6 +18,16 @@ from fuzz.inputs import Input
 Seeds = dict[str, Input]
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = ROOT / "scenes"
+SPAD = """[[instrument]]
+name = "spad"
+power_w = 0.5
+[instrument.sensor]
+type = "direct-tof"
+bins = 64
+bin_s = 400e-12
+pulse_fwhm_s = 1e-9
+"""
+"""An instrument of an experiment file."""
 
 
 def of_file(name: str, content: bytes, **others: bytes) -> Input:
@@ -103,14 +113,6 @@ axes = ["columns", "rows"]
 [instrument.optics]
 camera_focus_m = 1.0
 [[instrument]]
-name = "spad"
-power_w = 0.5
-[instrument.sensor]
-type = "direct-tof"
-bins = 64
-bin_s = 400e-12
-pulse_fwhm_s = 1e-9
-[[instrument]]
 name = "amcw"
 [instrument.sensor]
 type = "amcw-tof"
@@ -119,7 +121,7 @@ modulation_hz = [20e6, 100e6]
 name = "ideal"
 sensor = "ideal-tof"
 """
-    return seeds | {"every sensor": of_file("experiment.toml", every.encode())}
+    return seeds | {"every sensor": of_file("experiment.toml", (every + SPAD).encode())}
 
 
 # --- calibrations and models ------------------------------------------------------------------------------------------
