@@ -14,6 +14,7 @@ import numpy as np
 
 import rangesim
 from pcgraph.output import new_directory
+from rangesim.array_files import write_arrays
 from rangesim.capture import Capture
 from rangesim.capture_files import write_capture
 from rangesim.causes import explain
@@ -164,13 +165,9 @@ def segment(cloud: PointCloud, path: Path) -> None:
     import pcgraph
 
     result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))
-    np.savez_compressed(
-        path,
-        supervoxels=result.supervoxels,
-        labels=result.labels,
-        parents=result.tree.parents,
-        altitudes=result.tree.altitudes,
-    )
+    tree = result.tree
+    arrays = {"supervoxels": result.supervoxels, "labels": result.labels}
+    write_arrays(path, {**arrays, "parents": tree.parents, "altitudes": tree.altitudes})
 
 
 def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:

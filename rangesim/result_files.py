@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from pcgraph.output import DirectoryKind, recover
+from rangesim.array_files import write_arrays
 from rangesim.capture import Capture
 from rangesim.capture_files import load_capture
 from rangesim.causes import Cause, CauseMap
@@ -228,12 +229,12 @@ class Result:
 def save_range_image(image: RangeImage, path: Path) -> None:
     """Write the arrays of a range image to a compressed .npz file; its camera is in the capture's sidecar."""
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
-    np.savez_compressed(path, **arrays)
+    write_arrays(path, arrays)
 
 
 def save_causes(causes: CauseMap, path: Path) -> None:
     """Write a cause map to a compressed .npz file: `cause`, values of `rangesim.causes.Cause`, and `tolerance_m`."""
-    np.savez_compressed(path, cause=causes.cause, tolerance_m=causes.tolerance_m)
+    write_arrays(path, {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
 
 
 def save_rows(outlier_m: float, rows: Sequence[dict[str, Any]], folder: Path) -> None:

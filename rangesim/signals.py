@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 
+from rangesim.array_files import write_arrays
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
@@ -88,10 +90,16 @@ class Signals:
         channels = [self.channels[r] for r in sensor.responses()]
         return sensor.frames(channels, self.energy.projector, ambient_transmission * self.energy.ambient)
 
-    def save(self, path: str) -> None:
-        """Write energy split and ground truth to a compressed .npz file (for later comparison)."""
+    def save(self, path: str | Path) -> None:
+        """Write energy split and ground truth to a compressed .npz file (for later comparison).
+
+        Raises
+        ------
+        FileFormatError
+            The place cannot be written.
+        """
         arrays = {f"energy_{f.name}": getattr(self.energy, f.name) for f in fields(self.energy)}
         arrays |= {f"truth_{f.name}": np.asarray(getattr(self.truth, f.name)) for f in fields(self.truth)}
         if self.motion_m is not None:
             arrays["motion_m"] = self.motion_m
-        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+        write_arrays(path, arrays)

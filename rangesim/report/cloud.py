@@ -21,7 +21,7 @@ FAR = 1.5
 def pack(array: np.ndarray) -> str:
     """Base64 of the deflated bytes of an array, little-endian, row by row."""
     little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-    return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
+    return base64.b64encode(zlib.compress(little.tobytes())).decode("ascii")
 
 
 def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, Any]:
