@@ -16,12 +16,6 @@ if TYPE_CHECKING:
     from rangesim.cost import Cost
     from rangesim.experiment import Experiment
 
-SENSOR_HELP = "gray, gray-phase, amcw, direct-tof or ideal-tof; repeat for more. (default: gray-phase, amcw, ideal-tof)"
-BASELINE_HELP = (
-    "Metres from camera to emitter, of every sensor. (default: structured light a fifth of the working distance, "
-    "time of flight 0.03)"
-)
-
 
 def run_command(
     scene: Annotated[
