@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from many_shapes import balls
 from rangesim import Scene, load_scene, transport
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import meets_delta
+from rangesim.light_transport.surfaces import Surfaces, surfaces_of
 from rangesim.response import FirstReturn
 
 MANY = 3000
@@ -73,3 +75,59 @@ def test_the_pixels_before_glass_are_those_of_the_shapes_that_are_glass() -> Non
     assert exists.all()
     assert 0.005 < np.mean(glass) < 0.5
     np.testing.assert_array_equal(meets, glass)
+
+
+PYRAMID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\n"
+
+
+def mixed(folder: Path) -> dict[str, Any]:
+    """Spheres and meshes of all kinds, turned, mirrored, some with flipped normals, and shapes that are neither."""
+    scene = balls(2)
+    import mitsuba as mi
+
+    (folder / "pyramid.obj").write_text(PYRAMID)
+    to_world, rng = mi.ScalarTransform4f(), np.random.default_rng(0)
+    kinds: list[dict[str, Any]] = [
+        {"type": "sphere"},
+        {"type": "sphere", "flip_normals": True},
+        {"type": "cube"},
+        {"type": "cube", "face_normals": True},
+        {"type": "cube", "flip_normals": True},
+        {"type": "obj", "filename": str(folder / "pyramid.obj")},
+    ]
+    scene["disk"] = {"type": "disk", "to_world": to_world.translate([0.3, 0, 2]).scale([0.2, 0.2, 0.2])}
+    scene["tube"] = {"type": "cylinder", "p0": [-0.3, -1, 2], "p1": [-0.3, 1, 2], "radius": 0.1}
+    for i in range(180):
+        place = to_world.translate(rng.uniform((-0.9, -0.7, 1.4), (0.9, 0.7, 2.4)).tolist())
+        place = place.rotate(rng.normal(size=3).tolist(), float(rng.uniform(0, 360)))
+        size = [-0.05 if i % 4 == 0 else 0.05, 0.05, 0.05]
+        scene[f"shape_{i}"] = {**kinds[i % len(kinds)], "to_world": place.scale(size)}
+    return scene
+
+
+def test_surfaces_are_those_of_mitsuba_to_the_last_bit(tmp_path: Path) -> None:
+    scene = load_scene(mixed(tmp_path))
+    import drjit as dr
+    import mitsuba as mi
+
+    surfaces = surfaces_of(scene.mitsuba)
+    assert isinstance(surfaces, Surfaces)
+    assert len(surfaces.branches) == 8  # five of those kinds, wall, disk, cylinder
+    rays = Device.camera(scene.rig(width=320, height=240)).centre_rays(0, 320 * 240)
+    ray, active = mi.Ray3f(rays.origin, rays.direction), dr.arange(mi.UInt32, 320 * 240) % 7 != 0
+    theirs, ours = (
+        of.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active) for of in (scene.mitsuba, surfaces)
+    )
+    met = theirs.is_valid().numpy()
+    assert 0.3 < met.mean() < 0.9
+    for name in ("t", "p", "n", "uv", "dp_du", "dp_dv", "dn_du", "wi"):
+        np.testing.assert_array_equal(getattr(ours, name).numpy(), getattr(theirs, name).numpy(), name)
+    for name in ("s", "t", "n"):
+        np.testing.assert_array_equal(getattr(ours.sh_frame, name).numpy(), getattr(theirs.sh_frame, name).numpy())
+    np.testing.assert_array_equal(ours.prim_index.numpy()[met], theirs.prim_index.numpy()[met])
+    np.testing.assert_array_equal(*(dr.reinterpret_array(mi.UInt32, si.shape).numpy() for si in (ours, theirs)))
+
+
+def test_few_shapes_are_left_to_mitsuba() -> None:
+    scene = load_scene(balls(20)).mitsuba
+    assert surfaces_of(scene) is scene

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ def caustic_maps(
     seed: int,
     memory_bytes: int,
     media: Media | None,
+    surfaces: Any,
     report: Callable[[], None] = lambda: None,
 ) -> PhotonMaps | None:
     """Maps for a pass of `spp` samples; None if there are no photons, nothing to send them through, or none landed.
@@ -43,7 +45,7 @@ def caustic_maps(
         return None
     maps, projector = min(spp, MOST_MAPS), Device.projector(rig)
     landed = trace_photons(
-        scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media, report
+        scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media, surfaces, report
     )
     radius_m = radius_m or scene.working_distance_m * gathering_angle(rig, landed.per_pixel)
     irradiance = rig.projector_irradiance / scene.working_distance_m**2

@@ -72,12 +72,16 @@ def trace_glint(
     responses: Sequence[Response],
     seed: int,
     media: Media | None = None,
+    surfaces: Any = None,
     report: Callable[[], None] = lambda: None,
 ) -> Glint:
-    """What the camera of the rig sees of the projector's lens. `report` is called after each kernel launch."""
+    """What the camera of the rig sees of the projector's lens.
+
+    `surfaces`, see `surfaces_of`; `report` is called after each kernel launch.
+    """
     camera, projector = Device.camera(rig), Device.projector(rig)
     h, w = rig.camera.height, rig.camera.width
-    view = View(scene, camera, media, Seed.of(seed))
+    view = View(surfaces or scene, camera, media, Seed.of(seed))
     worth_probing = _worth_probing(scene, camera, projector, h, w)
     pixel, radius_m = _near_the_lens(view, rig, projector, worth_probing, report)
     total = np.zeros(len(pixel), np.float32)
@@ -109,7 +113,7 @@ def trace_glint(
 class View(NamedTuple):
     """What the camera looks into, and the seed of its random numbers."""
 
-    scene: Any
+    surfaces: Any
     camera: Device
     media: Media | None
     seed: Seed
@@ -142,7 +146,7 @@ class Lanes:
     """
 
     def __init__(self, view: View, pixel: np.ndarray, paths: int, first_place: int = 0) -> None:
-        self.scene, self.camera, self.media, seed = view
+        self.surfaces, self.camera, self.media, seed = view
         self.pixel, self.paths = mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, paths)
         self.place = dr.arange(mi.UInt32, len(pixel)) + dr.opaque(mi.UInt32, first_place)
         rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
@@ -241,7 +245,7 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
 
     Where light splits into reflection and refraction, probes take both alike, however faint one is.
     """
-    scene, camera, media = lanes.scene, lanes.camera, lanes.media
+    surfaces, camera, media = lanes.surfaces, lanes.camera, lanes.media
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
     nearest, spread, before = state.nearest, state.spread, state.before  # where the last one crossed
@@ -254,7 +258,7 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
         ray = mi.Ray3f(
             dr.select(chain == 0, primary.origin, origin), dr.select(chain == 0, primary.direction, direction)
         )
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
+        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
         across, _, crosses = lens.offset(ray, si)
         nearest = dr.select(crosses, dr.minimum(nearest, dr.norm(across)), nearest)
         # The least step, because probes that went another way are far off and say nothing
@@ -279,7 +283,7 @@ def _paths_to_the_lens(
 ) -> tuple[PathState, Any]:
     """The state after at most so many turns of the loop, and the turns taken: dense channels and radiance of the delta
     paths from each pixel to the lens; bins go to the accumulators."""
-    scene, camera, media = lanes.scene, lanes.camera, lanes.media
+    surfaces, camera, media = lanes.surfaces, lanes.camera, lanes.media
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
     throughput, length, ior, previous = state.throughput, state.length, state.ior, state.previous
@@ -297,7 +301,7 @@ def _paths_to_the_lens(
         primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, k), on_lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, direction))
         previous, length = dr.select(starts, primary.origin, previous), dr.select(starts, primary.lead, length)
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
+        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
 
         # ---- Does this segment meet the lens? --------------------------------------------------------
         across, way, crosses = lens.offset(ray, si)

@@ -22,7 +22,7 @@ MOST_CUTOUTS = 8
 """Holes behind each other that a camera ray is followed through."""
 
 
-def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
+def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> GroundTruth:
     """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
     h, w = rig.camera.height, rig.camera.width
     camera, projector = Device.camera(rig), Device.projector(rig)
@@ -32,7 +32,7 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
     transmits_of = mi.Bool(table_of(scene.mitsuba, transmits))
     parts = []
     for begin, end in launches.ranges(h * w):
-        part = _truth(scene, camera, projector, index_of, transmits_of, begin, end)
+        part = _truth(scene, surfaces, camera, projector, index_of, transmits_of, begin, end)
         launches.evaluate(part, end - begin)
         parts.append([np.asarray(x.numpy()) for x in part])
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -54,11 +54,18 @@ def ground_truth(scene: Scene, rig: Rig) -> GroundTruth:
 
 
 def _truth(
-    scene: Scene, camera: Device, projector: Device, index_of: Any, transmits_of: Any, begin: int, end: int
+    scene: Scene,
+    surfaces: Any,
+    camera: Device,
+    projector: Device,
+    index_of: Any,
+    transmits_of: Any,
+    begin: int,
+    end: int,
 ) -> list[Any]:
     """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of the normal."""
     ray = camera.centre_rays(begin, end)
-    si = _first_surface(scene, mi.Ray3f(ray.origin, ray.direction))
+    si = _first_surface(scene, surfaces, mi.Ray3f(ray.origin, ray.direction))
     hit = si.is_valid() if ray.exists is None else si.is_valid() & ray.exists
     to_camera = camera.centre - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
@@ -72,15 +79,15 @@ def _truth(
     return [hit, index, z, distance, visible, uv.x, uv.y, normal.x, normal.y, normal.z]
 
 
-def _first_surface(scene: Scene, ray: Any) -> Any:
+def _first_surface(scene: Scene, surfaces: Any, ray: Any) -> Any:
     """Where the ray meets the first surface that lets less than half of the light pass unchanged."""
     flags = mi.RayFlags.All if scene.has_cutouts else mi.RayFlags.Minimal
-    si = scene.mitsuba.ray_intersect(ray, flags, coherent=True)
+    si = surfaces.ray_intersect(ray, flags, coherent=True)
     for _ in range(MOST_CUTOUTS if scene.has_cutouts else 0):
         bsdf = si.bsdf()
         is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
         passes = si.is_valid() & ~is_glass & (mono(bsdf.eval_null_transmission(si)) > 0.5)
         passes &= ~si.shape.is_medium_transition()  # a translucent object begins at its boundary
-        behind = scene.mitsuba.ray_intersect(si.spawn_ray(ray.d), mi.RayFlags.All, coherent=True, active=passes)
+        behind = surfaces.ray_intersect(si.spawn_ray(ray.d), mi.RayFlags.All, coherent=True, active=passes)
         si = dr.select(passes, behind, si)
     return si

@@ -111,11 +111,13 @@ class State:
 class View(NamedTuple):
     """What the loop is run in: scene, devices, light; the same for all lanes.
 
+    surfaces : what rays are intersected with, see `surfaces_of`.
     irradiance : Float, W/m2 at z = 1 m, over the number of samples.
     maps : PhotonMaps, or None. media : Media, or None where there are none.
     """
 
     scene: Any
+    surfaces: Any
     camera: Device
     projector: Device
     irradiance: Any
@@ -226,7 +228,7 @@ def walk(
     view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
     """The state of the lanes after at most so many turns of the loop, and the turns that each one took."""
-    scene, camera, projector, _, maps, media = view
+    scene, surfaces, camera, projector, _, maps, media = view
     # ---- The state, by name ------------------------------------------------------------------------
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
     origin, towards, previous = state.origin, state.direction, state.previous
@@ -257,7 +259,7 @@ def walk(
             throughput = dr.select(starts & ~primary.exists, 0, throughput)  # no ray, no light
 
         # ---- Next surface ----------------------------------------------------------------------------
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
         si.p = dr.select(was_bent, on_its_line(si, previous, ray.d), met)

@@ -19,12 +19,13 @@ from rangesim.light_transport.loop import Radiance, Settings, View, trace
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Seed
+from rangesim.light_transport.surfaces import surfaces_of
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.seeds import check_seed
 from rangesim.sensors import Sensor
-from rangesim.signals import EnergySplit, Signals
+from rangesim.signals import EnergySplit, GroundTruth, Signals
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
@@ -95,9 +96,11 @@ def transport(
         lamps=scene.has_lamps,
     )
     irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
-    media = media_of(scene.mitsuba)
-    maps = caustic_maps(scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media, partial(report, 0.0))
-    view = View(scene.mitsuba, Device.camera(rig), Device.projector(rig), irradiance, maps, media)
+    media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
+    maps = caustic_maps(
+        scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media, surfaces, partial(report, 0.0)
+    )
+    view = View(scene.mitsuba, surfaces, Device.camera(rig), Device.projector(rig), irradiance, maps, media)
     for begin, end in _tiles(h * w, responses, memory_bytes):
         accumulators = Accumulators(responses, end - begin)
         so_far = partial(_report, report, begin / (h * w), (end - begin) / (h * w))
@@ -107,16 +110,17 @@ def transport(
     images = {r: _join(tiles, h, w) for r, tiles in channels.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
-        found = trace_glint(scene.mitsuba, rig, responses, seed, media, partial(report, PATHS_SHARE))
+        found = trace_glint(scene.mitsuba, rig, responses, seed, media, surfaces, partial(report, PATHS_SHARE))
         found.add_to(highlights, found.radiance[None])
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
     report(1.0)
-    return _signals(scene, rig, Radiance(*_join(radiances, h, w)), highlights[0], images, spp)
+    truth = ground_truth(scene, rig, surfaces)
+    return _signals(rig, truth, Radiance(*_join(radiances, h, w)), highlights[0], images, spp)
 
 
 def _signals(
-    scene: Scene, rig: Rig, radiance: Radiance, glint: np.ndarray, channels: dict[Response, np.ndarray], spp: int
+    rig: Rig, truth: GroundTruth, radiance: Radiance, glint: np.ndarray, channels: dict[Response, np.ndarray], spp: int
 ) -> Signals:
     split = EnergySplit(
         direct=radiance.direct,
@@ -126,7 +130,7 @@ def _signals(
         glint=glint,
         ambient=radiance.ambient / np.float32(spp),
     )
-    return Signals(rig, channels, split, ground_truth(scene, rig))
+    return Signals(rig, channels, split, truth)
 
 
 def _join(tiles: list[np.ndarray], h: int, w: int) -> np.ndarray:

@@ -32,7 +32,7 @@ class Landing(NamedTuple):
 
 
 def fly(
-    scene: Any,
+    surfaces: Any,
     projector: Device,
     pixel: np.ndarray,
     flux: np.ndarray,
@@ -47,12 +47,12 @@ def fly(
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
     power, most = mi.Float(flux.astype(np.float32)), dr.opaque(mi.UInt32, MAX_CHAIN)
-    return _chain(scene, projector, uv, power, rng, most, media)
+    return _chain(surfaces, projector, uv, power, rng, most, media)
 
 
 @dr.syntax
 def _chain(
-    scene: Any, projector: Device, uv: Any, power: Any, rng: Any, max_chain: Any, media: Any = None
+    surfaces: Any, projector: Device, uv: Any, power: Any, rng: Any, max_chain: Any, media: Any = None
 ) -> tuple[Landing, tuple[Any, ...]]:
     """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
     lanes = dr.width(power)
@@ -81,7 +81,7 @@ def _chain(
         rng, ray = numbers.at(random), mi.Ray3f(origin, towards)
         crosses = mi.Bool(False)  # the boundary of a medium
         # ---- Next surface ----------------------------------------------------------------------------
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         point = dr.select(chain > 0, on_its_line(si, previous, ray.d), si.p)
         escaped += dr.select(active & ~hit, flux, 0)

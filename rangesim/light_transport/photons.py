@@ -116,11 +116,12 @@ def trace_photons(
     seed: int,
     memory_bytes: int,
     media: Media | None = None,
+    surfaces: Any = None,
     report: Callable[[], None] = lambda: None,
 ) -> Photons:
     """`photons` photons of a projector of that power, dealt out evenly to `maps` independent maps.
 
-    `report` is called after each kernel launch.
+    `surfaces`, see `surfaces_of`; `report` is called after each kernel launch.
     """
     pixels, share = _worthwhile_pixels(scene, projector)
     per_map = -(-photons // maps)
@@ -134,7 +135,7 @@ def trace_photons(
         number = np.arange(begin, end)
         chosen = np.searchsorted(cumulative, _stratified(number, per_map) * cumulative[-1], side="right")
         flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
-        landing, fate = fly(scene, projector, pixels[chosen], flux, number, seed, media)
+        landing, fate = fly(surfaces or scene, projector, pixels[chosen], flux, number, seed, media)
         launches.evaluate([list(landing), list(fate)], SURFACES_PER_PHOTON * (end - begin))
         kept = np.flatnonzero(landing.flux)
         landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])

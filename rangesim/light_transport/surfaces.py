@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where rays meet a scene of many shapes: computed once for all spheres, and once for all meshes of one kind.
+
+Mitsuba asks the shape that a ray met for position, normal and frame: a virtual call. Dr.Jit traces the code of every
+shape wherever a kernel makes one, and the kernel runs it once for each of the shapes that neighbouring lanes met. Here
+shapes of one family share one branch, of the same operations in the same order: the results are the same bytes.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim.light_transport.shapes import number_of, table_of
+
+MANY = 100
+"""Shapes from which on tables of them are worth making."""
+MOST_FACES = 4096
+"""Of a mesh that is copied into a joint one."""
+
+
+def surfaces_of(scene: Any) -> Any:
+    """What to intersect rays with: the mitsuba.Scene itself, or its `Surfaces` where they have much in common."""
+    shapes = scene.shapes()
+    if len(shapes) < MANY:
+        return scene
+    families: dict[Any, list[int]] = {}
+    for i, shape in enumerate(shapes):
+        families.setdefault(_family(shape), []).append(i)
+    return Surfaces(scene, list(families.values())) if 2 * len(families) <= len(shapes) else scene
+
+
+def _family(shape: Any) -> Any:
+    """Equal for shapes that can share a branch; else the shape itself."""
+    if _is_sphere(shape):
+        return "sphere"
+    if shape.shape_type() == mi.ShapeType.Mesh.value and shape.face_count() <= MOST_FACES:
+        return _kind(shape)
+    return shape
+
+
+class Surfaces:
+    """Stands for a mitsuba.Scene where rays are intersected with it, as long as its shapes stay as they are.
+
+    families : places of the scene's shapes, those together that share a branch.
+    """
+
+    def __init__(self, scene: Any, families: list[list[int]]) -> None:
+        shapes = scene.shapes()
+        self.scene = scene
+        branch = np.zeros(len(shapes), np.uint32)
+        self.branches = []
+        for number, members in enumerate(families):
+            branch[members] = number
+            one = shapes[members[0]]
+            family = one if len(members) == 1 else (Spheres if _is_sphere(one) else Meshes)(scene, members)
+            self.branches.append(family.compute_surface_interaction)
+        self.branch = mi.UInt32(table_of(scene, branch))
+
+    def ray_intersect(self, ray: Any, flags: Any, coherent: bool, active: Any = True) -> Any:
+        """The surface interaction that `mitsuba.Scene.ray_intersect` returns; more than `flags` ask for may be set."""
+        found = self.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+        met = found.is_valid() & active
+        branch = dr.gather(mi.UInt32, self.branch, number_of(found.shape), met)
+        branches = [lambda ray, found, met, of=of: of(ray, found, flags, met) for of in self.branches]
+        si = dr.switch(branch, branches, ray, found, met)
+        si.t = dr.select(met, si.t, dr.inf)
+        met &= si.is_valid()
+        si.shape = dr.select(met, found.shape, dr.zeros(mi.ShapePtr))
+        si.prim_index, si.time = found.prim_index, ray.time
+        si.initialize_sh_frame()
+        si.wi = dr.select(met, si.to_local(-ray.d), -ray.d)
+        return si
+
+
+class Spheres:
+    """Spheres of a scene."""
+
+    def __init__(self, scene: Any, members: list[int]) -> None:
+        shapes = scene.shapes()
+        to_world = [mi.traverse(shapes[i])["to_world"] for i in members]
+        table = partial(_table, scene, members)
+        self.flipped = mi.Bool(table([shapes[i].has_flipped_normals() for i in members]))
+        self.to_world = dr.zeros(mi.AffineTransform4f)
+        self.to_world.matrix, self.to_world.inverse_transpose = (
+            mi.Matrix4f(np.moveaxis(table([m.numpy()[..., 0] for m in matrices]), 0, -1))
+            for matrices in ([t.matrix for t in to_world], [t.inverse_transpose for t in to_world])
+        )
+
+    def compute_surface_interaction(self, ray: Any, found: Any, flags: Any, met: Any) -> Any:
+        """What `Sphere` of Mitsuba 3.9 computes for `mitsuba.RayFlags.All`."""
+        number = number_of(found.shape)
+        to_world = dr.gather(mi.AffineTransform4f, self.to_world, number, met)
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.t, si.p = found.t, ray(found.t)
+        normal = dr.normalize(si.p - to_world.translation())
+        si.n = dr.select(dr.gather(mi.Bool, self.flipped, number, met), -normal, normal)
+        si.sh_frame.n = si.n
+
+        local = mi.Vector3f(to_world.inverse() @ si.p)
+        theta, phi = mi.dir_to_sph(local)
+        si.uv = mi.Point2f(dr.select(phi < 0, phi + 2 * dr.pi, phi) * dr.inv_two_pi, theta * dr.inv_pi)
+        radius = dr.sqrt(dr.square(local.x) + dr.square(local.y))
+        inverse = dr.rcp(radius)
+        along_meridian = mi.Vector3f(local.z * (local.x * inverse), local.z * (local.y * inverse), -radius)
+        along_meridian = dr.select(radius == 0, mi.Vector3f(1, 0, 0), along_meridian)
+        si.dp_du = to_world @ mi.Vector3f(-local.y, local.x, 0) * (2 * dr.pi)
+        si.dp_dv = to_world @ along_meridian * dr.pi
+        return si
+
+
+class Meshes:
+    """Meshes of a scene that are of one kind, joined to one mesh."""
+
+    def __init__(self, scene: Any, members: list[int]) -> None:
+        shapes = scene.shapes()
+        meshes = [shapes[i] for i in members]
+        vertices = np.cumsum([0, *(mesh.vertex_count() for mesh in meshes)])
+        faces = np.cumsum([0, *(mesh.face_count() for mesh in meshes)])
+        self.first_face = mi.UInt32(_table(scene, members, faces[:-1].astype(np.uint32)))
+        _, flipped, flat, has_normals, has_texcoords = _kind(meshes[0])
+        looks = mi.Properties()
+        looks["flip_normals"], looks["face_normals"] = flipped, flat
+        self.joint = mi.Mesh("joint", int(vertices[-1]), int(faces[-1]), looks, has_normals, has_texcoords)
+        parameters = mi.traverse(self.joint)
+        own_faces = (mesh.faces_buffer().numpy() for mesh in meshes)
+        parameters["faces"] = mi.UInt32(
+            np.concatenate([own + np.uint32(first) for own, first in zip(own_faces, vertices[:-1], strict=True)])
+        )
+        parameters["vertex_positions"] = _joined([m.vertex_positions_buffer() for m in meshes])
+        parameters.update()  # makes normals, so those of the meshes come later
+        if has_normals:
+            parameters["vertex_normals"] = _joined([m.vertex_normals_buffer() for m in meshes])
+        if has_texcoords:
+            parameters["vertex_texcoords"] = _joined([m.vertex_texcoords_buffer() for m in meshes])
+        parameters.update()
+
+    def compute_surface_interaction(self, ray: Any, found: Any, flags: Any, met: Any) -> Any:
+        """What the joint mesh computes, in which the faces have other numbers."""
+        of_joint = mi.PreliminaryIntersection3f(found)
+        of_joint.prim_index += dr.gather(mi.UInt32, self.first_face, number_of(found.shape), met)
+        return self.joint.compute_surface_interaction(ray, of_joint, flags, met)
+
+
+def _is_sphere(shape: Any) -> bool:
+    return bool(shape.shape_type() == mi.ShapeType.Sphere.value)
+
+
+def _kind(mesh: Any) -> tuple[str, bool, bool, bool, bool]:
+    """What of a mesh decides how its normals and texture coordinates are computed."""
+    return (
+        "mesh",
+        mesh.has_flipped_normals(),
+        mesh.has_face_normals(),
+        mesh.has_vertex_normals(),
+        mesh.has_vertex_texcoords(),
+    )
+
+
+def _joined(buffers: list[Any]) -> Any:
+    return mi.Float(np.concatenate([buffer.numpy() for buffer in buffers]))
+
+
+def _table(scene: Any, members: list[int], values: Any) -> np.ndarray:
+    """Table of `values` (members, ...) by the numbers of the shapes; 0 for all others."""
+    values = np.asarray(values)
+    of_shapes = np.zeros((len(scene.shapes()), *values.shape[1:]), values.dtype)
+    of_shapes[members] = values
+    return table_of(scene, of_shapes)
