@@ -26,6 +26,7 @@ from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import is_cutout, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.nodes import ids_of_shapes, take_material_classes
+from rangesim.scene.normals import repeat_normals
 from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
 from rangesim.text_files import check_xml
@@ -82,6 +83,13 @@ def load_scene(
     instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, label)
     loaded, ids, classes = instantiate()
     _check(loaded, ids, sensor, label)
+    repeat_normals(loaded)
+
+    def reload() -> Any:
+        again, _, _ = instantiate()
+        repeat_normals(again)
+        return again
+
     camera, T_world_camera = camera_of(loaded.sensors()[sensor], label)
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
@@ -92,7 +100,7 @@ def load_scene(
         working_distance_m=_median_depth(loaded, camera, T_world_camera),
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
         source=None if isinstance(source, Mapping) else scene_file(source),
-        reload=lambda: instantiate()[0],
+        reload=reload,
     )
 
 
