@@ -46,7 +46,7 @@ MANIFEST = "manifest.json"
 MANIFEST_FORMAT = "rangesim-manifest"
 MANIFEST_VERSION = 1
 MAX_MANIFEST_BYTES = 64 << 20
-_JOURNAL, _LOCK, _WORK, _NEW, _OLD = "journal.json", "lock", "work", "new", "old"
+_JOURNAL, _LOCK, _WORK, _NEW, _OLD, _DOOMED = "journal.json", "lock", "work", "new", "old", "doomed"
 
 
 @dataclass(frozen=True)
@@ -329,7 +329,8 @@ class _Staging:
 
     def make_new(self) -> Path:
         """The directory to fill."""
-        self.work.mkdir()
+        with _claims_lock:
+            self.work.mkdir()
         return self.work
 
     def is_ours(self) -> bool:
@@ -428,7 +429,9 @@ def _clear(staging: Path) -> None:
         if entry.name == _LOCK:
             continue
         if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry, ignore_errors=True)
+            doomed = staging / f"{_DOOMED}-{os.urandom(8).hex()}"
+            entry.rename(doomed)  # whoever still works in there finds no place for new files
+            shutil.rmtree(doomed, ignore_errors=True)
         else:
             entry.unlink()
 
@@ -437,8 +440,9 @@ def _dissolve(staging: Path) -> None:
     """Remove a staging directory whose lock is held; the lock last, so that nobody takes it for a foreign one."""
     with suppress(OSError):  # the next one clears it
         _clear(staging)
-        (staging / _LOCK).unlink()
-        staging.rmdir()
+        if os.listdir(staging) == [_LOCK]:
+            (staging / _LOCK).unlink()
+            staging.rmdir()
 
 
 def _forget_claims() -> None:

@@ -432,6 +432,28 @@ def test_abandon_waits_for_a_replacement_and_clears_the_rest(tmp_path: Path) -> 
     assert not output.abandon()
 
 
+def test_work_that_goes_on_while_it_is_abandoned_leaves_nothing(tmp_path: Path) -> None:
+    """The thread that ends a process clears away what the main thread still writes."""
+
+    def work(entered: threading.Event) -> None:
+        with suppress(Refused, OSError), new_directory(tmp_path / "n", KIND) as folder:
+            (folder / "deep").mkdir()
+            for i in range(10_000):
+                (folder / "deep" / str(i)).write_text("")
+                (folder / str(i)).write_text("")
+                if i == 20:
+                    entered.set()
+
+    for _ in range(20):
+        entered = threading.Event()
+        thread = threading.Thread(target=work, args=(entered,))
+        thread.start()
+        assert entered.wait(10)
+        assert output.abandon()
+        thread.join(20)
+        assert list(tmp_path.iterdir()) == []
+
+
 # ---- Files of a complete directory ----------------------------------------------------------------------------------
 
 
