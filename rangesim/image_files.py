@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import struct
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.plain_files import check_file
+from pcgraph.plain_files import DISK, check_file
 from rangesim import limits
 from rangesim.config import brief
 from rangesim.errors import FileFormatError
@@ -35,12 +36,22 @@ class _OtherFormatError(OSError):
 
 
 def write_grey(path: Path, image: np.ndarray) -> None:
-    """Write (h, w) uint8 or uint16 as PNG, or float32 as OpenEXR with one channel Y, by the suffix of `path`."""
+    """Write (h, w) uint8 or uint16 as PNG, or float32 as OpenEXR with one channel Y, by the suffix of `path`.
+
+    Raises
+    ------
+    OSError
+        The disk takes no more.
+    """
     if path.suffix == ".exr":
         import OpenEXR
 
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, {"Y": np.ascontiguousarray(image, dtype=np.float32)}).write(str(path))
+        try:
+            OpenEXR.File(header, {"Y": np.ascontiguousarray(image, dtype=np.float32)}).write(str(path))
+        except RuntimeError as error:  # OpenEXR's for whatever the system says
+            said = next((number for number in DISK if os.strerror(number) in str(error)), errno.EIO)
+            raise OSError(said, os.strerror(said), str(path)) from error
         return
     from PIL import Image
 

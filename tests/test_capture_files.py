@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -236,3 +238,22 @@ def test_calibration_settings_must_be_positive(tmp_path: Path) -> None:
     for wrong in ({"code_step": 0}, {"unit_m": 0.0}):
         with pytest.raises(ValueError, match=r"code_step|unit_m"):
             load_calibration(tmp_path / "a.xml", (8, 8), **wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("frame.exr", "float32"), ("frame.png", "uint16")])
+def test_images_on_a_disk_that_takes_no_more_are_an_error_of_the_system(tmp_path: Path, name: str, dtype: str) -> None:
+    """OpenEXR has an error of its own for it, which nobody would take for a full disk."""
+    pytest.importorskip("resource")
+    code = (
+        "import errno, resource, signal, sys; from pathlib import Path; import numpy as np\n"
+        "from rangesim.image_files import write_grey\n"
+        "image = (1e4 * np.random.default_rng(1).random((200, 300))).astype(sys.argv[2])\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "try: write_grey(Path(sys.argv[1]), image)\n"
+        "except OSError as error: sys.exit(0 if error.errno == errno.EFBIG else repr(error))\n"
+        "sys.exit('no error')\n"
+    )
+    line = [sys.executable, "-c", code, str(tmp_path / name), dtype]
+    done = subprocess.run(line, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
