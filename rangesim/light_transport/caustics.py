@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rangesim.light_transport.device import Device
+from rangesim.light_transport.indirect import REACH_PX
 from rangesim.light_transport.medium import Media
 from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
 from rangesim.light_transport.photons import has_delta, trace_photons
@@ -49,7 +50,8 @@ def caustic_maps(
     )
     radius_m = radius_m or scene.working_distance_m * gathering_angle(rig, landed.per_pixel)
     irradiance = rig.projector_irradiance / scene.working_distance_m**2
-    return PhotonMaps(landed, maps, radius_m, irradiance) if len(landed.flux) else None
+    wide_m = scene.working_distance_m * REACH_PX / rig.camera.fx
+    return PhotonMaps(landed, maps, radius_m, irradiance, wide_m) if len(landed.flux) else None
 
 
 def gathering_angle(rig: Rig, photons_per_pixel: float) -> float:

@@ -107,7 +107,7 @@ def trace_glint(
         state, _ = launches.run(loop, state, n, accumulators.pending, lambda state: report())
         accumulators.store(state.channels, some)
         total[some] = state.total.numpy()
-    return Glint(pixel, total, accumulators.images())
+    return Glint(pixel, total, [parts[0] for parts in accumulators.images()])
 
 
 class View(NamedTuple):

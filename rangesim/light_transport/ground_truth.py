@@ -10,8 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.device import Device, connect
+from rangesim.light_transport.indirect import Guides
 from rangesim.light_transport.launches import Launches
-from rangesim.light_transport.loop import mono
+from rangesim.light_transport.loop import Lanes, Settings, View, mono
+from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.rig import Rig
 from rangesim.scene import Scene
@@ -22,7 +24,7 @@ MOST_CUTOUTS = 8
 """Holes behind each other that a camera ray is followed through."""
 
 
-def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> GroundTruth:
+def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> tuple[GroundTruth, Guides]:
     """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
     h, w = rig.camera.height, rig.camera.width
     camera, projector = Device.camera(rig), Device.projector(rig)
@@ -30,17 +32,19 @@ def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> GroundTruth:
     index_of = mi.Int32(table_of(scene.mitsuba, np.arange(len(shapes), dtype=np.int32)))
     transmits = [bool(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission)) for s in shapes]
     transmits_of = mi.Bool(table_of(scene.mitsuba, transmits))
+    matte = np.array([is_matte(s) for s in shapes])
     parts = []
     for begin, end in launches.ranges(h * w):
         part = _truth(scene, surfaces, camera, projector, index_of, transmits_of, begin, end)
         launches.evaluate(part, end - begin)
         parts.append([np.asarray(x.numpy()) for x in part])
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    hit, index, z, distance, visible, u, v, *normal = (column.reshape(h, w) for column in columns)
+    hit, index, z, distance, visible, u, v, *vectors = (column.reshape(h, w) for column in columns)
+    normal, position, shading_normal, (reflectance,) = vectors[:3], vectors[3:6], vectors[6:9], vectors[9:]
     masked = lambda x: np.where(hit, x, np.float32(np.nan))  # noqa: E731
     instance = np.where(hit, index, -1).astype(np.int32)
     materials = np.array([MATERIAL_CLASSES.index(i.material) for i in scene.instances], dtype=np.int32)
-    return GroundTruth(
+    truth = GroundTruth(
         z=masked(z),
         range_m=masked(distance),
         normal=np.stack([masked(x) for x in normal], axis=-1),
@@ -51,6 +55,43 @@ def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> GroundTruth:
         instance_names=tuple(i.name for i in scene.instances),
         material_names=MATERIAL_CLASSES,
     )
+    shares = (instance >= 0) & matte[instance] & (reflectance > 0)
+    guides = Guides(
+        np.where(shares, instance, np.int32(-1)), np.stack(position, -1), np.stack(shading_normal, -1), reflectance
+    )
+    return truth, guides
+
+
+@dr.syntax
+def mean_reflectance(view: View, settings: Settings, has_cutouts: bool, samples: int, pixels: int) -> np.ndarray:
+    """(pixels,) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
+    launches, parts = Launches(), []
+    surfaces, camera, spp = view.surfaces, view.camera, settings.spp
+    for begin, end in launches.ranges(pixels, samples):
+        lanes = Lanes(view, settings, np.arange(begin, end), 0)
+        total, sample = dr.zeros(mi.Float, end - begin), dr.zeros(mi.UInt32, end - begin)
+        most = dr.opaque(mi.UInt32, samples)
+        while sample < most:
+            place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, spp)
+            ray = camera.sample_ray(lanes.corner + place, lens)
+            si = _first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
+            total += mono(si.bsdf().eval_diffuse_reflectance(si, si.is_valid()))
+            sample += 1
+        launches.evaluate(total, samples * (end - begin))
+        parts.append(total.numpy() / np.float32(samples))
+    return np.concatenate(parts)
+
+
+def has_matte_textures(scene: Any) -> bool:
+    """Whether the reflectance of some matte surface of a mitsuba.Scene is not the same everywhere."""
+    bsdfs = {shape.bsdf() for shape in scene.shapes() if is_matte(shape)}
+    return any(not name.endswith("reflectance.value") for bsdf in bsdfs for name in mi.traverse(bsdf).keys())  # noqa: SIM118
+
+
+def is_matte(shape: Any) -> bool:
+    """Whether a surface is nothing but a diffuse reflector."""
+    flags = shape.bsdf().flags() & mi.BSDFFlags.All.value
+    return bool(flags == flags & mi.BSDFFlags.DiffuseReflection.value != 0) and shape.interior_medium() is None
 
 
 def _truth(
@@ -63,9 +104,10 @@ def _truth(
     begin: int,
     end: int,
 ) -> list[Any]:
-    """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of the normal."""
+    """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of each of the normal,
+    the place from the camera, and the shading normal, and the diffuse reflectance."""
     ray = camera.centre_rays(begin, end)
-    si = _first_surface(scene, surfaces, mi.Ray3f(ray.origin, ray.direction))
+    si = _first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), scene.has_cutouts)
     hit = si.is_valid() if ray.exists is None else si.is_valid() & ray.exists
     to_camera = camera.centre - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
@@ -76,14 +118,15 @@ def _truth(
     visible = link.lit & (transmits | (dr.dot(normal, link.direction) > 0))
     z, distance = -dr.dot(to_camera, camera.z), dr.norm(to_camera)
     index = dr.gather(mi.Int32, index_of, shape, hit)
-    return [hit, index, z, distance, visible, uv.x, uv.y, normal.x, normal.y, normal.z]
+    seen = dr.normalize(si.sh_frame.n)
+    reflectance = mono(si.bsdf().eval_diffuse_reflectance(si, hit))
+    return [hit, index, z, distance, visible, uv.x, uv.y, *normal, *(-to_camera), *seen, reflectance]
 
 
-def _first_surface(scene: Scene, surfaces: Any, ray: Any) -> Any:
+def _first_surface(surfaces: Any, ray: Any, has_cutouts: bool) -> Any:
     """Where the ray meets the first surface that lets less than half of the light pass unchanged."""
-    flags = mi.RayFlags.All if scene.has_cutouts else mi.RayFlags.Minimal
-    si = surfaces.ray_intersect(ray, flags, coherent=True)
-    for _ in range(MOST_CUTOUTS if scene.has_cutouts else 0):
+    si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    for _ in range(MOST_CUTOUTS if has_cutouts else 0):
         bsdf = si.bsdf()
         is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
         passes = si.is_valid() & ~is_glass & (mono(bsdf.eval_null_transmission(si)) > 0.5)

@@ -32,7 +32,7 @@ from rangesim.light_transport.launches import Launches, Report, fewest_lanes
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import Continued, Seed, Stream, random_stream, stratified
+from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, random_stream
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
 NEIGHBOURS = 256
@@ -64,6 +64,8 @@ class Radiance(NamedTuple):
     via_delta: Any
     caustic: Any
     ambient: Any
+    faint: Any
+    """Caustics that were gathered from afar, and are smooth therefore; `caustic` has the others."""
 
 
 class Vertex(NamedTuple):
@@ -134,7 +136,7 @@ def trace(
     launches: Launches,
     report: Report,
 ) -> np.ndarray:
-    """Radiance by kind of path (5, pixels) float32, in the order of `Radiance`; channels go to the accumulators.
+    """Radiance by kind of path (6, pixels) float32, in the order of `Radiance`; channels go to the accumulators.
 
     The pixels are those of the accumulators, from `first_pixel` on in the whole image. `report` gets the share done.
     """
@@ -187,6 +189,8 @@ class Lanes:
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
         rng = random_stream(settings.seed, self.pixel)
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the samples in the pixel
+        on_lens = view.camera.has_lens
+        self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(rng)
         self.choice = Continued(random_stream(settings.seed, self.pixel, Stream.SECOND))
 
@@ -194,7 +198,7 @@ class Lanes:
 def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes) -> State:
     """The state of lanes that have done nothing yet."""
     lanes, gathers, in_media = dr.width(at.pixel), view.maps is not None, view.media is not None
-    shines = [True, True, True, gathers, settings.ambient]
+    shines = [True, True, True, gathers, settings.ambient, gathers]
     return State(
         # ---- Of the lane: its random numbers, its sums -----------------------------------------------
         random=mi.UInt64(at.random.rng.state),
@@ -232,7 +236,7 @@ def walk(
     # ---- The state, by name ------------------------------------------------------------------------
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
     origin, towards, previous = state.origin, state.direction, state.previous
-    direct, multipath, via_delta, caustic, ambient = state.radiance
+    direct, multipath, via_delta, caustic, ambient, faint = state.radiance
     depth, throughput, length, ior = state.depth, state.throughput, state.length, state.ior
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
@@ -249,8 +253,7 @@ def walk(
         starts = depth == 0
         if dr.hint(media is not None, mode="scalar"):
             starts &= events == 0
-        jitter = stratified(at.shift, sample)
-        lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(camera.has_lens, mode="scalar") else None
+        jitter, lens = in_pairs(at.shift, at.lens_shift, sample, settings.spp)
         primary = camera.sample_ray(at.corner + jitter, lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
         length = dr.select(starts, primary.lead, length)
@@ -301,7 +304,7 @@ def walk(
         u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, length + link.distance))
         kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
         light = LightPath(u, v, path_length, first, kind, link.blur_px)
-        channels = accumulators.add(channels, light, radiance, at.place, link.lit)
+        channels = accumulators.add(channels, light, radiance, at.place, link.lit, kind == MULTIPATH)
         direct += dr.select(kind == DIRECT, radiance, 0)
         via_delta += dr.select(kind == VIA_DELTA, radiance, 0)
         multipath += dr.select(kind == MULTIPATH, radiance, 0)
@@ -313,9 +316,11 @@ def walk(
             xi = [chosen.next_float32() for _ in range(3)]
             choice = chosen.state
             turns += 2654435769  # 2^32 over the golden ratio
-            photon, brought = gather(maps, vertex, sample, xi, mi.Float(turns >> 8) * 2**-24, may_connect & ~scatters)
-            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, at.place)
-            caustic += radiance
+            chance, gathers = mi.Float(turns >> 8) * 2**-24, may_connect & ~scatters
+            photon, brought, is_wide = gather(maps, vertex, sample, xi, chance, gathers)
+            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
+            caustic += dr.select(is_wide, 0, radiance)
+            faint += dr.select(is_wide, radiance, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
@@ -385,7 +390,7 @@ def walk(
         choice=choice,
         turns=turns,
         channels=channels,
-        radiance=[direct, multipath, via_delta, caustic, ambient],
+        radiance=[direct, multipath, via_delta, caustic, ambient, faint],
         sample=sample,
         depth=depth,
         origin=origin,
@@ -406,13 +411,15 @@ def walk(
 
 
 @dr.syntax
-def gather(maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance: Any, active: Any) -> tuple[Any, Any]:
-    """The photon that stands for all around a vertex, and their irradiance.
+def gather(
+    maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance: Any, active: Any
+) -> tuple[Any, Any, Any]:
+    """The photon that stands for all around a vertex, their irradiance, and whether it was found in a wide circle.
 
     `chance` decides which levels are gathered. Neighbouring lanes share it, so that they skip a level together.
     """
     photon, irradiance = dr.zeros(mi.UInt32, dr.width(sample)), dr.zeros(mi.Float, dr.width(sample))
-    pick = mi.Float(xi[2])
+    pick, is_wide = mi.Float(xi[2]), dr.full(mi.Bool, False, dr.width(sample))
     for level, kind in enumerate(LEVELS):
         p, n = vertex.si.p, vertex.si.n
         if maps.near(level, p, sample, active & (chance < kind.chance)):
@@ -421,8 +428,9 @@ def gather(maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance:
             share = dr.select(irradiance > 0, found.irradiance / kind.chance / irradiance, 0)
             taken = pick < share
             photon = dr.select(taken, found.photon, photon)
+            is_wide = dr.select(taken, maps.is_wide[level], is_wide)
             pick = dr.select(taken, pick / share, (pick - share) / (1 - share))
-    return photon, irradiance
+    return photon, irradiance, is_wide
 
 
 @dr.syntax
@@ -433,6 +441,7 @@ def caustics(
     vertex: Vertex,
     photon: Any,
     irradiance: Any,
+    is_wide: Any,
     place: Any,
 ) -> tuple[list[list[Any]], Any]:
     """Channels with the light of the photons at a vertex added, and the radiance they bring to the camera."""
@@ -447,7 +456,7 @@ def caustics(
         radiance = dr.select(found & (wo.z != 0), radiance, 0)
         length = vertex.length + flight.length
         path = LightPath(flight.u, flight.v, length, vertex.is_first, mi.UInt32(CAUSTIC))
-        channels = accumulators.add(channels, path, radiance, place, found)
+        channels = accumulators.add(channels, path, radiance, place, found, is_wide)
     return channels, radiance
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Literal, get_args
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +14,8 @@ import numpy as np
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
-from rangesim.light_transport.ground_truth import ground_truth
+from rangesim.light_transport.ground_truth import ground_truth, has_matte_textures, mean_reflectance
+from rangesim.light_transport.indirect import smooth
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Radiance, Settings, View, trace
 from rangesim.light_transport.medium import media_of
@@ -29,6 +31,9 @@ from rangesim.signals import EnergySplit, GroundTruth, Signals
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
+Indirect = Literal["filtered", "raw"]
+TEXTURE_SAMPLES = 64
+"""Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
 PATHS_SHARE = 0.95
 """Of the progress, that the path loop makes."""
 
@@ -46,6 +51,7 @@ def transport(
     photons: int = PHOTONS,
     caustic_radius_m: float | None = None,
     glint: bool = True,
+    indirect: Indirect = "filtered",
     memory_bytes: int = 2 << 30,
     progress: Callable[[float], None] | None = None,
 ) -> Signals:
@@ -66,6 +72,8 @@ def transport(
         asks for, at most four pixels of the projector or three of the camera at the working distance. Caustics are
         blurred by about half of it.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
+    indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and far less
+        noise (`rangesim.light_transport.indirect`); "raw": the unbiased sum over each pixel's own paths.
     seed : int, 0 to 2^64 - 1; the same seed gives the same bytes, whatever the number of threads and the memory
         budget, and each its own noise.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed
@@ -83,6 +91,9 @@ def transport(
     check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     h, w = rig.camera.height, rig.camera.width
+    if indirect not in get_args(Indirect):
+        raise ValueError(f"expected indirect to be one of {', '.join(get_args(Indirect))}, got {indirect!r}.")
+    keeps_apart = indirect == "filtered"
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
     radiances: list[np.ndarray] = []
     report = Progress(progress)
@@ -101,13 +112,25 @@ def transport(
         scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media, surfaces, partial(report, 0.0)
     )
     view = View(scene.mitsuba, surfaces, Device.camera(rig), Device.projector(rig), irradiance, maps, media)
-    for begin, end in _tiles(h * w, responses, memory_bytes):
-        accumulators = Accumulators(responses, end - begin)
+    for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
+        accumulators = Accumulators(responses, end - begin, keeps_apart)
         so_far = partial(_report, report, begin / (h * w), (end - begin) / (h * w))
-        radiances.append(trace(view, settings, spp, accumulators, begin, launches, so_far))
+        radiances.append(trace(view, settings, spp, accumulators, begin, launches, so_far)[:, None])
         for response, values in zip(responses, accumulators.images(), strict=True):
             channels[response].append(values)
-    images = {r: _join(tiles, h, w) for r, tiles in channels.items()}
+    sums = {r: _join(tiles, h, w) for r, tiles in channels.items()}
+    radiance = Radiance(*_join(radiances, h, w)[:, 0])
+    truth, guides = ground_truth(scene, rig, surfaces)
+    if keeps_apart:
+        if has_matte_textures(scene.mitsuba):
+            seen = mean_reflectance(view, settings, scene.has_cutouts, min(spp, TEXTURE_SAMPLES), h * w)
+            guides = guides._replace(reflectance=seen.reshape(h, w))
+        split = np.stack([radiance.multipath, radiance.faint])
+        (multipath, faint), *filtered = smooth([split, *(both[1] for both in sums.values())], guides)
+        radiance = radiance._replace(multipath=multipath, faint=faint)
+        for (others, _), smoothed in zip(sums.values(), filtered, strict=True):
+            others += smoothed
+    images = {r: parts[0] for r, parts in sums.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
         found = trace_glint(scene.mitsuba, rig, responses, seed, media, surfaces, partial(report, PATHS_SHARE))
@@ -115,8 +138,7 @@ def transport(
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
     report(1.0)
-    truth = ground_truth(scene, rig, surfaces)
-    return _signals(rig, truth, Radiance(*_join(radiances, h, w)), highlights[0], images, spp)
+    return _signals(rig, truth, radiance, highlights[0], images, spp)
 
 
 def _signals(
@@ -126,7 +148,7 @@ def _signals(
         direct=radiance.direct,
         multipath=radiance.multipath,
         via_delta=radiance.via_delta,
-        caustic=radiance.caustic,
+        caustic=radiance.caustic + radiance.faint,
         glint=glint,
         ambient=radiance.ambient / np.float32(spp),
     )
@@ -134,17 +156,17 @@ def _signals(
 
 
 def _join(tiles: list[np.ndarray], h: int, w: int) -> np.ndarray:
-    """(c, h, w) of tiles (c, pixels), without a copy where there is but one."""
-    return (tiles[0] if len(tiles) == 1 else np.concatenate(tiles, axis=1)).reshape(-1, h, w)
+    """(parts, c, h, w) of tiles (parts, c, pixels), without a copy where there is but one."""
+    return (tiles[0] if len(tiles) == 1 else np.concatenate(tiles, axis=-1)).reshape(*tiles[0].shape[:2], h, w)
 
 
 def _report(report: Report, before: float, share: float, of_tile: float) -> None:
     report(PATHS_SHARE * (before + share * of_tile))
 
 
-def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int) -> Iterator[tuple[int, int]]:
+def _tiles(pixels: int, responses: Sequence[Response], memory_bytes: int, parts: int) -> Iterator[tuple[int, int]]:
     """Ranges of flat pixel indices that fit the budget, of about equal size."""
-    bytes_per_pixel = BYTES_PER_LANE + 4 * sum(r.channels for r in responses)
+    bytes_per_pixel = BYTES_PER_LANE + 4 * parts * sum(r.channels for r in responses)
     if memory_bytes < bytes_per_pixel:
         raise ValueError(f"expected a memory budget of at least {bytes_per_pixel} bytes, got {memory_bytes}.")
     tiles = -(-pixels * bytes_per_pixel // memory_bytes)

@@ -81,9 +81,11 @@ class PhotonMaps:
     maps : int in 1..MOST_MAPS, independent maps they were dealt out to.
     radius_m : metres, largest radius of the brightest level.
     irradiance : W/m2, direct light of the projector where the scene is.
+    wide_m : metres, radius from which on gathered light counts as smooth.
     """
 
-    def __init__(self, photons: Photons, maps: int, radius_m: float, irradiance: float) -> None:
+    def __init__(self, photons: Photons, maps: int, radius_m: float, irradiance: float, wide_m: float = np.inf) -> None:
+        self.is_wide = [radius_m * one.radius >= wide_m for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
         level = levels_of(photons, maps, 4 * radius_m, irradiance)
         radii = np.concatenate([radii_of_maps(radius_m * one.radius, maps) for one in LEVELS])

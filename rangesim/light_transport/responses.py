@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import drjit as dr
@@ -38,26 +39,30 @@ class Accumulators:
     A dense channel is a loop variable of the lane, so it lives in registers and costs one multiply-add per
     vertex. A sparse response is a buffer in memory: each lane adds to its own column, hence no two threads ever
     write to the same place, no atomics are needed, and sums are made in the same order on any machine.
+
+    keeps_apart : whether smooth light has sums of its own. `parts` then are two: all other light, and that.
     """
 
-    def __init__(self, responses: Sequence[Response], pixels: int) -> None:
+    def __init__(self, responses: Sequence[Response], pixels: int, keeps_apart: bool = False) -> None:
         self.responses = tuple(responses)
         self.pixels = pixels
+        self.parts = 2 if keeps_apart else 1
         self.stride = dr.opaque(mi.UInt32, pixels)
         self.bins: dict[Response, Any] = {
-            r: dr.zeros(mi.Float, pixels * r.channels) for r in responses if isinstance(r, SparseResponse)
+            r: dr.zeros(mi.Float, pixels * r.channels * self.parts) for r in responses if isinstance(r, SparseResponse)
         }
-        self.dense = {r: np.empty((r.channels, pixels), np.float32) for r in responses if isinstance(r, DenseResponse)}
+        dense = [r for r in responses if isinstance(r, DenseResponse)]
+        self.dense = {r: np.empty((self.parts * r.channels, pixels), np.float32) for r in dense}
 
     def zeros(self, lanes: int) -> list[list[Any]]:
         """Fresh dense channels, the loop variable that `add` updates."""
         return [
-            [dr.zeros(mi.Float, lanes) for _ in range(r.channels)] if isinstance(r, DenseResponse) else []
+            [dr.zeros(mi.Float, lanes) for _ in range(self.parts * r.channels)] if isinstance(r, DenseResponse) else []
             for r in self.responses
         ]
 
     def add(
-        self, channels: list[list[Any]], path: LightPath, radiance: Any, place: Any, active: Any
+        self, channels: list[list[Any]], path: LightPath, radiance: Any, place: Any, active: Any, is_smooth: Any = False
     ) -> list[list[Any]]:
         """Channels after a path of this radiance (0 where not `active`); `place` is the number of the lane's pixel."""
         math = DrjitMath()
@@ -65,11 +70,16 @@ class Accumulators:
         for response, values in zip(self.responses, channels, strict=True):
             if isinstance(response, DenseResponse):
                 weights = response.weights(path, math)
-                values = [dr.fma(radiance, w, v) for v, w in zip(values, weights, strict=True)]
+                brought = [radiance]
+                if self.parts == 2:
+                    brought = [dr.select(is_smooth, 0, radiance), dr.select(is_smooth, radiance, 0)]
+                values = [dr.fma(b, w, v) for v, (b, w) in zip(values, product(brought, weights), strict=True)]
             elif isinstance(response, SparseResponse):
                 index = response.bin(path, math)
                 target = dr.fma(index, self.stride, place)
                 inside = active & (index < response.channels)
+                if self.parts == 2:
+                    target += dr.select(is_smooth, response.channels * self.stride, 0)
                 dr.scatter_add(self.bins[response], radiance, target, inside, mode=dr.ReduceMode.NoConflicts)
             result.append(values)
         return result
@@ -86,8 +96,6 @@ class Accumulators:
                     image[places] = value.numpy()
 
     def images(self) -> list[np.ndarray]:
-        """(c, pixels) float32 of each response."""
-        return [
-            self.dense[r] if isinstance(r, DenseResponse) else self.bins[r].numpy().reshape(-1, self.pixels)
-            for r in self.responses
-        ]
+        """(parts, c, pixels) float32 of each response."""
+        flat = [self.dense[r] if isinstance(r, DenseResponse) else self.bins[r].numpy() for r in self.responses]
+        return [values.reshape(self.parts, -1, self.pixels) for values in flat]

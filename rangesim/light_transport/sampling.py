@@ -63,6 +63,29 @@ class Continued:
 
 def stratified(shift: Any, sample: Any) -> Any:
     """Place of a sample within its pixel: the R2 sequence (Roberts 2018), shifted per pixel; fills the pixel evenly."""
-    n = mi.Float(sample)
-    p = shift + mi.Point2f(n * 0.7548776662466927, n * 0.5698402909980532)
+    return _sequence(shift, sample, (0.7548776662466927, 0.5698402909980532))
+
+
+def in_pairs(shift: Any, lens_shift: Any, sample: Any, samples: Any) -> tuple[Any, Any]:
+    """Places of a sample in its pixel and on the lens (None without a `lens_shift`), each in the unit square.
+
+    Every second sample is the one before it mirrored about the centres; of an odd number of samples, the last one is at
+    the centres. What is linear in the place, as phase and depth are on a plane, then has no sampling error at all: its
+    mean is its value at the centre (antithetic variates; Hammersley and Morton, Proc. Camb. Phil. Soc. 52, 1956).
+    The pairs follow the R2 sequence, with a lens the R4 sequence.
+    """
+    pair, mirrors = sample >> 1, (sample & 1) == 1
+    alone = ~mirrors & (sample + 1 == samples)
+
+    def place(p: Any) -> Any:
+        return dr.select(alone, 0.5, dr.select(mirrors, 1 - p, p))
+
+    if lens_shift is None:
+        return place(stratified(shift, pair)), None
+    in_pixel = _sequence(shift, pair, (0.8566748838545029, 0.733891856627126))
+    return place(in_pixel), place(_sequence(lens_shift, pair, (0.6287067210378087, 0.5385972572236101)))
+
+
+def _sequence(shift: Any, number: Any, steps: tuple[float, float]) -> Any:
+    p = shift + mi.Point2f(*(mi.Float(number) * step for step in steps))
     return p - dr.floor(p)

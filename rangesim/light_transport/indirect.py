@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Indirect light with less noise: multipath on matte surfaces is smooth, so neighbouring pixels share their samples.
+
+Light that has been diffusely reflected twice comes to a matte point from a whole hemisphere, and changes little from
+one pixel to the next; but a pixel's few paths sample it badly. The mean over neighbours has the noise of many more
+paths, and a bias where the light bends within the window. All that is filtered is radiance over the reflectance of the
+matte surface, so that textures stay; only pixels of the same instance count, with like normals and in one plane with
+each other; and the weights reproduce what is linear in place, so that the bias begins with the second derivative, in
+corners and at contacts too (local linear regression: Fan, Ann. Statist. 21, 1993; for rendered images: Bitterli et al.,
+Computer Graphics Forum 35, 2016). The same weights act on every channel: a filtered pass is what a slightly blurred
+light would have given, with sensors, histograms and energy split in agreement.
+
+The window is built from levels of 3 x 3 pixels that are 1, 3, 9 ... pixels apart, so that 9 taps for each level cover a
+square of 3^levels pixels (the "a trous" scheme: Dammertz et al., High Performance Graphics 2010).
+
+Light seen in mirrors, through glass and on glossy surfaces is not smooth, and left as it is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pcgraph.parallel import in_blocks
+
+LEVELS = 2
+"""The window is 3^LEVELS pixels wide."""
+REACH_PX = 3**LEVELS // 2
+"""How far from a pixel the light that it gets comes."""
+SAME_NORMAL = 0.9
+"""Least cosine between the normals of two pixels that share light."""
+OFF_PLANE = 0.3
+"""Sine, at most, between the line to a neighbour and the surface."""
+JUMP = 0.02
+"""Distance of a neighbour off the surface, over that from the camera, from which on a pixel sees an edge with something
+behind: it sees both, and does not lend its light to others."""
+RIDGE = 0.05
+"""Of the regression, as a share of the weight times the squared step: how soon a one-sided window is a plain mean."""
+
+
+class Guides(NamedTuple):
+    """What decides which pixels share light.
+
+    instance : (h, w) int32; -1: a pixel of its own, such as one that sees no matte surface.
+    position : (h, w, 3) float32, metres. normal : (h, w, 3) float32, unit.
+    reflectance : (h, w) float32, of the matte surface.
+    """
+
+    instance: NDArray[np.int32]
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    reflectance: NDArray[np.float32]
+
+
+def smooth(images: list[NDArray[np.float32]], guides: Guides, levels: int = LEVELS) -> list[NDArray[np.float32]]:
+    """Filtered copies of images (c, h, w) of indirect light."""
+    shown = guides.instance >= 0
+    reflectance = np.where(shown, guides.reflectance, np.float32(1)).astype(np.float32)
+    done = [image / reflectance for image in images]
+    for level in range(levels):
+        weights = level_weights(guides, 3**level)
+        for i, image in enumerate(done):
+            out = np.empty_like(image)
+            in_blocks(_apply, image.shape[1], weights, 3**level, image, out)
+            done[i] = out
+    return [image * reflectance for image in done]
+
+
+def level_weights(guides: Guides, step: int) -> NDArray[np.float32]:
+    """(h, 9, w) float32 weights of the 3 x 3 pixels `step` apart, row by row; they add up to 1."""
+    h, w = guides.instance.shape
+    weights, mixed = np.zeros((h, 9, w), np.float32), np.zeros((h, w), np.bool_)
+    in_blocks(_find_mixed, h, guides.instance, guides.position, guides.normal, mixed)
+    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights)
+    return weights
+
+
+@njit(nogil=True, cache=True)
+def _find_mixed(start, stop, instance, position, normal, mixed):  # type: ignore[no-untyped-def]
+    h, w = instance.shape
+    for y in range(start, stop):
+        for x in range(w):
+            if instance[y, x] < 0:
+                continue
+            for k in range(9):
+                yk, xk = y + k // 3 - 1, x + k % 3 - 1
+                if not (0 <= yk < h and 0 <= xk < w):
+                    continue
+                off = distance = 0.0
+                for i in range(3):
+                    off += (position[yk, xk, i] - position[y, x, i]) * normal[y, x, i]
+                    distance += position[y, x, i] * position[y, x, i]
+                if not off * off < JUMP * JUMP * distance:
+                    mixed[y, x] = True
+
+
+@njit(nogil=True, cache=True)
+def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # type: ignore[no-untyped-def]
+    h, w = instance.shape
+    for y in range(start, stop):
+        for x in range(w):
+            if instance[y, x] < 0:
+                weights[y, 4, x] = 1.0
+                continue
+            shares = np.zeros(9, np.bool_)
+            n = sx = sy = sxx = sxy = syy = 0.0
+            for k in range(9):
+                dy, dx = k // 3 - 1, k % 3 - 1
+                yk, xk = y + dy * step, x + dx * step
+                if not (0 <= yk < h and 0 <= xk < w) or instance[yk, xk] != instance[y, x]:
+                    continue
+                if mixed[yk, xk] and not mixed[y, x]:
+                    continue
+                if k != 4:
+                    cosine = off = distance = 0.0
+                    for i in range(3):
+                        d = position[yk, xk, i] - position[y, x, i]
+                        cosine += normal[yk, xk, i] * normal[y, x, i]
+                        off += d * normal[y, x, i]
+                        distance += d * d
+                    if cosine < SAME_NORMAL or off * off > OFF_PLANE * OFF_PLANE * distance:
+                        continue
+                shares[k] = True
+                n += 1
+                sx += dx
+                sy += dy
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+            # The weights a + b dx + c dy whose moments are 1, 0, 0 (up to a factor)
+            sxx += RIDGE * n
+            syy += RIDGE * n
+            a, b, c = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
+            total = 0.0
+            for k in range(9):
+                if shares[k]:
+                    weights[y, k, x] = max(0.0, a + b * (k % 3 - 1) + c * (k // 3 - 1))  # no negative light
+                    total += weights[y, k, x]
+            for k in range(9):
+                weights[y, k, x] /= total
+
+
+@njit(nogil=True, cache=True)
+def _apply(start, stop, weights, step, image, out):  # type: ignore[no-untyped-def]
+    channels, h, w = image.shape
+    for c in range(channels):
+        for y in range(start, stop):
+            row = np.zeros(w, np.float32)
+            for k in range(9):
+                yk, dx = y + (k // 3 - 1) * step, (k % 3 - 1) * step
+                if 0 <= yk < h:
+                    for x in range(max(0, -dx), min(w, w - dx)):
+                        row[x] += weights[y, k, x] * image[c, yk, x + dx]
+            out[c, y] = row
