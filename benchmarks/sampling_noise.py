@@ -74,7 +74,7 @@ def worst_ratio(name: str, args: argparse.Namespace) -> float:
             return transport(scene, rig, sensors, spp=spp, max_depth=experiment.max_depth, seed=seed, **options)
 
         references = [traced(10_000 + i, args.reference_spp, indirect="raw") for i in range(2)]
-        passes = [traced(seed, experiment.spp) for seed in range(args.seeds)]
+        passes = [traced(seed, experiment.spp or "auto") for seed in range(args.seeds)]
         ratios += [ratio_of(one, scene, references, passes) for one in group]
     return max(ratios)
 

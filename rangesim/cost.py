@@ -28,6 +28,8 @@ LONG_S = 30.0
 """A run that takes longer is announced."""
 LARGE_BYTES = 1e9
 """A run that takes more is announced."""
+USUAL_SPP = 24
+"""Of light paths per pixel, if their number is not given: 16 to 64, by the surface."""
 PATHS_PER_CORE_S = 1.1e6
 """Camera paths per second and core: tabletop and matte scenes, 5 segments, LLVM."""
 PATHS_PER_GPU_S = 1e8
@@ -111,7 +113,7 @@ def estimate_cost(
         limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
         pixels, count = pixels + traced, count + n
-    paths, all_photons = pixels * experiment.spp, photons * count
+    paths, all_photons = pixels * (experiment.spp or USUAL_SPP), photons * count
     rest_s = START_S + sum(_rest_s(rig, instruments) for rig, instruments in passes)
     seconds = rest_s + count * PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
     cost = Cost(paths, experiment.max_depth, all_photons, count, _memory_bytes(passes, photons), seconds)
@@ -152,10 +154,10 @@ def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) 
         pixels = rig.camera.width * rig.camera.height
         responses = dict.fromkeys(r for one in instruments for r in one.sensor.responses())
         channels = sum(r.channels for r in responses)
-        tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 4 * channels))
+        tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light apart
         signals = pixels * (4 * channels + TRUTH_BYTES)
         frames = max(one.sensor.n_frames for one in instruments)
-        tracing = tiles + 2 * signals + photons * PHOTON_BYTES  # tiles are joined: twice for a moment
+        tracing = tiles + 3 * signals + photons * PHOTON_BYTES  # tiles are joined, and filtered
         exposing = signals + 14 * frames * pixels  # three times float32, and the digital numbers
         at_once = max(at_once, tracing, exposing)
         report += pixels * sum(2 * one.sensor.n_frames + RESULT_BYTES for one in instruments)

@@ -32,7 +32,7 @@ class Experiment:
     material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
     unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
-    spp : light paths per pixel.
+    spp : light paths per pixel; None: as many as the surface needs, see `rangesim.transport`.
     max_depth : longest path in segments up to the light; 2 is direct light alone.
     photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
     glint : whether the camera sees the projector's lens in mirrors.
@@ -47,7 +47,7 @@ class Experiment:
     unit_m: Metres | None = None
     width: Annotated[int, whole(1, "pixels")] | None = None
     height: Annotated[int, whole(1, "pixels")] | None = None
-    spp: Annotated[int, whole(1, "spp")] = 64
+    spp: Annotated[int, whole(1, "spp")] | None = None
     max_depth: Annotated[int, whole(1, "depth")] = 5
     photons: Annotated[int, whole(0, "photons")] | None = None
     glint: bool = True

@@ -240,7 +240,7 @@ def _trace(
     stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
     say(stage, _share(number, passes, 0.0))
     settings: dict[str, Any] = {
-        "spp": experiment.spp,
+        "spp": "auto" if experiment.spp is None else experiment.spp,
         "max_depth": experiment.max_depth,
         "glint": experiment.glint,
         "seed": experiment.seed,

@@ -148,11 +148,14 @@ def test_a_long_run_is_estimated_by_a_trial_within_a_factor_of_three() -> None:
     experiment = Experiment(MATTE, width=320, height=240, spp=64, instruments=(instrument("ideal-tof"),))
     scene = load_scene(experiment.scene)
     ((rig, instruments),) = pipeline.group_by_rig(experiment, scene)
-    compile_s, fixed_s, path_s = cost._timed_trial(experiment, scene, (rig, instruments))
-    assert compile_s >= 0
-    start = time.monotonic()
     from rangesim import transport
 
-    transport(scene, rig, [i.sensor for i in instruments], spp=64)
-    took = time.monotonic() - start
-    assert took / 3 < fixed_s + 320 * 240 * 64 * path_s < took * 3
+    for _ in range(3):  # on a machine with other work to do
+        compile_s, fixed_s, path_s = cost._timed_trial(experiment, scene, (rig, instruments))
+        assert compile_s >= 0
+        start = time.monotonic()
+        transport(scene, rig, [i.sensor for i in instruments], spp=64)
+        took = time.monotonic() - start
+        if took / 3 < fixed_s + 320 * 240 * 64 * path_s < took * 3:
+            return
+    pytest.fail(f"it took {took:.2f} s, expected {fixed_s + 320 * 240 * 64 * path_s:.2f} s")

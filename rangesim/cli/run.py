@@ -42,7 +42,7 @@ def run_command(
             show_default=False,
         ),
     ] = None,
-    spp: Annotated[int | None, typer.Option(help="Light paths per pixel. (default: 64)")] = None,
+    spp: Annotated[int | None, typer.Option(help="Light paths per pixel. (default: matte 16, others 64)")] = None,
     width: Annotated[int | None, typer.Option(help="Camera width, pixels. (default: the scene's)")] = None,
     height: Annotated[int | None, typer.Option(help="Camera height, pixels. (default: the scene's)")] = None,
     max_depth: Annotated[

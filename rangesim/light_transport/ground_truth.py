@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.indirect import Guides
 from rangesim.light_transport.launches import Launches
-from rangesim.light_transport.loop import Lanes, Settings, View, mono
+from rangesim.light_transport.loop import Budget, Lanes, Settings, View, mono
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.rig import Rig
@@ -63,16 +63,16 @@ def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> tuple[GroundTruth, Gu
 
 
 @dr.syntax
-def mean_reflectance(view: View, settings: Settings, has_cutouts: bool, samples: int, pixels: int) -> np.ndarray:
+def mean_reflectance(view: View, settings: Settings, budget: Budget, has_cutouts: bool, samples: int) -> np.ndarray:
     """(pixels,) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
     launches, parts = Launches(), []
-    surfaces, camera, spp = view.surfaces, view.camera, settings.spp
-    for begin, end in launches.ranges(pixels, samples):
-        lanes = Lanes(view, settings, np.arange(begin, end), 0)
+    surfaces, camera = view.surfaces, view.camera
+    for begin, end in launches.ranges(len(budget.samples), samples):
+        lanes = Lanes(view, settings, budget, np.arange(begin, end), 0)
         total, sample = dr.zeros(mi.Float, end - begin), dr.zeros(mi.UInt32, end - begin)
         most = dr.opaque(mi.UInt32, samples)
         while sample < most:
-            place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, spp)
+            place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, lanes.samples)
             ray = camera.sample_ray(lanes.corner + place, lens)
             si = _first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
             total += mono(si.bsdf().eval_diffuse_reflectance(si, si.is_valid()))

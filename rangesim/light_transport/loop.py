@@ -49,11 +49,21 @@ class Settings(NamedTuple):
     """
 
     seed: Seed
-    spp: Any
     max_depth: Any
     rr_depth: Any
     ambient: bool
     lamps: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """What each pixel of the image gets.
+
+    samples : (pixels,) uint32. irradiance : of the projector, W/m2 at z = 1 m.
+    """
+
+    samples: np.ndarray
+    irradiance: float
 
 
 class Radiance(NamedTuple):
@@ -111,10 +121,9 @@ class State:
 
 
 class View(NamedTuple):
-    """What the loop is run in: scene, devices, light; the same for all lanes.
+    """What the loop is run in: scene, devices, photons; the same for all lanes.
 
     surfaces : what rays are intersected with, see `surfaces_of`.
-    irradiance : Float, W/m2 at z = 1 m, over the number of samples.
     maps : PhotonMaps, or None. media : Media, or None where there are none.
     """
 
@@ -122,7 +131,6 @@ class View(NamedTuple):
     surfaces: Any
     camera: Device
     projector: Device
-    irradiance: Any
     maps: PhotonMaps | None = None
     media: Any = None
 
@@ -130,7 +138,7 @@ class View(NamedTuple):
 def trace(
     view: View,
     settings: Settings,
-    spp: int,
+    budget: Budget,
     accumulators: Accumulators,
     first_pixel: int,
     launches: Launches,
@@ -142,25 +150,26 @@ def trace(
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
     radiance = np.empty((len(Radiance._fields), pixels), np.float32)
-    begin, finished, turns = 0, 0, 0
+    samples = budget.samples[first_pixel : first_pixel + pixels]
+    total, begin, finished, turns = int(samples.sum(dtype=np.int64)), 0, 0, 0
 
     def tell(state: State) -> None:
-        report((finished + float(state.sample.numpy().sum()) / spp) / pixels)
+        report((finished + float(state.sample.numpy().sum(dtype=np.int64))) / total)
 
     while begin < len(runs):
-        per_pixel = turns / finished if finished else TURNS_PER_SAMPLE * spp
-        most = max(fewest_lanes(), int(launches.units / per_pixel)) // NEIGHBOURS
+        per_sample = turns / finished if finished else TURNS_PER_SAMPLE
+        most = max(fewest_lanes(), int(launches.units / (per_sample * total / pixels))) // NEIGHBOURS
         left = len(runs) - begin
         end = begin + -(-left // -(-left // most))  # launches of even size
         places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
         places = places[places < pixels]
-        lanes = Lanes(view, settings, places, first_pixel)
+        lanes = Lanes(view, settings, budget, places, first_pixel)
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
         accumulators.store(state.channels, places)
         for image, values in zip(radiance, state.radiance, strict=True):
             image[places] = 0 if values is None else values.numpy()
-        begin, finished, turns = end, finished + len(places), turns + taken
+        begin, finished, turns = end, finished + int(samples[places].sum(dtype=np.int64)), turns + taken
     return radiance
 
 
@@ -175,15 +184,18 @@ class Lanes:
 
     Parameters
     ----------
-    view, settings : View and Settings.
+    view, settings, budget : View, Settings and Budget.
     places : (lanes,) int, numbers of the pixels in the accumulators.
     first_pixel : int, flat index in the whole image of the first pixel of the accumulators. Random numbers depend on a
         pixel's flat index in the whole image and the seed alone.
     """
 
-    def __init__(self, view: View, settings: Settings, places: np.ndarray, first_pixel: int) -> None:
+    def __init__(self, view: View, settings: Settings, budget: Budget, places: np.ndarray, first_pixel: int) -> None:
         self.place = mi.UInt32(places.astype(np.uint32))
         self.pixel = self.place + dr.opaque(mi.UInt32, first_pixel)
+        samples = budget.samples[first_pixel + places]
+        self.samples = mi.UInt32(samples)
+        self.irradiance = mi.Float((budget.irradiance / samples).astype(np.float32))  # sums over samples are means
         dr.eval(self.pixel)
         width = mi.UInt32(view.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
@@ -232,7 +244,7 @@ def walk(
     view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
     """The state of the lanes after at most so many turns of the loop, and the turns that each one took."""
-    scene, surfaces, camera, projector, _, maps, media = view
+    scene, surfaces, camera, projector, maps, media = view
     # ---- The state, by name ------------------------------------------------------------------------
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
     origin, towards, previous = state.origin, state.direction, state.previous
@@ -243,7 +255,7 @@ def walk(
     inside, events, stays = state.inside, state.events, state.stays
     lanes = dr.width(sample)
     left = most + dr.zeros(mi.UInt32, lanes)  # turns
-    active = (sample < settings.spp) & (left > 0)
+    active = (sample < at.samples) & (left > 0)
 
     while active:
         rng = at.random.at(random)
@@ -253,7 +265,7 @@ def walk(
         starts = depth == 0
         if dr.hint(media is not None, mode="scalar"):
             starts &= events == 0
-        jitter, lens = in_pairs(at.shift, at.lens_shift, sample, settings.spp)
+        jitter, lens = in_pairs(at.shift, at.lens_shift, sample, at.samples)
         primary = camera.sample_ray(at.corner + jitter, lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
         length = dr.select(starts, primary.lead, length)
@@ -299,7 +311,7 @@ def walk(
             bs_weight = dr.select(scatters, inside.albedo, bs_weight)
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
             wo = dr.select(scatters, inside.scattered(ray.d, xi), wo)
-        radiance = dr.select(link.lit, throughput * value * link.geometry * view.irradiance, 0)
+        radiance = dr.select(link.lit, throughput * value * link.geometry * at.irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
         u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, length + link.distance))
         kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
@@ -311,7 +323,7 @@ def walk(
 
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
-            vertex = Vertex(si, bsdf, throughput / mi.Float(settings.spp), length, first & ~link.lit)
+            vertex = Vertex(si, bsdf, throughput / mi.Float(at.samples), length, first & ~link.lit)
             chosen = at.choice.at(choice)
             xi = [chosen.next_float32() for _ in range(3)]
             choice = chosen.state
@@ -383,7 +395,7 @@ def walk(
             stays &= ~ends
         random, origin, towards = rng.state, ray.o, ray.d
         left -= 1
-        active = (sample < settings.spp) & (left > 0)
+        active = (sample < at.samples) & (left > 0)
 
     return State(
         random=random,

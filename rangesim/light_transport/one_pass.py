@@ -17,7 +17,7 @@ from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, has_matte_textures, mean_reflectance
 from rangesim.light_transport.indirect import smooth
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
-from rangesim.light_transport.loop import Radiance, Settings, View, trace
+from rangesim.light_transport.loop import Budget, Radiance, Settings, View, trace
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Seed
@@ -32,6 +32,8 @@ from rangesim.signals import EnergySplit, GroundTruth, Signals
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 Indirect = Literal["filtered", "raw"]
+MATTE_SPP, OTHER_SPP = 16, 64
+"""Samples of a pixel if their number is not given; measured by benchmarks/sampling_noise.py."""
 TEXTURE_SAMPLES = 64
 """Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
 PATHS_SHARE = 0.95
@@ -44,7 +46,7 @@ def transport(
     rig: Rig,
     sensors: Sequence[Sensor | Response],
     *,
-    spp: int = 64,
+    spp: int | Literal["auto"] = "auto",
     max_depth: int = 5,
     rr_depth: int = 5,
     seed: int = 0,
@@ -62,7 +64,8 @@ def transport(
     scene : Scene
     rig : Rig
     sensors : sensors, or bare responses; none for energy split and ground truth alone.
-    spp : int >= 1, samples (camera paths) per pixel.
+    spp : int >= 1, samples (camera paths) per pixel; "auto": `MATTE_SPP` where a pixel shares its indirect light with
+        its neighbours, so that sampling adds little to the noise of a sensor, and `OTHER_SPP` elsewhere.
     max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba. A photon's way
         from the projector counts as one segment, however many delta surfaces it met.
     rr_depth : int >= 1, surfaces after which Russian roulette may end a path.
@@ -86,7 +89,7 @@ def transport(
     ValueError
         A number out of its range, patterns that do not fit the projector, or too little memory.
     """
-    _check(scene, rig, sensors, spp=spp, max_depth=max_depth, rr_depth=rr_depth)
+    _check(scene, rig, sensors, spp=1 if spp == "auto" else spp, max_depth=max_depth, rr_depth=rr_depth)
     seed = check_seed(seed)
     check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
@@ -98,32 +101,42 @@ def transport(
     radiances: list[np.ndarray] = []
     report = Progress(progress)
     launches = Launches(is_watched=progress is not None)
+    media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
+    truth, guides = ground_truth(scene, rig, surfaces)
+    shares = keeps_apart & (guides.instance.ravel() >= 0)
+    samples = (np.where(shares, MATTE_SPP, OTHER_SPP) if spp == "auto" else np.full(h * w, spp)).astype(np.uint32)
     settings = Settings(
         seed=Seed.of(seed),
-        spp=dr.opaque(mi.UInt32, spp),
         max_depth=dr.opaque(mi.UInt32, max_depth),
         rr_depth=dr.opaque(mi.UInt32, rr_depth),
         ambient=scene.has_ambient,
         lamps=scene.has_lamps,
     )
-    irradiance = dr.opaque(mi.Float, rig.projector_irradiance / spp)  # so that sums over samples are means
-    media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
     maps = caustic_maps(
-        scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media, surfaces, partial(report, 0.0)
+        scene,
+        rig,
+        photons,
+        caustic_radius_m,
+        int(samples.min()),
+        seed,
+        memory_bytes,
+        media,
+        surfaces,
+        partial(report, 0.0),
     )
-    view = View(scene.mitsuba, surfaces, Device.camera(rig), Device.projector(rig), irradiance, maps, media)
+    view = View(scene.mitsuba, surfaces, Device.camera(rig), Device.projector(rig), maps, media)
+    budget = Budget(samples, rig.projector_irradiance)
     for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
         accumulators = Accumulators(responses, end - begin, keeps_apart)
         so_far = partial(_report, report, begin / (h * w), (end - begin) / (h * w))
-        radiances.append(trace(view, settings, spp, accumulators, begin, launches, so_far)[:, None])
+        radiances.append(trace(view, settings, budget, accumulators, begin, launches, so_far)[:, None])
         for response, values in zip(responses, accumulators.images(), strict=True):
             channels[response].append(values)
     sums = {r: _join(tiles, h, w) for r, tiles in channels.items()}
     radiance = Radiance(*_join(radiances, h, w)[:, 0])
-    truth, guides = ground_truth(scene, rig, surfaces)
     if keeps_apart:
         if has_matte_textures(scene.mitsuba):
-            seen = mean_reflectance(view, settings, scene.has_cutouts, min(spp, TEXTURE_SAMPLES), h * w)
+            seen = mean_reflectance(view, settings, budget, scene.has_cutouts, min(int(samples.min()), TEXTURE_SAMPLES))
             guides = guides._replace(reflectance=seen.reshape(h, w))
         split = np.stack([radiance.multipath, radiance.faint])
         (multipath, faint), *filtered = smooth([split, *(both[1] for both in sums.values())], guides)
@@ -138,11 +151,16 @@ def transport(
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
     report(1.0)
-    return _signals(rig, truth, radiance, highlights[0], images, spp)
+    return _signals(rig, truth, radiance, highlights[0], images, samples.reshape(h, w))
 
 
 def _signals(
-    rig: Rig, truth: GroundTruth, radiance: Radiance, glint: np.ndarray, channels: dict[Response, np.ndarray], spp: int
+    rig: Rig,
+    truth: GroundTruth,
+    radiance: Radiance,
+    glint: np.ndarray,
+    channels: dict[Response, np.ndarray],
+    samples: np.ndarray,
 ) -> Signals:
     split = EnergySplit(
         direct=radiance.direct,
@@ -150,7 +168,7 @@ def _signals(
         via_delta=radiance.via_delta,
         caustic=radiance.caustic + radiance.faint,
         glint=glint,
-        ambient=radiance.ambient / np.float32(spp),
+        ambient=radiance.ambient / samples.astype(np.float32),
     )
     return Signals(rig, channels, split, truth)
 
