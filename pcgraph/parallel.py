@@ -11,10 +11,11 @@ from numba import config
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
-_SMALLEST_BLOCK = 4096  # elements; starting a thread costs as much as some thousands of them
+SMALLEST_BLOCK = 4096
+"""Elements; starting a thread costs as much as some thousands of them."""
 
 
-def in_blocks(kernel: Callable[..., None], n: int, *arguments: object) -> None:
+def in_blocks(kernel: Callable[..., None], n: int, *arguments: object, smallest: int = SMALLEST_BLOCK) -> None:
     """Nothing; `kernel(start, stop, *arguments)` has run for blocks that cover 0..n, at the same time.
 
     Threads are started anew and joined: no pool outlives the call, so a process may fork at any time and
@@ -27,8 +28,10 @@ def in_blocks(kernel: Callable[..., None], n: int, *arguments: object) -> None:
     n : int
     arguments
         Handed on to every call.
+    smallest : int
+        Elements of a block, at least.
     """
-    blocks = max(1, min(int(config.NUMBA_NUM_THREADS), n // _SMALLEST_BLOCK))
+    blocks = max(1, min(int(config.NUMBA_NUM_THREADS), n // smallest))
     bounds = [n * block // blocks for block in range(blocks + 1)]
     if blocks == 1:
         kernel(0, n, *arguments)

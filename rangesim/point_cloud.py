@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
 
+from pcgraph.parallel import in_blocks
 from rangesim.range_image import RangeImage
 
 FRAMES = ("camera", "world")
@@ -16,6 +18,8 @@ NORMAL_RADIUS = 2
 """Pixels; normals are fitted to a window of (2 r + 1)^2 pixels."""
 MAX_SLOPE = 4.0
 """Depth step over lateral step between two pixels of one surface: 4 keeps surfaces seen up to 76 degrees off."""
+ROWS = 16
+"""Of an image that are worth a thread."""
 STEP_FLOOR = 0.005
 """Share of z by which neighbours may always differ, for noise."""
 
@@ -132,22 +136,31 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
     ----------
     z : (h, w) float, metres, NaN where invalid. rays : (h, w, 3) float, directions with z = 1, camera frame.
     """
-    h, w = z.shape
-    pixel = _pixel_size(rays)
     inverse = 1 / z
-    sums = np.zeros((9, h, w))
-    for dy in range(-radius, radius + 1):
-        for dx in range(-radius, radius + 1):
-            here, there = _overlap(h, dy), _overlap(h, -dy)
-            at, other = (here, _overlap(w, dx)), (there, _overlap(w, -dx))
-            limit = np.maximum(MAX_SLOPE * np.hypot(dx, dy) * pixel, STEP_FLOOR) * z[at]
-            used = np.abs(z[other] - z[at]) <= limit  # False with NaN
-            x, y = rays[other][..., 0] - rays[at][..., 0], rays[other][..., 1] - rays[at][..., 1]
-            value = np.where(used, inverse[other] - inverse[at], 0.0)
-            x, y = x * used, y * used
-            for total, term in zip(sums, (used, x, y, value, x * x, x * y, y * y, x * value, y * value), strict=True):
-                total[at] += term
+    sums = np.zeros((9, *z.shape))
+    steps = np.arange(-radius, radius + 1)
+    limits = np.maximum(MAX_SLOPE * np.hypot(*np.meshgrid(steps, steps)) * _pixel_size(rays), STEP_FLOOR)
+    in_blocks(
+        _add_up, len(z), radius, limits, z, inverse, np.ascontiguousarray(rays, dtype=np.float64), sums, smallest=ROWS
+    )
     return _normals_of_fit(sums, rays, inverse)
+
+
+@njit(nogil=True, cache=True)
+def _add_up(start, stop, radius, limits, z, inverse, rays, sums):  # type: ignore[no-untyped-def]
+    """Of the rows from `start` to `stop`, the sums that `_normals_of_fit` takes."""
+    h, w = z.shape
+    for row in range(start, stop):
+        for column in range(w):
+            for i in range(max(0, row - radius), min(h, row + radius + 1)):
+                for j in range(max(0, column - radius), min(w, column + radius + 1)):
+                    limit = limits[i - row + radius, j - column + radius] * z[row, column]
+                    if abs(z[i, j] - z[row, column]) <= limit:  # False with NaN
+                        x = rays[i, j, 0] - rays[row, column, 0]
+                        y = rays[i, j, 1] - rays[row, column, 1]
+                        value = inverse[i, j] - inverse[row, column]
+                        for k, term in enumerate((1.0, x, y, value, x * x, x * y, y * y, x * value, y * value)):
+                            sums[k, row, column] += term
 
 
 def _normals_of_fit(sums: np.ndarray, rays: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -169,11 +182,6 @@ def _normals_of_fit(sums: np.ndarray, rays: np.ndarray, inverse: np.ndarray) -> 
 def _pixel_size(rays: np.ndarray) -> float:
     """Typical step between neighbouring rays at z = 1."""
     return float(np.median(np.abs(np.diff(rays[..., 0], axis=1)))) if rays.shape[1] > 1 else 1.0
-
-
-def _overlap(size: int, shift: int) -> slice:
-    """Part of an axis that stays inside when moved by `shift`."""
-    return slice(max(0, -shift), min(size, max(0, size - shift)))
 
 
 def _grey_colors(intensity: np.ndarray, valid: np.ndarray) -> np.ndarray:

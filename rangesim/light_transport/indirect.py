@@ -41,6 +41,10 @@ RIDGE = 0.05
 """Of the regression, as a share of the weight times the squared step: how soon a one-sided window is a plain mean."""
 
 
+ROWS = 16
+"""Of an image that are worth a thread."""
+
+
 class Guides(NamedTuple):
     """What decides which pixels share light.
 
@@ -64,7 +68,7 @@ def smooth(images: list[NDArray[np.float32]], guides: Guides, levels: int = LEVE
         weights = level_weights(guides, 3**level)
         for i, image in enumerate(done):
             out = np.empty_like(image)
-            in_blocks(_apply, image.shape[1], weights, 3**level, image, out)
+            in_blocks(_apply, image.shape[1], weights, 3**level, image, out, smallest=ROWS)
             done[i] = out
     return [image * reflectance for image in done]
 
@@ -73,8 +77,8 @@ def level_weights(guides: Guides, step: int) -> NDArray[np.float32]:
     """(h, 9, w) float32 weights of the 3 x 3 pixels `step` apart, row by row; they add up to 1."""
     h, w = guides.instance.shape
     weights, mixed = np.zeros((h, 9, w), np.float32), np.zeros((h, w), np.bool_)
-    in_blocks(_find_mixed, h, guides.instance, guides.position, guides.normal, mixed)
-    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights)
+    in_blocks(_find_mixed, h, guides.instance, guides.position, guides.normal, mixed, smallest=ROWS)
+    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights, smallest=ROWS)
     return weights
 
 
