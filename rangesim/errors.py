@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that are about files and the environment; bad arguments are a plain ValueError.
+"""Errors that are about files and the environment, and warnings; bad arguments are a plain ValueError.
 
 The message of each is one clear sentence that names what was found, what is needed and the fix: the
 command line prints it as it stands.
@@ -8,8 +8,9 @@ command line prints it as it stands.
 from __future__ import annotations
 
 import re
+import warnings
 
-__all__ = ["EnvironmentProblem", "FileFormatError", "RangesimError", "sentence", "visible"]
+__all__ = ["EnvironmentProblem", "FileFormatError", "RangesimError", "RangesimWarning", "sentence", "visible", "warn"]
 
 MAX_SENTENCE = 480
 """Characters of a message. Files may hold names of a megabyte."""
@@ -28,6 +29,15 @@ class FileFormatError(RangesimError):
 
 class EnvironmentProblem(RangesimError):
     """This machine lacks something that rangesim needs, such as a new enough LLVM."""
+
+
+class RangesimWarning(UserWarning):
+    """Something is left out of a result, or read as what it may not be."""
+
+
+def warn(message: str) -> None:
+    """Warn with one sentence; the command line prints it on a line of its own."""
+    warnings.warn(sentence(message), RangesimWarning, stacklevel=3)
 
 
 def sentence(message: str) -> str:

@@ -31,6 +31,10 @@ _BROKEN = (
 """What Pillow and OpenEXR raise on a file that is no image, or broken."""
 
 
+GREY_LEVELS = 5
+"""Of 255, difference at most between the channels of a pixel that counts as grey."""
+
+
 class _OtherFormatError(OSError):
     """A file begins like none of the formats that are read here."""
 
@@ -74,6 +78,16 @@ def read_grey(path: Path) -> np.ndarray:
         raise
     except _BROKEN as error:
         raise FileFormatError(f"{path} cannot be read as an image: {brief(error)}.") from error
+
+
+def is_coloured(path: Path) -> bool:
+    """Whether an image has colours, as far as a few of its pixels tell; False for what cannot be read here."""
+    try:
+        with _quiet(), _open_raster(path) as image:
+            small = np.asarray(image.convert("RGB").resize((32, 32), 0), dtype=np.int16)
+    except _BROKEN:  # Mitsuba says so, or reads what Pillow does not
+        return False
+    return bool((small.max(axis=-1) - small.min(axis=-1)).max() > GREY_LEVELS)
 
 
 def check_pixels(path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import rangesim
 from rangesim.catalogue import scene_names
-from rangesim.errors import FileFormatError
+from rangesim.errors import FileFormatError, RangesimWarning
 from rangesim.light_transport.backend import select_variant
 from rangesim.scene.materials import material_class
 
@@ -63,7 +63,8 @@ def test_mitsuba_s_own_cornell_box_runs_as_it_is() -> None:
     import mitsuba as mi
 
     select_variant()
-    scene = rangesim.load_scene(mi.cornell_box())
+    with pytest.warns(RangesimWarning, match=r"colours of 3 materials \(white, green, red\)"):
+        scene = rangesim.load_scene(mi.cornell_box())
     signals = rangesim.transport(scene, scene.rig(width=64, height=64), [rangesim.IdealToF()], spp=4)
     assert signals.energy.ambient.max() > 0
     assert signals.energy.direct.mean() > 0

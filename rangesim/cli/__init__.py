@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+import warnings
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
 
@@ -13,7 +15,7 @@ from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
 from rangesim.doctor import doctor_command
-from rangesim.errors import RangesimError, sentence
+from rangesim.errors import RangesimError, RangesimWarning, sentence
 
 app = typer.Typer(
     name="rangesim", no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False
@@ -48,11 +50,26 @@ def root(
 
 
 def main() -> None:
-    """Run the command line: errors become one sentence on stderr and exit status 1."""
+    """Run the command line: errors become one sentence on stderr and exit status 1, warnings one sentence each."""
     try:
-        app()
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", RangesimWarning)
+            warnings.showwarning = _show_warning(warnings.showwarning)
+            app()
     except (RangesimError, ValueError, OSError) as error:
         if "--debug" in sys.argv:
             raise
         typer.echo(f"rangesim: {sentence(str(error))}", err=True)
         sys.exit(1)
+
+
+def _show_warning(others: Callable[..., None]) -> Callable[..., None]:
+    """Prints warnings of our own as a line on stderr, and leaves `others` to whoever showed them before."""
+
+    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        if issubclass(category, RangesimWarning):
+            typer.echo(f"rangesim: {message}", err=True)
+        else:
+            others(message, category, *place)
+
+    return show

@@ -29,6 +29,12 @@ from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
 from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
+from rangesim.scene.sensor_band import (
+    coloured_materials,
+    take_sensor_reflectances,
+    warn_of_colours,
+    warn_of_lamps_behind_glass,
+)
 from rangesim.text_files import check_xml
 
 Source = str | Path | Mapping[str, Any]
@@ -81,8 +87,9 @@ def load_scene(
     select_variant(variant)
     retroreflector.register()
     instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, label)
-    loaded, ids, classes = instantiate()
+    loaded, ids, classes = instantiate(advises=True)
     _check(loaded, ids, sensor, label)
+    warn_of_lamps_behind_glass(loaded, label)
     repeat_normals(loaded)
 
     def reload() -> Any:
@@ -104,7 +111,9 @@ def load_scene(
     )
 
 
-def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tuple[Any, set[str], dict[str, str]]:
+def _instantiate(
+    source: Source, material: str, unit_m: float, label: str, advises: bool = False
+) -> tuple[Any, set[str], dict[str, str]]:
     """The Mitsuba scene, the ids of its shapes, and the material classes that the file states."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
@@ -114,7 +123,9 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
             check_depth(state, label)
             mi.parser.transform_all(config, state)
             ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
+            take_sensor_reflectances(state, label)
             check_properties(state, label)
+            coloured = coloured_materials(state) if advises else []
             loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
@@ -122,6 +133,7 @@ def _instantiate(source: Source, material: str, unit_m: float, label: str) -> tu
             :400
         ]  # of a BSDF in Python
         raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
+    warn_of_colours(coloured, label)
     return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
 
 
