@@ -247,9 +247,10 @@ def test_light_through_a_cut_out_hole_arrives_undimmed_and_counts_as_caustic() -
     np.testing.assert_array_equal(through.energy.caustic, through.energy.projector)
 
 
-def test_half_a_hole_passes_half_the_light() -> None:
+@pytest.mark.parametrize("nested", [matte(), PLASTIC, MIRROR], ids=lambda bsdf: str(bsdf["type"]))
+def test_half_a_hole_passes_half_the_light(nested: dict[str, Any]) -> None:
     free = before_the_projector()
-    veil = {"type": "mask", "opacity": 0.5, "bsdf": matte()}
+    veil = {"type": "mask", "opacity": 0.5, "bsdf": nested}
     through = before_the_projector(hole=wall(0.2, veil, 0.15, x=0.3))
     assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(0.5, abs=0.01)
 

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
+from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, has_matte_textures, mean_reflectance
@@ -111,7 +112,8 @@ def transport(
     maps = caustic_maps(
         scene, rig, photons, caustic_radius_m, spp, seed, memory_bytes, media, surfaces, partial(report, 0.0)
     )
-    view = View(scene.mitsuba, surfaces, Device.camera(rig), Device.projector(rig), irradiance, maps, media)
+    camera, projector, cutouts = Device.camera(rig), Device.projector(rig), cutouts_of(scene.mitsuba)
+    view = View(scene.mitsuba, surfaces, camera, projector, irradiance, maps, media, cutouts)
     for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
         accumulators = Accumulators(responses, end - begin, keeps_apart)
         so_far = partial(_report, report, begin / (h * w), (end - begin) / (h * w))
