@@ -30,7 +30,7 @@ from rangesim.light_transport import photon_maps
 from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photon_maps import ALPHA, Level, radii_of_maps
-from rangesim.light_transport.photons import PhotonBalance, Photons, trace_photons
+from rangesim.light_transport.photons import PhotonBalance, Photons, shift_of, stratified_choice, trace_photons
 from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Images, LengthBins, LightPath
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -247,9 +247,10 @@ def test_light_through_a_cut_out_hole_arrives_undimmed_and_counts_as_caustic() -
     np.testing.assert_array_equal(through.energy.caustic, through.energy.projector)
 
 
-def test_half_a_hole_passes_half_the_light() -> None:
+@pytest.mark.parametrize("nested", [matte(), PLASTIC, MIRROR], ids=lambda bsdf: str(bsdf["type"]))
+def test_half_a_hole_passes_half_the_light(nested: dict[str, Any]) -> None:
     free = before_the_projector()
-    veil = {"type": "mask", "opacity": 0.5, "bsdf": matte()}
+    veil = {"type": "mask", "opacity": 0.5, "bsdf": nested}
     through = before_the_projector(hole=wall(0.2, veil, 0.15, x=0.3))
     assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(0.5, abs=0.01)
 
@@ -370,6 +371,50 @@ def test_more_photons_make_less_noise() -> None:
         ]
         noise.append(np.std(images, axis=0, ddof=1).mean() / np.mean(images))
     assert noise[0] / noise[1] > 2.5  # 4 by Poisson; strata and the pixels' own sampling change it a little
+
+
+# ---- Through which pixels photons are sent ----------------------------------------------------------
+
+
+def test_every_seed_sends_photons_through_other_pixels_with_the_chance_of_each() -> None:
+    """Systematic sampling: a photon of a map in every stratum, so a pixel's chance per map is its share, at most 1."""
+    select_variant()
+    share = np.random.default_rng(1).choice([1.0, 0.02], 400)
+    per_map, maps, seeds = 60, 3, range(2000)
+    number, cumulative = np.arange(per_map * maps), np.cumsum(share)
+    shifts = np.array([shift_of(seed) for seed in seeds])
+    chosen = np.stack([stratified_choice(cumulative, number, per_map, shift) for shift in shifts])
+    expected = per_map * share / share.sum()
+    per_seed = [np.bincount(one, minlength=400) for one in chosen.reshape(-1, per_map)]
+    found = np.mean(per_seed, axis=0)
+    tolerance = 5 * np.sqrt(expected * (1 - expected) / len(seeds))  # as if maps were no help
+    assert np.all(np.abs(found - expected) < tolerance)
+    assert found.min() > 0
+    assert (
+        len(np.unique(np.sort(chosen), axis=0)) > 500
+    )  # 180 photons shift over 400 pixels: each pixel changes it once
+    assert np.all(np.diff(chosen[:, :per_map]) >= 0)  # and each seed is spread along the curve
+
+
+def test_all_64_bits_of_a_seed_shift_the_photons_evenly() -> None:
+    """Kolmogorov and Smirnov's distance to the uniform distribution, over low and over high halves."""
+    select_variant()
+    for step in (0, 32):
+        shifts = np.sort([shift_of((k << step) + 3) for k in range(1000)])
+        assert len(np.unique(shifts)) == len(shifts)
+        assert np.abs(shifts - (np.arange(1000) + 0.5) / 1000).max() < 1.95 / np.sqrt(1000)  # p = 0.001
+
+
+def test_photons_of_many_seeds_light_every_pixel_that_sees_glass() -> None:
+    """One in eight pixels is lit by a seed; were it the same ones each time, seeds would average nothing out."""
+    scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
+    projector = Device.projector(rig_of(CAMERA, Intrinsics.from_fov(32, 24, 12)))
+    lit = []
+    for seed in range(64):
+        landed = trace_photons(scene.mitsuba, projector, 1.0, 96, 2, seed, 1 << 30)
+        lit.append(np.bincount(landed.v.astype(int) * 32 + landed.u.astype(int), minlength=32 * 24) > 0)
+    assert max(map(np.sum, lit)) <= 96
+    assert np.any(lit, axis=0).mean() > 0.99
 
 
 # ---- Same bytes -------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from delta_scenes import GLASS, MIRROR, matte, rig_of, scene_of, wall
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, StructuredLight, look_at, transport
@@ -298,6 +299,52 @@ def test_a_cut_out_hole_is_seen_through() -> None:
     assert lit.mean() > 0.8
     np.testing.assert_allclose(image.z[lit], 2.0, atol=2e-3)
     assert not signals.energy.via_delta.any()
+
+
+NESTED: dict[str, tuple[dict[str, Any], str]] = {
+    "diffuse": ({"type": "diffuse"}, "matte"),
+    "plastic": ({"type": "plastic"}, "glossy"),
+    "conductor": (MIRROR, "mirror"),
+    "dielectric": (GLASS, "transparent"),
+    "thindielectric": ({**GLASS, "type": "thindielectric"}, "transparent"),
+}
+
+
+@pytest.mark.parametrize("nested", NESTED)
+def test_the_holes_of_a_mask_are_as_if_nothing_were_there_whatever_it_is_cut_from(nested: str) -> None:
+    """Two quadrants of a sheet before the camera are cut out. There, what is lit straight is that of a free wall."""
+    bsdf, material = NESTED[nested]
+    checks = {
+        "type": "checkerboard",
+        **{f"color{i}": {"type": "spectrum", "value": float(i)} for i in (0, 1)},
+    }
+    sheet = wall(0.1, {"type": "mask", "opacity": checks, "bsdf": bsdf}, 0.1 * np.tan(np.radians(20)))
+    rig = rig_of(Intrinsics.from_fov(8, 8, 40), Intrinsics.from_fov(64, 64, 60), (0.5, 0.0, 0.0), (0.0, 0.0, 2.0))
+    response = FirstReturn()
+    free, through = (
+        transport(scene_of(**parts, wall=wall(2.0, matte())), rig, [response], spp=16, max_depth=3, photons=0)
+        for parts in ({}, {"sheet": sheet})
+    )
+    holes = np.kron([[False, True], [True, False]], np.ones((4, 4), dtype=bool))
+    truth = through.truth
+    classes = np.array(truth.material_names)[truth.material]
+    np.testing.assert_allclose(truth.z, np.where(holes, 2.0, 0.1), rtol=1e-5)
+    np.testing.assert_array_equal(classes, np.where(holes, "matte", material))
+    np.testing.assert_array_equal(truth.projector_visible[holes], free.truth.projector_visible[holes])
+    assert free.energy.direct[holes].all()
+    assert not through.energy.via_delta[holes].any()
+    np.testing.assert_allclose(through.energy.direct[holes], free.energy.direct[holes], rtol=1e-5)
+    np.testing.assert_allclose(through.channels[response][:, holes], free.channels[response][:, holes], rtol=1e-5)
+
+
+def test_the_back_of_a_masked_sheet_is_not_lit() -> None:
+    """Holes let light pass between what is left of the sheet, not through it."""
+    sheet = {"type": "mask", "opacity": 0.9, "bsdf": matte()}
+    camera = projector = Intrinsics.from_fov(8, 8, 40)
+    rigs = [rig_of(camera, projector, (0.1, 0.0, z), (0.0, 0.0, 1.0)) for z in (0.0, 2.0)]
+    before, behind = (transport(scene_of(sheet=wall(1.0, sheet)), rig, [], spp=1).truth for rig in rigs)
+    assert before.projector_visible.any()
+    assert not behind.projector_visible.any()
 
 
 def test_the_back_of_a_thin_sheet_is_not_lit() -> None:

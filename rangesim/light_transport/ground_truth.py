@@ -9,19 +9,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.cutouts import first_surface
 from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.indirect import Guides
 from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.loop import Budget, Lanes, Settings, View, mono
+from rangesim.light_transport.medium import is_boundary
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.rig import Rig
 from rangesim.scene import Scene
-from rangesim.scene.materials import MATERIAL_CLASSES
+from rangesim.scene.materials import MATERIAL_CLASSES, transmits
 from rangesim.signals import GroundTruth
-
-MOST_CUTOUTS = 8
-"""Holes behind each other that a camera ray is followed through."""
 
 
 def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> tuple[GroundTruth, Guides]:
@@ -30,8 +29,7 @@ def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> tuple[GroundTruth, Gu
     camera, projector = Device.camera(rig), Device.projector(rig)
     launches, shapes = Launches(), scene.mitsuba.shapes()
     index_of = mi.Int32(table_of(scene.mitsuba, np.arange(len(shapes), dtype=np.int32)))
-    transmits = [bool(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission)) for s in shapes]
-    transmits_of = mi.Bool(table_of(scene.mitsuba, transmits))
+    transmits_of = mi.Bool(table_of(scene.mitsuba, [is_boundary(s) or transmits(s.bsdf()) for s in shapes]))
     matte = np.array([is_matte(s) for s in shapes])
     parts = []
     for begin, end in launches.ranges(h * w):
@@ -74,7 +72,7 @@ def mean_reflectance(view: View, settings: Settings, budget: Budget, has_cutouts
         while sample < most:
             place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, lanes.samples)
             ray = camera.sample_ray(lanes.corner + place, lens)
-            si = _first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
+            si = first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
             total += mono(si.bsdf().eval_diffuse_reflectance(si, si.is_valid()))
             sample += 1
         launches.evaluate(total, samples * (end - begin))
@@ -107,30 +105,17 @@ def _truth(
     """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of each of the normal,
     the place from the camera, and the shading normal, and the diffuse reflectance."""
     ray = camera.centre_rays(begin, end)
-    si = _first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), scene.has_cutouts)
+    si = first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), scene.has_cutouts)
     hit = si.is_valid() if ray.exists is None else si.is_valid() & ray.exists
     to_camera = camera.centre - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
     link = connect(scene.mitsuba, projector, si, hit)
     uv = link.uv
     shape = number_of(si.shape)
-    transmits = dr.gather(mi.Bool, transmits_of, shape, hit)
-    visible = link.lit & (transmits | (dr.dot(normal, link.direction) > 0))
+    through = dr.gather(mi.Bool, transmits_of, shape, hit)
+    visible = link.lit & (through | (dr.dot(normal, link.direction) > 0))
     z, distance = -dr.dot(to_camera, camera.z), dr.norm(to_camera)
     index = dr.gather(mi.Int32, index_of, shape, hit)
     seen = dr.normalize(si.sh_frame.n)
     reflectance = mono(si.bsdf().eval_diffuse_reflectance(si, hit))
     return [hit, index, z, distance, visible, uv.x, uv.y, *normal, *(-to_camera), *seen, reflectance]
-
-
-def _first_surface(surfaces: Any, ray: Any, has_cutouts: bool) -> Any:
-    """Where the ray meets the first surface that lets less than half of the light pass unchanged."""
-    si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    for _ in range(MOST_CUTOUTS if has_cutouts else 0):
-        bsdf = si.bsdf()
-        is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
-        passes = si.is_valid() & ~is_glass & (mono(bsdf.eval_null_transmission(si)) > 0.5)
-        passes &= ~si.shape.is_medium_transition()  # a translucent object begins at its boundary
-        behind = surfaces.ray_intersect(si.spawn_ray(ray.d), mi.RayFlags.All, coherent=True, active=passes)
-        si = dr.select(passes, behind, si)
-    return si

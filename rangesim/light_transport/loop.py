@@ -124,7 +124,7 @@ class View(NamedTuple):
     """What the loop is run in: scene, devices, photons; the same for all lanes.
 
     surfaces : what rays are intersected with, see `surfaces_of`.
-    maps : PhotonMaps, or None. media : Media, or None where there are none.
+    maps : PhotonMaps, or None. media, cutouts : Media and Cutouts, or None where there are none.
     """
 
     scene: Any
@@ -133,6 +133,7 @@ class View(NamedTuple):
     projector: Device
     maps: PhotonMaps | None = None
     media: Any = None
+    cutouts: Any = None
 
 
 def trace(
@@ -244,7 +245,7 @@ def walk(
     view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
     """The state of the lanes after at most so many turns of the loop, and the turns that each one took."""
-    scene, surfaces, camera, projector, maps, media = view
+    scene, surfaces, camera, projector, maps, media, cutouts = view
     # ---- The state, by name ------------------------------------------------------------------------
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
     origin, towards, previous = state.origin, state.direction, state.previous
@@ -358,8 +359,9 @@ def walk(
             survival = dr.select(scatters, dr.minimum(throughput / FAINT, 1), dr.select(crosses, 1, survival))
         survives = rng.next_float32() < survival
         throughput /= survival
-        is_glass = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
-        passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) & ~is_glass  # through a hole, as if nothing were there
+        passes = mi.Bool(False)  # through a hole, as if nothing were there
+        if dr.hint(cutouts is not None, mode="scalar"):
+            passes = cutouts.passed(si, bs, at_surface)
         first &= ~scatters & (passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         via |= is_delta & ~passes
         previous = mi.Point3f(si.p)

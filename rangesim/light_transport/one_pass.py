@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
+from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, has_matte_textures, mean_reflectance
@@ -124,7 +125,8 @@ def transport(
         surfaces,
         partial(report, 0.0),
     )
-    view = View(scene.mitsuba, surfaces, Device.camera(rig), Device.projector(rig), maps, media)
+    camera, projector, cutouts = Device.camera(rig), Device.projector(rig), cutouts_of(scene.mitsuba)
+    view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts)
     budget = Budget(samples, rig.projector_irradiance)
     for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
         accumulators = Accumulators(responses, end - begin, keeps_apart)

@@ -26,6 +26,7 @@ from rangesim.light_transport.device import Device
 from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.medium import Media, is_boundary
 from rangesim.light_transport.photon_flight import fly
+from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.shapes import number_of, table_of
 
 DEFENSIVE_SHARE = 0.05
@@ -125,7 +126,7 @@ def trace_photons(
     """
     pixels, share = _worthwhile_pixels(scene, projector)
     per_map = -(-photons // maps)
-    cumulative = np.cumsum(share)
+    cumulative, shift = np.cumsum(share), shift_of(seed)
     total = per_map * maps
     most = max(1, min(memory_bytes // BYTES_PER_PHOTON, MOST_AT_ONCE))
     landed: list[list[np.ndarray]] = []
@@ -133,7 +134,7 @@ def trace_photons(
     launches = Launches()
     for begin, end in launches.ranges(total, SURFACES_PER_PHOTON, min(most, SUMMED_TOGETHER), at_most=most):
         number = np.arange(begin, end)
-        chosen = np.searchsorted(cumulative, _stratified(number, per_map) * cumulative[-1], side="right")
+        chosen = stratified_choice(cumulative, number, per_map, shift)
         flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
         landing, fate = fly(surfaces or scene, projector, pixels[chosen], flux, number, seed, media)
         launches.evaluate([list(landing), list(fate)], SURFACES_PER_PHOTON * (end - begin))
@@ -171,10 +172,22 @@ def _morton(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return spread(x) | (spread(y) << np.uint64(1))
 
 
-def _stratified(number: np.ndarray, per_map: int) -> np.ndarray:
-    """Places in 0..1, evenly spaced within each map, each map shifted against the others (golden ratio)."""
-    shift = (number // per_map * 0.6180339887498949 + 0.5) % 1.0
-    return np.asarray((number % per_map + shift) / per_map)
+def shift_of(seed: int) -> float:
+    """Uniform in 0..1, of the seed's own random numbers."""
+    rng = random_stream(Seed.of(seed), mi.UInt32(0xC2B2AE35), Stream.THIRD)
+    return float(rng.next_float64()[0])
+
+
+def stratified_choice(cumulative: np.ndarray, number: np.ndarray, per_map: int, shift: float) -> np.ndarray:
+    """Which of the pixels with these cumulative chances each photon is sent through.
+
+    The photons of a map are evenly spaced in 0..1 (systematic sampling), each map shifted against the others (golden
+    ratio) and all by `shift`, in spacings. If that is uniform, so is every photon's place in its stratum: the chance of
+    a pixel is its share, and the mean over seeds has no bias.
+    """
+    shifts = (number // per_map * 0.6180339887498949 + shift) % 1.0
+    place = (number % per_map + shifts) / per_map
+    return np.minimum(np.searchsorted(cumulative, place * cumulative[-1], side="right"), len(cumulative) - 1)
 
 
 def _columns(array: Any) -> np.ndarray:

@@ -15,6 +15,8 @@ transparent: (nearly) specular refraction. translucent: scattered transmission. 
 SMOOTH = 0.05
 """Microfacet roughness alpha up to which a surface looks polished to a range sensor."""
 
+ALL_COMPONENTS = 0xFFFFFFFF
+
 _ALPHAS = ("alpha", "alpha_u", "alpha_v")
 
 
@@ -28,7 +30,7 @@ def material_class(bsdf: Any) -> str:
     alphas += [parameters["roughness"] ** 2] if "roughness" in parameters else []  # principled (Burley 2012)
     polished = all(alpha <= SMOOTH for alpha in alphas)
     delta = _has(bsdf, "DeltaReflection") or (polished and _has(bsdf, "GlossyReflection"))
-    if _has(bsdf, "DeltaTransmission", "GlossyTransmission") or (_is_thin_glass(bsdf) and "opacity" not in parameters):
+    if _has(bsdf, "DeltaTransmission", "GlossyTransmission") or _has_thin_glass(bsdf):
         return "transparent" if polished else "translucent"
     if _has(bsdf, "DiffuseTransmission"):
         return "translucent"
@@ -42,12 +44,28 @@ def material_class(bsdf: Any) -> str:
 
 
 def is_cutout(bsdf: Any) -> bool:
-    """Whether light can pass this surface unchanged (`mask`, `null`); thin glass, which reflects as well, is none."""
-    return _has(bsdf, "Null") and not _is_thin_glass(bsdf)
+    """Whether the surface has holes (`mask`, `null`); thin glass, which light passes unchanged as well, is none."""
+    return holes(bsdf) != 0
 
 
-def _is_thin_glass(bsdf: Any) -> bool:
-    return _has(bsdf, "Null") and _has(bsdf, "DeltaReflection")
+def holes(bsdf: Any) -> int:
+    """Bits of the components of a mitsuba.BSDF that are holes: light passes there as if nothing were there."""
+    if not _has(bsdf, "Null"):
+        return 0
+    if not _has_thin_glass(bsdf):
+        return ALL_COMPONENTS
+    return 1 << (bsdf.component_count() - 1) if bsdf.class_name() == "MaskBSDF" else 0  # of a mask, the last one
+
+
+def transmits(bsdf: Any) -> bool:
+    """Whether light gets through the material itself, not through its holes alone."""
+    return _has(bsdf, "DiffuseTransmission", "GlossyTransmission", "DeltaTransmission") or _has_thin_glass(bsdf)
+
+
+def _has_thin_glass(bsdf: Any) -> bool:
+    """Whether a `thindielectric` is in it: what passes that has the flag of what passes a hole."""
+    parts = mi.traverse(bsdf).hierarchy if _has(bsdf, "Null") else {}
+    return any(isinstance(part, mi.BSDF) and part.class_name() == "ThinDielectric" for part in parts)
 
 
 def _has(bsdf: Any, *lobes: str) -> bool:
