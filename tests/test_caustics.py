@@ -255,6 +255,77 @@ def test_half_a_hole_passes_half_the_light(nested: dict[str, Any]) -> None:
     assert (through.energy.projector / free.energy.direct).mean() == pytest.approx(0.5, abs=0.01)
 
 
+# ---- Shading normals --------------------------------------------------------------------------------
+
+
+def mesh(file: Path, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any]) -> Any:
+    """A mesh with the normals of its own at the vertices."""
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"vn {x} {y} {z}" for x, y, z in normals]
+    lines += ["f " + " ".join(f"{i}//{i}" for i in face) for face in faces + 1]
+    file.write_text("\n".join(lines) + "\n")
+    return {"type": "obj", "filename": str(file), "bsdf": bsdf}
+
+
+def tilted(file: Path, square: Any, towards: Any, degrees: float, bsdf: dict[str, Any]) -> Any:
+    """A square (4, 3) whose vertex normals are its own, tilted towards a direction in it."""
+    square, towards = np.asarray(square, dtype=float), np.asarray(towards, dtype=float)
+    normal = np.cross(square[1] - square[0], square[2] - square[0])
+    tilt = np.cos(np.radians(degrees)) * normal / np.linalg.norm(normal) + np.sin(np.radians(degrees)) * towards
+    return mesh(file, square, np.tile(tilt, (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), bsdf)
+
+
+@pytest.mark.parametrize("wound_outwards", [True, False])
+@pytest.mark.parametrize("degrees", [60, 30, -15])
+def test_photons_meet_shading_normals_as_direct_light_does(
+    tmp_path: Path, degrees: float, wound_outwards: bool
+) -> None:
+    """Where light and sight are on one side for both normals, a pane before the projector does no more than dim."""
+    square = np.array([[-5, -5, PLANE], [-5, 5, PLANE], [5, 5, PLANE], [5, -5, PLANE]])
+    way = [1, 0, 0] if wound_outwards else [-1, 0, 0]
+    part = tilted(tmp_path / "wall.obj", square if wound_outwards else square[::-1], way, degrees, matte())
+    free, dimmed = ({"wall": part}, {"wall": part, "pane": wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)})
+    rig = rig_of(CAMERA, PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+    direct, caustic = (
+        transport(scene_of(**parts), rig, [], spp=64, max_depth=2, caustic_radius_m=4e-3).energy
+        for parts in (free, dimmed)
+    )
+    points = points_on_the_plane(rig) - [0.3, 0.0, 0.0]
+    sine = np.linalg.norm(points[..., :2], axis=-1) / np.linalg.norm(points, axis=-1)
+    ratio = caustic.caustic / direct.direct / pane_transmittance(sine)
+    assert not caustic.direct.any()
+    assert ratio.mean() == pytest.approx(1, abs=0.01)
+    # Nor does it change how light falls off across the image
+    assert np.abs(ratio.reshape(4, 12, 4, 16).mean(axis=(1, 3)) - 1).max() < 0.03
+
+
+def test_a_coarse_smooth_ball_has_no_facets_behind_a_pane(tmp_path: Path) -> None:
+    """Each 4 x 4 pixels are as bright as in direct light, on the facets and along their edges."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.2)
+    part = mesh(tmp_path / "ball.obj", np.add(ball.vertices, [0, 0, PLANE]), ball.vertices / 0.2, ball.faces, matte())
+    pane = wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3)
+    rig = rig_of(Intrinsics.from_fov(64, 48, 16), PROJECTOR, (0.3, 0.0, 0.0), (0.0, 0.0, 1.0))
+    options: dict[str, Any] = {"spp": 64, "max_depth": 2, "caustic_radius_m": 4e-3, "photons": 2_000_000}
+    free = transport(scene_of(ball=part), rig, [], **options).energy.direct
+    dimmed = transport(scene_of(ball=part, pane=pane), rig, [], **options).energy.caustic
+    blocks = [x.reshape(12, 4, 16, 4).mean(axis=(1, 3)) for x in (free, dimmed)]
+    ratio = blocks[1] / blocks[0] / pane_transmittance(np.array(0.1))
+    assert ratio.mean() == pytest.approx(1, abs=0.01)
+    assert ratio.std() < 0.03  # 0.11 where the geometric cosine is left out
+
+
+def test_no_photon_lights_a_surface_that_one_of_its_normals_turns_away(tmp_path: Path) -> None:
+    """Light from behind the geometric normal, or from behind the shading normal."""
+    square = np.array([[-5, -5, PLANE], [-5, 5, PLANE], [5, 5, PLANE], [5, -5, PLANE]])
+    part = tilted(tmp_path / "wall.obj", square, [1, 0, 0], 60, matte())
+    for at, pane in (((0.8, 0.0, 1.5), wall(1.4, {**GLASS, "type": "thindielectric"}, 0.5, x=0.8)),
+                     ((-1.0, 0.0, 0.0), wall(0.2, {**GLASS, "type": "thindielectric"}, 0.4, x=-0.8))):  # fmt: skip
+        rig = rig_of(CAMERA, PROJECTOR, at, (0.0, 0.0, 1.0))
+        energy = transport(scene_of(wall=part, pane=pane), rig, [], spp=4, max_depth=2, glint=False).energy
+        assert not energy.projector.any()
+
+
 # ---- Density estimation -----------------------------------------------------------------------------
 
 
@@ -284,7 +355,7 @@ def test_a_gather_is_the_sum_over_all_photons_of_its_map(
     position, of_map, nothing = on_the_plane(photons), np.arange(photons) % maps, np.zeros(photons, np.float32)
     flux = rng.uniform(0.5, 1.5, photons).astype(np.float32)
     none = PhotonBalance(0, 0, 0, 0, 0, 0)
-    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, of_map, none, per_pixel=1.0)
+    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map, none, per_pixel=1.0)
     built = photon_maps.PhotonMaps(landed, maps, radius_m, irradiance=1e-9)  # all brighter than the first level
     points, repeats = on_the_plane(1000), 64
     sample = np.arange(1000) % maps

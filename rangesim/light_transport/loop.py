@@ -39,6 +39,8 @@ NEIGHBOURS = 256
 """Pixels in a row that share a launch. Launches take such runs from all over the image: so their times are alike."""
 TURNS_PER_SAMPLE = 2
 """As long as nothing is known."""
+MOST_BENT = 4.0
+"""Cosine of a photon to the surface at a vertex, at most, over that where it landed."""
 
 
 class Settings(NamedTuple):
@@ -463,11 +465,15 @@ def caustics(
     found = irradiance > 0
     if found:
         flight = maps.flight(photon, found)
-        wo = vertex.si.to_local(-flight.direction)
+        wi, wo = vertex.si.wi, vertex.si.to_local(-flight.direction)
         value = vertex.bsdf.eval(mi.BSDFContext(), vertex.si, wo, found)
-        # Photons count flux per area of the surface: its cosine is in them already
-        radiance = vertex.throughput * irradiance * mono(value) / dr.abs(wo.z)
-        radiance = dr.select(found & (wo.z != 0), radiance, 0)
+        # Photons count flux per area, so the geometric cosine is in them already; the BSDF counts that to the shading
+        # normal (Veach 1997, 5.3). Where a photon landed beside an edge, its own facet is the one that counts
+        seen, lit = dr.dot(vertex.si.to_world(wi), vertex.si.n), -dr.dot(flight.direction, vertex.si.n)
+        cosine = dr.maximum(flight.cosine, dr.abs(lit) / MOST_BENT)
+        on_one_side = seen * lit * wi.z * wo.z > 0  # for both normals, or for neither
+        radiance = vertex.throughput * irradiance * mono(value) / cosine
+        radiance = dr.select(found & on_one_side, radiance, 0)
         length = vertex.length + flight.length
         path = LightPath(flight.u, flight.v, length, vertex.is_first, mi.UInt32(CAUSTIC))
         channels = accumulators.add(channels, path, radiance, place, found, is_wide)

@@ -29,6 +29,8 @@ class Landing(NamedTuple):
     u: Any
     v: Any
     length: Any
+    cosine: Any
+    """Of its direction to the geometric normal; its flux is that of so much of a surface that faces it."""
 
 
 def fly(
@@ -69,6 +71,7 @@ def _chain(
     left = max_chain + dr.zeros(mi.UInt32, lanes)  # surfaces and boundaries of media that may still be met
     previous = mi.Point3f(primary.origin)
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
+    cosine = dr.ones(mi.Float, lanes)
     direct, stored, absorbed, escaped, truncated = (dr.zeros(mi.Float, lanes) for _ in range(5))
     context = mi.BSDFContext(mi.TransportMode.Importance)
     context.type_mask = mi.BSDFFlags.Delta
@@ -104,6 +107,7 @@ def _chain(
         stored = dr.select(lands, landing_flux, stored)
         position = dr.select(lands, point, position)
         direction = dr.select(lands, ray.d, direction)
+        cosine = dr.select(lands, dr.abs(dr.dot(ray.d, si.n)), cosine)
 
         # ---- Or goes on as a delta interaction -------------------------------------------------------
         goes_on = mirrors & ~lands
@@ -126,5 +130,5 @@ def _chain(
         active = goes_on & (left > 0)
         random, origin, towards = rng.state, ray.o, ray.d
 
-    landing = Landing(position, direction, stored, uv.x, uv.y, length)
+    landing = Landing(position, direction, stored, uv.x, uv.y, length, cosine)
     return landing, (emitted, direct, stored, absorbed, escaped, truncated)

@@ -62,12 +62,14 @@ class Gathered(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """How a photon came: unit direction of flight (world), projector pixel coordinates, optical length in metres."""
+    """How a photon came: unit direction of flight (world), projector pixel coordinates, optical length in metres, and
+    the cosine of its direction to the geometric normal of the surface."""
 
     direction: Any
     u: Any
     v: Any
     length: Any
+    cosine: Any
 
 
 class PhotonMaps:
@@ -100,8 +102,9 @@ class PhotonMaps:
         order = np.argsort(key, kind="stable")
         starts = np.cumsum(np.bincount(key + 1, minlength=len(radii) * stride + 1))
         points = np.column_stack([photons.position, photons.flux])
-        padding = np.zeros((len(order), 2), np.float32)
-        flights = np.column_stack([photons.direction, photons.u, photons.v, photons.length_m, padding])
+        padding = np.zeros(len(order), np.float32)
+        columns = [photons.direction, photons.u, photons.v, photons.length_m, photons.cosine, padding]
+        flights = np.column_stack(columns)
 
         opaque = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731
         self.starts = mi.UInt32(starts.astype(np.uint32))
@@ -158,7 +161,7 @@ class PhotonMaps:
     def flight(self, photon: Any, active: Any) -> Flight:
         """How a photon came."""
         a, b = (dr.gather(mi.Vector4f, self.flights, photon * 2 + half, active) for half in (0, 1))
-        return Flight(mi.Vector3f(a.x, a.y, a.z), a.w, b.x, b.y)
+        return Flight(mi.Vector3f(a.x, a.y, a.z), a.w, b.x, b.y, b.z)
 
     def _ranges(self, point: Any, of_map: Any, radius: Any, active: Any) -> tuple[list[Any], list[Any]]:
         """Start and length of the four ranges of photons that lie in the 2 x 2 x 2 cells around a point."""

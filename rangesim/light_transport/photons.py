@@ -66,6 +66,7 @@ class Photons:
     flux : (n,) float32, watts, of white.
     u, v : (n,) float32, projector pixel coordinates.
     length_m : (n,) float32, metres, optical length from the projector.
+    cosine : (n,) float32, of the direction to the geometric normal where it landed.
     map : (n,) int, which of the independent maps a photon belongs to; each map alone carries all the power.
     balance : PhotonBalance, the mean over the maps.
     per_pixel : float, photons of all maps sent through each projector pixel that is worth it.
@@ -77,6 +78,7 @@ class Photons:
     u: np.ndarray
     v: np.ndarray
     length_m: np.ndarray
+    cosine: np.ndarray
     map: np.ndarray
     balance: PhotonBalance
     per_pixel: float
@@ -144,9 +146,8 @@ def trace_photons(
         for sums in np.column_stack([np.add.reduceat(x.numpy(), blocks, dtype=np.float64) for x in fate]):
             balance += sums
         report()
-    position, direction, flux, u, v, length, of_map = (np.concatenate(parts) for parts in zip(*landed, strict=True))
-    total_balance = PhotonBalance(*(balance / maps))
-    return Photons(position, direction, flux, u, v, length, of_map, total_balance, total / cumulative[-1])
+    columns = [np.concatenate(parts) for parts in zip(*landed, strict=True)]
+    return Photons(*columns, PhotonBalance(*(balance / maps)), total / cumulative[-1])
 
 
 def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:
