@@ -147,7 +147,8 @@ def trace_photons(
             balance += sums
         report()
     columns = [np.concatenate(parts) for parts in zip(*landed, strict=True)]
-    return Photons(*columns, PhotonBalance(*(balance / maps)), total / cumulative[-1])
+    per_pixel = total / cumulative[-1]
+    return Photons(*columns, balance=PhotonBalance(*(balance / maps)), per_pixel=per_pixel)
 
 
 def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:
