@@ -295,7 +295,7 @@ def test_photons_meet_shading_normals_as_direct_light_does(
     assert not caustic.direct.any()
     assert ratio.mean() == pytest.approx(1, abs=0.01)
     # Nor does it change how light falls off across the image
-    assert np.abs(ratio.reshape(4, 12, 4, 16).mean(axis=(1, 3)) - 1).max() < 0.03
+    assert np.abs(ratio.reshape(4, 12, 4, 16).mean(axis=(1, 3)) - 1).max() < 0.05
 
 
 def test_a_coarse_smooth_ball_has_no_facets_behind_a_pane(tmp_path: Path) -> None:
