@@ -33,7 +33,8 @@ class Experiment:
     unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
     spp : light paths per pixel; None: as many as the surface needs, see `rangesim.transport`.
-    max_depth : longest path in segments up to the light; 2 is direct light alone.
+    max_depth : longest path, in segments between surfaces that scatter it, up to the light; 2 is direct light alone.
+        Glass and mirrors do not count.
     photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
     glint : whether the camera sees the projector's lens in mirrors.
     seed : of transport and noise, 0 to 2^64 - 1; the same seed gives the same bytes.

@@ -46,7 +46,11 @@ def run_command(
     width: Annotated[int | None, typer.Option(help="Camera width, pixels. (default: the scene's)")] = None,
     height: Annotated[int | None, typer.Option(help="Camera height, pixels. (default: the scene's)")] = None,
     max_depth: Annotated[
-        int | None, typer.Option(help="Segments of a light path; 2 is direct light alone. (default: 5)")
+        int | None,
+        typer.Option(
+            help="Segments of a light path between surfaces that scatter it; glass and mirrors do not count; "
+            "2 is direct light alone. (default: 5)"
+        ),
     ] = None,
     photons: Annotated[
         int | None,

@@ -20,12 +20,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import spawn_close
 from rangesim.light_transport.launches import Launches, fewest_lanes
 from rangesim.light_transport.loop import mono
 from rangesim.light_transport.medium import Media, bounded
-from rangesim.light_transport.photon_flight import MAX_CHAIN
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Continued, Seed, random_stream, stratified
@@ -331,7 +331,10 @@ def _paths_to_the_lens(
         previous = mi.Point3f(si.p)
         ray = spawn_close(si, si.p, si.to_world(bs.wo))
         chain += 1
+        chance = survival(chain, throughput * dr.square(ior))
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
+        ends |= rng.next_float32() >= chance
+        throughput /= chance
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)
         throughput, ior = dr.select(ends, 1, throughput), dr.select(ends, 1, ior)
         random, origin, direction = rng.state, ray.o, ray.d

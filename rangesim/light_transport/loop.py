@@ -7,6 +7,9 @@ register instead of a film, and each sum is made by one thread in one order: sam
 whatever the number of threads. The loop is run in launches of bounded time, each of which takes some lanes so many
 turns further: what a lane has done is its `State`, so that neither the lanes of a launch nor its turns change a byte.
 
+A path has two limits. `max_depth` counts the surfaces that scatter it; delta interactions (glass, mirrors, coats,
+holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.delta_chain`).
+
 Inside a translucent object a turn of the loop is a scattering event instead of a surface; a stay inside counts as one
 surface towards the depth, however often it scatters (`rangesim.light_transport.medium`).
 
@@ -26,6 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
 from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.launches import Launches, Report, fewest_lanes
@@ -44,8 +48,9 @@ MOST_BENT = 4.0
 
 
 class Settings(NamedTuple):
-    """Sampling of the loop. Numbers are opaque; the two flags shape the kernel.
+    """Sampling of the loop. Numbers are opaque; the flags shape the kernel.
 
+    delta : whether some surface of the scene has a delta interaction.
     ambient : whether the scene has light of its own.
     lamps : whether that light has a direction worth sampling; uniform surroundings are found best by the BSDF alone.
     """
@@ -53,6 +58,7 @@ class Settings(NamedTuple):
     seed: Seed
     max_depth: Any
     rr_depth: Any
+    delta: bool
     ambient: bool
     lamps: bool
 
@@ -106,6 +112,7 @@ class State:
     radiance: list[Any]
     sample: Any
     depth: Any
+    chain: Any
     origin: Any
     direction: Any
     throughput: Any
@@ -224,7 +231,8 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
         radiance=[dr.zeros(mi.Float, lanes) if any_of_it else None for any_of_it in shines],
         sample=dr.zeros(mi.UInt32, lanes),  # samples of this pixel finished so far
         # ---- Of the path -----------------------------------------------------------------------------
-        depth=dr.zeros(mi.UInt32, lanes),  # surfaces met so far
+        depth=dr.zeros(mi.UInt32, lanes),  # surfaces that scattered it so far
+        chain=dr.zeros(mi.UInt32, lanes) if settings.delta else None,  # delta interactions since
         origin=dr.zeros(mi.Point3f, lanes),  # of the ray
         direction=dr.zeros(mi.Vector3f, lanes),
         throughput=dr.ones(mi.Float, lanes),  # radiance at the camera per radiance along the ray
@@ -252,7 +260,7 @@ def walk(
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
     origin, towards, previous = state.origin, state.direction, state.previous
     direct, multipath, via_delta, caustic, ambient, faint = state.radiance
-    depth, throughput, length, ior = state.depth, state.throughput, state.length, state.ior
+    depth, chain, throughput, length, ior = state.depth, state.chain, state.throughput, state.length, state.ior
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
     inside, events, stays = state.inside, state.events, state.stays
@@ -266,6 +274,8 @@ def walk(
 
         # ---- A new sample starts at the camera -------------------------------------------------------
         starts = depth == 0
+        if dr.hint(settings.delta, mode="scalar"):
+            starts &= chain == 0
         if dr.hint(media is not None, mode="scalar"):
             starts &= events == 0
         jitter, lens = in_pairs(at.shift, at.lens_shift, sample, at.samples)
@@ -288,6 +298,7 @@ def walk(
             si.p = dr.select(scatters, dr.fma(ray.d, flight, previous), si.p)
             si.n = dr.select(scatters, 0, si.n)  # so that rays start at the event itself
         at_surface = hit & ~scatters
+        # It counts if it scatters the path; whether it does is known when the next direction is
         if dr.hint(media is not None, mode="scalar"):
             depth += dr.select(crosses | (scatters & stays), mi.UInt32(0), mi.UInt32(1))
         else:
@@ -356,11 +367,18 @@ def walk(
         is_transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
         throughput *= bs_weight
         ior = dr.select(is_transmitted, ior * bs.eta, ior)
-        survival = dr.select(depth > settings.rr_depth, dr.minimum(throughput * dr.square(ior), 0.95), 1)
+        was_bent = is_delta & ~crosses
+        if dr.hint(settings.delta, mode="scalar"):
+            depth -= dr.select(was_bent, mi.UInt32(1), mi.UInt32(0))
+            chain = dr.select(crosses, chain, dr.select(was_bent, chain + 1, 0))
+        share = throughput * dr.square(ior)  # of the light, that this path stands for
+        chance = dr.select(depth > settings.rr_depth, dr.minimum(share, 0.95), 1)
+        if dr.hint(settings.delta, mode="scalar"):
+            chance = dr.minimum(chance, survival(chain, share))
         if dr.hint(media is not None, mode="scalar"):
-            survival = dr.select(scatters, dr.minimum(throughput / FAINT, 1), dr.select(crosses, 1, survival))
-        survives = rng.next_float32() < survival
-        throughput /= survival
+            chance = dr.select(scatters, dr.minimum(throughput / FAINT, 1), dr.select(crosses, 1, chance))
+        survives = rng.next_float32() < chance
+        throughput /= chance
         passes = mi.Bool(False)  # through a hole, as if nothing were there
         if dr.hint(cutouts is not None, mode="scalar"):
             passes = cutouts.passed(si, bs, at_surface)
@@ -370,7 +388,6 @@ def walk(
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
-        was_bent = is_delta & ~crosses
         ray.o = dr.select(was_bent, spawn_close(si, met, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
@@ -383,9 +400,14 @@ def walk(
         goes_on = depth < last
         if dr.hint(media is not None, mode="scalar"):
             goes_on |= (scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS)
-        ends = ~(hit & survives & (throughput > 0) & goes_on)
+        goes_on &= hit & survives & (throughput > 0)
+        if dr.hint(settings.delta, mode="scalar"):
+            goes_on &= chain < MAX_CHAIN
+        ends = ~goes_on
         sample = dr.select(ends, sample + 1, sample)
         depth = dr.select(ends, 0, depth)
+        if dr.hint(settings.delta, mode="scalar"):
+            chain = dr.select(ends, 0, chain)
         throughput = dr.select(ends, 1, throughput)
         length = dr.select(ends, 0, length)
         ior = dr.select(ends, 1, ior)
@@ -409,6 +431,7 @@ def walk(
         radiance=[direct, multipath, via_delta, caustic, ambient, faint],
         sample=sample,
         depth=depth,
+        chain=chain,
         origin=origin,
         direction=towards,
         throughput=throughput,

@@ -20,6 +20,7 @@ from rangesim.light_transport.indirect import smooth
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Budget, Radiance, Settings, View, trace
 from rangesim.light_transport.medium import media_of
+from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Seed
 from rangesim.light_transport.surfaces import surfaces_of
@@ -67,9 +68,10 @@ def transport(
     sensors : sensors, or bare responses; none for energy split and ground truth alone.
     spp : int >= 1, samples (camera paths) per pixel; "auto": `MATTE_SPP` where a pixel shares its indirect light with
         its neighbours, so that sampling adds little to the noise of a sensor, and `OTHER_SPP` elsewhere.
-    max_depth : int >= 1, segments of a path up to the light: 2 is direct light alone, as in Mitsuba. A photon's way
-        from the projector counts as one segment, however many delta surfaces it met.
-    rr_depth : int >= 1, surfaces after which Russian roulette may end a path.
+    max_depth : int >= 1, segments of a path between surfaces that scatter it, up to the light: 2 is direct light alone,
+        as in Mitsuba. Delta interactions (glass, mirrors, thin panes, coats, holes) do not count; they have a limit of
+        their own, `rangesim.light_transport.delta_chain.MAX_CHAIN` in a row.
+    rr_depth : int >= 1, surfaces that scatter after which Russian roulette may end a path.
     photons : int >= 0, caustic photons: the projector's light through glass and off mirrors, see
         `rangesim.light_transport.photons`; 0: none, and such light is missing. No cost without such surfaces.
     caustic_radius_m : metres, largest radius over which photons are gathered; None: as wide as the number of photons
@@ -110,6 +112,7 @@ def transport(
         seed=Seed.of(seed),
         max_depth=dr.opaque(mi.UInt32, max_depth),
         rr_depth=dr.opaque(mi.UInt32, rr_depth),
+        delta=has_delta(scene.mitsuba),
         ambient=scene.has_ambient,
         lamps=scene.has_lamps,
     )

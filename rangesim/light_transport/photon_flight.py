@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.medium import Media
@@ -16,8 +17,6 @@ from rangesim.light_transport.sampling import Continued, Seed, random_stream
 
 LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
-MAX_CHAIN = 16
-"""Delta surfaces in a row that a photon is followed through."""
 
 
 class Landing(NamedTuple):
@@ -116,7 +115,9 @@ def _chain(
         )
         remains = flux * dr.select(mixed, 1 / (1 - LANDING_SHARE), 1) * mi.unpolarized_spectrum(weight)[0]
         goes_on &= (remains > 0) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        remains = dr.select(goes_on, remains, 0)
+        chance = survival(chain, remains / emitted)
+        goes_on &= rng.next_float32() < chance
+        remains = dr.select(goes_on, remains / chance, 0)  # on average nothing is absorbed by this
         absorbed += dr.select(hit & ~(~mirrors & (chain == 0)), flux - remains - dr.select(lands, landing_flux, 0), 0)
         flux = dr.select(active, remains, flux)
         ior = dr.select(goes_on & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)

@@ -47,7 +47,8 @@ class PhotonBalance:
 
     emitted : of the pixels that photons were sent through. direct : landed without a delta surface, left to next-event
     estimation. stored : landed beyond delta surfaces. absorbed : by delta surfaces and by the parts of mixed ones that
-    scatter, and by media. escaped : met no surface. truncated : still under way after `MAX_CHAIN` surfaces.
+    scatter, and by media; by Russian roulette on average nothing. escaped : met no surface. truncated : still under way
+    after `MAX_CHAIN` surfaces.
     """
 
     emitted: float

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What limits a light path: surfaces that scatter it by `max_depth`, delta interactions by a limit of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from delta_scenes import GLASS, fresnel_dielectric, matte, rig_of, scene_of, slab, transform, wall
+from scipy.spatial import ConvexHull
+
+from rangesim import Intrinsics, Scene, transport
+from rangesim.light_transport import delta_chain
+from rangesim.light_transport.backend import select_variant
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.photons import PhotonBalance, trace_photons
+
+CAMERA = Intrinsics.from_fov(64, 48, 12)
+PROJECTOR = Intrinsics.from_fov(160, 120, 26)
+THIN = {**GLASS, "type": "thindielectric"}
+
+
+def panes(n: int, kind: str) -> dict[str, dict[str, Any]]:
+    """Panes one behind the other, so close that light reflected between them goes on as if it were not."""
+    z = 0.3 + 0.003 * np.arange(n)
+    return {f"pane_{i}": slab(a, a + 0.001) if kind == "thick" else wall(a, THIN) for i, a in enumerate(z)}
+
+
+# ---- Delta interactions do not count ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "kind"), [(2, "thick"), (2, "thin"), (6, "thick"), (6, "thin")])
+def test_panes_weaken_light_and_do_not_use_up_the_depth(n: int, kind: str) -> None:
+    """n panes pass (1 - R) / (1 + (2 n - 1) R) (Stokes 1862), once for the projector and once for the camera."""
+    rig = rig_of(CAMERA, PROJECTOR, (0.05, 0.0, 0.0))
+    options = {"spp": 64, "max_depth": 2, "glint": False, "photons": 1_000_000}
+    plain, covered = (
+        transport(scene_of(wall=wall(1.0, matte()), **glass), rig, [], **options).energy.projector.mean(dtype=float)
+        for glass in ({}, panes(n, kind))
+    )
+    r = fresnel_dielectric(0.0)
+    passed = ((1 - r) / (1 + (2 * n - 1) * r)) ** 2  # two panes: 0.735
+    assert covered / plain == pytest.approx(passed, rel=0.02)
+
+
+def hollow_ball() -> Scene:
+    """Seen from the origin, with four faces before the wall."""
+    outside = {"type": "sphere", "center": [0.0, 0.0, 0.5], "radius": 0.2, "bsdf": GLASS}
+    inside = {**outside, "radius": 0.18, "flip_normals": True}
+    return scene_of(outside=outside, inside=inside, wall=wall(1.0, matte()))
+
+
+def test_what_is_seen_through_a_hollow_ball_is_that_of_a_deep_path_tracer() -> None:
+    """The lamp between the ball and the wall lights the wall straight, so that plain Mitsuba finds it."""
+    import mitsuba as mi
+    from plain_mitsuba import plain_scene, render, z_score
+
+    scene, rig = hollow_ball(), rig_of(CAMERA, Intrinsics.from_fov(64, 64, 90), (0.0, 0.0, 0.75))
+    deep = mi.load_dict({"type": "path", "max_depth": 200, "rr_depth": 200})
+    reference = render(plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"}), deep, 1024, seed=1)
+    energy = transport(scene, rig, [], spp=1024, photons=0, glint=False).energy
+    assert energy.projector.mean() == pytest.approx(reference.mean(), rel=3e-3)
+    assert abs(z_score(energy.projector, reference)) < 5
+    straight = transport(scene_of(wall=wall(1.0, matte())), rig, [], spp=16).energy.projector.mean()
+    assert energy.projector.mean() / straight > 0.8
+
+
+def test_light_off_coats_and_through_holes_counts_the_scattering_surface_alone() -> None:
+    """At max_depth 2 a coat shows the lit wall, and so do six holes one behind the other."""
+    coat: dict[str, Any] = {"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0}
+    coat["diffuse_reflectance"] = {"type": "spectrum", "value": 0.0}
+    place = transform().translate([0.0, 0.0, 0.5]).rotate([0, 1, 0], 180 - 45).scale(0.2)
+    tilted = {"type": "rectangle", "to_world": place, "bsdf": coat}
+    side = transform().translate([1.0, 0.0, 0.5]).rotate([0, 1, 0], -90).scale(2)
+    beside = {"type": "rectangle", "to_world": side, "bsdf": matte()}
+    lamp = {"at": (0.3, 0.0, 0.5), "looks_at": (1.0, 0.0, 0.5)}
+    rig = rig_of(CAMERA, Intrinsics.from_fov(64, 64, 90), **lamp)
+    seen, deep = (
+        transport(scene_of(tilted=tilted, wall=beside), rig, [], spp=64, max_depth=n, photons=0).energy.projector
+        for n in (2, 7)
+    )
+    # Where the sight line leaves the coat at 45 degrees
+    mirrored = fresnel_dielectric(np.sqrt(0.5)) * 0.5 / np.pi * rig.projector_irradiance / 0.7**2
+    assert seen[20:28, 28:36].mean() == pytest.approx(mirrored, rel=0.02)
+    assert deep.mean() == pytest.approx(seen.mean(), rel=0.01)
+
+    hole = {"type": "mask", "opacity": 0.0, "b": matte()}
+    holes = {f"hole_{i}": wall(0.2 + 0.1 * i, hole, 0.3) for i in range(6)}
+    rig = rig_of(CAMERA, Intrinsics.from_fov(64, 64, 90), (0.0, 0.0, 0.75))
+    plain, through = (
+        transport(scene_of(wall=wall(1.0, matte()), **parts), rig, [], spp=16, max_depth=2, photons=0).energy.direct
+        for parts in ({}, holes)
+    )
+    np.testing.assert_allclose(through, plain, rtol=1e-4)
+
+
+# ---- The limit of a chain ---------------------------------------------------------------------------
+
+
+def gem(folder: Path, bsdf: dict[str, Any]) -> dict[str, Any]:
+    """A brilliant 0.3 m wide at 1 m, its table towards the origin: 8 + 16 + 1 corners, flat faces."""
+
+    def ring(radius: float, z: float, n: int) -> np.ndarray:
+        turn = 2 * np.pi * np.arange(n) / n
+        return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.full(n, z)])
+
+    import mitsuba as mi
+
+    select_variant()
+    hull = ConvexHull(np.vstack([ring(0.55, -0.32, 8), ring(1, 0, 16), [[0, 0, 0.86]]]))
+    faces = hull.simplices.copy()
+    a, b, c = (hull.points[faces[:, i]] for i in range(3))
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
+    faces[inwards] = faces[inwards, ::-1]
+    mesh = mi.Mesh("gem", len(hull.points), len(faces))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float((0.15 * hull.points + [0, 0, 1]).ravel().astype(np.float32))
+    parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+    parameters.update()
+    mesh.write_ply(str(folder / "gem.ply"))
+    return {"type": "ply", "filename": str(folder / "gem.ply"), "face_normals": True, "bsdf": bsdf}
+
+
+def balance(scene: Scene) -> PhotonBalance:
+    rig = rig_of(CAMERA, PROJECTOR, projector_power_w=2.0)
+    return trace_photons(scene.mitsuba, Device.projector(rig), 2.0, 100_000, 1, 1, 2 << 30).balance
+
+
+def test_what_enters_a_diamond_comes_out(tmp_path: Path) -> None:
+    """Total reflection keeps light in a faceted body of n = 2.4 for long; lossless, it gives all of it back."""
+    diamond = {"type": "dielectric", "int_ior": 2.4, "ext_ior": 1.0}
+    box = {"type": "cube", "to_world": transform().scale(2.5), "bsdf": matte()}
+    b = balance(scene_of(gem=gem(tmp_path, diamond), box=box))
+    assert b.direct + b.stored + b.truncated == pytest.approx(b.emitted, rel=1e-6)
+    assert b.truncated < 3e-3 * (b.stored + b.truncated)  # after 16 surfaces 5.8 %, after 64 0.9 %
+
+
+def test_roulette_between_mirrors_takes_no_light_and_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two facing mirrors, and the light leaves the gap after a dozen reflections: R^k of it, roulette or not."""
+    metal = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "spectrum", "value": 0.8}}
+    left, right = (
+        {
+            "type": "rectangle",
+            "to_world": transform().translate([x, 0, 1]).rotate([0, 1, 0], turn).scale(1),
+            "bsdf": metal,
+        }
+        for x, turn in ((-0.06, 90), (0.06, -90))
+    )
+    scene = scene_of(left=left, right=right, wall=wall(2.5, matte()))
+    rig = rig_of(CAMERA, Intrinsics.from_fov(64, 16, 70))
+    stored = {}
+    for after in (2, 1000):
+        monkeypatch.setattr(delta_chain, "ROULETTE_AFTER", after)
+        stored[after] = trace_photons(scene.mitsuba, Device.projector(rig), 2.0, 200_000, 1, 1, 2 << 30)
+    few, all_of_them = stored[2], stored[1000]
+    assert len(few.flux) < 0.7 * len(all_of_them.flux)
+    assert few.balance.stored == pytest.approx(all_of_them.balance.stored, rel=0.01)
