@@ -24,6 +24,7 @@ SENSORS: dict[str, tuple[Sensor, float, int]] = {  # sensor, baseline in metres,
     "amcw-tof": (AmcwToF(), 0.03, 2),
     "amcw-tof square": (AmcwToF(waveform="square"), 0.03, 2),
     "direct-tof, 200 ps pulse": (DirectToF(pulse_fwhm_s=200e-12), 0.03, 2),
+    "direct-tof, 1 ns pulse": (DirectToF(), 0.03, 2),
 }
 
 

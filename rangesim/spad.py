@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 class SpadDetector(PhotoDetector):
     """Single-photon counter with a histogram memory per pixel.
 
-    The laser fires again as soon as the histogram is full, so an exposure holds exposure_s / (start_s + bins
-    bin_s) pulses of the laser's mean power. Ambient light and dark counts spread evenly over the bins; before
-    start_s nothing is counted.
+    An exposure holds as many pulses of the laser's mean power as there are periods in it (`DirectToF.period_s`).
+    Ambient light and dark counts spread evenly over the bins; before start_s nothing is counted.
 
     Parameters
     ----------
@@ -31,8 +30,8 @@ class SpadDetector(PhotoDetector):
     quantum_efficiency : float in (0, 1], photon detection efficiency, fill factor included.
     dark_counts_hz : float, counts per second per pixel.
     bits : int in 1..16, depth of the counter of a bin.
-    pile_up : bool; True: only the first photon after each pulse is counted (Coates 1968), False: every
-        photon.
+    pile_up : bool; True: only the first photon of each histogram is counted (Coates 1968), be it of an earlier
+        pulse. False: every photon.
     ambient_transmission, band_width_m : the band-pass filter against ambient light, as of `Detector`.
     min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
     """
@@ -41,7 +40,7 @@ class SpadDetector(PhotoDetector):
     quantum_efficiency: PositiveFraction = 0.15
     dark_counts_hz: Annotated[float, Bounds("0 or positive", 0, 1e12)] = 500.0
     bits: Bits = 12
-    pile_up: bool = False
+    pile_up: bool = True
     ambient_transmission: Fraction = 0.02
     band_width_m: BandWidth = 30e-9
     min_exposure_s: Seconds = 10e-6
@@ -90,5 +89,4 @@ def _gate_s(sensor: Sensor) -> tuple[float, float]:
     """Seconds from pulse to pulse, and seconds of them during which photons are counted."""
     if not isinstance(sensor, DirectToF):
         raise ValueError(f"expected a direct-tof sensor for a SpadDetector, got {sensor.type_name}.")
-    open_s = sensor.bins * sensor.bin_s
-    return sensor.start_s + open_s, open_s
+    return sensor.period_s, sensor.bins * sensor.bin_s

@@ -168,7 +168,7 @@ def test_a_quarter_of_the_band_lets_a_quarter_of_tungsten_through_and_halves_its
 
 def test_sun_in_a_photon_counter_is_poisson_in_every_bin() -> None:
     sensor = DirectToF(bins=40, bin_s=200e-12)
-    detector = SpadDetector(bits=16, dark_counts_hz=0.0)
+    detector = SpadDetector(bits=16, dark_counts_hz=0.0, pile_up=False)
     dark = signals_of_depth(stereo_rig(), np.full((120, 160), 1.0), [sensor], albedo=0.0, ambient=1.0)
     light = Ambient("sun", irradiance_w_m2=500.0)
     counts = expose(dark, sensor, detector, 1e-3, ambient=light).frames.astype(float)

@@ -62,7 +62,7 @@ def test_captures_load_back_the_same(tmp_path: Path, sensor: Sensor, detector: P
 
 
 def test_an_uncalibrated_capture_and_wide_counts_load_back(tmp_path: Path) -> None:
-    sensor = DirectToF(bins=2)
+    sensor = DirectToF(bins=2, pulse_fwhm_s=0.0)
     capture = Capture(np.full((2, 3, 4), 60_000, dtype=np.uint32), sensor)
     capture.save(tmp_path / "c")
     loaded = load_capture(tmp_path / "c")
@@ -73,6 +73,16 @@ def test_an_uncalibrated_capture_and_wide_counts_load_back(tmp_path: Path) -> No
     with pytest.raises(FileFormatError, match="70000"):
         too_many.save(tmp_path / "d")
     assert not (tmp_path / "d").exists()
+
+
+def test_a_capture_from_before_a_setting_was_there_loads(tmp_path: Path) -> None:
+    """Its laser is the usual one."""
+    sensor = DirectToF(bins=20, bin_s=1e-9)
+    small_capture(SpadDetector(pile_up=False), sensor).save(tmp_path / "c")
+    _edit(lambda s: s["sensor"].pop("laser"))(tmp_path / "c")
+    loaded = load_capture(tmp_path / "c")
+    assert loaded.sensor == sensor
+    assert loaded.detector == SpadDetector(pile_up=False)
 
 
 def test_a_capture_is_replaced_and_nothing_else_is(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +19,10 @@ from rangesim.decoding.histogram import coates, decode_direct
 from rangesim.decoding.path_length import range_from_path_length
 from rangesim.detector import Detector
 from rangesim.exposure import expose
-from rangesim.response import SPEED_OF_LIGHT
-from rangesim.rig import Rig, translation
+from rangesim.response import SPEED_OF_LIGHT, LengthBins, LightPath, NumpyMath
+from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF
+from rangesim.signals import Signals
 from rangesim.spad import SpadDetector
 from rangesim.status import Status
 
@@ -147,8 +149,8 @@ def test_dark_and_saturated_taps_say_so() -> None:
     assert (decode(expose(signals, sensor, detector, 1.0)).status == Status.SATURATED).mean() > 0.9
 
 
-def histogram_sensor(**changes: float) -> DirectToF:
-    return DirectToF(**({"bins": 200, "bin_s": 100e-12, "start_s": 3e-9} | changes))  # type: ignore[arg-type]
+def histogram_sensor(**changes: Any) -> DirectToF:
+    return DirectToF(**({"bins": 200, "bin_s": 100e-12, "start_s": 3e-9, "pulse_fwhm_s": 0.0} | changes))
 
 
 @pytest.mark.parametrize("fwhm", [0.0, 300e-12])
@@ -194,6 +196,130 @@ def test_coates_undoes_pile_up() -> None:
     restored = coates(capture.frames.astype(np.float64), pulses)
     assert abs(restored.sum() / mean.sum() - 1) < 0.01
     assert capture.frames.sum() < 0.99 * mean.sum()
+
+
+# ---- A laser that fires again and again -------------------------------------------------------------
+
+
+def walls_at(range_m: np.ndarray, sensor: DirectToF, **settings: float) -> Signals:
+    """A wall per pixel, (1, n) of them; camera and lamp are in one place, so the path length is twice the range."""
+    rig = Rig(Intrinsics.from_fov(len(range_m), 1, 1e-3), Intrinsics.from_fov(1280, 800, 60), **settings)  # type: ignore[arg-type]
+    return signals_of_depth(rig, range_m[None], [sensor])
+
+
+GATED = {"start_s": 10e-9}
+
+
+@pytest.mark.parametrize("changes", [{}, {"pulse_fwhm_s": 0.0}, GATED], ids=["pulse", "no pulse", "gate"])
+def test_what_lies_beyond_the_range_is_a_ghost_at_the_remainder(changes: dict[str, float]) -> None:
+    """From 0.5 to 4.2 ranges: the range found is the true one modulo c / 2 times the period."""
+    sensor = DirectToF(**changes)  # type: ignore[arg-type]
+    period_m, start_m = (seconds * SPEED_OF_LIGHT / 2 for seconds in (sensor.period_s, sensor.start_s))
+    true = np.linspace(0.5, 4.2, 3701) * period_m
+    expected = true % period_m
+    image = decode(expose(walls_at(true, sensor), sensor))
+    error = (image.range_m[0] - expected + period_m / 2) % period_m - period_m / 2
+    margin = 3 * sensor.pulse_fwhm_s * SPEED_OF_LIGHT / 2 if start_m else 0.0  # a pulse that a gate cuts off is off
+    seen = (expected > start_m + margin) & (expected < period_m - margin)
+    lost = (expected > margin) & (expected < start_m - margin)
+    most_m = 2e-3 if sensor.pulse_fwhm_s else sensor.bin_s * SPEED_OF_LIGHT / 4 + 1e-4
+    assert image.valid[0][seen].mean() > 0.999  # at a range of 0 nothing is known
+    assert np.nanmax(np.abs(error[seen])) <= most_m
+    assert not image.valid[0][lost].any()
+    assert lost.any() == bool(start_m)
+
+
+def test_what_a_single_shot_leaves_behind_is_lost() -> None:
+    for laser, found in (("periodic", 0.2), ("single-shot", np.nan)):
+        sensor = DirectToF(laser=laser)  # type: ignore[arg-type]
+        most_m = sensor.period_s * SPEED_OF_LIGHT / 2
+        image = decode(expose(walls_at(np.array([0.7, 1.2]) * most_m, sensor), sensor))
+        np.testing.assert_allclose(image.range_m[0] / most_m, [0.7, found], atol=1e-3)
+
+
+@given(st.floats(0, 400), st.integers(1, 300), st.floats(1e-3, 0.5), st.floats(0, 3), st.floats(0, 3))
+def test_lengths_are_binned_modulo_the_period(
+    length_m: float, bins: int, width_m: float, start_m: float, gap_m: float
+) -> None:
+    """Every length has a bin where the bins fill the period; exactly on an edge, that on either side."""
+    response = LengthBins(start_m, width_m, bins, bins * width_m + gap_m)
+    path = LightPath(*(np.array([x]) for x in (0.0, 0.0, length_m)), np.array([True]))
+    found = response.bin(path, NumpyMath())[0]
+    places = [(length_m - start_m + d) % (bins * width_m + gap_m) for d in (-1e-6, 1e-6)]
+    assert found in [min(int(place // width_m), bins) for place in places]
+    assert found < bins or gap_m > 0
+
+
+def test_the_ghost_piles_up_before_what_it_comes_before() -> None:
+    """A pixel sees walls at 1.2 and 0.5 ranges. In each period the first photon counts, be it the ghost's."""
+    sensor = DirectToF(pulse_fwhm_s=0.0)
+    most_m = sensor.period_s * SPEED_OF_LIGHT / 2
+    ghost, near = walls_at(np.full(2000, 1.2 * most_m), sensor), walls_at(np.full(2000, 0.5 * most_m), sensor)
+    (response,) = sensor.responses()
+    detector, exposure_s, photons = SpadDetector(dark_counts_hz=0.0, bits=16), 2e-4, np.array([0.7, 0.4])  # a period
+    pulses = detector.pulses(sensor, exposure_s)
+    channel = 0
+    for signals, n in zip((ghost, near), photons, strict=True):
+        brought = detector.mean_electrons(signals.frames(sensor), sensor, ghost.rig, exposure_s).sum(axis=0)
+        channel = channel + signals.channels[response] * (n * pulses / brought)
+    capture = expose(dataclasses.replace(ghost, channels={response: channel}), sensor, detector, exposure_s)
+    bins = np.flatnonzero(capture.frames.any(axis=(1, 2)))
+    assert bins.tolist() == [51, 128]
+    expected = -np.expm1(-photons) * [1, np.exp(-photons[0])] * pulses
+    counts = capture.frames[bins, 0].mean(axis=1)
+    np.testing.assert_allclose(counts, expected, atol=5 * np.sqrt(expected.max() / 2000))
+    restored = coates(capture.frames.astype(float), pulses)[bins, 0].mean(axis=1)
+    np.testing.assert_allclose(restored, photons * pulses, rtol=0.01)
+
+
+@given(st.floats(0, 400), st.integers(2, 300), st.floats(1e-3, 0.5), st.floats(0, 3))
+def test_shared_bins_keep_the_mean_length(length_m: float, bins: int, width_m: float, start_m: float) -> None:
+    """Two bins side by side, of weights that add up to one; their centres' mean is the length modulo the period."""
+    response = LengthBins(start_m, width_m, bins, bins * width_m, is_shared=True)
+    path = LightPath(*(np.array([x]) for x in (0.0, 0.0, length_m)), np.array([True]))
+    (lower, a), (upper, b) = [(int(i[0]), float(w[0])) for i, w in response.shares(path, NumpyMath())]
+    assert a + b == pytest.approx(1)
+    assert min(a, b) >= 0
+    assert upper == (lower + 1) % bins
+    off = start_m + (lower + 0.5 + b) * width_m - length_m
+    assert (off + bins * width_m / 2) % (bins * width_m) == pytest.approx(bins * width_m / 2, abs=1e-6)
+
+
+@pytest.mark.parametrize("pulse_bins", [0.1, 0.5, 1.0, 2.0, 10.0])
+def test_the_histogram_has_the_place_and_width_of_the_pulse(pulse_bins: float) -> None:
+    """Mean, and over all places within a bin also the variance: that of the pulse, and of fine bins in a bin."""
+    sensor = DirectToF(bins=100, pulse_fwhm_s=pulse_bins * 100e-12)
+    range_m = np.linspace(0.7, 0.8, 2001)
+    frames = walls_at(range_m, sensor).channels
+    histogram = sensor.frames(list(frames.values()), np.zeros((1, 2001)), np.zeros((1, 2001)))[:, 0].astype(float)
+    histogram /= histogram.sum(axis=0)
+    place = (np.arange(100) + 0.5) @ histogram
+    true = 2 * range_m / SPEED_OF_LIGHT / sensor.bin_s
+    variance = ((np.arange(100)[:, None] + 0.5 - true) ** 2 * histogram).sum(axis=0)
+    fine = sensor.responses()[0].channels // 100
+    assert np.abs(place - true).max() < (1e-3 if fine == 1 else 0.5)
+    assert np.abs((place - true).mean()) < 0.01
+    assert variance.mean() == pytest.approx(sensor.sigma_bins**2 + (1 - fine**-2) / 12, abs=0.02)
+
+
+def test_no_light_is_lost_by_the_pulse() -> None:
+    sensor = DirectToF()
+    signals = walls_at(np.linspace(1.0, 9.0, 500), sensor)
+    (response,) = sensor.responses()
+    np.testing.assert_allclose(signals.frames(sensor).sum(axis=0), signals.channels[response].sum(axis=0), rtol=1e-5)
+
+
+def test_the_usual_sensor_knows_the_place_within_a_bin_and_piles_up() -> None:
+    """Light is shared by two bins, so the mean of a peak has no error but that of the window around it. Without a
+    pulse all light is in one bin, and the error its width over the root of 12."""
+    range_m = np.linspace(0.5, 3.5, 5000)
+    rms_m = []
+    for sensor in (DirectToF(), DirectToF(pulse_fwhm_s=0.0)):
+        image = decode(expose(walls_at(range_m, sensor), sensor))
+        rms_m.append(np.sqrt(np.mean((image.range_m[0] - range_m) ** 2)))
+    assert rms_m[0] < 0.7e-3
+    assert rms_m[1] == pytest.approx(DirectToF().bin_s * SPEED_OF_LIGHT / 2 / np.sqrt(12), rel=0.01)
+    assert SpadDetector().pile_up
 
 
 def test_histogram_of_darkness_is_low_signal() -> None:

@@ -112,8 +112,8 @@ def test_the_filter_holds_back_ambient_light() -> None:
 
 
 def test_photon_counts_are_poisson() -> None:
-    rig, sensor = stereo_rig(200, 200), DirectToF(bins=4)
-    detector = SpadDetector(dark_counts_hz=0.0, bits=16)
+    rig, sensor = stereo_rig(200, 200), DirectToF(bins=4, pulse_fwhm_s=0.0)
+    detector = SpadDetector(dark_counts_hz=0.0, bits=16, pile_up=False)
     radiance = 50 / detector.electrons_per_radiance(rig) / 1e-3
     counts = detector.read_out(np.full((4, 200, 200), radiance), sensor, rig, 1e-3, seed=0)
     assert abs(counts.mean() / 50 - 1) < 0.01
@@ -125,7 +125,7 @@ def test_the_laser_fires_again_only_when_the_histogram_is_full(start_s: float) -
     """Per second: signal at the mean power of the laser, ambient and dark counts while the histogram is open."""
     rig, sensor = stereo_rig(), DirectToF(bins=80, bin_s=100e-12, start_s=start_s)
     signals = signals_of_depth(rig, np.full((120, 160), (start_s + 5e-9) * SPEED_OF_LIGHT / 2), [sensor], ambient=2.0)
-    detector = SpadDetector(bits=16, dark_counts_hz=2e5, ambient_transmission=0.5)
+    detector = SpadDetector(bits=16, dark_counts_hz=2e5, ambient_transmission=0.5, pile_up=False)
     exposure = 1e-3
     assert detector.pulses(sensor, exposure) == round(exposure / (start_s + 8e-9))
     open_s = exposure * 8e-9 / (start_s + 8e-9)
@@ -171,13 +171,13 @@ def test_impossible_detectors_are_refused(cls: type[PhotoDetector], wrong: dict[
 
 
 def test_impossible_exposures_are_refused() -> None:
-    signals = plane_signals(stereo_rig(), SENSOR, DirectToF(bins=4))
+    signals = plane_signals(stereo_rig(), SENSOR, DirectToF(bins=4, pulse_fwhm_s=0.0))
     for exposure in (0.0, -1.0, float("inf")):
         with pytest.raises(ValueError, match="exposure_s to be positive and finite"):
             expose(signals, SENSOR, Detector(), exposure)
     with pytest.raises(ValueError, match="expected a direct-tof sensor"):
         expose(signals, SENSOR, SpadDetector(), 1e-3)
     with pytest.raises(ValueError, match="SpadDetector"):
-        expose(signals, DirectToF(bins=4), Detector(), 1e-3)
+        expose(signals, DirectToF(bins=4, pulse_fwhm_s=0.0), Detector(), 1e-3)
     with pytest.raises(ValueError, match="trace it with this sensor"):
         expose(signals, AmcwToF(), Detector(), 1e-3)

@@ -368,6 +368,27 @@ def test_the_back_of_a_thin_sheet_is_not_lit() -> None:
     assert sorted(v > 0 for v in visible) == [False, True]
 
 
+def test_bins_of_a_periodic_laser_are_those_of_a_single_shot_folded(corner: rangesim.Scene) -> None:
+    once, again = LengthBins(0.0, 0.1, 400), LengthBins(0.0, 0.1, 16, 1.6)
+    signals = transport(corner, corner.rig(**SIZE), [once, again], spp=16)
+    folded = signals.channels[once].reshape(25, 16, 48, 64).sum(axis=0)
+    assert signals.channels[once][16:].any()
+    np.testing.assert_allclose(signals.channels[again], folded, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(signals.channels[again].sum(axis=0), signals.energy.projector, rtol=1e-4, atol=1e-6)
+
+
+def test_shared_bins_keep_the_mean_length_of_light() -> None:
+    scene = rangesim.load_scene(SCENES / "plane.xml")
+    bins, first = LengthBins(0.0, 0.2, 20, is_shared=True), FirstReturn()
+    signals = transport(scene, scene.rig(**SIZE), [bins, first], spp=16, max_depth=2)
+    radiance, moment = signals.channels[first]
+    centres = (np.arange(20) + 0.5) * 0.2
+    np.testing.assert_allclose(signals.channels[bins].sum(axis=0), radiance, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.tensordot(centres, signals.channels[bins], 1) / radiance, moment / radiance, atol=1e-5
+    )
+
+
 # ---- Ground truth -----------------------------------------------------------------------------------
 
 

@@ -145,5 +145,4 @@ def _ambient_in_frame(capture: Capture) -> float:
 
 def _window_bins(sensor: DirectToF) -> int:
     """Bins in the window of a peak; see `rangesim.decoding.histogram.find_peak`."""
-    sigma_bins = sensor.pulse_fwhm_s / sensor.bin_s / np.sqrt(8 * np.log(2))
-    return 2 * max(1, int(np.ceil(2 * sigma_bins + 0.5))) + 1
+    return 2 * max(1, int(np.ceil(2 * sensor.sigma_bins + 0.5))) + 1

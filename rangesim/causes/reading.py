@@ -82,9 +82,10 @@ def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath
 
 def _weights(response: Response, path: LightPath) -> np.ndarray:
     if isinstance(response, SparseResponse):
-        index = np.minimum(np.asarray(response.bin(path, NumpyMath())), response.channels).astype(np.intp)
-        result = np.zeros((response.channels + 1, *index.shape), dtype=np.float32)
-        np.put_along_axis(result, index[None], 1.0, axis=0)
+        result = np.zeros((response.channels + 1, *path.u.shape), dtype=np.float32)
+        for index, weight in response.shares(path, NumpyMath()):
+            bins = np.minimum(np.asarray(index), response.channels).astype(np.intp)[None]
+            np.put_along_axis(result, bins, np.take_along_axis(result, bins, axis=0) + weight, axis=0)
         return result[:-1]
     assert isinstance(response, DenseResponse)
     shape = path.u.shape

@@ -46,7 +46,8 @@ def decode_direct(capture: Capture) -> RangeImage:
     position, peak, background = (np.empty(capture.frames.shape[1:]) for _ in range(3))
     for rows in _row_chunks(capture.frames.shape):
         histogram = _histogram(capture, capture.frames[:, rows])
-        position[rows], peak[rows], background[rows] = find_peak(histogram, _sigma_bins(sensor))
+        found = find_peak(histogram, sensor.sigma_bins, sensor.is_cyclic)
+        position[rows], peak[rows], background[rows] = found
     length = (sensor.start_s + position * sensor.bin_s) * SPEED_OF_LIGHT
 
     status = np.where(_is_weak(capture, peak, background), Status.LOW_SIGNAL, Status.OK)
@@ -55,24 +56,33 @@ def decode_direct(capture: Capture) -> RangeImage:
     return range_image_from_path_length(capture, length, status, peak / (bright_level(peak) or 1.0), intensity)
 
 
-def find_peak(histogram: np.ndarray, sigma_bins: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_peak(
+    histogram: np.ndarray, sigma_bins: float, is_cyclic: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Strongest peak of histograms (k, h, w): its place, its height and the background under it, each (h, w).
 
     Place in bins from the start of the first bin (the centre of bin b is b + 0.5); height is the sum over the
-    peak's window less the background, background the sum under that window.
+    peak's window less the background, background the sum under that window. `is_cyclic`: a window goes on at the
+    other end.
     """
-    reach = max(1, int(np.ceil(2 * sigma_bins + 0.5)))
-    highest = _matched(histogram, sigma_bins).argmax(axis=0)
     bins = len(histogram)
-    width = np.minimum(highest + reach, bins - 1) - np.maximum(highest - reach, 0) + 1
-    inside = _window(histogram, highest, reach)
-    level = (histogram.sum(axis=0) - np.sum([c for _, c in inside], axis=0)) / np.maximum(bins - width, 1)
-    place = _centroid(inside, level, highest)
-    recentred = np.clip(np.floor(place), 0, bins - 1).astype(np.intp)
-    inside = _window(histogram, recentred, reach)
+    reach = max(1, int(np.ceil(2 * sigma_bins + 0.5)))
+    if is_cyclic:
+        reach = min(reach, (bins - 1) // 2)
+    highest = _matched(histogram, sigma_bins, is_cyclic).argmax(axis=0)
+    width: np.ndarray | int = 2 * reach + 1
+    if not is_cyclic:
+        width = np.minimum(highest + reach, bins - 1) - np.maximum(highest - reach, 0) + 1
+    inside = _window(histogram, highest, reach, is_cyclic)
+    outside = histogram.sum(axis=0) - np.sum([c for _, c in inside], axis=0)
+    level = np.maximum(outside, 0) / np.maximum(bins - width, 1)  # a difference: rounding may leave less than nothing
+    place = np.floor(_centroid(inside, level, highest))
+    recentred = (place % bins if is_cyclic else np.clip(place, 0, bins - 1)).astype(np.intp)
+    inside = _window(histogram, recentred, reach, is_cyclic)
     counts = np.sum([c for _, c in inside], axis=0)
     background = level * width
-    return _centroid(inside, level, recentred), counts - background, background
+    centroid = _centroid(inside, level, recentred)
+    return centroid % bins if is_cyclic else centroid, counts - background, background
 
 
 def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
@@ -89,25 +99,27 @@ def _histogram(capture: Capture, frames: np.ndarray) -> np.ndarray:
     return counts
 
 
-def _sigma_bins(sensor: DirectToF) -> float:
-    return sensor.pulse_fwhm_s / sensor.bin_s / np.sqrt(8 * np.log(2))
-
-
-def _matched(histogram: np.ndarray, sigma_bins: float) -> np.ndarray:
+def _matched(histogram: np.ndarray, sigma_bins: float, is_cyclic: bool) -> np.ndarray:
     if sigma_bins <= 0:
         return histogram
     from scipy.ndimage import gaussian_filter1d
 
-    return np.asarray(gaussian_filter1d(histogram, sigma_bins, axis=0, mode="nearest"))
+    return np.asarray(gaussian_filter1d(histogram, sigma_bins, axis=0, mode="wrap" if is_cyclic else "nearest"))
 
 
-def _window(histogram: np.ndarray, centre: np.ndarray, reach: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Bin index and counts (zero beyond the ends), each (h, w), of the bins `reach` around `centre`."""
-    result = []
+def _window(
+    histogram: np.ndarray, centre: np.ndarray, reach: int, is_cyclic: bool
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Bin index and counts, each (h, w), of the bins `reach` around `centre`; beyond the ends zero, or the other end.
+
+    Indices go on beyond the ends, so that their mean is a place.
+    """
+    result, bins = [], len(histogram)
     for offset in range(-reach, reach + 1):
         index = centre + offset
-        valid = (index >= 0) & (index < len(histogram))
-        counts = np.take_along_axis(histogram, np.clip(index, 0, len(histogram) - 1)[None], axis=0)[0]
+        valid = is_cyclic | ((index >= 0) & (index < bins))
+        at = index % bins if is_cyclic else np.clip(index, 0, bins - 1)
+        counts = np.take_along_axis(histogram, at[None], axis=0)[0]
         result.append((index, np.where(valid, counts, 0.0)))
     return result
 

@@ -75,12 +75,13 @@ class Accumulators:
                     brought = [dr.select(is_smooth, 0, radiance), dr.select(is_smooth, radiance, 0)]
                 values = [dr.fma(b, w, v) for v, (b, w) in zip(values, product(brought, weights), strict=True)]
             elif isinstance(response, SparseResponse):
-                index = response.bin(path, math)
-                target = dr.fma(index, self.stride, place)
-                inside = active & (index < response.channels)
-                if self.parts == 2:
-                    target += dr.select(is_smooth, response.channels * self.stride, 0)
-                dr.scatter_add(self.bins[response], radiance, target, inside, mode=dr.ReduceMode.NoConflicts)
+                for index, weight in response.shares(path, math):
+                    target = dr.fma(index, self.stride, place)
+                    inside = active & (index < response.channels)
+                    if self.parts == 2:
+                        target += dr.select(is_smooth, response.channels * self.stride, 0)
+                    brought = radiance * weight
+                    dr.scatter_add(self.bins[response], brought, target, inside, mode=dr.ReduceMode.NoConflicts)
             result.append(values)
         return result
 

@@ -105,8 +105,12 @@ class DenseResponse(Response):
 
 
 class SparseResponse(Response):
-    """A path counts in one bin, with weight one, or in none."""
+    """A path counts in one bin, with weight one, or in none; or in the few that `shares` names."""
 
     @abstractmethod
     def bin(self, path: LightPath, m: Math) -> Any:
         """Unsigned bin index; an index >= `channels` means none."""
+
+    def shares(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
+        """Unsigned bin indices, each with the weight that the path has there."""
+        return [(self.bin(path, m), 1.0)]

@@ -14,8 +14,10 @@ from rangesim.bounds import HERTZ, Bounds, Hertz, check_fields, check_number, wh
 from rangesim.response import SPEED_OF_LIGHT, FirstReturn, LengthBins, Phasor, Response
 from rangesim.sensors.base import Sensor
 
-OVERSAMPLING = 4
-"""Bins of the transport pass per bin of a sensor with a pulse."""
+OVERSAMPLING = (1, 2, 4)
+"""Bins of the transport pass per bin of a sensor with a pulse: so many that its sigma is at least one of them."""
+SHARED_VARIANCE = 1 / 6
+"""Mean variance in bins squared of light that is shared by two bins, which the blur leaves out."""
 MAX_RANGE_M = 100.0
 """Ranges beyond are not searched by phase unwrapping, even if the frequencies were unambiguous farther out."""
 TAPS = 4
@@ -109,7 +111,9 @@ class AmcwToF(Sensor):
 class DirectToF(Sensor):
     """Pulsed time of flight with a photon histogram per pixel (SPAD and TDC). Frames: the bins.
 
-    Ambient light spreads evenly over the bins.
+    The laser fires again as soon as the histogram is full, every `period_s`. So light that comes back later is counted
+    with that of a later pulse: a wall at 1.2 times the range is a ghost at 0.2 times. Ambient light spreads evenly over
+    the bins.
 
     Parameters
     ----------
@@ -117,13 +121,16 @@ class DirectToF(Sensor):
     bin_s : float, seconds, width of a bin.
     start_s : float, seconds, delay of the first bin after the pulse.
     pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response; 0 for none. With a
-        pulse, paths are sorted into `OVERSAMPLING` times finer bins, so that the blur keeps their place within a bin.
+        pulse, a path is shared by the two bins next to it, so that its place within a bin is kept; bins of the pass are
+        up to four times as fine where the pulse is narrow (`OVERSAMPLING`).
+    laser : "periodic", or "single-shot": light that comes back after the histogram is full is lost.
     """
 
     bins: Annotated[int, whole(2, "bins")] = 256
     bin_s: Annotated[float, Bounds("positive and finite", 1e-15, 1e-3)] = 100e-12
     start_s: Annotated[float, Bounds("0 or positive", 1e-15, 1e-3, or_zero=True)] = 0.0
-    pulse_fwhm_s: Annotated[float, Bounds("0 or positive", 1e-15, 1e-3, or_zero=True)] = 0.0
+    pulse_fwhm_s: Annotated[float, Bounds("0 or positive", 1e-15, 1e-3, or_zero=True)] = 1e-9
+    laser: Literal["periodic", "single-shot"] = "periodic"
 
     type_name: ClassVar[str] = "direct-tof"
 
@@ -136,23 +143,44 @@ class DirectToF(Sensor):
                 f"got {self.pulse_fwhm_s:g}."
             )
 
+    @property
+    def period_s(self) -> float:
+        """Seconds from pulse to pulse."""
+        return self.start_s + self.bins * self.bin_s
+
+    @property
+    def is_cyclic(self) -> bool:
+        """Whether the first bin follows on the last one."""
+        return self.laser == "periodic" and self.start_s == 0
+
     def responses(self) -> tuple[Response, ...]:
-        fine = self._fine
-        return (LengthBins(self.start_s * SPEED_OF_LIGHT, self.bin_s * SPEED_OF_LIGHT / fine, self.bins * fine),)
+        fine, c = self._fine, SPEED_OF_LIGHT
+        period_m = self.period_s * c if self.laser == "periodic" else None
+        width_m, has_pulse = self.bin_s * c / fine, self.pulse_fwhm_s > 0
+        return (LengthBins(self.start_s * c, width_m, self.bins * fine, period_m, is_shared=has_pulse),)
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         histogram = np.asarray(channels[0], dtype=np.float32)
-        if self.pulse_fwhm_s > 0:
+        variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
+        if variance > 0:
             from scipy.ndimage import gaussian_filter1d
 
-            sigma = self._fine * self.pulse_fwhm_s / self.bin_s / np.sqrt(8 * np.log(2))
-            blurred = gaussian_filter1d(histogram, sigma, axis=0, mode="constant")
-            histogram = blurred.reshape(self.bins, self._fine, *blurred.shape[1:]).sum(axis=1)
+            mode = "wrap" if self.is_cyclic else "constant"
+            histogram = gaussian_filter1d(histogram, np.sqrt(variance), axis=0, mode=mode)
+        if self._fine > 1:
+            histogram = histogram.reshape(self.bins, self._fine, *histogram.shape[1:]).sum(axis=1)
         return np.asarray(histogram + (ambient / self.bins).astype(np.float32), dtype=np.float32)
 
     @property
+    def sigma_bins(self) -> float:
+        """Standard deviation of the pulse, in bins."""
+        return float(self.pulse_fwhm_s / self.bin_s / np.sqrt(8 * np.log(2)))
+
+    @property
     def _fine(self) -> int:
-        return OVERSAMPLING if self.pulse_fwhm_s > 0 else 1
+        if self.pulse_fwhm_s == 0:
+            return 1
+        return next((n for n in OVERSAMPLING if n * self.sigma_bins >= 1), OVERSAMPLING[-1])
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:
         return self.n_frames
