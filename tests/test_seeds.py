@@ -81,7 +81,7 @@ def a_moving_scan(scene: Scene, seed: int) -> list[np.ndarray]:
     sensor, motion = AmcwToF(), Motion({"ball": SteadyTrack((1.0, 0.0, 0.0))})
     timing = Timing(line_period_s=1e-4, bands=2)
     rig = scene.rig(width=8, height=8)
-    options: dict[str, Any] = {"spp": 1, "photons": 0, "glint": False}
+    options: dict[str, Any] = {"spp": 2, "photons": 0, "glint": False}
     return [transport_moving(scene, rig, {sensor: timing}, motion, seed=seed, **options)[sensor].lit[:, 4:]]
 
 
