@@ -145,8 +145,9 @@ def trace_photons(
         for sums in np.column_stack([np.add.reduceat(x.numpy(), blocks, dtype=np.float64) for x in fate]):
             balance += sums
         report()
-    columns = [np.concatenate(parts) for parts in zip(*landed, strict=True)]
-    return Photons(*columns, PhotonBalance(*(balance / maps)), total / cumulative[-1])
+    position, direction, flux, u, v, length, cosine, of_map = map(np.concatenate, zip(*landed, strict=True))
+    total_balance = PhotonBalance(*(balance / maps))
+    return Photons(position, direction, flux, u, v, length, cosine, of_map, total_balance, total / cumulative[-1])
 
 
 def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:
