@@ -44,19 +44,18 @@ def timed(task: Callable[[], Any]) -> tuple[Any, np.ndarray]:
 
 def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.ndarray]:
     """Photons that landed, and (repeats, 2) seconds to trace them and to build their maps."""
-    from rangesim.light_transport.caustics import PHOTONS, gathering_angle
+    from rangesim.light_transport.caustics import PHOTONS, gathering_radius
     from rangesim.light_transport.device import Device
     from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
     from rangesim.light_transport.photons import trace_photons
 
-    maps, z = min(spp, MOST_MAPS), scene.working_distance_m
-    irradiance = rig.projector_irradiance / z**2
+    maps = min(spp, MOST_MAPS)
     trace = partial(trace_photons, scene.mitsuba, Device.projector(rig), rig.projector_power_w, PHOTONS, maps)
     seconds = []
     for seed in range(repeats + 1):
         landed, tracing = timed(partial(trace, seed=seed, memory_bytes=2 << 30))
-        radius_m = z * gathering_angle(rig, landed.per_pixel)
-        _, building = timed(partial(PhotonMaps, landed, maps, radius_m, irradiance))
+        radius = gathering_radius(rig, landed.per_pixel)
+        _, building = timed(partial(PhotonMaps, landed, maps, radius, rig.projector_irradiance))
         seconds.append([tracing[0], building[0]])
     return len(landed.flux), np.array(seconds[1:])
 

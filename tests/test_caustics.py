@@ -29,9 +29,9 @@ from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight,
 from rangesim.light_transport import photon_maps
 from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.photon_maps import ALPHA, Level, radii_of_maps
+from rangesim.light_transport.photon_maps import ALPHA, GatheringRadius, Level, radii_of_maps
 from rangesim.light_transport.photons import PhotonBalance, Photons, shift_of, stratified_choice, trace_photons
-from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Images, LengthBins, LightPath
+from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Fringes, Images, LengthBins, LightPath
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 CAMERA = Intrinsics.from_fov(64, 48, 20)
@@ -355,13 +355,16 @@ def test_a_gather_is_the_sum_over_all_photons_of_its_map(
     flux = rng.uniform(0.5, 1.5, photons).astype(np.float32)
     none = PhotonBalance(0, 0, 0, 0, 0, 0)
     landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map, none, per_pixel=1.0)
-    built = photon_maps.PhotonMaps(landed, maps, radius_m, irradiance=1e-9)  # all brighter than the first level
+    there = np.array([0.0, 0.0, 3.0])
+    radius = GatheringRadius(0.0, (0.0, 0.0), there, there, fixed_m=radius_m)
+    built = photon_maps.PhotonMaps(landed, maps, radius, irradiance=1e-9)  # all brighter than the first level
     points, repeats = on_the_plane(1000), 64
     sample = np.arange(1000) % maps
     many = mi.UInt32(np.tile(sample, repeats).astype(np.uint32))
     uniform = [mi.Float(rng.random(1000 * repeats).astype(np.float32)) for _ in range(2)]
     active = dr.full(mi.Bool, True, 1000 * repeats)
-    found = built.gather(0, mi.Point3f(np.tile(points, (repeats, 1)).T), mi.Normal3f(*normal), many, *uniform, active)
+    place = mi.Point3f(np.tile(points, (repeats, 1)).T)
+    found = built.gather(0, place, mi.Normal3f(*normal), built.reach(place), many, *uniform, active)
     gathered = found.irradiance.numpy().reshape(repeats, 1000)
 
     radii = radii_of_maps(radius_m, maps)[sample][:, None]
@@ -372,6 +375,42 @@ def test_a_gather_is_the_sum_over_all_photons_of_its_map(
         np.testing.assert_allclose(gathered, np.broadcast_to(expected, gathered.shape), atol=1e-4 * expected.max())
     error = gathered.mean(axis=1).std(ddof=1) / np.sqrt(repeats)
     assert abs(gathered.mean() - expected.mean()) < 5 * error + 1e-4 * expected.mean()
+
+
+def test_a_gather_whose_radius_grows_with_distance_is_the_sum_over_all_photons(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Radii of some twenty classes on one plane; a point has the radius of its own place."""
+    import drjit as dr
+    import mitsuba as mi
+
+    select_variant()
+    monkeypatch.setattr(photon_maps, "MOST_LOOKED_AT", 10_000)
+    rng, n, maps = np.random.default_rng(2), 40_000, 4
+
+    def on_the_plane(k: int) -> np.ndarray:
+        return np.column_stack([rng.uniform(-2, 2, (k, 2)), np.zeros(k)]).astype(np.float32)
+
+    position, of_map, nothing = on_the_plane(n), np.arange(n) % maps, np.zeros(n, np.float32)
+    flux = rng.uniform(0.5, 1.5, n).astype(np.float32)
+    none = PhotonBalance(0, 0, 0, 0, 0, 0)
+    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map, none, per_pixel=1.0)
+    radius = GatheringRadius(0.05, (0.02, 0.07), np.array([-1.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.05]))
+    built = photon_maps.PhotonMaps(landed, maps, radius, irradiance=1e-9)
+    points, sample = on_the_plane(2000), np.arange(2000) % maps
+    place, many = mi.Point3f(points.T), mi.UInt32(sample.astype(np.uint32))
+    active, half = dr.full(mi.Bool, True, 2000), dr.full(mi.Float, 0.5, 2000)
+    reach = built.reach(place)
+    found = built.gather(0, place, mi.Normal3f(0, 0, 1), reach, many, half, half, active)
+
+    radii = radius.at(points) * radii_of_maps(1.0, maps)[sample]
+    np.testing.assert_allclose(reach.radius.numpy(), radius.at(points), rtol=1e-5)
+    square = ((points[:, None].astype(float) - position[None]) ** 2).sum(axis=-1)
+    kernel = np.maximum(1 - square / radii[:, None] ** 2, 0) * 2 / (np.pi * radii[:, None] ** 2)
+    expected = (kernel * (of_map[None] == sample[:, None])) @ flux
+    np.testing.assert_allclose(found.irradiance.numpy(), expected, atol=1e-3 * expected.max())
+    near = built.near(0, place, reach, many, active).numpy()
+    assert near[expected > 0].all()
 
 
 def ball_over_a_plane() -> tuple[Scene, Rig]:
@@ -427,6 +466,34 @@ def test_levels_change_the_noise_and_not_the_mean(monkeypatch: pytest.MonkeyPatc
     assert np.abs(ratio[1:3, 1:3] - 1).max() < 0.02
     assert np.abs(ratio - ratio[:, ::-1]).max() < 0.06
     assert with_levels.mean() == pytest.approx(without.mean(), rel=0.005)
+
+
+def board_behind_a_pane(wall_z: float | None, **parts: dict[str, Any]) -> tuple[Scene, Rig]:
+    """A board at 0.6 m that covers a fifth of the image, behind a pane at 0.5 m, and a wall behind."""
+    parts["board"] = wall(0.6, matte(), 0.09)
+    if wall_z is not None:
+        parts["wall"] = wall(wall_z, matte())
+    camera = Intrinsics.from_fov(160, 120, 40)
+    return scene_of(**parts), rig_of(camera, Intrinsics.from_fov(640, 480, 44), (0.1, 0.0, 0.0), (0.0, 0.0, 0.6))
+
+
+def fringe_contrast(scene: Scene, rig: Rig, **options: Any) -> float:
+    """Of fringes of 16 projector pixels: amplitude over mean, mean over the board's inner pixels."""
+    options = {"spp": 64, "max_depth": 4, "glint": False, **options}
+    signals = transport(scene, rig, [Fringes(0, 16.0)], **options)
+    board = (..., slice(32, -32), slice(52, -52))
+    amplitude = np.hypot(*signals.channels[Fringes(0, 16.0)][board])
+    return float((amplitude / signals.energy.projector[board]).mean())
+
+
+@pytest.mark.parametrize("wall_z", [0.9, 6.0])
+def test_a_far_wall_does_not_blur_near_fringes_behind_a_pane(wall_z: float) -> None:
+    pane = wall(0.5, {**GLASS, "type": "thindielectric"}, 0.1)
+    free = fringe_contrast(*board_behind_a_pane(None))
+    alone = fringe_contrast(*board_behind_a_pane(None, pane=pane))
+    behind = fringe_contrast(*board_behind_a_pane(wall_z, pane=pane))
+    assert behind == pytest.approx(alone, abs=0.005)
+    assert behind == pytest.approx(free, abs=0.05)
 
 
 def test_more_photons_make_less_noise() -> None:

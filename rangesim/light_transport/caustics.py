@@ -11,7 +11,7 @@ import numpy as np
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.indirect import REACH_PX
 from rangesim.light_transport.medium import Media
-from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
+from rangesim.light_transport.photon_maps import MOST_MAPS, GatheringRadius, PhotonMaps
 from rangesim.light_transport.photons import has_delta, trace_photons
 from rangesim.rig import Rig
 from rangesim.scene import Scene
@@ -19,9 +19,9 @@ from rangesim.scene import Scene
 PHOTONS = 500_000
 PHOTONS_PER_DISC = 400
 """Photons of all maps within the largest radius, where light is neither spread nor focused."""
-RADIUS_IN_PROJECTOR_PIXELS = 4.0
+RADIUS_IN_PROJECTOR_PIXELS = 3.0
 RADIUS_IN_CAMERA_PIXELS = (0.3, 3.0)
-"""Bounds of the largest photon radius, at the working distance: finer than the stripes, about as fine as the image."""
+"""Bounds of the largest photon radius, where it is: finer than the stripes, about as fine as the image."""
 
 SMALLEST_RADIUS_M = 1e-6
 
@@ -48,17 +48,17 @@ def caustic_maps(
     landed = trace_photons(
         scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media, surfaces, report
     )
-    radius_m = radius_m or scene.working_distance_m * gathering_angle(rig, landed.per_pixel)
-    irradiance = rig.projector_irradiance / scene.working_distance_m**2
-    wide_m = scene.working_distance_m * REACH_PX / rig.camera.fx
-    return PhotonMaps(landed, maps, radius_m, irradiance, wide_m) if len(landed.flux) else None
+    radius = gathering_radius(rig, landed.per_pixel, radius_m)
+    wide = REACH_PX / rig.camera.fx
+    return PhotonMaps(landed, maps, radius, rig.projector_irradiance, wide) if len(landed.flux) else None
 
 
-def gathering_angle(rig: Rig, photons_per_pixel: float) -> float:
-    """Largest photon radius at z = 1 m: wide enough for `PHOTONS_PER_DISC`, within bounds."""
+def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None = None) -> GatheringRadius:
+    """Largest photon radius: wide enough for `PHOTONS_PER_DISC`, within bounds; or the same everywhere."""
     of_projector = min(np.sqrt(PHOTONS_PER_DISC / (np.pi * photons_per_pixel)), RADIUS_IN_PROJECTOR_PIXELS)
     low, high = (pixels / rig.camera.fx for pixels in RADIUS_IN_CAMERA_PIXELS)
-    return float(np.clip(of_projector / rig.projector.fx, low, high))
+    places = (rig.T_world_projector[:3, 3], rig.T_world_camera[:3, 3])
+    return GatheringRadius(float(of_projector / rig.projector.fx), (low, high), *places, fixed_m)
 
 
 def check_photons(photons: int, radius_m: float | None) -> None:

@@ -459,10 +459,11 @@ def gather(
     """
     photon, irradiance = dr.zeros(mi.UInt32, dr.width(sample)), dr.zeros(mi.Float, dr.width(sample))
     pick, is_wide = mi.Float(xi[2]), dr.full(mi.Bool, False, dr.width(sample))
+    reach = maps.reach(vertex.si.p)
     for level, kind in enumerate(LEVELS):
         p, n = vertex.si.p, vertex.si.n
-        if maps.near(level, p, sample, active & (chance < kind.chance)):
-            found = maps.gather(level, p, n, sample, xi[0], xi[1], active)
+        if maps.near(level, p, reach, sample, active & (chance < kind.chance)):
+            found = maps.gather(level, p, n, reach, sample, xi[0], xi[1], active)
             irradiance += found.irradiance / kind.chance
             share = dr.select(irradiance > 0, found.irradiance / kind.chance / irradiance, 0)
             taken = pick < share

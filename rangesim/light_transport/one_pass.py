@@ -75,7 +75,7 @@ def transport(
     photons : int >= 0, caustic photons: the projector's light through glass and off mirrors, see
         `rangesim.light_transport.photons`; 0: none, and such light is missing. No cost without such surfaces.
     caustic_radius_m : metres, largest radius over which photons are gathered; None: as wide as the number of photons
-        asks for, at most four pixels of the projector or three of the camera at the working distance. Caustics are
+        asks for, at most three pixels of the projector or of the camera at the distance of the point. Caustics are
         blurred by about half of it.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and far less

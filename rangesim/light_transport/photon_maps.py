@@ -6,6 +6,10 @@ of one large one: sample s of a pixel looks into map s mod n, and the maps' radi
 photon mapping (Knaus, Zwicker 2011, eq. 15; their alpha is our `ALPHA`). A sample so pays for a few photons only, and
 the pixel as a whole sees all of them.
 
+How far a gather reaches follows from where it is (`GatheringRadius`). A grid has cells of one size, so photons are
+sorted by the radius there into classes, `CLASSES_PER_OCTAVE` for each factor of two, and a point looks into the cells
+of its own class. Photons near a border between two classes are in the cells of both.
+
 Photons are sorted into `LEVELS` by the light they bring, compared with the projector's direct light. Fainter light is
 gathered over larger radii, because few photons carry it, and by fewer vertices, because little depends on it.
 
@@ -15,6 +19,7 @@ stands for them all. So BSDF and sensor responses are evaluated once per vertex,
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -26,16 +31,29 @@ from rangesim.light_transport.photons import Photons
 ALPHA = 2 / 3
 MOST_MAPS = 64
 """Photon maps; with more samples per pixel than this, several samples share a map."""
+CLASSES_PER_OCTAVE = 4
+STEEPEST = 1 / 12
+"""Radius of the brightest level over the distance, at most; that of the faintest is half the distance then."""
 FLATNESS = 0.3
 """Photons farther than this share of the radius above or below the tangent plane lie on another surface."""
 MOST_LOOKED_AT = 16
 """Photons that a gather looks at, where there are more."""
 OCCUPANCY_CELLS = 1 << 18
 PRIMES = (73856093, 19349663, 83492791)
+CLASS_PRIME = 50331653
 """Spatial hash (Teschner et al. 2003), but added: combined by exclusive or, opposite cells would share a place."""
+BESIDE = 1e-4
+"""Relative error of a radius that does not put a photon into the wrong class."""
+USUAL = 0.05
+"""Quantile of the radii, over the distance from the camera, that stands for them all."""
 FOLD = 1024
 """Cells along x after which a row turns back on itself, so that the table stays small in a large scene."""
 ROW_FACTORS = (0x9E3779B3, 0x85EBCA75)
+CLASS_FACTOR = 0xC2B2AE3D
+UNBOUNDED = 1e30
+"""Stands for infinity in single precision."""
+LEAST_M = 1e-9
+"""Least radius: at a device itself."""
 
 
 class Level(NamedTuple):
@@ -54,11 +72,54 @@ class Level(NamedTuple):
 LEVELS = (Level(np.inf, 1.0, 1.0), Level(0.1, 2.5, 0.25), Level(0.01, 6.0, 0.1))
 
 
+@dataclass(frozen=True)
+class GatheringRadius:
+    """How far photons of the brightest level are gathered around a point, in the first map: `projector` times the
+    distance from the projector, within `camera` (least, most) times the distance from the camera; or `fixed_m`.
+
+    Distances are straight ones: light that came a long way round, off a mirror, has spread and is fainter than direct
+    light would be, so a wider level has it. Angles are radians, capped at `STEEPEST`; centres metres, world.
+    """
+
+    projector: float
+    camera: tuple[float, float]
+    projector_at: np.ndarray
+    camera_at: np.ndarray
+    fixed_m: float | None = None
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """a, b, c, d: the radius is a + b x distance from the projector, within c and d x distance from the camera."""
+        if self.fixed_m is not None:
+            return self.fixed_m, 0.0, 0.0, UNBOUNDED
+        of_projector, least, most = (min(angle, STEEPEST) for angle in (self.projector, *self.camera))
+        return 0.0, of_projector, least, most
+
+    def at(self, position: np.ndarray) -> np.ndarray:
+        """(n,) metres at positions (n, 3)."""
+        a, b, c, d = self.bounds()
+        from_camera = np.linalg.norm(position - self.camera_at, axis=1)
+        return np.clip(a + b * np.linalg.norm(position - self.projector_at, axis=1), c * from_camera, d * from_camera)
+
+    @property
+    def steepness(self) -> float:
+        """How fast the radius grows, at most, in metres per metre."""
+        return 0.0 if self.fixed_m is not None else max(self.bounds()[1:])
+
+
 class Gathered(NamedTuple):
     """The photons near a point: index of the one that stands for all, and their irradiance in W/m2; 0: none."""
 
     photon: Any
     irradiance: Any
+
+
+class Reach(NamedTuple):
+    """How far a gather reaches at a point: radius of the brightest level in the first map, metres; number of the class
+    of that radius; and edge of the cells of this class, metres."""
+
+    radius: Any
+    kind: Any
+    edge: Any
 
 
 class Flight(NamedTuple):
@@ -73,7 +134,7 @@ class Flight(NamedTuple):
 
 
 class PhotonMaps:
-    """Photons sorted into grid cells of twice the radius of their map and level, on the renderer's side.
+    """Photons sorted into grid cells of twice the radius of their map, level and class, on the renderer's side.
 
     A point looks at 2 x 2 x 2 cells. The two along x are neighbours in memory, so that makes four ranges of photons.
 
@@ -81,28 +142,37 @@ class PhotonMaps:
     ----------
     photons : Photons, one or more.
     maps : int in 1..MOST_MAPS, independent maps they were dealt out to.
-    radius_m : metres, largest radius of the brightest level.
-    irradiance : W/m2, direct light of the projector where the scene is.
-    wide_m : metres, radius from which on gathered light counts as smooth.
+    radius : GatheringRadius, of the first map and the brightest level.
+    irradiance : W/m2, direct light of the projector at 1 m.
+    wide : radians, radius over the distance from the camera from which on gathered light counts as smooth.
     """
 
-    def __init__(self, photons: Photons, maps: int, radius_m: float, irradiance: float, wide_m: float = np.inf) -> None:
-        self.is_wide = [radius_m * one.radius >= wide_m for one in LEVELS]
+    def __init__(
+        self, photons: Photons, maps: int, radius: GatheringRadius, irradiance: float, wide: float = np.inf
+    ) -> None:
+        at_photons = np.maximum(radius.at(photons.position), LEAST_M)
+        # Of a whole level, lest light be smooth on one side of a line and not on the other
+        from_camera = np.linalg.norm(photons.position - radius.camera_at, axis=1)
+        usual = float(np.quantile(at_photons / np.maximum(from_camera, LEAST_M), USUAL))
+        self.is_wide = [usual * one.radius >= wide for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
-        level = levels_of(photons, maps, 4 * radius_m, irradiance)
-        radii = np.concatenate([radii_of_maps(radius_m * one.radius, maps) for one in LEVELS])
-        of_map = level * maps + photons.map
-        origin = photons.position.min(axis=0) - radii.max()
+        unit = float(at_photons.min()) * (1 + BESIDE)
+        level = levels_of(photons, maps, at_photons, radius, irradiance)
+        factors = np.array([one.radius for one in LEVELS])
+        shrinkage = radii_of_maps(1.0, maps)
+        copies, kind = _in_classes(at_photons / unit, radius.steepness * factors[level])
+        position, level, of_map = photons.position[copies], level[copies], photons.map[copies]
+        origin = position.min(axis=0)
+        edge = 2 * unit * 2 ** (kind / CLASSES_PER_OCTAVE) * factors[level]
         rows = 1 << int(np.ceil(np.log2(max(16, len(photons.flux) / maps))))
-        cell = np.floor((photons.position - origin) * (0.5 / radii[of_map])[:, None].astype(np.float32)).astype(
-            np.int64
-        )
+        cell = _cells(position - origin, edge * shrinkage[of_map])
         stride = rows + FOLD + 1
-        key = of_map * stride + _row(cell[:, 1], cell[:, 2], rows - 1) + _column(cell[:, 0])
+        key = (level * maps + of_map) * stride + _row(cell[:, 1], cell[:, 2], kind, rows - 1) + _column(cell[:, 0])
         order = np.argsort(key, kind="stable")
-        starts = np.cumsum(np.bincount(key + 1, minlength=len(radii) * stride + 1))
+        starts = np.cumsum(np.bincount(key + 1, minlength=len(LEVELS) * maps * stride + 1))
+        order, occupancy_of = copies[order], (position - origin, of_map, kind, edge)
         points = np.column_stack([photons.position, photons.flux])
-        padding = np.zeros(len(order), np.float32)
+        padding = np.zeros(len(points), np.float32)
         columns = [photons.direction, photons.u, photons.v, photons.length_m, photons.cosine, padding]
         flights = np.column_stack(columns)
 
@@ -110,30 +180,43 @@ class PhotonMaps:
         self.starts = mi.UInt32(starts.astype(np.uint32))
         self.points = mi.Float(points[order].astype(np.float32).ravel())
         self.flights = mi.Float(flights[order].astype(np.float32).ravel())
-        self.radii = mi.Float(radii.astype(np.float32))
-        self.origin = mi.Vector3f(*(opaque(x) for x in origin))
+        self.shrinkage = mi.Float(shrinkage.astype(np.float32))
+        self.origin, self.projector_at, self.camera_at = (
+            mi.Vector3f(*(opaque(x) for x in place)) for place in (origin, radius.projector_at, radius.camera_at)
+        )
+        self.bounds, self.unit = [opaque(x) for x in radius.bounds()], opaque(unit)
         self.row_mask, self.stride = dr.opaque(mi.UInt32, rows - 1), dr.opaque(mi.UInt32, stride)
-        self.coarse = [opaque(0.5 / (radius_m * one.radius)) for one in LEVELS]
-        self.occupied = [
-            mi.UInt32(_occupancy(photons.position[level == i] - origin, photons.map[level == i], radius_m * one.radius))
-            for i, one in enumerate(LEVELS)
-        ]
-        dr.eval([self.starts, self.points, self.flights, self.radii, *self.occupied])
+        self.occupied = [mi.UInt32(_occupancy(*(x[level == i] for x in occupancy_of))) for i in range(len(LEVELS))]
+        dr.eval([self.starts, self.points, self.flights, self.shrinkage, *self.occupied])
 
-    def near(self, level: int, point: Any, sample: Any, active: Any) -> Any:
+    def reach(self, point: Any) -> Reach:
+        """How far photons of the brightest level are gathered around a point."""
+        point = mi.Vector3f(point)
+        a, b, c, d = self.bounds
+        from_camera = dr.norm(point - self.camera_at)
+        radius = dr.fma(b, dr.norm(point - self.projector_at), a)
+        radius = dr.maximum(dr.clip(radius, c * from_camera, d * from_camera), LEAST_M)
+        kind = dr.ceil(dr.log2(radius / self.unit) * CLASSES_PER_OCTAVE)
+        return Reach(radius, mi.UInt32(mi.Int32(kind)), 2 * self.unit * dr.exp2(kind / CLASSES_PER_OCTAVE))
+
+    def near(self, level: int, point: Any, reach: Reach, sample: Any, active: Any) -> Any:
         """Whether there may be photons of a level within its radius, in the map of `sample`."""
-        cell = dr.floor((mi.Vector3f(point) - self.origin) * self.coarse[level])
-        index = _hash(*(mi.UInt32(mi.Int32(x)) for x in cell)) & (OCCUPANCY_CELLS - 1)
+        cell = dr.floor((mi.Vector3f(point) - self.origin) / (reach.edge * LEVELS[level].radius))
+        index = _hash(*(mi.UInt32(mi.Int32(x)) for x in cell)) + reach.kind * CLASS_PRIME
+        index &= OCCUPANCY_CELLS - 1
         of_map = sample % self.maps
         bits = dr.gather(mi.UInt32, self.occupied[level], index * (MOST_MAPS // 32) + (of_map >> 5), active)
         return active & ((bits >> (of_map & 31)) & 1 != 0)
 
     @dr.syntax
-    def gather(self, level: int, point: Any, normal: Any, sample: Any, pick: Any, offset: Any, active: Any) -> Gathered:
+    def gather(
+        self, level: int, point: Any, normal: Any, reach: Reach, sample: Any, pick: Any, offset: Any, active: Any
+    ) -> Gathered:
         """Photons of a level around a surface point, in the map of `sample`; `pick`, `offset` are uniform in 0..1."""
-        of_map = sample % self.maps + level * self.maps
-        radius = dr.gather(mi.Float, self.radii, of_map, active)
-        starts, counts = self._ranges(point, of_map, radius, active)
+        of_map = sample % self.maps
+        shrunk = dr.gather(mi.Float, self.shrinkage, of_map, active) * LEVELS[level].radius
+        radius = reach.radius * shrunk
+        starts, counts = self._ranges(point, of_map + level * self.maps, reach.edge * shrunk, reach.kind, active)
         one, two = counts[0] + counts[1], counts[0] + counts[1] + counts[2]
         count = two + counts[3]
         # Where photons crowd, every n-th will do; they are in the order in which they left the projector
@@ -163,14 +246,14 @@ class PhotonMaps:
         a, b = (dr.gather(mi.Vector4f, self.flights, photon * 2 + half, active) for half in (0, 1))
         return Flight(mi.Vector3f(a.x, a.y, a.z), a.w, b.x, b.y, b.z)
 
-    def _ranges(self, point: Any, of_map: Any, radius: Any, active: Any) -> tuple[list[Any], list[Any]]:
+    def _ranges(self, point: Any, of_map: Any, edge: Any, kind: Any, active: Any) -> tuple[list[Any], list[Any]]:
         """Start and length of the four ranges of photons that lie in the 2 x 2 x 2 cells around a point."""
-        base = dr.floor((mi.Vector3f(point) - self.origin) * (0.5 * dr.rcp(radius)) - 0.5)
+        base = dr.floor((mi.Vector3f(point) - self.origin) / edge - 0.5)
         x, y, z = mi.Int32(base.x), mi.UInt32(mi.Int32(base.y)), mi.UInt32(mi.Int32(base.z))
         first = mi.UInt32(dr.minimum(_column(x), _column(x + 1)))  # the other one follows
         starts, counts = [], []
         for dy, dz in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            row = of_map * self.stride + _row(y + dy, z + dz, self.row_mask)
+            row = of_map * self.stride + _row(y + dy, z + dz, kind, self.row_mask)
             begin = dr.gather(mi.UInt32, self.starts, row + first, active)
             end = dr.gather(mi.UInt32, self.starts, row + first + 2, active)
             starts.append(begin)
@@ -184,12 +267,38 @@ def radii_of_maps(radius_m: float, maps: int) -> np.ndarray:
     return np.asarray(radius_m * np.sqrt(np.cumprod(np.concatenate([[1.0], (i + ALPHA) / (i + 1)]))))
 
 
-def levels_of(photons: Photons, maps: int, cell_m: float, irradiance: float) -> np.ndarray:
-    """(n,) int, index into `LEVELS`, from the irradiance that the photons of all maps bring to a cell of that edge."""
-    key = _hash(*np.floor(photons.position / cell_m).astype(np.int64).T) & (OCCUPANCY_CELLS - 1)
+def levels_of(
+    photons: Photons, maps: int, radius_m: np.ndarray, radius: GatheringRadius, irradiance: float
+) -> np.ndarray:
+    """(n,) int, index into `LEVELS`, from the irradiance that the photons of all maps bring to a cell of about four
+    times the radius (n,) there, compared with the direct light of the projector at that distance."""
+    octave = np.ceil(np.log2(radius_m / (radius_m.min() * (1 + BESIDE)))).astype(np.int64)
+    cell_m = 4 * radius_m.min() * (1 + BESIDE) * 2.0**octave
+    key = _hash(*_cells(photons.position, cell_m).T) + octave * CLASS_PRIME & (OCCUPANCY_CELLS - 1)
     power = np.bincount(key, photons.flux, OCCUPANCY_CELLS)[key] / maps
-    share = power / (irradiance * cell_m**2)
+    direct = irradiance / np.maximum(np.sum((photons.position - radius.projector_at) ** 2, axis=1), LEAST_M)
+    share = power / (direct * cell_m**2)
     return np.count_nonzero([share < one.brightest for one in LEVELS], axis=0) - 1
+
+
+def _in_classes(radius: np.ndarray, steepness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (m,) of photons, and a class of each: all classes from which a point may gather it.
+
+    A point at distance d of a photon has a radius r' that differs from the photon's r by steepness x d, at most, and
+    reaches that far: r' <= r / (1 - steepness), r' >= r / (1 + steepness). `radius` (n,) in units of that of class 0.
+    """
+    low, high = (
+        np.ceil(CLASSES_PER_OCTAVE * np.log2(radius * bound)).astype(np.int64)
+        for bound in ((1 - BESIDE) / (1 + steepness), (1 + BESIDE) / (1 - steepness))
+    )
+    count = high - low + 1
+    photon = np.repeat(np.arange(len(radius)), count)
+    return photon, np.arange(len(photon)) - np.repeat(np.cumsum(count) - count, count) + low[photon]
+
+
+def _cells(position: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """(n, 3) int coordinates of grid cells."""
+    return np.floor(position / np.asarray(edge, np.float32)[:, None]).astype(np.int64)
 
 
 def _hash(x: Any, y: Any, z: Any) -> Any:
@@ -202,22 +311,22 @@ def _column(x: Any) -> Any:
     return FOLD - abs(FOLD - (x & (2 * FOLD - 1)))
 
 
-def _row(y: Any, z: Any, mask: Any) -> Any:
+def _row(y: Any, z: Any, kind: Any, mask: Any) -> Any:
     """Where the cells of a row along x begin, in 0..mask; mask + 1 is a power of two of at least 16.
 
     A point looks at two cells in each of four neighbouring rows and must count no photon twice, so these begin two
     cells or more apart: their differences are 3, 5, 8 or 2 modulo 16.
     """
-    return (y * ROW_FACTORS[0] + z * ROW_FACTORS[1]) & mask
+    return (y * ROW_FACTORS[0] + z * ROW_FACTORS[1] + kind * CLASS_FACTOR) & mask
 
 
-def _occupancy(position: np.ndarray, of_map: np.ndarray, radius_m: float) -> np.ndarray:
-    """(cells * MOST_MAPS / 32,) uint32: one bit per map and hash of a cell within the radius of some photon."""
+def _occupancy(position: np.ndarray, of_map: np.ndarray, kind: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """(cells * MOST_MAPS / 32,) uint32: one bit per map and hash of a cell within the radius, half an edge, of some
+    photon of that class."""
     occupied = np.zeros(OCCUPANCY_CELLS * MOST_MAPS, dtype=bool)
-    size = 2 * radius_m
-    low = np.floor((position - radius_m) / size).astype(np.int64)
-    high = np.floor((position + radius_m) / size).astype(np.int64)
+    low, high = (_cells(position + offset * edge[:, None], edge) for offset in (-0.5, 0.5))
     for corner in range(8):
         cell = [np.where(corner >> axis & 1, high[:, axis], low[:, axis]) for axis in range(3)]
-        occupied[(_hash(*cell) & (OCCUPANCY_CELLS - 1)) * MOST_MAPS + of_map] = True
+        index = _hash(*cell) + kind * CLASS_PRIME
+        occupied[(index & (OCCUPANCY_CELLS - 1)) * MOST_MAPS + of_map] = True
     return np.packbits(occupied, bitorder="little").view(np.uint32)
