@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["EnvironmentProblem", "FileFormatError", "RangesimError", "sentence", "visible"]
+__all__ = ["EnvironmentProblem", "FileFormatError", "RangesimError", "TruncationWarning", "sentence", "visible"]
 
 MAX_SENTENCE = 480
 """Characters of a message. Files may hold names of a megabyte."""
@@ -24,6 +24,14 @@ class RangesimError(Exception):
 
 class FileFormatError(RangesimError):
     """A file is missing, broken, or does not hold what its place asks for."""
+
+
+class TruncationWarning(UserWarning):
+    """Light paths were ended so early that a noticeable part of the projector's light, `share`, is missing."""
+
+    def __init__(self, message: str, share: float) -> None:
+        super().__init__(message)
+        self.share = share
 
 
 class EnvironmentProblem(RangesimError):

@@ -87,6 +87,7 @@ class PhotonMaps:
     def __init__(self, photons: Photons, maps: int, radius_m: float, irradiance: float, wide_m: float = np.inf) -> None:
         self.is_wide = [radius_m * one.radius >= wide_m for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
+        self.cut = photons.balance.cut
         level = levels_of(photons, maps, 4 * radius_m, irradiance)
         radii = np.concatenate([radii_of_maps(radius_m * one.radius, maps) for one in LEVELS])
         of_map = level * maps + photons.map
