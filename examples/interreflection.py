@@ -7,11 +7,13 @@ which takes the strongest peak of a histogram, hardly notices.
 Usage: python examples/interreflection.py
 """
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from rangesim import AmcwToF, DirectToF, decode, expose, load_scene, transport
+from rangesim.errors import TruncationWarning
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "corner.xml"
 
@@ -20,6 +22,7 @@ def main() -> None:
     scene = load_scene(SCENE)
     rig = scene.rig(baseline_m=0.03, width=160, height=120)
     sensors = {"AMCW, 20 MHz": AmcwToF((20e6,)), "dToF, 100 ps bins": DirectToF(pulse_fwhm_s=200e-12)}
+    warnings.simplefilter("ignore", TruncationWarning)  # light is left out on purpose
     for max_depth in (2, 3, 6):
         signals = transport(scene, rig, list(sensors.values()), spp=64, max_depth=max_depth)
         for name, sensor in sensors.items():

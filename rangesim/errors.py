@@ -10,7 +10,16 @@ from __future__ import annotations
 import re
 import warnings
 
-__all__ = ["EnvironmentProblem", "FileFormatError", "RangesimError", "RangesimWarning", "sentence", "visible", "warn"]
+__all__ = [
+    "EnvironmentProblem",
+    "FileFormatError",
+    "RangesimError",
+    "RangesimWarning",
+    "TruncationWarning",
+    "sentence",
+    "visible",
+    "warn",
+]
 
 MAX_SENTENCE = 480
 """Characters of a message. Files may hold names of a megabyte."""
@@ -33,6 +42,14 @@ class EnvironmentProblem(RangesimError):
 
 class RangesimWarning(UserWarning):
     """Something is left out of a result, or read as what it may not be."""
+
+
+class TruncationWarning(RangesimWarning):
+    """Light paths were ended so early that a noticeable part of the projector's light, `share`, is missing."""
+
+    def __init__(self, message: str, share: float) -> None:
+        super().__init__(message)
+        self.share = share
 
 
 def warn(message: str) -> None:

@@ -47,7 +47,7 @@ from rangesim.schema import (
     read_record,
     write_record,
 )
-from rangesim.signals import EnergySplit, GroundTruth
+from rangesim.signals import EnergySplit, GroundTruth, Truncation
 from rangesim.status import Status
 
 SETTINGS = "experiment.json"
@@ -154,6 +154,7 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "truth_instance_names": ArraySpec("str", ("instances",)),
     "truth_material_names": ArraySpec("str", ("materials",)),
     "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
+    "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
 }
 _RANGE = {
     "z": _DEPTH,

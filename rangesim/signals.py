@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +62,26 @@ class GroundTruth:
     material_names: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Truncation:
+    """Estimate of the projector's light that a pass left out, by what ended it; shares of all its light in the image,
+    glint excepted and what is left out included. See `rangesim.light_transport.truncation`.
+
+    depth : of paths with more scattering surfaces than `max_depth` allows; NaN where that is 2 or less, which asks for
+        direct light alone. chains : of camera paths with too many delta interactions in a row. photons : of photons
+        with too many.
+    """
+
+    depth: float
+    chains: float
+    photons: float
+
+    @property
+    def total(self) -> float:
+        """All that is known to be left out, a share of the projector's light."""
+        return float(np.nansum([self.depth, self.chains, self.photons]))
+
+
 @dataclass(frozen=True, eq=False)
 class Signals:
     """Everything one transport pass accumulated for the sensors that share a rig.
@@ -72,6 +92,7 @@ class Signals:
     truth : GroundTruth
     motion_m : (h, w) float32, metres, how far what a pixel sees moves while its frames are taken, see
         `rangesim.motion`; None: nothing moves.
+    truncation : what the pass left out, an estimate; None: not known.
     """
 
     rig: Rig
@@ -79,6 +100,7 @@ class Signals:
     energy: EnergySplit
     truth: GroundTruth
     motion_m: np.ndarray | None = None
+    truncation: Truncation | None = None
 
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0) -> np.ndarray:
         """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass."""
@@ -91,7 +113,7 @@ class Signals:
         return sensor.frames(channels, self.energy.projector, ambient_transmission * self.energy.ambient)
 
     def save(self, path: str | Path) -> None:
-        """Write energy split and ground truth to a compressed .npz file (for later comparison).
+        """Write energy split, ground truth and truncation to a compressed .npz file (for later comparison).
 
         Raises
         ------
@@ -102,4 +124,6 @@ class Signals:
         arrays |= {f"truth_{f.name}": np.asarray(getattr(self.truth, f.name)) for f in fields(self.truth)}
         if self.motion_m is not None:
             arrays["motion_m"] = self.motion_m
+        if self.truncation is not None:
+            arrays["truncation"] = np.array(astuple(self.truncation))
         write_arrays(path, arrays)

@@ -64,6 +64,18 @@ def test_run_writes_a_report(command: Command, tmp_path: Path) -> None:
     assert again.status == 0  # an older result is replaced
 
 
+def test_run_says_in_one_line_what_light_it_leaves_out(command: Command, tmp_path: Path) -> None:
+    """In passes of several rigs, the line is that of the pass that leaves out most."""
+    sensors = ("--sensor", "ideal-tof", "--sensor", "gray")
+    answer = command("run", "cornell", *sensors, *TINY, "--max-depth", "4", "--out", tmp_path / "a")
+    assert answer.status == 0
+    assert re.fullmatch(
+        r"rangesim: about \d+% of the projector's light is left out: a max_depth of 4 ends light paths early; "
+        r"a larger one brings it\.\n",
+        answer.err,
+    )
+
+
 def test_run_takes_an_experiment_file_that_options_override(command: Command, tmp_path: Path) -> None:
     (tmp_path / "one.toml").write_text(
         f'scene = "{PLANE}"\nwidth = 640\nspp = 9\n[[instrument]]\nsensor = "amcw"\n', encoding="utf-8"

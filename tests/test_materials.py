@@ -111,6 +111,7 @@ def test_every_material_is_classified_and_listed_in_the_docs() -> None:
     assert [n for n in NEAR_INFRARED if f"`{n}`" not in text] == []
 
 
+@pytest.mark.filterwarnings("ignore::rangesim.errors.TruncationWarning")
 @pytest.mark.parametrize("names", [NEAR_INFRARED, [n for n in NAMES if n.endswith("_550nm")]], ids=["850", "550"])
 def test_no_material_returns_more_than_it_receives(tmp_path: Path, names: list[str]) -> None:
     """White furnace: balls of all materials in a uniform light of 1 look no brighter than it, and black ones dark."""

@@ -144,6 +144,7 @@ def test_equal_places_share_a_pass_whatever_the_sensor(matte: Scene) -> None:
 # ---- What stands still ------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::rangesim.errors.TruncationWarning")  # cornell at the default depth
 def test_without_motion_the_bytes_are_those_of_a_static_pass() -> None:
     scene = rangesim.load_scene(SCENES / "cornell.xml")  # with a lamp
     rig = scene.rig(width=32, height=24)
@@ -378,6 +379,7 @@ def test_motion_is_told_of_what_moves_and_of_what_it_passes(card: Scene) -> None
     assert (signals.motion_m == 0).sum() > 1000
 
 
+@pytest.mark.filterwarnings("ignore::rangesim.errors.TruncationWarning")  # cornell at the default depth
 def test_ambient_light_is_filtered_frame_by_frame() -> None:
     scene = rangesim.load_scene(SCENES / "cornell.xml")
     rig, sensor = scene.rig(width=32, height=24), AmcwToF((20e6,))

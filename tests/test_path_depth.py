@@ -11,14 +11,16 @@ import pytest
 from delta_scenes import GLASS, fresnel_dielectric, matte, rig_of, scene_of, slab, transform, wall
 from scipy.spatial import ConvexHull
 
-from rangesim import Intrinsics, Scene, transport
-from rangesim.light_transport import delta_chain
+from rangesim import Intrinsics, Rig, Scene, load_scene, transport
+from rangesim.errors import TruncationWarning
+from rangesim.light_transport import delta_chain, loop, photon_flight
 from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import PhotonBalance, trace_photons
 
 CAMERA = Intrinsics.from_fov(64, 48, 12)
 PROJECTOR = Intrinsics.from_fov(160, 120, 26)
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
 THIN = {**GLASS, "type": "thindielectric"}
 
 
@@ -157,3 +159,75 @@ def test_roulette_between_mirrors_takes_no_light_and_gives_none(monkeypatch: pyt
     few, all_of_them = stored[2], stored[1000]
     assert len(few.flux) < 0.7 * len(all_of_them.flux)
     assert few.balance.stored == pytest.approx(all_of_them.balance.stored, rel=0.01)
+
+
+# ---- What is left out -------------------------------------------------------------------------------
+
+
+def closed_room(lamp_fov: float = 45.0, lamp_at: tuple[float, float, float] = (0.1, 0.0, 0.0)) -> tuple[Scene, Rig]:
+    """3 x 2.4 x 4 m, all of albedo 0.8."""
+    box = {"type": "cube", "to_world": transform().translate([0, 0, 1.0]).scale([1.5, 1.2, 2.0]), "bsdf": matte(0.8)}
+    lamp = Intrinsics.from_fov(160, 120, lamp_fov)
+    return scene_of(box=box), rig_of(Intrinsics.from_fov(64, 48, 40), lamp, lamp_at)
+
+
+def test_what_a_closed_room_loses_is_estimated_and_warned_about() -> None:
+    """A deep pass is the reference. The camera sees what the lamp lights, all of it or next to nothing of it."""
+    for lamp in ((45.0, (0.1, 0.0, 0.0)), (90.0, (0.8, 0.2, -0.3))):
+        scene, rig = closed_room(*lamp)
+        deep = transport(scene, rig, [], spp=32, max_depth=100, rr_depth=20)
+        assert deep.truncation is not None
+        assert deep.truncation.total < 1e-6
+        for max_depth in (4, 5, 8):
+            with pytest.warns(TruncationWarning, match=f"a max_depth of {max_depth} ends") as warned:
+                signals = transport(scene, rig, [], spp=32, max_depth=max_depth)
+            lost = 1 - signals.energy.projector.sum(dtype=float) / deep.energy.projector.sum(dtype=float)
+            assert signals.truncation is not None
+            assert signals.truncation.depth == pytest.approx(lost, rel=1 / 3)  # at 5: 13 % and 34 %
+            assert [w.filename for w in warned] == [__file__]
+            assert signals.truncation.chains == signals.truncation.photons == 0
+
+
+@pytest.mark.parametrize("name", ["plane", "matte", "corner", "tabletop", "glassware"])
+def test_little_is_left_out_at_the_default_depth_and_no_warning_given(name: str) -> None:
+    scene = load_scene(SCENES / f"{name}.xml")
+    rig = scene.rig(width=64, height=48)
+    whole, tiles = (transport(scene, rig, [], spp=4, memory_bytes=n).truncation for n in (2 << 30, 1 << 19))
+    assert whole is not None
+    assert 0 <= whole.total < 0.01
+    assert whole == tiles
+
+
+def test_direct_light_alone_is_asked_for() -> None:
+    truncation = transport(*closed_room(), [], spp=1, max_depth=2).truncation
+    assert truncation is not None
+    assert np.isnan(truncation.depth)
+    assert truncation.total == 0
+
+
+def test_what_cut_chains_lose_is_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hollow ball covers part of an evenly lit wall; after three faces nothing is seen through it any more."""
+    wide = Intrinsics.from_fov(64, 48, 60)
+    scene, rig = hollow_ball(), rig_of(wide, Intrinsics.from_fov(64, 64, 120), (0.0, 0.0, 0.75))
+    options = {"spp": 32, "max_depth": 4, "photons": 0}
+    all_of_it = transport(scene, rig, [], **options).energy.projector.sum(dtype=float)
+    monkeypatch.setattr(loop, "MAX_CHAIN", 3)
+    with pytest.warns(TruncationWarning, match="more than 128 surfaces of glass"):
+        signals = transport(scene, rig, [], **options)
+    assert signals.truncation is not None
+    lost = 1 - signals.energy.projector.sum(dtype=float) / all_of_it
+    assert signals.truncation.chains == pytest.approx(lost, rel=1 / 3)
+
+
+def test_what_cut_photons_lose_is_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    box = {"type": "cube", "to_world": transform().scale(2.5), "bsdf": matte()}
+    scene = scene_of(gem=gem(tmp_path, {"type": "dielectric", "int_ior": 2.4, "ext_ior": 1.0}), box=box)
+    rig = rig_of(Intrinsics.from_fov(64, 64, 130), PROJECTOR, camera_at=(0.0, 0.0, -2.4))
+    options = {"spp": 32, "glint": False, "max_depth": 9, "caustic_radius_m": 0.1}
+    whole = transport(scene, rig, [], **options)
+    monkeypatch.setattr(photon_flight, "MAX_CHAIN", 8)
+    with pytest.warns(TruncationWarning, match="more than 128 surfaces of glass"):
+        signals = transport(scene, rig, [], **options)
+    lost = 1 - signals.energy.projector.sum(dtype=float) / whole.energy.projector.sum(dtype=float)
+    assert signals.truncation is not None
+    assert signals.truncation.photons == pytest.approx(lost, rel=1 / 3)

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import typer
+
+from rangesim.errors import TruncationWarning
 
 
 @contextmanager
@@ -35,3 +38,17 @@ def say_where(out: Path, target: Path) -> None:
     """Print a line if the output is reached by a link, and so lies elsewhere than its name says."""
     if out.is_symlink():
         typer.echo(f"rangesim: {out} is a link; the results go to {target}.", err=True)
+
+
+@contextmanager
+def light_left_out_in_a_line() -> Iterator[None]:
+    """Afterwards print a line if passes left out light: the warning of the one that left out most."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", TruncationWarning)
+        yield
+    left_out = [one.message for one in caught if isinstance(one.message, TruncationWarning)]
+    for one in caught:
+        if one.message not in left_out:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    if left_out:
+        typer.echo(f"rangesim: {max(left_out, key=lambda warning: warning.share)}", err=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rangesim.catalogue import scene_names
-from rangesim.cli.progress import progress_bar, say_where
+from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
 
 if TYPE_CHECKING:
     from rangesim.cost import Cost
@@ -109,7 +109,7 @@ def run_command(
         return
     target = check_directory(out, RESULT, inputs=[experiment.scene])
     say_where(out, target)
-    with progress_bar() as progress:
+    with light_left_out_in_a_line(), progress_bar() as progress:
         pipeline.run(experiment, out, progress, announce=_announce)
     _say_what_measured_nothing(target)
     typer.echo(f"{out / 'report.html'}")

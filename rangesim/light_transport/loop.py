@@ -37,6 +37,7 @@ from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, random_stream
+from rangesim.light_transport.truncation import Tally
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
 NEIGHBOURS = 256
@@ -86,6 +87,16 @@ class Radiance(NamedTuple):
     """Caustics that were gathered from afar, and are smooth therefore; `caustic` has the others."""
 
 
+class Traced(NamedTuple):
+    """Sums over the samples of each pixel, besides channels.
+
+    radiance : (6, pixels) float32, in the order of `Radiance`. tally : (6, pixels) float32, in the order of `Tally`.
+    """
+
+    radiance: np.ndarray
+    tally: np.ndarray
+
+
 class Vertex(NamedTuple):
     """A vertex of a camera path: surface, throughput, optical length from the camera, and whether light that reaches it
     is the first to do so."""
@@ -110,6 +121,7 @@ class State:
     turns: Any
     channels: list[list[Any]]
     radiance: list[Any]
+    tally: list[Any]
     sample: Any
     depth: Any
     chain: Any
@@ -153,13 +165,13 @@ def trace(
     first_pixel: int,
     launches: Launches,
     report: Report,
-) -> np.ndarray:
-    """Radiance by kind of path (6, pixels) float32, in the order of `Radiance`; channels go to the accumulators.
+) -> Traced:
+    """Radiance by kind of path, and what tells how much is left out; channels go to the accumulators.
 
     The pixels are those of the accumulators, from `first_pixel` on in the whole image. `report` gets the share done.
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
-    radiance = np.empty((len(Radiance._fields), pixels), np.float32)
+    traced = Traced(*(np.empty((len(kind._fields), pixels), np.float32) for kind in (Radiance, Tally)))
     samples = budget.samples[first_pixel : first_pixel + pixels]
     total, begin, finished, turns = int(samples.sum(dtype=np.int64)), 0, 0, 0
 
@@ -177,10 +189,11 @@ def trace(
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
         accumulators.store(state.channels, places)
-        for image, values in zip(radiance, state.radiance, strict=True):
-            image[places] = 0 if values is None else values.numpy()
+        for images, sums in zip(traced, (state.radiance, state.tally), strict=True):
+            for image, values in zip(images, sums, strict=True):
+                image[places] = 0 if values is None else values.numpy()
         begin, finished, turns = end, finished + int(samples[places].sum(dtype=np.int64)), turns + taken
-    return radiance
+    return traced
 
 
 def _dealt(n: int) -> np.ndarray:
@@ -229,6 +242,7 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
         turns=random_stream(settings.seed, at.pixel >> 4, Stream.THIRD).next_uint32() if gathers else None,
         channels=accumulators.zeros(lanes),
         radiance=[dr.zeros(mi.Float, lanes) if any_of_it else None for any_of_it in shines],
+        tally=[dr.zeros(mi.Float, lanes) for _ in range(5)] + [dr.zeros(mi.Float, lanes) if settings.delta else None],
         sample=dr.zeros(mi.UInt32, lanes),  # samples of this pixel finished so far
         # ---- Of the path -----------------------------------------------------------------------------
         depth=dr.zeros(mi.UInt32, lanes),  # surfaces that scattered it so far
@@ -260,6 +274,7 @@ def walk(
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
     origin, towards, previous = state.origin, state.direction, state.previous
     direct, multipath, via_delta, caustic, ambient, faint = state.radiance
+    at_first, further, before_last, at_last, indirect, cut = state.tally
     depth, chain, throughput, length, ior = state.depth, state.chain, state.throughput, state.length, state.ior
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
@@ -300,13 +315,23 @@ def walk(
         at_surface = hit & ~scatters
         # It counts if it scatters the path; whether it does is known when the next direction is
         if dr.hint(media is not None, mode="scalar"):
-            depth += dr.select(crosses | (scatters & stays), mi.UInt32(0), mi.UInt32(1))
+            arrives = ~(crosses | (scatters & stays))
+            depth += dr.select(arrives, mi.UInt32(1), mi.UInt32(0))
         else:
+            arrives = mi.Bool(True)
             depth += 1
         # Not si.t: spawned rays start a little off the surface
         length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
         bsdf = si.bsdf(ray)
         may_connect = hit & (depth < settings.max_depth) & (scatters | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+
+        # ---- What is left when paths end: see `truncation` -------------------------------------------
+        arriving = dr.select(may_connect & arrives, throughput, 0)
+        is_later = depth > 1
+        at_first += dr.select(is_later, 0, arriving)
+        further += dr.select(is_later, arriving, 0)
+        before_last += dr.select(depth + 2 == settings.max_depth, arriving, 0)
+        at_last += dr.select(depth + 1 == settings.max_depth, arriving, 0)
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
         link = connect(scene, projector, si, may_connect, media, inside)
@@ -334,6 +359,7 @@ def walk(
         direct += dr.select(kind == DIRECT, radiance, 0)
         via_delta += dr.select(kind == VIA_DELTA, radiance, 0)
         multipath += dr.select(kind == MULTIPATH, radiance, 0)
+        indirect += dr.select(is_later, radiance, 0)
 
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
@@ -347,6 +373,7 @@ def walk(
             channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
             caustic += dr.select(is_wide, 0, radiance)
             faint += dr.select(is_wide, radiance, 0)
+            indirect += dr.select(is_later, radiance, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
@@ -402,6 +429,7 @@ def walk(
             goes_on |= (scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS)
         goes_on &= hit & survives & (throughput > 0)
         if dr.hint(settings.delta, mode="scalar"):
+            cut += dr.select(goes_on & (chain >= MAX_CHAIN), throughput * dr.square(ior), 0)
             goes_on &= chain < MAX_CHAIN
         ends = ~goes_on
         sample = dr.select(ends, sample + 1, sample)
@@ -429,6 +457,7 @@ def walk(
         turns=turns,
         channels=channels,
         radiance=[direct, multipath, via_delta, caustic, ambient, faint],
+        tally=[at_first, further, before_last, at_last, indirect, cut],
         sample=sample,
         depth=depth,
         chain=chain,

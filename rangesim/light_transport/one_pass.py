@@ -18,18 +18,19 @@ from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, has_matte_textures, mean_reflectance
 from rangesim.light_transport.indirect import smooth
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
-from rangesim.light_transport.loop import Budget, Radiance, Settings, View, trace
+from rangesim.light_transport.loop import Budget, Radiance, Settings, Traced, View, trace
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Seed
 from rangesim.light_transport.surfaces import surfaces_of
+from rangesim.light_transport.truncation import Tally, estimate_truncation, warn_of_truncation
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.seeds import check_seed
 from rangesim.sensors import Sensor
-from rangesim.signals import EnergySplit, GroundTruth, Signals
+from rangesim.signals import EnergySplit, Signals
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
@@ -91,6 +92,11 @@ def transport(
     ------
     ValueError
         A number out of its range, patterns that do not fit the projector, or too little memory.
+
+    Warns
+    -----
+    TruncationWarning
+        By estimate (`Signals.truncation`), more than 2 % of the projector's light is left out.
     """
     _check(scene, rig, sensors, spp=1 if spp == "auto" else spp, max_depth=max_depth, rr_depth=rr_depth)
     seed = check_seed(seed)
@@ -101,7 +107,7 @@ def transport(
         raise ValueError(f"expected indirect to be one of {', '.join(get_args(Indirect))}, got {indirect!r}.")
     keeps_apart = indirect == "filtered"
     channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
-    radiances: list[np.ndarray] = []
+    tiles: list[Traced] = []
     report = Progress(progress)
     launches = Launches(is_watched=progress is not None)
     media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
@@ -134,11 +140,13 @@ def transport(
     for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
         accumulators = Accumulators(responses, end - begin, keeps_apart)
         so_far = partial(_report, report, begin / (h * w), (end - begin) / (h * w))
-        radiances.append(trace(view, settings, budget, accumulators, begin, launches, so_far)[:, None])
+        tiles.append(trace(view, settings, budget, accumulators, begin, launches, so_far))
         for response, values in zip(responses, accumulators.images(), strict=True):
             channels[response].append(values)
-    sums = {r: _join(tiles, h, w) for r, tiles in channels.items()}
-    radiance = Radiance(*_join(radiances, h, w)[:, 0])
+    sums = {r: _join(parts, h, w) for r, parts in channels.items()}
+    radiances, tally = (_join([part[:, None] for part in parts], h, w)[:, 0] for parts in zip(*tiles, strict=True))
+    tally[[name != "indirect" for name in Tally._fields]] /= samples.reshape(h, w)
+    radiance = Radiance(*radiances)
     if keeps_apart:
         if has_matte_textures(scene.mitsuba):
             seen = mean_reflectance(view, settings, budget, scene.has_cutouts, min(int(samples.min()), TEXTURE_SAMPLES))
@@ -156,18 +164,14 @@ def transport(
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
     report(1.0)
-    return _signals(rig, truth, radiance, highlights[0], images, samples.reshape(h, w))
+    energy = _energy(radiance, highlights[0], samples.reshape(h, w))
+    truncation = estimate_truncation(tally, energy, max_depth, maps.cut if maps else 0.0)
+    warn_of_truncation(truncation, max_depth, stacklevel=3)  # where `transport` was called
+    return Signals(rig, images, energy, truth, truncation=truncation)
 
 
-def _signals(
-    rig: Rig,
-    truth: GroundTruth,
-    radiance: Radiance,
-    glint: np.ndarray,
-    channels: dict[Response, np.ndarray],
-    samples: np.ndarray,
-) -> Signals:
-    split = EnergySplit(
+def _energy(radiance: Radiance, glint: np.ndarray, samples: np.ndarray) -> EnergySplit:
+    return EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,
         via_delta=radiance.via_delta,
@@ -175,7 +179,6 @@ def _signals(
         glint=glint,
         ambient=radiance.ambient / samples.astype(np.float32),
     )
-    return Signals(rig, channels, split, truth)
 
 
 def _join(tiles: list[np.ndarray], h: int, w: int) -> np.ndarray:

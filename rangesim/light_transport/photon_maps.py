@@ -156,6 +156,7 @@ class PhotonMaps:
         usual = float(np.quantile(at_photons / np.maximum(from_camera, LEAST_M), USUAL))
         self.is_wide = [usual * one.radius >= wide for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
+        self.cut = photons.balance.cut
         unit = float(at_photons.min()) * (1 + BESIDE)
         level = levels_of(photons, maps, at_photons, radius, irradiance)
         factors = np.array([one.radius for one in LEVELS])

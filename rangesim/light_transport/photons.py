@@ -58,6 +58,11 @@ class PhotonBalance:
     escaped: float
     truncated: float
 
+    @property
+    def cut(self) -> float:
+        """Flux that was cut off, over that which landed."""
+        return self.truncated / self.stored if self.stored else 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class Photons:

@@ -89,6 +89,7 @@ class FrameStack:
             energy=self.at_middle.energy,
             truth=self.at_middle.truth,
             motion_m=self.motion_m,
+            truncation=self.at_middle.truncation,
             sensor=self.sensor,
             lit=self.lit,
             ambient=self.ambient,

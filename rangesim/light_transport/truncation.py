@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An estimate of the projector's light that a pass leaves out, because it ends paths, chains and photons somewhere.
+
+A camera path brings light at each vertex that scatters. The throughput with which paths arrive at their k-th such
+vertex, T_k, falls off geometrically after a few of them: t = T_n / T_(n-1) at the last one that a pass looks at is the
+mean albedo times the chance to meet another surface. (Its ratio is used and not that of the light itself, which swings:
+what a lamp lights and what this lights in turn are most often opposite each other.) What all later vertices would
+receive is T_n t / (1 - t), and they are taken to be lit, per throughput, as vertices after the first are on average:
+
+    left out = T_n t / (1 - t) * (light at vertices 2..n) / (T_2 + ... + T_n)
+
+Light in chains of delta interactions that are cut off is taken to be as bright as all other, and photons cut off to
+land where the others do.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rangesim.errors import TruncationWarning
+from rangesim.light_transport.delta_chain import MAX_CHAIN
+from rangesim.signals import EnergySplit, Truncation
+
+DIRECT_ALONE = 2
+"""The `max_depth` that asks for direct light alone; how much else there would be is not known then."""
+WORTH_A_WARNING = 0.02
+"""Share of the projector's light."""
+STEEPEST_DECAY, FLATTEST_DECAY = 0.0, 0.99
+"""Bounds of t: nothing is known about a closed room that absorbs next to nothing."""
+
+
+class Tally(NamedTuple):
+    """Sums over the samples of a pixel.
+
+    first, further : throughput at the first vertex that scatters, and at all later ones up to the last.
+    before_last, last : throughput at the last vertex at which a pass looks for the projector, and at the one before.
+    indirect : radiance that the projector brings at vertices after the first.
+    cut : throughput of paths that ended in a chain of delta interactions which was too long.
+    """
+
+    first: Any
+    further: Any
+    before_last: Any
+    last: Any
+    indirect: Any
+    cut: Any
+
+
+def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, photons_cut: float) -> Truncation:
+    """What a pass left out.
+
+    Parameters
+    ----------
+    tally : (6, h, w) float32, in the order of `Tally`.
+    photons_cut : flux of photons that were cut off, over that of those that landed.
+    """
+    first, further, before_last, last, indirect, cut = (float(x.sum(dtype=float)) for x in tally)
+    seen = sum(float(x.sum(dtype=float)) for x in (energy.direct, energy.multipath, energy.via_delta, energy.caustic))
+    by_depth = np.nan
+    if max_depth > DIRECT_ALONE:
+        t = min(max(last / before_last, STEEPEST_DECAY), FLATTEST_DECAY) if before_last else 0.0
+        by_depth = indirect / further * last * t / (1 - t) if further else 0.0
+    by_chains = seen * cut / (first + further) if first + further else 0.0
+    by_photons = float(energy.caustic.sum(dtype=float)) * photons_cut
+    parts = np.array([by_depth, by_chains, by_photons])
+    total = seen + np.nansum(parts)
+    return Truncation(*(float(x) for x in parts / total)) if total else Truncation(0.0 * by_depth, 0.0, 0.0)
+
+
+def warn_of_truncation(truncation: Truncation, max_depth: int, stacklevel: int) -> None:
+    """Warn if a pass left out more than `WORTH_A_WARNING`."""
+    if truncation.total <= WORTH_A_WARNING:
+        return
+    why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
+    if not truncation.depth > truncation.chains + truncation.photons:
+        why = f"it meets more than {MAX_CHAIN} surfaces of glass and mirrors in a row"
+    text = f"about {truncation.total:.0%} of the projector's light is left out: {why}."
+    warnings.warn(TruncationWarning(text, truncation.total), stacklevel=stacklevel + 1)
