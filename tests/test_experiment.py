@@ -167,7 +167,7 @@ def test_progress_rises_to_the_end(tmp_path: Path) -> None:
     assert 0.9 < seen[-1] <= 1
 
 
-@pytest.mark.filterwarnings("ignore::rangesim.errors.TruncationWarning")
+@pytest.mark.filterwarnings("ignore::rangesim.errors.RangesimWarning")  # it is in colours
 def test_a_scene_from_a_dictionary_runs_too(tmp_path: Path) -> None:
     """Mitsuba's own Cornell box, which nobody here prepared; its camera looks at a box of 2 m."""
     import mitsuba as mi

@@ -489,7 +489,7 @@ def test_photons_through_a_pane_that_does_nothing_bring_the_light_that_connectio
     rig = Rig(clear.camera, projector, clear.T_world_camera, translation(0.4, 0, 0), projector_vignetting=vignetting)
     rig = dataclasses.replace(rig, projector_focus_m=focus)
     fringes = Fringes(0, 32.0)
-    by_connection, by_photons = (transport(s, rig, [fringes], spp=64) for s in (clear, behind))
+    by_connection, by_photons = (transport(s, rig, [fringes], spp=64, photons=1_000_000) for s in (clear, behind))
     inner = binary_erosion(by_connection.energy.direct > 0, iterations=2)
     expected, caustic = by_connection.energy.direct[inner], by_photons.energy.caustic[inner]
     assert not by_photons.energy.direct.any()
