@@ -13,6 +13,8 @@ _A = TypeVar("_A")
 _B = TypeVar("_B")
 SMALLEST_BLOCK = 4096
 """Elements; starting a thread costs as much as some thousands of them."""
+SMALLEST_ROWS = 16
+"""The same for elements that are rows of an image."""
 
 
 def in_blocks(kernel: Callable[..., None], n: int, *arguments: object, smallest: int = SMALLEST_BLOCK) -> None:
@@ -23,7 +25,7 @@ def in_blocks(kernel: Callable[..., None], n: int, *arguments: object, smallest:
 
     Parameters
     ----------
-    kernel : callable compiled with ``nogil=True``
+    kernel : callable that spends its time without the interpreter's lock, such as one compiled with ``nogil=True``
         Writes only what belongs to its own block, so that no result depends on the number of threads.
     n : int
     arguments

@@ -9,9 +9,7 @@ towards the corners is the rig's (`camera_vignetting`), and comes before the det
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -171,14 +169,18 @@ class Detector(PhotoDetector):
             raise ValueError("expected a SpadDetector for direct-tof, got an integrating Detector.")
         result = np.empty(radiance.shape, dtype=self.dtype)
 
-        def read(frame: np.ndarray, out: np.ndarray, rng: np.random.Generator) -> None:
-            mean = np.maximum(self.mean_electrons(frame, sensor, rig, exposure_s), 0)
-            electrons = rng.poisson(np.minimum(mean, 10 * self.full_well_e + 1000)).astype(np.float64)
-            electrons += self.read_noise_e * rng.standard_normal(frame.shape)
-            out[:] = np.clip(np.rint(self.gain_dn_e * electrons + self.offset_dn), 0, self.max_dn)
+        rngs = streams(seed, len(radiance))  # each frame has random numbers of its own
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:  # each frame has random numbers of its own
-            list(pool.map(read, radiance, result, streams(seed, len(radiance))))
+        def read(start: int, stop: int) -> None:
+            for k in range(start, stop):
+                mean = np.maximum(self.mean_electrons(radiance[k], sensor, rig, exposure_s), 0)
+                electrons = rngs[k].poisson(np.minimum(mean, 10 * self.full_well_e + 1000)).astype(np.float64)
+                electrons += self.read_noise_e * rngs[k].standard_normal(mean.shape)
+                result[k] = np.clip(np.rint(self.gain_dn_e * electrons + self.offset_dn), 0, self.max_dn)
+
+        from pcgraph.parallel import in_blocks
+
+        in_blocks(read, len(radiance), smallest=1)
         return result
 
     def noise_dn(self, dn: np.ndarray) -> np.ndarray:

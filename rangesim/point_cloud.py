@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from pcgraph.parallel import in_blocks
+from pcgraph.parallel import SMALLEST_ROWS, in_blocks
 from rangesim.range_image import RangeImage
 
 FRAMES = ("camera", "world")
@@ -18,8 +18,6 @@ NORMAL_RADIUS = 2
 """Pixels; normals are fitted to a window of (2 r + 1)^2 pixels."""
 MAX_SLOPE = 4.0
 """Depth step over lateral step between two pixels of one surface: 4 keeps surfaces seen up to 76 degrees off."""
-ROWS = 16
-"""Of an image that are worth a thread."""
 STEP_FLOOR = 0.005
 """Share of z by which neighbours may always differ, for noise."""
 
@@ -140,9 +138,8 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
     sums = np.zeros((9, *z.shape))
     steps = np.arange(-radius, radius + 1)
     limits = np.maximum(MAX_SLOPE * np.hypot(*np.meshgrid(steps, steps)) * _pixel_size(rays), STEP_FLOOR)
-    in_blocks(
-        _add_up, len(z), radius, limits, z, inverse, np.ascontiguousarray(rays, dtype=np.float64), sums, smallest=ROWS
-    )
+    rays = np.ascontiguousarray(rays, dtype=np.float64)
+    in_blocks(_add_up, len(z), radius, limits, z, inverse, rays, sums, smallest=SMALLEST_ROWS)
     return _normals_of_fit(sums, rays, inverse)
 
 

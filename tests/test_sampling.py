@@ -12,7 +12,7 @@ import pytest
 
 from rangesim import AmcwToF, DirectToF, Signals, StructuredLight, decode, expose, load_scene, transport
 from rangesim.light_transport.backend import select_variant
-from rangesim.light_transport.indirect import Guides, level_weights, smooth
+from rangesim.light_transport.indirect import Guides, level_weights, mixed_pixels, smooth
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 
@@ -109,7 +109,7 @@ def test_noise_falls_as_the_root_of_the_pixels_of_the_window() -> None:
 def test_weights_add_up_to_one_and_stay_within_an_instance() -> None:
     guides = plane_guides(instance=two_instances())
     for step in (1, 3):
-        weights = level_weights(guides, step)
+        weights = level_weights(guides, mixed_pixels(guides), step)
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-5)
     for number in range(3):
         light = np.where(guides.instance == number, 1.0, 1e6).astype(np.float32)[None]

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -43,12 +44,18 @@ def say_where(out: Path, target: Path) -> None:
 @contextmanager
 def light_left_out_in_a_line() -> Iterator[None]:
     """Afterwards print a line if passes left out light: the warning of the one that left out most."""
-    with warnings.catch_warnings(record=True) as caught:
+    left_out: list[TruncationWarning] = []
+    show_others: Callable[..., None] = warnings.showwarning
+
+    def keep(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        if isinstance(message, TruncationWarning):
+            left_out.append(message)
+        else:
+            show_others(message, category, *place)
+
+    with warnings.catch_warnings():
         warnings.simplefilter("always", TruncationWarning)
+        warnings.showwarning = keep  # type: ignore[assignment]
         yield
-    left_out = [one.message for one in caught if isinstance(one.message, TruncationWarning)]
-    for one in caught:
-        if one.message not in left_out:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     if left_out:
         typer.echo(f"rangesim: {max(left_out, key=lambda warning: warning.share)}", err=True)

@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks
+from pcgraph.parallel import SMALLEST_ROWS, in_blocks
 
 LEVELS = 2
 """The window is 3^LEVELS pixels wide."""
@@ -39,10 +39,6 @@ JUMP = 0.02
 behind: it sees both, and does not lend its light to others."""
 RIDGE = 0.05
 """Of the regression, as a share of the weight times the squared step: how soon a one-sided window is a plain mean."""
-
-
-ROWS = 16
-"""Of an image that are worth a thread."""
 
 
 class Guides(NamedTuple):
@@ -64,21 +60,28 @@ def smooth(images: list[NDArray[np.float32]], guides: Guides, levels: int = LEVE
     shown = guides.instance >= 0
     reflectance = np.where(shown, guides.reflectance, np.float32(1)).astype(np.float32)
     done = [image / reflectance for image in images]
+    mixed = mixed_pixels(guides)
     for level in range(levels):
-        weights = level_weights(guides, 3**level)
+        weights = level_weights(guides, mixed, 3**level)
         for i, image in enumerate(done):
             out = np.empty_like(image)
-            in_blocks(_apply, image.shape[1], weights, 3**level, image, out, smallest=ROWS)
+            in_blocks(_apply, image.shape[1], weights, 3**level, image, out, smallest=SMALLEST_ROWS)
             done[i] = out
     return [image * reflectance for image in done]
 
 
-def level_weights(guides: Guides, step: int) -> NDArray[np.float32]:
+def mixed_pixels(guides: Guides) -> NDArray[np.bool_]:
+    """(h, w) whether a pixel sees an edge with something behind it."""
+    mixed = np.zeros(guides.instance.shape, np.bool_)
+    in_blocks(_find_mixed, len(mixed), guides.instance, guides.position, guides.normal, mixed, smallest=SMALLEST_ROWS)
+    return mixed
+
+
+def level_weights(guides: Guides, mixed: NDArray[np.bool_], step: int) -> NDArray[np.float32]:
     """(h, 9, w) float32 weights of the 3 x 3 pixels `step` apart, row by row; they add up to 1."""
     h, w = guides.instance.shape
-    weights, mixed = np.zeros((h, 9, w), np.float32), np.zeros((h, w), np.bool_)
-    in_blocks(_find_mixed, h, guides.instance, guides.position, guides.normal, mixed, smallest=ROWS)
-    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights, smallest=ROWS)
+    weights = np.zeros((h, 9, w), np.float32)
+    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights, smallest=SMALLEST_ROWS)
     return weights
 
 

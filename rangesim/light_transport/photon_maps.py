@@ -40,8 +40,9 @@ MOST_LOOKED_AT = 16
 """Photons that a gather looks at, where there are more."""
 OCCUPANCY_CELLS = 1 << 18
 PRIMES = (73856093, 19349663, 83492791)
-CLASS_PRIME = 50331653
 """Spatial hash (Teschner et al. 2003), but added: combined by exclusive or, opposite cells would share a place."""
+CLASS_PRIME = 50331653
+"""The same for the number of a class."""
 BESIDE = 1e-4
 """Relative error of a radius that does not put a photon into the wrong class."""
 USUAL = 0.05

@@ -91,12 +91,6 @@ def load_scene(
     _check(loaded, ids, sensor, label)
     warn_of_lamps_behind_glass(loaded, label)
     repeat_normals(loaded)
-
-    def reload() -> Any:
-        again, _, _ = instantiate()
-        repeat_normals(again)
-        return again
-
     camera, T_world_camera = camera_of(loaded.sensors()[sensor], label)
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
@@ -107,7 +101,7 @@ def load_scene(
         working_distance_m=_median_depth(loaded, camera, T_world_camera),
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
         source=None if isinstance(source, Mapping) else scene_file(source),
-        reload=reload,
+        reload=lambda: repeat_normals(instantiate()[0]),
     )
 
 

@@ -20,8 +20,8 @@ UNKNOWN = (1.0, 0.0, 0.0)
 """What Mitsuba too takes at a vertex whose faces have no normal, or cancel."""
 
 
-def repeat_normals(scene: Any) -> None:
-    """Replace the vertex normals that Mitsuba has made for the meshes of `scene` by ones that every load repeats.
+def repeat_normals(scene: Any) -> Any:
+    """The mitsuba.Scene itself, whose meshes have vertex normals that every load repeats where Mitsuba has made them.
 
     Normals of a file stay. Mitsuba's are told from them by their values: all of a mesh agree with the sums here, up to
     the rounding of additions. A mesh whose faces cancel at every vertex (a sheet wound both ways) stays as it is too,
@@ -43,6 +43,7 @@ def repeat_normals(scene: Any) -> None:
         normals[clear] = sums[clear] / lengths[clear, None]
         parameters["vertex_normals"] = mi.Float(np.float32(normals).ravel())
         parameters.update()
+    return scene
 
 
 def _sums_at_vertices(vertices: Any, indices: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

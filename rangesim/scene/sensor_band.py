@@ -72,9 +72,9 @@ def warn_of_colours(names: list[str], label: str) -> None:
 
 def warn_of_lamps_behind_glass(scene: Any, label: str) -> None:
     """Warn once if there are lamps without extent, and glass that keeps paths from them."""
-    extent = mi.EmitterFlags.DeltaPosition.value | mi.EmitterFlags.DeltaDirection.value
+    without_extent = mi.EmitterFlags.DeltaPosition.value | mi.EmitterFlags.DeltaDirection.value
     glass = mi.BSDFFlags.DeltaTransmission
-    if any(e.flags() & extent for e in scene.emitters()) and any(
+    if any(e.flags() & without_extent for e in scene.emitters()) and any(
         mi.has_flag(shape.bsdf().flags(), glass) for shape in scene.shapes()
     ):
         warn(
