@@ -15,7 +15,7 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.decoding.gray import CONTRAST_SIGMAS, RELATIVE_CONTRAST
-from rangesim.decoding.histogram import MIN_COUNTS, PEAK_SIGMAS, RELATIVE_PEAK
+from rangesim.decoding.histogram import MIN_COUNTS, PEAK_SIGMAS, RELATIVE_PEAK, window_reach
 from rangesim.decoding.phase_shift import MAX_PHASE_SIGMA, RELATIVE_MODULATION
 from rangesim.detector import Detector, PhotoDetector
 from rangesim.rig import Rig
@@ -145,4 +145,4 @@ def _ambient_in_frame(capture: Capture) -> float:
 
 def _window_bins(sensor: DirectToF) -> int:
     """Bins in the window of a peak; see `rangesim.decoding.histogram.find_peak`."""
-    return 2 * max(1, int(np.ceil(2 * sensor.sigma_bins + 0.5))) + 1
+    return 2 * window_reach(sensor.bins, sensor.sigma_bins, sensor.is_cyclic) + 1

@@ -66,9 +66,7 @@ def find_peak(
     other end.
     """
     bins = len(histogram)
-    reach = max(1, int(np.ceil(2 * sigma_bins + 0.5)))
-    if is_cyclic:
-        reach = min(reach, (bins - 1) // 2)
+    reach = window_reach(bins, sigma_bins, is_cyclic)
     highest = _matched(histogram, sigma_bins, is_cyclic).argmax(axis=0)
     width: np.ndarray | int = 2 * reach + 1
     if not is_cyclic:
@@ -83,6 +81,12 @@ def find_peak(
     background = level * width
     centroid = _centroid(inside, level, recentred)
     return centroid % bins if is_cyclic else centroid, counts - background, background
+
+
+def window_reach(bins: int, sigma_bins: float, is_cyclic: bool) -> int:
+    """Bins on either side of a peak that its window holds."""
+    reach = max(1, int(np.ceil(2 * sigma_bins + 0.5)))
+    return min(reach, (bins - 1) // 2) if is_cyclic else reach
 
 
 def coates(counts: np.ndarray, pulses: int) -> np.ndarray:

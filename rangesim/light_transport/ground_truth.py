@@ -19,7 +19,7 @@ from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.rig import Rig
 from rangesim.scene import Scene
-from rangesim.scene.materials import MATERIAL_CLASSES, transmits
+from rangesim.scene.materials import MATERIAL_CLASSES, is_matte, transmits
 from rangesim.signals import GroundTruth
 
 
@@ -78,18 +78,6 @@ def mean_reflectance(view: View, settings: Settings, budget: Budget, has_cutouts
         launches.evaluate(total, samples * (end - begin))
         parts.append(total.numpy() / np.float32(samples))
     return np.concatenate(parts)
-
-
-def has_matte_textures(scene: Any) -> bool:
-    """Whether the reflectance of some matte surface of a mitsuba.Scene is not the same everywhere."""
-    bsdfs = {shape.bsdf() for shape in scene.shapes() if is_matte(shape)}
-    return any(not name.endswith("reflectance.value") for bsdf in bsdfs for name in mi.traverse(bsdf).keys())  # noqa: SIM118
-
-
-def is_matte(shape: Any) -> bool:
-    """Whether a surface is nothing but a diffuse reflector."""
-    flags = shape.bsdf().flags() & mi.BSDFFlags.All.value
-    return bool(flags == flags & mi.BSDFFlags.DiffuseReflection.value != 0) and shape.interior_medium() is None
 
 
 def _truth(

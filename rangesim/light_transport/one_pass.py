@@ -15,7 +15,7 @@ from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photo
 from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
-from rangesim.light_transport.ground_truth import ground_truth, has_matte_textures, mean_reflectance
+from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect import smooth
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Budget, Radiance, Settings, Traced, View, trace
@@ -148,7 +148,7 @@ def transport(
     tally[[name != "indirect" for name in Tally._fields]] /= samples.reshape(h, w)
     radiance = Radiance(*radiances)
     if keeps_apart:
-        if has_matte_textures(scene.mitsuba):
+        if scene.has_matte_textures:
             seen = mean_reflectance(view, settings, budget, scene.has_cutouts, min(int(samples.min()), TEXTURE_SAMPLES))
             guides = guides._replace(reflectance=seen.reshape(h, w))
         split = np.stack([radiance.multipath, radiance.faint])

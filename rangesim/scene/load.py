@@ -23,7 +23,7 @@ from rangesim.light_transport.medium import is_boundary, why_not_traced
 from rangesim.rig import Intrinsics
 from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of
-from rangesim.scene.materials import is_cutout, material_class
+from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
@@ -100,6 +100,7 @@ def load_scene(
         T_world_camera=T_world_camera,
         working_distance_m=_median_depth(loaded, camera, T_world_camera),
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
+        has_matte_textures=any(map(has_texture, {s.bsdf() for s in loaded.shapes() if is_matte(s)})),
         source=None if isinstance(source, Mapping) else scene_file(source),
         reload=lambda: repeat_normals(instantiate()[0]),
     )

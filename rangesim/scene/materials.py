@@ -62,6 +62,17 @@ def transmits(bsdf: Any) -> bool:
     return _has(bsdf, "DiffuseTransmission", "GlossyTransmission", "DeltaTransmission") or _has_thin_glass(bsdf)
 
 
+def is_matte(shape: Any) -> bool:
+    """Whether a surface is nothing but a diffuse reflector, without holes and with nothing inside that scatters."""
+    flags = shape.bsdf().flags() & mi.BSDFFlags.All.value
+    return bool(flags == flags & mi.BSDFFlags.DiffuseReflection.value != 0) and shape.interior_medium() is None
+
+
+def has_texture(bsdf: Any) -> bool:
+    """Whether the reflectance of a matte mitsuba.BSDF is not the same everywhere."""
+    return any(not name.endswith("reflectance.value") for name in mi.traverse(bsdf).keys())  # noqa: SIM118
+
+
 def _has_thin_glass(bsdf: Any) -> bool:
     """Whether a `thindielectric` is in it: what passes that has the flag of what passes a hole."""
     parts = mi.traverse(bsdf).hierarchy if _has(bsdf, "Null") else {}

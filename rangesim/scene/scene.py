@@ -35,6 +35,7 @@ class Scene:
     camera, T_world_camera : the scene's own sensor.
     working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
     has_cutouts : bool, whether some surface lets light pass unchanged (`mask`, `null`).
+    has_matte_textures : bool, whether the reflectance of some matte surface is not the same everywhere.
     source : Path of the file it was loaded from; None for a dictionary.
     reload : makes another mitsuba.Scene of the same source, for shapes to be moved in.
     """
@@ -46,6 +47,7 @@ class Scene:
     T_world_camera: np.ndarray
     working_distance_m: float
     has_cutouts: bool = False
+    has_matte_textures: bool = False
     source: Path | None = None
     reload: Callable[[], Any] | None = None
 
