@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,8 @@ from rangesim.array_files import write_arrays
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
+
+NO_SAMPLING_ERROR = "expected signals whose sampling error is known: those of a pass of at least 3 samples per pixel."
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,19 @@ class Truncation:
 
 
 @dataclass(frozen=True, eq=False)
+class SamplingError:
+    """One draw of the error that the sampling of light paths leaves in signals: half the difference of what two halves
+    of the samples say, scaled where these are not equal. It has the variance of the error, and its covariance between
+    channels, at each pixel; it is not the error itself.
+
+    channels : response -> (c, h, w) float32, W/m2/sr. projector : (h, w) float32, W/m2/sr, of `EnergySplit.projector`.
+    """
+
+    channels: dict[Response, np.ndarray]
+    projector: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Signals:
     """Everything one transport pass accumulated for the sensors that share a rig.
 
@@ -93,6 +108,7 @@ class Signals:
     motion_m : (h, w) float32, metres, how far what a pixel sees moves while its frames are taken, see
         `rangesim.motion`; None: nothing moves.
     truncation : what the pass left out, an estimate; None: not known.
+    sampling : SamplingError; None: not known.
     """
 
     rig: Rig
@@ -101,16 +117,39 @@ class Signals:
     truth: GroundTruth
     motion_m: np.ndarray | None = None
     truncation: Truncation | None = None
+    sampling: SamplingError | None = None
 
-    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0) -> np.ndarray:
-        """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass."""
+    def only(self, sensor: Sensor) -> Signals:
+        """These signals without what other sensors need."""
+        kept = sensor.responses()
+        sampling = self.sampling
+        if sampling is not None:
+            sampling = replace(sampling, channels={r: sampling.channels[r] for r in kept})
+        return replace(self, channels={r: self.channels[r] for r in kept}, sampling=sampling)
+
+    @property
+    def knows_sampling_error(self) -> bool:
+        """Whether `frames` can have its sampling error added."""
+        return self.sampling is not None
+
+    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
+        """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass.
+
+        sampling_errors : so many times `sampling` is added to the signals.
+        """
         missing = [r for r in sensor.responses() if r not in self.channels]
         if missing:
             raise ValueError(
                 f"expected signals of {sensor.type_name}, but the pass has no {missing[0]}; trace it with this sensor."
             )
-        channels = [self.channels[r] for r in sensor.responses()]
-        return sensor.frames(channels, self.energy.projector, ambient_transmission * self.energy.ambient)
+        channels, projector = [self.channels[r] for r in sensor.responses()], self.energy.projector
+        if sampling_errors:
+            if self.sampling is None:
+                raise ValueError(NO_SAMPLING_ERROR)
+            scale, error = np.float32(sampling_errors), self.sampling
+            channels = [c + scale * error.channels[r] for c, r in zip(channels, sensor.responses(), strict=True)]
+            projector = projector + scale * error.projector
+        return sensor.frames(channels, projector, ambient_transmission * self.energy.ambient)
 
     def save(self, path: str | Path) -> None:
         """Write energy split, ground truth and truncation to a compressed .npz file (for later comparison).

@@ -90,10 +90,16 @@ def two_instances() -> np.ndarray:
     return instance
 
 
+def smoothed(light: np.ndarray, guides: Guides) -> np.ndarray:
+    after = np.array(light, np.float32)
+    smooth([after], guides)
+    return after
+
+
 def test_light_that_is_linear_in_place_stays_as_it_is_but_for_one_sided_windows() -> None:
     guides = plane_guides()
     y, x = np.mgrid[:40, :50].astype(np.float32)
-    (after,) = smooth([np.stack([1 + 0.03 * x - 0.02 * y, np.ones_like(x)])], guides)
+    after = smoothed(np.stack([1 + 0.03 * x - 0.02 * y, np.ones_like(x)]), guides)
     np.testing.assert_allclose(after[0, 4:-4, 4:-4], (1 + 0.03 * x - 0.02 * y)[4:-4, 4:-4], rtol=1e-5)
     np.testing.assert_allclose(after[0], 1 + 0.03 * x - 0.02 * y, atol=0.04)  # a plain mean would be off by 0.2
     np.testing.assert_allclose(after[1], 1, rtol=1e-5)
@@ -101,7 +107,7 @@ def test_light_that_is_linear_in_place_stays_as_it_is_but_for_one_sided_windows(
 
 def test_noise_falls_as_the_root_of_the_pixels_of_the_window() -> None:
     noise = np.random.default_rng(5).normal(size=(6, 40, 50)).astype(np.float32)
-    (after,) = smooth([noise], plane_guides())
+    after = smoothed(noise, plane_guides())
     assert after[:, 4:-4, 4:-4].std() == pytest.approx(1 / 9, rel=0.1)
     assert after.std() < 1 / 5
 
@@ -113,7 +119,7 @@ def test_weights_add_up_to_one_and_stay_within_an_instance() -> None:
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-5)
     for number in range(3):
         light = np.where(guides.instance == number, 1.0, 1e6).astype(np.float32)[None]
-        (after,) = smooth([light], guides)
+        after = smoothed(light, guides)
         np.testing.assert_allclose(after[0][guides.instance == number], 1, rtol=1e-5)
 
 
@@ -127,15 +133,15 @@ def test_pixels_of_their_own_other_normals_and_other_planes_share_nothing() -> N
     light = np.ones((1, 40, 50), np.float32)
     light[:, :, 20:] = 5
     for changed in (guides._replace(instance=alone), guides._replace(normal=tilted), guides._replace(position=behind)):
-        (after,) = smooth([light], changed)
+        after = smoothed(light, changed)
         np.testing.assert_allclose(after, light, rtol=1e-5)
-    assert not np.allclose(smooth([light], guides)[0], light)
+    assert not np.allclose(smoothed(light, guides), light)
 
 
 def test_textures_are_not_blurred() -> None:
     """What is smooth is the light that arrives: radiance over reflectance."""
     reflectance = np.random.default_rng(2).uniform(0.05, 0.9, (40, 50)).astype(np.float32)
-    (after,) = smooth([reflectance[None]], plane_guides(reflectance=reflectance))
+    after = smoothed(reflectance[None], plane_guides(reflectance=reflectance))
     np.testing.assert_allclose(after[0], reflectance, rtol=1e-5)
 
 

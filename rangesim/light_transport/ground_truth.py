@@ -65,12 +65,12 @@ def mean_reflectance(view: View, settings: Settings, budget: Budget, has_cutouts
     """(pixels,) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
     launches, parts = Launches(), []
     surfaces, camera = view.surfaces, view.camera
-    for begin, end in launches.ranges(len(budget.samples), samples):
-        lanes = Lanes(view, settings, budget, np.arange(begin, end), 0)
+    for begin, end in launches.ranges(len(budget.pixels), samples):
+        lanes = Lanes(view, settings, budget, np.arange(begin, end))
         total, sample = dr.zeros(mi.Float, end - begin), dr.zeros(mi.UInt32, end - begin)
         most = dr.opaque(mi.UInt32, samples)
         while sample < most:
-            place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, lanes.samples)
+            place, lens = in_pairs(lanes.shift, lanes.lens_shift, sample, lanes.total)
             ray = camera.sample_ray(lanes.corner + place, lens)
             si = first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
             total += mono(si.bsdf().eval_diffuse_reflectance(si, si.is_valid()))

@@ -40,6 +40,9 @@ behind: it sees both, and does not lend its light to others."""
 RIDGE = 0.05
 """Of the regression, as a share of the weight times the squared step: how soon a one-sided window is a plain mean."""
 
+CHANNELS_AT_ONCE, ROWS_AT_ONCE = 32, 16
+"""Of the filter: what fits into the caches."""
+
 
 class Guides(NamedTuple):
     """What decides which pixels share light.
@@ -55,19 +58,25 @@ class Guides(NamedTuple):
     reflectance: NDArray[np.float32]
 
 
-def smooth(images: list[NDArray[np.float32]], guides: Guides, levels: int = LEVELS) -> list[NDArray[np.float32]]:
-    """Filtered copies of images (c, h, w) of indirect light."""
-    shown = guides.instance >= 0
-    reflectance = np.where(shown, guides.reflectance, np.float32(1)).astype(np.float32)
-    done = [image / reflectance for image in images]
+def smooth(images: list[NDArray[np.float32]], guides: Guides, levels: int = LEVELS) -> None:
+    """Filter images (c, h, w) of indirect light in place."""
+    if not levels:
+        return
     mixed = mixed_pixels(guides)
-    for level in range(levels):
-        weights = level_weights(guides, mixed, 3**level)
-        for i, image in enumerate(done):
-            out = np.empty_like(image)
-            in_blocks(_apply, image.shape[1], weights, 3**level, image, out, smallest=SMALLEST_ROWS)
-            done[i] = out
-    return [image * reflectance for image in done]
+    weights = [level_weights(guides, mixed, 3**level) for level in range(levels)]
+    reflectance = np.where(guides.instance >= 0, guides.reflectance, np.float32(1)).astype(np.float32)
+    _of_radiance(weights[0], weights[-1], reflectance)
+    h, w = reflectance.shape
+    scratch = [np.empty((CHANNELS_AT_ONCE, h, w), np.float32) for _ in range(min(levels, 2))]
+    for image in images:
+        for begin in range(0, len(image), CHANNELS_AT_ONCE):
+            some = image[begin : begin + CHANNELS_AT_ONCE]
+            before = some
+            for level in range(levels):
+                after = scratch[level % 2][: len(some)]
+                in_blocks(_apply, h, weights[level], 3**level, before, after, smallest=SMALLEST_ROWS)
+                before = after
+            some[:] = before
 
 
 def mixed_pixels(guides: Guides) -> NDArray[np.bool_]:
@@ -150,15 +159,51 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
                 weights[y, k, x] /= total
 
 
+def _of_radiance(first: NDArray[np.float32], last: NDArray[np.float32], reflectance: NDArray[np.float32]) -> None:
+    """Make weights of radiance over reflectance those of radiance: divided by that of the neighbour at the first level,
+    times that of the pixel at the last."""
+    h, w = reflectance.shape
+    for k in range(9):
+        dy, dx = k // 3 - 1, k % 3 - 1
+        here = np.s_[max(0, -dy) : h - max(0, dy), max(0, -dx) : w - max(0, dx)]
+        there = np.s_[max(0, dy) : h - max(0, -dy), max(0, dx) : w - max(0, -dx)]
+        first[here[0], k, here[1]] /= reflectance[there]
+    last *= reflectance[:, None, :]
+
+
 @njit(nogil=True, cache=True)
 def _apply(start, stop, weights, step, image, out):  # type: ignore[no-untyped-def]
-    channels, h, w = image.shape
-    for c in range(channels):
-        for y in range(start, stop):
-            row = np.zeros(w, np.float32)
-            for k in range(9):
-                yk, dx = y + (k // 3 - 1) * step, (k % 3 - 1) * step
-                if 0 <= yk < h:
-                    for x in range(max(0, -dx), min(w, w - dx)):
-                        row[x] += weights[y, k, x] * image[c, yk, x + dx]
-            out[c, y] = row
+    channels, h, _ = image.shape
+    for first in range(start, stop, ROWS_AT_ONCE):  # whose weights stay in the cache
+        for c in range(channels):
+            for y in range(first, min(first + ROWS_AT_ONCE, stop)):
+                # Beyond the borders weights are 0, so any pixel will do
+                above, below = image[c, max(y - step, 0)], image[c, min(y + step, h - 1)]
+                _apply_to_row(weights[y], step, above, image[c, y], below, out[c, y])
+
+
+@njit(nogil=True, cache=True)
+def _apply_to_row(weights, step, above, row, below, out):  # type: ignore[no-untyped-def]
+    w = len(row)
+    for border in range(min(step, (w + 1) // 2)):
+        for x in (border, w - 1 - border):
+            total = np.float32(0)
+            for i in range(3):
+                neighbour = min(max(x + (i - 1) * step, 0), w - 1)
+                total += weights[i, x] * above[neighbour]
+                total += weights[3 + i, x] * row[neighbour]
+                total += weights[6 + i, x] * below[neighbour]
+            out[x] = total
+    # Views that all start where the sum begins: else the loop is not vectorised
+    w0, w1, w2, w3, w4, w5, w6, w7, w8 = (
+        weights[0, step:], weights[1, step:], weights[2, step:], weights[3, step:], weights[4, step:],
+        weights[5, step:], weights[6, step:], weights[7, step:], weights[8, step:],
+    )  # fmt: skip
+    a0, a1, a2, r0, r1, r2 = above, above[step:], above[2 * step :], row, row[step:], row[2 * step :]
+    b0, b1, b2, result = below, below[step:], below[2 * step :], out[step:]
+    for x in range(w - 2 * step):
+        result[x] = (
+            (w0[x] * a0[x] + w3[x] * r0[x] + w6[x] * b0[x])
+            + (w1[x] * a1[x] + w4[x] * r1[x] + w7[x] * b1[x])
+            + (w2[x] * a2[x] + w5[x] * r2[x] + w8[x] * b2[x])
+        )

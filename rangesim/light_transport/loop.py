@@ -21,7 +21,7 @@ non-delta vertex (`rangesim.light_transport.glint`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -36,7 +36,7 @@ from rangesim.light_transport.launches import Launches, Report, fewest_lanes
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.responses import Accumulators
-from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, random_stream
+from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
 from rangesim.light_transport.truncation import Tally
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 
@@ -66,13 +66,40 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """What each pixel of the image gets.
+    """Samples that some pixels get, and the projector's light.
 
-    samples : (pixels,) uint32. irradiance : of the projector, W/m2 at z = 1 m.
+    pixels : (n,) flat indices in the whole image. samples : (n,) uint32, how many of each pixel are taken.
+    total : (n,) uint32, samples of each pixel all in all, those taken at other times included.
+    first, stride : number of the first of the samples taken, and numbers from a pair of samples to the next.
+    part : int, numbers the parts of a pass; their random numbers are independent.
+    irradiance : of the projector, W/m2 at z = 1 m.
     """
 
+    pixels: np.ndarray
     samples: np.ndarray
+    total: np.ndarray
     irradiance: float
+    first: int = 0
+    stride: int = 2
+    part: int = 0
+
+    def of(self, some: slice) -> Budget:
+        """The budget of some of the pixels."""
+        return replace(self, pixels=self.pixels[some], samples=self.samples[some], total=self.total[some])
+
+    def halves(self) -> list[Budget]:
+        """Two budgets that have every second pair of samples each, so that both fill the pixel evenly."""
+        pairs, odd = (self.samples + 1) >> 1, self.samples & 1
+        return [
+            replace(
+                self,
+                samples=2 * (pairs + 1 - half >> 1) - odd * ((pairs - 1 & 1) == half),
+                first=self.first + 2 * half,
+                stride=2 * self.stride,
+                part=2 * self.part + half,
+            )
+            for half in (0, 1)
+        ]
 
 
 class Radiance(NamedTuple):
@@ -90,7 +117,7 @@ class Radiance(NamedTuple):
 class Traced(NamedTuple):
     """Sums over the samples of each pixel, besides channels.
 
-    radiance : (6, pixels) float32, in the order of `Radiance`. tally : (6, pixels) float32, in the order of `Tally`.
+    radiance : (6, n) float32, in the order of `Radiance`. tally : (6, n) float32, in the order of `Tally`.
     """
 
     radiance: np.ndarray
@@ -162,17 +189,16 @@ def trace(
     settings: Settings,
     budget: Budget,
     accumulators: Accumulators,
-    first_pixel: int,
     launches: Launches,
     report: Report,
 ) -> Traced:
     """Radiance by kind of path, and what tells how much is left out; channels go to the accumulators.
 
-    The pixels are those of the accumulators, from `first_pixel` on in the whole image. `report` gets the share done.
+    The pixels of the budget are those of the accumulators. `report` gets the share done.
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
     traced = Traced(*(np.empty((len(kind._fields), pixels), np.float32) for kind in (Radiance, Tally)))
-    samples = budget.samples[first_pixel : first_pixel + pixels]
+    samples = budget.samples
     total, begin, finished, turns = int(samples.sum(dtype=np.int64)), 0, 0, 0
 
     def tell(state: State) -> None:
@@ -185,7 +211,7 @@ def trace(
         end = begin + -(-left // -(-left // most))  # launches of even size
         places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
         places = places[places < pixels]
-        lanes = Lanes(view, settings, budget, places, first_pixel)
+        lanes = Lanes(view, settings, budget, places)
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
         accumulators.store(state.channels, places)
@@ -208,26 +234,30 @@ class Lanes:
     Parameters
     ----------
     view, settings, budget : View, Settings and Budget.
-    places : (lanes,) int, numbers of the pixels in the accumulators.
-    first_pixel : int, flat index in the whole image of the first pixel of the accumulators. Random numbers depend on a
-        pixel's flat index in the whole image and the seed alone.
+    places : (lanes,) int, numbers of the pixels in budget and accumulators. Random numbers depend on a pixel's flat
+        index in the whole image, the part and the seed alone.
     """
 
-    def __init__(self, view: View, settings: Settings, budget: Budget, places: np.ndarray, first_pixel: int) -> None:
+    def __init__(self, view: View, settings: Settings, budget: Budget, places: np.ndarray) -> None:
         self.place = mi.UInt32(places.astype(np.uint32))
-        self.pixel = self.place + dr.opaque(mi.UInt32, first_pixel)
-        samples = budget.samples[first_pixel + places]
-        self.samples = mi.UInt32(samples)
-        self.irradiance = mi.Float((budget.irradiance / samples).astype(np.float32))  # sums over samples are means
-        dr.eval(self.pixel)
+        self.pixel = mi.UInt32(budget.pixels[places].astype(np.uint32))
+        self.samples, self.total = mi.UInt32(budget.samples[places]), mi.UInt32(budget.total[places])
+        self.first, self.stride, self.part = (
+            dr.opaque(mi.UInt32, n) for n in (budget.first, budget.stride, budget.part)
+        )
+        self.irradiance = dr.opaque(mi.Float, budget.irradiance)
         width = mi.UInt32(view.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
         rng = random_stream(settings.seed, self.pixel)
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the samples in the pixel
         on_lens = view.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
-        self.random = Continued(rng)
-        self.choice = Continued(random_stream(settings.seed, self.pixel, Stream.SECOND))
+        self.random = Continued(of_part(rng, self.part))
+        self.choice = Continued(of_part(random_stream(settings.seed, self.pixel, Stream.SECOND), self.part))
+
+    def number(self, taken: Any) -> Any:
+        """Number among all samples of the pixel of the next one, after so many were taken."""
+        return self.first + (taken >> 1) * self.stride + (taken & 1)
 
 
 def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes) -> State:
@@ -239,11 +269,13 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
         random=mi.UInt64(at.random.rng.state),
         choice=mi.UInt64(at.choice.rng.state) if gathers else None,  # of photons; they change no other light
         # Shared by neighbours; evenly spread from here on
-        turns=random_stream(settings.seed, at.pixel >> 4, Stream.THIRD).next_uint32() if gathers else None,
+        turns=of_part(random_stream(settings.seed, at.pixel >> 4, Stream.THIRD), at.part).next_uint32()
+        if gathers
+        else None,
         channels=accumulators.zeros(lanes),
         radiance=[dr.zeros(mi.Float, lanes) if any_of_it else None for any_of_it in shines],
         tally=[dr.zeros(mi.Float, lanes) for _ in range(5)] + [dr.zeros(mi.Float, lanes) if settings.delta else None],
-        sample=dr.zeros(mi.UInt32, lanes),  # samples of this pixel finished so far
+        sample=dr.zeros(mi.UInt32, lanes),  # samples of this pixel finished so far, of those to be taken
         # ---- Of the path -----------------------------------------------------------------------------
         depth=dr.zeros(mi.UInt32, lanes),  # surfaces that scattered it so far
         chain=dr.zeros(mi.UInt32, lanes) if settings.delta else None,  # delta interactions since
@@ -293,7 +325,8 @@ def walk(
             starts &= chain == 0
         if dr.hint(media is not None, mode="scalar"):
             starts &= events == 0
-        jitter, lens = in_pairs(at.shift, at.lens_shift, sample, at.samples)
+        number = at.number(sample)
+        jitter, lens = in_pairs(at.shift, at.lens_shift, number, at.total)
         primary = camera.sample_ray(at.corner + jitter, lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
         length = dr.select(starts, primary.lead, length)
@@ -363,13 +396,13 @@ def walk(
 
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
-            vertex = Vertex(si, bsdf, throughput / mi.Float(at.samples), length, first & ~link.lit)
+            vertex = Vertex(si, bsdf, throughput, length, first & ~link.lit)
             chosen = at.choice.at(choice)
             xi = [chosen.next_float32() for _ in range(3)]
             choice = chosen.state
             turns += 2654435769  # 2^32 over the golden ratio
             chance, gathers = mi.Float(turns >> 8) * 2**-24, may_connect & ~scatters
-            photon, brought, is_wide = gather(maps, vertex, sample, xi, chance, gathers)
+            photon, brought, is_wide = gather(maps, vertex, number, xi, chance, gathers)
             channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
             caustic += dr.select(is_wide, 0, radiance)
             faint += dr.select(is_wide, radiance, 0)

@@ -16,7 +16,7 @@ from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
-from rangesim.light_transport.indirect import smooth
+from rangesim.light_transport.indirect import Guides, smooth
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Budget, Radiance, Settings, Traced, View, trace
 from rangesim.light_transport.medium import media_of
@@ -30,13 +30,15 @@ from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.seeds import check_seed
 from rangesim.sensors import Sensor
-from rangesim.signals import EnergySplit, Signals
+from rangesim.signals import EnergySplit, SamplingError, Signals
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 Indirect = Literal["filtered", "raw"]
 MATTE_SPP, OTHER_SPP = 16, 64
 """Samples of a pixel if their number is not given; measured by benchmarks/sampling_noise.py."""
+FEWEST_FOR_HALVES = 3
+"""Samples of a pixel: two and one."""
 TEXTURE_SAMPLES = 64
 """Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
 PATHS_SHARE = 0.95
@@ -106,8 +108,6 @@ def transport(
     if indirect not in get_args(Indirect):
         raise ValueError(f"expected indirect to be one of {', '.join(get_args(Indirect))}, got {indirect!r}.")
     keeps_apart = indirect == "filtered"
-    channels: dict[Response, list[np.ndarray]] = {r: [] for r in responses}
-    tiles: list[Traced] = []
     report = Progress(progress)
     launches = Launches(is_watched=progress is not None)
     media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
@@ -136,27 +136,31 @@ def transport(
     )
     camera, projector, cutouts = Device.camera(rig), Device.projector(rig), cutouts_of(scene.mitsuba)
     view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts)
-    budget = Budget(samples, rig.projector_irradiance)
+    whole = Budget(np.arange(h * w), samples, samples, rig.projector_irradiance)
+    halves = whole.halves() if samples.min() >= FEWEST_FOR_HALVES else [whole]
+    sums = [Sums(responses, 1 + keeps_apart, h, w) for _ in halves]
+    done = 0
     for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
-        accumulators = Accumulators(responses, end - begin, keeps_apart)
-        so_far = partial(_report, report, begin / (h * w), (end - begin) / (h * w))
-        tiles.append(trace(view, settings, budget, accumulators, begin, launches, so_far))
-        for response, values in zip(responses, accumulators.images(), strict=True):
-            channels[response].append(values)
-    sums = {r: _join(parts, h, w) for r, parts in channels.items()}
-    radiances, tally = (_join([part[:, None] for part in parts], h, w)[:, 0] for parts in zip(*tiles, strict=True))
-    tally[[name != "indirect" for name in Tally._fields]] /= samples.reshape(h, w)
-    radiance = Radiance(*radiances)
+        for half, total in zip(halves, sums, strict=True):
+            budget = half.of(slice(begin, end))
+            accumulators = Accumulators(responses, end - begin, keeps_apart)
+            taken = int(budget.samples.sum(dtype=np.int64))
+            so_far = partial(_report, report, done / samples.sum(dtype=np.int64), taken / samples.sum(dtype=np.int64))
+            traced = trace(view, settings, budget, accumulators, launches, so_far)
+            total.add(slice(begin, end), traced, accumulators)
+            done += taken
+    tally = sum(total.tally for total in sums) / samples.reshape(h, w)
+    mean = sums[0]
+    error = mean.average(sums[1], *(half.samples.reshape(h, w) for half in halves)) if len(sums) == 2 else None
+    if error is None:
+        mean.divide(samples.reshape(h, w))
     if keeps_apart:
         if scene.has_matte_textures:
-            seen = mean_reflectance(view, settings, budget, scene.has_cutouts, min(int(samples.min()), TEXTURE_SAMPLES))
+            seen = mean_reflectance(view, settings, whole, scene.has_cutouts, min(int(samples.min()), TEXTURE_SAMPLES))
             guides = guides._replace(reflectance=seen.reshape(h, w))
-        split = np.stack([radiance.multipath, radiance.faint])
-        (multipath, faint), *filtered = smooth([split, *(both[1] for both in sums.values())], guides)
-        radiance = radiance._replace(multipath=multipath, faint=faint)
-        for (others, _), smoothed in zip(sums.values(), filtered, strict=True):
-            others += smoothed
-    images = {r: parts[0] for r, parts in sums.items()}
+        _share_indirect([part for part in (mean, error) if part is not None], guides)
+    radiance = Radiance(*mean.radiance)
+    images = {r: parts[0] for r, parts in mean.channels.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
         found = trace_glint(scene.mitsuba, rig, responses, seed, media, surfaces, partial(report, PATHS_SHARE))
@@ -164,26 +168,82 @@ def transport(
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
     report(1.0)
-    energy = _energy(radiance, highlights[0], samples.reshape(h, w))
+    energy = _energy(radiance, highlights[0])
     truncation = estimate_truncation(tally, energy, max_depth, maps.cut if maps else 0.0)
     warn_of_truncation(truncation, max_depth, stacklevel=3)  # where `transport` was called
-    return Signals(rig, images, energy, truth, truncation=truncation)
+    return Signals(rig, images, energy, truth, truncation=truncation, sampling=None if error is None else error.drawn())
 
 
-def _energy(radiance: Radiance, glint: np.ndarray, samples: np.ndarray) -> EnergySplit:
+class Sums:
+    """Sums over samples of each pixel, or means.
+
+    channels : response -> (parts, c, h, w) float32; `parts` as of `Accumulators`. radiance : (6, h, w) float32, in the
+    order of `Radiance`. tally : (6, h, w) float32, in the order of `Tally`.
+    """
+
+    def __init__(self, responses: Sequence[Response], parts: int, h: int, w: int) -> None:
+        self.channels = {r: np.zeros((parts, r.channels, h, w), np.float32) for r in responses}
+        self.radiance = np.zeros((len(Radiance._fields), h, w), np.float32)
+        self.tally = np.zeros((len(Tally._fields), h, w), np.float32)
+
+    def add(self, pixels: slice, traced: Traced, accumulators: Accumulators) -> None:
+        """Take the sums of some of the pixels."""
+        parts = [*zip(self.channels.values(), accumulators.images(), strict=True)]
+        for image, values in [*parts, (self.radiance, traced.radiance), (self.tally, traced.tally)]:
+            image.reshape(*image.shape[:-2], -1)[..., pixels] = values
+
+    def planes(self) -> Iterator[np.ndarray]:
+        """Channels and radiance, one (h, w) view after the other."""
+        for image in (*self.channels.values(), self.radiance):
+            yield from image.reshape(-1, *image.shape[-2:])
+
+    def divide(self, samples: np.ndarray) -> None:
+        """Make means of these sums over so many samples (h, w)."""
+        for plane in self.planes():
+            plane /= samples
+
+    def average(self, other: Sums, own_samples: np.ndarray, other_samples: np.ndarray) -> Sums:
+        """Make means over all samples of these sums and the other; the other ones become a draw of the error of that.
+
+        With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all.
+        """
+        p, q = own_samples.astype(np.float32), other_samples.astype(np.float32)
+        n = p + q
+        of_own, of_other = np.sqrt(q / p) / n, np.sqrt(p / q) / n
+        for a, b in zip(self.planes(), other.planes(), strict=True):
+            difference = a * of_own - b * of_other
+            a += b
+            a /= n
+            b[:] = difference
+        return other
+
+    def drawn(self) -> SamplingError:
+        """These errors, as signals keep them."""
+        radiance = Radiance(*self.radiance)
+        projector = radiance.direct + radiance.multipath + radiance.via_delta + radiance.caustic + radiance.faint
+        return SamplingError({r: parts[0] for r, parts in self.channels.items()}, projector)
+
+
+def _share_indirect(parts: Sequence[Sums], guides: Guides) -> None:
+    """Let neighbouring pixels share what is smooth of their light, in place; what each part has first then has all."""
+    smooth_light = [Radiance._fields.index("multipath"), Radiance._fields.index("faint")]
+    images = [part.radiance[smooth_light] for part in parts]
+    smooth(images + [values[1] for part in parts for values in part.channels.values()], guides)
+    for part, image in zip(parts, images, strict=True):
+        part.radiance[smooth_light] = image
+        for direct, indirect in part.channels.values():
+            direct += indirect
+
+
+def _energy(radiance: Radiance, glint: np.ndarray) -> EnergySplit:
     return EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,
         via_delta=radiance.via_delta,
         caustic=radiance.caustic + radiance.faint,
         glint=glint,
-        ambient=radiance.ambient / samples.astype(np.float32),
+        ambient=radiance.ambient,
     )
-
-
-def _join(tiles: list[np.ndarray], h: int, w: int) -> np.ndarray:
-    """(parts, c, h, w) of tiles (parts, c, pixels), without a copy where there is but one."""
-    return (tiles[0] if len(tiles) == 1 else np.concatenate(tiles, axis=-1)).reshape(*tiles[0].shape[:2], h, w)
 
 
 def _report(report: Report, before: float, share: float, of_tile: float) -> None:

@@ -44,6 +44,11 @@ def random_stream(seed: Seed, number: Any, stream: Stream = Stream.FIRST) -> Any
     return mi.PCG32(1, *(reversed(states) if stream is Stream.SECOND else states))  # 1: no lane number mixed in
 
 
+def of_part(rng: Any, part: Any) -> Any:
+    """The numbers of a PCG32 for one of several parts (UInt32) that share its seed, 2^40 numbers apart."""
+    return rng + mi.Int64(mi.UInt64(part) << 40)
+
+
 class Continued:
     """A stream of which a loop carries the state alone.
 

@@ -13,7 +13,7 @@ from rangesim.motion.passes import Pass
 from rangesim.motion.timing import Timing
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
-from rangesim.signals import Signals
+from rangesim.signals import NO_SAMPLING_ERROR, Signals
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +28,7 @@ class MovingSignals(Signals):
     ambient : (e, h, w) float32, W/m2/sr, ambient light during each exposure, before any filter.
     ambient_gain : (k,) float32, how much of it a frame holds.
     exposure_of_frames : (k,) int, index into `ambient`.
+    lit_error : (k, h, w) float32, W/m2/sr, a draw of the sampling error of `lit`; None: not known.
     """
 
     sensor: Sensor = field(kw_only=True)
@@ -35,13 +36,23 @@ class MovingSignals(Signals):
     ambient: np.ndarray = field(kw_only=True)
     ambient_gain: np.ndarray = field(kw_only=True)
     exposure_of_frames: np.ndarray = field(kw_only=True)
+    lit_error: np.ndarray | None = field(kw_only=True, default=None)
 
-    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0) -> np.ndarray:
+    @property
+    def knows_sampling_error(self) -> bool:
+        return self.lit_error is not None
+
+    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
         if sensor != self.sensor:
             raise ValueError(f"expected {self.sensor}, whose frames these are, got {sensor}.")
+        lit = self.lit
+        if sampling_errors:
+            if self.lit_error is None:
+                raise ValueError(NO_SAMPLING_ERROR)
+            lit = lit + np.float32(sampling_errors) * self.lit_error
         gain = np.float32(ambient_transmission) * self.ambient_gain
-        parts = zip(self.lit, gain, self.exposure_of_frames, strict=True)
-        return np.stack([lit + g * self.ambient[exposure] for lit, g, exposure in parts])
+        parts = zip(lit, gain, self.exposure_of_frames, strict=True)
+        return np.stack([frame + g * self.ambient[exposure] for frame, g, exposure in parts])
 
 
 class FrameStack:
@@ -56,19 +67,23 @@ class FrameStack:
 
     def __init__(self, sensor: Sensor, timing: Timing, rig: Rig, middle: Pass, at_middle: Signals) -> None:
         self.sensor, self.rig = sensor, rig
-        self.middle, self.at_middle = middle, replace(at_middle, channels={})
+        self.middle, self.at_middle = middle, replace(at_middle, channels={}, sampling=None)
         self.exposure_of_frames = timing.exposure_of_frames(sensor)
         image = (rig.camera.height, rig.camera.width)
         self.lit = np.zeros((sensor.n_frames, *image), dtype=np.float32)
+        self.lit_error = np.zeros_like(self.lit) if at_middle.knows_sampling_error else None
         self.ambient = np.zeros((len(timing.exposure_times_s(sensor)), *image), dtype=np.float32)
         self.motion_m = np.zeros(image, dtype=np.float32)
 
     def add(self, one: Pass, signals: Signals) -> None:
         """Take what a pass has for this sensor."""
-        frames = signals.frames(self.sensor, ambient_transmission=0.0)
+        frames = signals.frames(self.sensor, 0.0)
+        error = None if self.lit_error is None else signals.frames(self.sensor, 0.0, sampling_errors=1.0) - frames
         for share in one.shares:
             if share.sensor == self.sensor:
                 one.window.of(self.lit)[share.frames] += np.float32(share.share) * frames[share.frames]
+                if self.lit_error is not None and error is not None:
+                    one.window.of(self.lit_error)[share.frames] += np.float32(share.share) * error[share.frames]
                 one.window.of(self.ambient)[share.exposure] += np.float32(share.share) * signals.energy.ambient
         cropped = replace(self.rig, camera=signals.rig.camera)
         leaves = displacement(self.at_middle.truth, self.rig, self.middle.placement, one.placement)
@@ -95,6 +110,7 @@ class FrameStack:
             ambient=self.ambient,
             ambient_gain=_ambient_gain(self.sensor),
             exposure_of_frames=self.exposure_of_frames,
+            lit_error=self.lit_error,
         )
 
 

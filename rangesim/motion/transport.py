@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -85,7 +84,7 @@ def transport_moving(
             if any(sensor in other.sensors for other in passes if other is not one):
                 stacks[sensor] = FrameStack(sensor, timings[sensor], rig, one, signals)
             else:
-                at_once[sensor] = replace(signals, channels={r: signals.channels[r] for r in sensor.responses()})
+                at_once[sensor] = signals.only(sensor)
         for sensor in one.sensors:
             if sensor in stacks:
                 stacks[sensor].add(one, signals)
