@@ -17,7 +17,6 @@ EDGE_RADIUS = 2
 """Pixels from a depth edge within which a pixel can be a flying pixel."""
 EDGE_SHARE = 0.02
 """A depth edge is where neighbours' true depths differ by more than this share of the nearer, and `outlier_m`."""
-ALL = "all"
 
 
 @dataclass(frozen=True)
@@ -111,12 +110,9 @@ def compare(image: RangeImage, truth: GroundTruth, outlier_m: float = OUTLIER_M)
         raise ValueError(f"expected a positive outlier_m in metres, got {outlier_m}.")
     error = np.where(image.valid, image.z.astype(np.float64) - truth.z, np.nan)
     edge, flying = _flying(image.z, truth.z, outlier_m)
-    seen = np.isfinite(truth.z)
-    classes = {name: seen & (truth.material == i) for i, name in enumerate(truth.material_names)}
     table = [
         _statistics(name, mask, error, truth.projector_visible, edge, flying, outlier_m)
-        for name, mask in [*classes.items(), (ALL, seen)]
-        if mask.any() or name == ALL
+        for name, mask in truth.classes().items()
     ]
     return Comparison(tuple(table), error.astype(np.float32), flying, outlier_m)
 

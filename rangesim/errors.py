@@ -15,6 +15,7 @@ __all__ = [
     "FileFormatError",
     "RangesimError",
     "RangesimWarning",
+    "SamplingWarning",
     "TruncationWarning",
     "sentence",
     "visible",
@@ -50,6 +51,10 @@ class TruncationWarning(RangesimWarning):
     def __init__(self, message: str, share: float) -> None:
         super().__init__(message)
         self.share = share
+
+
+class SamplingWarning(RangesimWarning):
+    """The noise that the sampling of light paths makes is not small against the detector's."""
 
 
 def warn(message: str) -> None:

@@ -59,15 +59,21 @@ def expose(
     if ambient is not None:
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or isinstance(sensor, IdealToF):
-        unfiltered = 1.0 if ambient is None else ambient.scale
-        return Capture(
-            _through_lens(signals.frames(sensor, unfiltered), signals.rig), sensor, signals.rig, ambient=ambient
-        )
+        return noise_free_capture(signals, sensor, ambient)
     radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor, ambient)), signals.rig)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor, signals.rig, exposure_s, seed)
     return Capture(frames, sensor, signals.rig, detector, exposure_s, ambient)
+
+
+def noise_free_capture(
+    signals: Signals, sensor: Sensor, ambient: Ambient | None = None, sampling_errors: float = 0.0
+) -> Capture:
+    """Capture of radiance, without a detector; so many times the sampling error of the signals is added to them."""
+    unfiltered = 1.0 if ambient is None else ambient.scale
+    frames = signals.frames(sensor, unfiltered, sampling_errors)
+    return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections import ChainMap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,6 +25,7 @@ from rangesim.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.provenance import provenance
+from rangesim.reading_noise import reading_noise, warn_of_sampling
 from rangesim.result_files import (
     RESULT,
     SETTINGS,
@@ -106,8 +108,10 @@ def run(
         write_record(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
         say("Writing the report", 0.97)
         result = load_result(folder)
-        _write_comparison(folder, [(m.name, m.rows) for m in result.measurements])
+        tables = {m.name: m.rows for m in result.measurements}
+        _write_comparison(folder, list(tables.items()))
         write_report(result, folder / "report.html")
+    warn_of_sampling(tables)
 
 
 def estimate(experiment: Experiment) -> Cost:
@@ -134,12 +138,18 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     write_capture(capture, folder / "capture")
     with timed(times, "decode"):
         image = rangesim.decode(capture)
+    noise = None
+    if signals.knows_sampling_error:
+        with timed(times, "noise"):
+            noise = reading_noise(image, capture, signals)
+        image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
     save_range_image(image, folder / "range.npz")
     comparison = rangesim.compare(image, signals.truth)
     with timed(times, "causes"):
         causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
     save_causes(causes, folder / "causes.npz")
-    rows = [row | failures for row, failures in zip(comparison.rows(), causes.shares(signals.truth), strict=True)]
+    parts = [comparison.rows(), causes.shares(signals.truth), *([noise.by_material(signals.truth)] if noise else [])]
+    rows = [dict(ChainMap(*parts_of_row)) for parts_of_row in zip(*parts, strict=True)]
     save_rows(comparison.outlier_m, rows, folder)
     with timed(times, "points"):
         cloud = image.to_point_cloud()

@@ -32,6 +32,9 @@ class RangeImage:
     T_world_camera : (4, 4) float64.
     projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
         integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
+    sampling_sigma_m : (h, w) float32, metres, of a simulated reading: standard deviation of z by the sampling of light
+        paths, estimated from one pair of draws for each pixel, so take medians or mean squares over many; NaN where it
+        is not known. None: not known anywhere, see `rangesim.reading_noise`.
     """
 
     z: np.ndarray
@@ -43,6 +46,7 @@ class RangeImage:
     T_world_camera: np.ndarray | None = None
     projector_column: np.ndarray | None = None
     projector_row: np.ndarray | None = None
+    sampling_sigma_m: np.ndarray | None = None
 
     @property
     def valid(self) -> np.ndarray:

@@ -28,7 +28,6 @@ from rangesim.array_files import write_arrays
 from rangesim.capture import Capture
 from rangesim.capture_files import load_capture
 from rangesim.causes import Cause, CauseMap
-from rangesim.comparison import ALL
 from rangesim.config import from_dict, shown
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
@@ -47,7 +46,7 @@ from rangesim.schema import (
     read_record,
     write_record,
 )
-from rangesim.signals import EnergySplit, GroundTruth, Truncation
+from rangesim.signals import ALL, EnergySplit, GroundTruth, Truncation
 from rangesim.status import Status
 
 SETTINGS = "experiment.json"
@@ -112,7 +111,8 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 
 
 class RowRecord(Record, frozen=True, kw_only=True):
-    """Statistics of one material class; see `rangesim.comparison.ErrorStatistics` and `rangesim.causes.CauseMap`."""
+    """Statistics of one material class; see `rangesim.comparison.ErrorStatistics`, `rangesim.causes.CauseMap` and
+    `rangesim.reading_noise.ReadingNoise`."""
 
     material: Name
     pixels: Count
@@ -128,6 +128,8 @@ class RowRecord(Record, frozen=True, kw_only=True):
     flying_rate: Fraction | None
     failed: Fraction | None
     causes: dict[str, Fraction]
+    detector_sigma_m: Metres | None = None
+    sampling_sigma_m: Metres | None = None
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):
@@ -165,6 +167,7 @@ _RANGE = {
     "T_world_camera": ArraySpec("float64", (4, 4), required=False),
     "projector_column": ArraySpec("float32", nan=True, required=False),
     "projector_row": ArraySpec("float32", nan=True, required=False),
+    "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, required=False),
 }
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
 _SEGMENTATION = {

@@ -13,6 +13,8 @@ from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.sensors import Sensor
 
+ALL = "all"
+"""Stands for all material classes."""
 NO_SAMPLING_ERROR = "expected signals whose sampling error is known: those of a pass of at least 3 samples per pixel."
 
 
@@ -62,6 +64,12 @@ class GroundTruth:
     projector_visible: np.ndarray
     instance_names: tuple[str, ...] = ()
     material_names: tuple[str, ...] = ()
+
+    def classes(self) -> dict[str, np.ndarray]:
+        """(h, w) bool, pixels of each material class that occurs; of "all" last, which may have none."""
+        seen = np.isfinite(self.z)
+        of_class = {name: seen & (self.material == i) for i, name in enumerate(self.material_names)}
+        return {name: mask for name, mask in of_class.items() if mask.any()} | {ALL: seen}
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ def test_light_and_sight_through_a_slab_and_what_time_of_flight_makes_of_it() ->
     by_phase = rangesim.decode(rangesim.expose(signals, amcw)).range_m
     assert abs((by_phase - from_phase).mean()) < 2e-5
     axis = (slice(22, 26), slice(30, 34))
-    assert (by_phase[axis] - PLANE).mean() == pytest.approx(0.5 * d, abs=4e-4)
+    assert (by_phase[axis] - PLANE).mean() == pytest.approx(0.5 * d, abs=8e-4)  # photon noise is 1.5e-4
 
     # A histogram tells the bounces apart: 2 n d later
     histogram = signals.channels[bins].sum(axis=(1, 2))  # 2.05 to 2.1 m, and 2.2 to 2.25 m

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.comparison import ALL
 from rangesim.signals import GroundTruth
 
 
@@ -94,10 +93,7 @@ class CauseMap:
         Each is a dict of `material` (str), `failed` (share of the pixels of this class; None if it has none) and
         `causes` (name of the cause -> share of the pixels of this class, largest first, none of them 0).
         """
-        seen = np.isfinite(truth.z)
-        classes = {name: seen & (truth.material == i) for i, name in enumerate(truth.material_names)}
-        rows = [_row(name, self.cause[mask]) for name, mask in classes.items() if mask.any()]
-        return [*rows, _row(ALL, self.cause[seen])]
+        return [_row(name, self.cause[mask]) for name, mask in truth.classes().items()]
 
 
 def _row(material: str, causes: np.ndarray) -> dict[str, Any]:

@@ -49,6 +49,14 @@ COLUMNS = (
     Column("p95_abs_m", "95\N{NO-BREAK SPACE}% within", "mm", "95th percentile of |z − true z|"),
     Column("outlier_rate", "outliers", "%", "share of the measurements off by more than 10 mm"),
     Column("flying_rate", "flying", "%", "share of the measurements at depth edges that lie on neither side"),
+    Column("detector_sigma_m", "detector noise", "mm", "standard deviation of z by the noise of the detector", ""),
+    Column(
+        "sampling_sigma_m",
+        "sampling noise",
+        "mm",
+        "the same by the random light paths of the renderer, to be small against that of the detector",
+        "",
+    ),
 )
 
 
@@ -238,7 +246,7 @@ def settings_line(experiment: Experiment, width: int, height: int) -> str:
 
 def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
     values = [row[column.key] for row in rows if row[column.key] is not None]
-    if len(rows) < 2 or not values:
+    if len(rows) < 2 or not values or not column.better:
         return None
     return float(max(values) if column.better == "high" else min(values, key=abs))
 
