@@ -15,6 +15,7 @@ import numpy as np
 
 import rangesim
 from pcgraph.output import new_directory
+from rangesim.adaptive_sampling import AdaptiveSampling
 from rangesim.array_files import write_arrays
 from rangesim.capture import Capture
 from rangesim.capture_files import write_capture
@@ -250,7 +251,7 @@ def _trace(
     stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
     say(stage, _share(number, passes, 0.0))
     settings: dict[str, Any] = {
-        "spp": "auto" if experiment.spp is None else experiment.spp,
+        "spp": _spp(experiment, instruments),
         "max_depth": experiment.max_depth,
         "glint": experiment.glint,
         "seed": experiment.seed,
@@ -263,6 +264,14 @@ def _trace(
             return rangesim.transport(scene, rig, [i.sensor for i in instruments], **settings)
         (one,) = instruments
         return transport_moving(scene, rig, {one.sensor: one.timing}, experiment.motion, **settings)[one.sensor]
+
+
+def _spp(experiment: Experiment, instruments: list[Instrument]) -> int | str | AdaptiveSampling:
+    if experiment.spp is not None:
+        return experiment.spp
+    if experiment.motion is not None:
+        return "auto"
+    return AdaptiveSampling(tuple(instruments), experiment.max_spp, ambient=experiment.ambient)
 
 
 def _share(number: int, passes: int, of_pass: float) -> float:

@@ -42,7 +42,10 @@ def run_command(
             show_default=False,
         ),
     ] = None,
-    spp: Annotated[int | None, typer.Option(help="Light paths per pixel. (default: matte 16, others 64)")] = None,
+    spp: Annotated[
+        int | None, typer.Option(help="Light paths per pixel. (default: 16, more where the detector needs it)")
+    ] = None,
+    max_spp: Annotated[int | None, typer.Option(help="At most so many where --spp is not given. (default: 64)")] = None,
     width: Annotated[int | None, typer.Option(help="Camera width, pixels. (default: the scene's)")] = None,
     height: Annotated[int | None, typer.Option(help="Camera height, pixels. (default: the scene's)")] = None,
     max_depth: Annotated[
@@ -89,7 +92,14 @@ def run_command(
     """
     if out is None and not estimate:
         raise typer.BadParameter("expected --out DIRECTORY, unless --estimate is given.", param_hint="--out")
-    given: dict[str, Any] = {"width": width, "height": height, "spp": spp, "max_depth": max_depth, "seed": seed}
+    given: dict[str, Any] = {
+        "width": width,
+        "height": height,
+        "spp": spp,
+        "max_spp": max_spp,
+        "max_depth": max_depth,
+        "seed": seed,
+    }
     given |= {"material": material, "unit_m": unit_m, "photons": photons}
     experiment = _experiment(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
     if baseline is not None:

@@ -61,11 +61,13 @@ def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> tuple[GroundTruth, Gu
 
 
 @dr.syntax
-def mean_reflectance(view: View, settings: Settings, budget: Budget, has_cutouts: bool, samples: int) -> np.ndarray:
-    """(pixels,) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
+def mean_reflectance(view: View, settings: Settings, rig: Rig, has_cutouts: bool, samples: int) -> np.ndarray:
+    """(h, w) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
     launches, parts = Launches(), []
-    surfaces, camera = view.surfaces, view.camera
-    for begin, end in launches.ranges(len(budget.pixels), samples):
+    surfaces, camera, shape = view.surfaces, view.camera, (rig.camera.height, rig.camera.width)
+    count = np.full(shape[0] * shape[1], samples, np.uint32)
+    budget = Budget(np.arange(len(count)), count, count, rig.projector_irradiance)
+    for begin, end in launches.ranges(len(count), samples):
         lanes = Lanes(view, settings, budget, np.arange(begin, end))
         total, sample = dr.zeros(mi.Float, end - begin), dr.zeros(mi.UInt32, end - begin)
         most = dr.opaque(mi.UInt32, samples)
@@ -77,7 +79,7 @@ def mean_reflectance(view: View, settings: Settings, budget: Budget, has_cutouts
             sample += 1
         launches.evaluate(total, samples * (end - begin))
         parts.append(total.numpy() / np.float32(samples))
-    return np.concatenate(parts)
+    return np.concatenate(parts).reshape(shape)
 
 
 def _truth(

@@ -45,7 +45,8 @@ def transport_moving(
     motion : Motion, what moves.
     seed : int, 0 to 2^64 - 1; the same seed gives the same bytes.
     progress : called with the share done, 0..1.
-    options : spp, max_depth and what else `transport` takes, for each pass.
+    options : spp, max_depth and what else `transport` takes, for each pass. No AdaptiveSampling: passes that sampled
+        a thing differently would make it differ from frame to frame.
 
     Returns
     -------
@@ -62,10 +63,13 @@ def transport_moving(
     ValueError
         No such shape, one that cannot be moved, or what `transport` refuses.
     """
+    from rangesim.adaptive_sampling import AdaptiveSampling
     from rangesim.light_transport.one_pass import transport
     from rangesim.scene.moving import MovingScene
 
     _check(scene, rig, timings, motion)
+    if isinstance(options.get("spp"), AdaptiveSampling):
+        raise ValueError('expected a number of samples or "auto" where something moves, got AdaptiveSampling.')
     seed = check_seed(seed)
     passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
@@ -75,7 +79,7 @@ def transport_moving(
         signals = transport(
             stage.at(one.placement.objects),
             one.rig(rig),
-            one.sensors,
+            [response for sensor in one.sensors for response in sensor.responses()],
             seed=one.seed(seed),
             progress=progress and partial(_report, progress, number, len(passes)),
             **options,
@@ -109,4 +113,5 @@ def _check(scene: Scene, rig: Rig, timings: Mapping[Sensor, Timing], motion: Mot
     for sensor, timing in timings.items():
         if not isinstance(sensor, Sensor) or not isinstance(timing, Timing):
             raise ValueError(f"expected a Timing for each sensor, got {timing!r} for {sensor!r}.")
+        sensor.check(rig.projector.width, rig.projector.height)
     motion.check(i.name for i in scene.instances)
