@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.absorption import absorbers_of
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
@@ -110,7 +111,7 @@ def transport(
     tiles: list[Traced] = []
     report = Progress(progress)
     launches = Launches(is_watched=progress is not None)
-    media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
+    media, surfaces, absorbers = media_of(scene.mitsuba), surfaces_of(scene.mitsuba), absorbers_of(scene.mitsuba)
     truth, guides = ground_truth(scene, rig, surfaces)
     shares = keeps_apart & (guides.instance.ravel() >= 0)
     samples = (np.where(shares, MATTE_SPP, OTHER_SPP) if spp == "auto" else np.full(h * w, spp)).astype(np.uint32)
@@ -131,11 +132,12 @@ def transport(
         seed,
         memory_bytes,
         media,
+        absorbers,
         surfaces,
         partial(report, 0.0),
     )
     camera, projector, cutouts = Device.camera(rig), Device.projector(rig), cutouts_of(scene.mitsuba)
-    view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts)
+    view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts, absorbers)
     budget = Budget(samples, rig.projector_irradiance)
     for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
         accumulators = Accumulators(responses, end - begin, keeps_apart)
@@ -159,7 +161,8 @@ def transport(
     images = {r: parts[0] for r, parts in sums.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
-        found = trace_glint(scene.mitsuba, rig, responses, seed, media, surfaces, partial(report, PATHS_SHARE))
+        told = partial(report, PATHS_SHARE)
+        found = trace_glint(scene.mitsuba, rig, responses, seed, media, absorbers, surfaces, told)
         found.add_to(highlights, found.radiance[None])
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
