@@ -60,10 +60,14 @@ def absorbers_of(scene: Any) -> Absorbers | None:
 
 
 def _sides(shape: Any) -> tuple[float, float]:
-    if not shape.is_medium_transition() or is_boundary(shape):
+    """Inside and outside of a shape, 1/m. A scattering medium inside is not this module's; if nothing is said of what
+    lies around it, that is what light came through."""
+    if not shape.is_medium_transition():
         return UNCHANGED, UNCHANGED
-    inside, outside = (
-        0.0 if medium is None else medium_numbers(medium)[0]
-        for medium in (shape.interior_medium(), shape.exterior_medium())
-    )
-    return inside, outside
+    untold = UNCHANGED if is_boundary(shape) else 0.0
+    inside = untold if is_boundary(shape) else _sigma_a(shape.interior_medium(), untold)
+    return inside, _sigma_a(shape.exterior_medium(), untold)
+
+
+def _sigma_a(medium: Any, untold: float) -> float:
+    return untold if medium is None else medium_numbers(medium)[0]

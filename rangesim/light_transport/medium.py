@@ -149,8 +149,8 @@ def medium_numbers(medium: Any) -> tuple[float, float, float]:
 def why_not_traced(shape: Any) -> str | None:
     """What keeps the media of a shape from being traced; None: nothing.
 
-    A medium that scatters needs a boundary of matched index, one that absorbs alone may also fill or surround a body
-    that refracts (`rangesim.light_transport.absorption`).
+    A medium that scatters fills a shape behind a boundary of matched index; one that absorbs alone may also fill a body
+    that refracts, or lie around either (`rangesim.light_transport.absorption`).
     """
     if not shape.is_medium_transition():
         return None
@@ -161,8 +161,8 @@ def why_not_traced(shape: Any) -> str | None:
             return f"{holds} a {varies}; only homogeneous media are traced"
     if _lobes(shape.bsdf()) != int(mi.BSDFFlags.Null):
         return _why_not_absorbing(shape.bsdf(), [m for m in (interior, exterior) if m is not None])
-    if exterior is not None or interior is None:
-        return "has an exterior medium behind a boundary of matched index; only media inside closed shapes are traced"
+    if interior is None or (exterior is not None and medium_numbers(exterior)[1] > 0):
+        return "has an exterior medium that scatters, or none inside; only media inside closed shapes are traced"
     if not medium_numbers(interior)[0] > 0:
         return "is filled with a medium of no density; expected a positive sigma_t"
     if interior.phase_function().class_name() not in ("IsotropicPhaseFunction", "HGPhaseFunction"):
