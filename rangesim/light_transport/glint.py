@@ -5,7 +5,7 @@ The lens is a disc as large as its aperture. A camera path of delta interactions
 radiance. Where all of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much finer
 than a pixel counts. Random paths of the pass would mostly miss it, hence three steps: pixels behind whose centre there
 is a delta surface; of those, pixels of which a few probing paths come near the lens; and these get thousands of paths.
-The lens is not seen through a participating medium: its boundary ends a path.
+The lens is not seen through a medium that scatters: its boundary ends a path. Through glass that absorbs it is seen.
 """
 
 from __future__ import annotations

@@ -11,7 +11,8 @@ A path has two limits. `max_depth` counts the surfaces that scatter it; delta in
 holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.delta_chain`).
 
 Inside a translucent object a turn of the loop is a scattering event instead of a surface; a stay inside counts as one
-surface towards the depth, however often it scatters (`rangesim.light_transport.medium`).
+surface towards the depth, however often it scatters (`rangesim.light_transport.medium`). Inside glass that absorbs,
+what a segment leaves of the throughput is exp(-sigma_a d) (`rangesim.light_transport.absorption`).
 
 The strategies that bring projector light to the camera partition all light paths: next-event estimation (here),
 caustic photons gathered at every non-delta vertex (here, from maps made before), and glint, paths without any

@@ -4,7 +4,8 @@
 Inside, light travels exponentially distributed ways between scattering events (mean 1 / sigma_t), keeps the share
 `albedo` of itself at each, and turns by an angle of the phase function of Henyey and Greenstein (1941); g = 0 is
 isotropic. The boundary neither reflects nor refracts, so the way to the projector is straight, and what is left of the
-light along it is exp(-sigma_t times the way inside) (Beer-Lambert). See docs/subsurface.md.
+light along it is exp(-sigma_t times the way inside) (Beer-Lambert). See docs/subsurface.md. Media that absorb alone
+inside bodies that refract are another matter: `rangesim.light_transport.absorption`.
 """
 
 from __future__ import annotations
@@ -179,13 +180,14 @@ def _why_not_homogeneous(medium: Any) -> str | None:
 
 def _why_not_absorbing(bsdf: Any, media: list[Any]) -> str | None:
     """What keeps media from being traced on the sides of a surface that is no boundary of matched index."""
-    bounds = f"bounds a medium by a {bsdf.class_name()}"
     if any(medium_numbers(medium)[1] > 0 for medium in media):
-        return f"{bounds}; a medium that scatters is traced behind a boundary of matched index alone (null)"
+        bounds = f"bounds a medium that scatters by a {bsdf.class_name()}"
+        return f"{bounds}; only boundaries of matched index are traced (null)"
     refracts = int(mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission)
     has_no_inside = int(mi.BSDFFlags.Null | mi.BSDFFlags.DiffuseTransmission)
     if not _lobes(bsdf) & refracts or _lobes(bsdf) & has_no_inside:
-        return f"{bounds}; a medium that absorbs is traced in bodies that refract light (dielectric, roughdielectric)"
+        bounds = f"bounds a medium that absorbs by a {bsdf.class_name()}"
+        return f"{bounds}; only bodies that refract light are traced (dielectric, roughdielectric)"
     return None
 
 

@@ -4,7 +4,8 @@
 A photon leaves the projector through a pixel, follows delta interactions alone (dielectric, conductor, thin
 dielectric, hole), and lands on the first non-delta surface. Light that lands without any delta interaction is
 next-event estimation's (`rangesim.light_transport.loop`) and ends at once. A translucent object's medium weakens
-photons by what it scatters out of their way; that scattered light is not followed further.
+photons by what it scatters out of their way; that scattered light is not followed further. Glass that absorbs weakens
+them on their way inside (`rangesim.light_transport.absorption`).
 
 Only pixels whose light meets a delta surface first are worth photons. A pre-pass with one ray per pixel finds them and
 their neighbours; a small share of the photons goes to all other pixels, so that the estimate stays unbiased where
