@@ -78,6 +78,42 @@ def test_bk7_has_the_index_of_its_data_sheet() -> None:
     assert sellmeier(0.5876, SELLMEIER["bk7"]) == pytest.approx(1.5168, abs=1e-5)
 
 
+# Rows of the published tables of k on both sides of 850 and 550 nm: wavelength in um, k
+EXTINCTIONS = {
+    "water": [(0.850, 2.93e-7), (0.875, 3.91e-7), (0.550, 1.96e-9), (0.575, 3.60e-9)],
+    "bk7": [(0.700, 8.9305e-9), (1.060, 1.0137e-8), (0.546, 6.9658e-9), (0.580, 9.2541e-9)],
+    "soda_lime_glass": [(0.85, 3.150e-6), (0.86, 3.274e-6), (0.55, 2.200e-7), (0.56, 2.529e-7)],
+    "pmma": [(0.85, 1.05e-7), (0.86, 1.50e-7), (0.55, 1.74e-7), (0.56, 1.78e-7)],
+    "polycarbonate": [(0.85, 1.06e-7), (0.86, 1.35e-7), (0.55, 4.08e-7), (0.56, 4.27e-7)],
+}
+EXTINCTIONS |= dict.fromkeys(("frosted_glass", "antiglare_glass"), EXTINCTIONS["soda_lime_glass"])
+
+
+@pytest.mark.parametrize("name", EXTINCTIONS)
+def test_clear_materials_absorb_what_their_tables_say(name: str) -> None:
+    """sigma_a = 4 pi k / lambda."""
+    rows = np.array(EXTINCTIONS[name])
+    for band, wavelength_um, pair in (("", 0.85, rows[:2]), ("_550nm", 0.55, rows[2:])):
+        found = numbers(name + band)
+        k = np.interp(wavelength_um, pair[:, 0], pair[:, 1])
+        assert found["sigma_t"] == pytest.approx(4 * np.pi * k / (wavelength_um * 1e-6), rel=1e-3)
+        assert found["albedo"] == 0
+
+
+@pytest.mark.parametrize("name", EXTINCTIONS)
+def test_a_body_of_a_clear_material_is_filled_by_its_interior(tmp_path: Path, name: str) -> None:
+    """A slab of 1 m, so that each of them takes some of the light."""
+    filled = f'<ref id="{name}_interior" name="interior"/>'
+    seen = []
+    for interior in ("", filled):
+        body = f'<include filename="materials/{name}.xml"/><shape type="cube"><ref id="{name}"/>{interior}'
+        body += '<transform name="to_world"><scale x="5" y="0.5" z="5"/></transform></shape>'
+        scene = load(tmp_path, VIEW.format(fov=8) + body)
+        signals = rangesim.transport(scene, scene.rig(baseline_m=0.1, width=16), [], spp=32, glint=False, photons=0)
+        seen.append(signals.energy.ambient.mean())
+    assert seen[1] < seen[0] - 0.5 * (1 - np.exp(-numbers(name)["sigma_t"]))
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_constants_of_metals_lie_on_their_tables(name: str) -> None:
     rows = np.array(TABLES[name])

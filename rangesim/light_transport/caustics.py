@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rangesim.light_transport.absorption import Absorbers
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.indirect import REACH_PX
 from rangesim.light_transport.medium import Media
@@ -35,6 +36,7 @@ def caustic_maps(
     seed: int,
     memory_bytes: int,
     media: Media | None,
+    absorbers: Absorbers | None,
     surfaces: Any,
     report: Callable[[], None] = lambda: None,
 ) -> PhotonMaps | None:
@@ -46,7 +48,17 @@ def caustic_maps(
         return None
     maps, projector = min(spp, MOST_MAPS), Device.projector(rig)
     landed = trace_photons(
-        scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, memory_bytes, media, surfaces, report
+        scene.mitsuba,
+        projector,
+        rig.projector_power_w,
+        photons,
+        maps,
+        seed,
+        memory_bytes,
+        media,
+        absorbers,
+        surfaces,
+        report,
     )
     radius = gathering_radius(rig, landed.per_pixel, radius_m)
     wide = REACH_PX / rig.camera.fx

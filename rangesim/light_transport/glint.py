@@ -5,7 +5,7 @@ The lens is a disc as large as its aperture. A camera path of delta interactions
 radiance. Where all of a pixel sees the lens, that is 10^4 times the radiance of a lit wall, so a highlight much finer
 than a pixel counts. Random paths of the pass would mostly miss it, hence three steps: pixels behind whose centre there
 is a delta surface; of those, pixels of which a few probing paths come near the lens; and these get thousands of paths.
-The lens is not seen through a participating medium: its boundary ends a path.
+The lens is not seen through a medium that scatters: its boundary ends a path. Through glass that absorbs it is seen.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from rangesim.light_transport.absorption import Absorbers
 from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import spawn_close
@@ -72,6 +73,7 @@ def trace_glint(
     responses: Sequence[Response],
     seed: int,
     media: Media | None = None,
+    absorbers: Absorbers | None = None,
     surfaces: Any = None,
     report: Callable[[], None] = lambda: None,
 ) -> Glint:
@@ -81,7 +83,7 @@ def trace_glint(
     """
     camera, projector = Device.camera(rig), Device.projector(rig)
     h, w = rig.camera.height, rig.camera.width
-    view = View(surfaces or scene, camera, media, Seed.of(seed))
+    view = View(surfaces or scene, camera, media, absorbers, Seed.of(seed))
     worth_probing = _worth_probing(scene, camera, projector, h, w)
     pixel, radius_m = _near_the_lens(view, rig, projector, worth_probing, report)
     total = np.zeros(len(pixel), np.float32)
@@ -100,6 +102,7 @@ def trace_glint(
             length=dr.zeros(mi.Float, n),
             ior=dr.ones(mi.Float, n),
             previous=dr.zeros(mi.Point3f, n),
+            sigma_a=None if absorbers is None else dr.zeros(mi.Float, n),
             channels=accumulators.zeros(n),
             total=dr.zeros(mi.Float, n),
         )
@@ -116,6 +119,7 @@ class View(NamedTuple):
     surfaces: Any
     camera: Device
     media: Media | None
+    absorbers: Any
     seed: Seed
 
 
@@ -146,7 +150,7 @@ class Lanes:
     """
 
     def __init__(self, view: View, pixel: np.ndarray, paths: int, first_place: int = 0) -> None:
-        self.surfaces, self.camera, self.media, seed = view
+        self.surfaces, self.camera, self.media, self.absorbers, seed = view
         self.pixel, self.paths = mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, paths)
         self.place = dr.arange(mi.UInt32, len(pixel)) + dr.opaque(mi.UInt32, first_place)
         rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
@@ -181,6 +185,7 @@ class PathState:
     length: Any
     ior: Any
     previous: Any
+    sigma_a: Any
     channels: list[list[Any]]
     total: Any
 
@@ -283,11 +288,11 @@ def _paths_to_the_lens(
 ) -> tuple[PathState, Any]:
     """The state after at most so many turns of the loop, and the turns taken: dense channels and radiance of the delta
     paths from each pixel to the lens; bins go to the accumulators."""
-    surfaces, camera, media = lanes.surfaces, lanes.camera, lanes.media
+    surfaces, camera, media, absorbers = lanes.surfaces, lanes.camera, lanes.media, lanes.absorbers
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
     throughput, length, ior, previous = state.throughput, state.length, state.ior, state.previous
-    channels, total = state.channels, state.total
+    sigma_a, channels, total = state.sigma_a, state.channels, state.total
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
     left = most + dr.zeros(mi.UInt32, dr.width(k))  # turns
@@ -323,6 +328,8 @@ def _paths_to_the_lens(
         # ---- On through delta interactions, or the next path -----------------------------------------
         hit = si.is_valid() & ~meets & ~bounded(media, si)
         length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
+        if dr.hint(absorbers is not None, mode="scalar"):
+            throughput *= absorbers.transmittance(sigma_a, dr.select(hit, dr.norm(si.p - previous), 0))
         bs, weight = si.bsdf(ray).sample(
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), hit
         )
@@ -335,9 +342,11 @@ def _paths_to_the_lens(
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
         ends |= rng.next_float32() >= chance
         throughput /= chance
+        if dr.hint(absorbers is not None, mode="scalar"):
+            sigma_a = dr.select(ends, 0, absorbers.beyond(si, ray.d, sigma_a, hit))
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)
         throughput, ior = dr.select(ends, 1, throughput), dr.select(ends, 1, ior)
         random, origin, direction = rng.state, ray.o, ray.d
         left -= 1
     at = Chain(random, k, chain, origin, direction)
-    return PathState(at, throughput, length, ior, previous, channels, total), most - left
+    return PathState(at, throughput, length, ior, previous, sigma_a, channels, total), most - left

@@ -11,7 +11,8 @@ A path has two limits. `max_depth` counts the surfaces that scatter it; delta in
 holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.delta_chain`).
 
 Inside a translucent object a turn of the loop is a scattering event instead of a surface; a stay inside counts as one
-surface towards the depth, however often it scatters (`rangesim.light_transport.medium`).
+surface towards the depth, however often it scatters (`rangesim.light_transport.medium`). Inside glass that absorbs,
+what a segment leaves of the throughput is exp(-sigma_a d) (`rangesim.light_transport.absorption`).
 
 The strategies that bring projector light to the camera partition all light paths: next-event estimation (here),
 caustic photons gathered at every non-delta vertex (here, from maps made before), and glint, paths without any
@@ -29,6 +30,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.absorption import ENDLESS, Absorbers
 from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
 from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
@@ -166,13 +168,14 @@ class State:
     inside: Any
     events: Any
     stays: Any
+    sigma_a: Any
 
 
 class View(NamedTuple):
     """What the loop is run in: scene, devices, photons; the same for all lanes.
 
     surfaces : what rays are intersected with, see `surfaces_of`.
-    maps : PhotonMaps, or None. media, cutouts : Media and Cutouts, or None where there are none.
+    maps : PhotonMaps, or None. media, cutouts, absorbers : Media, Cutouts and Absorbers, or None where there are none.
     """
 
     scene: Any
@@ -182,6 +185,7 @@ class View(NamedTuple):
     maps: PhotonMaps | None = None
     media: Any = None
     cutouts: Any = None
+    absorbers: Any = None
 
 
 def trace(
@@ -293,6 +297,7 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
         inside=view.media.none(lanes) if in_media else None,  # what the ray runs through
         events=dr.zeros(mi.UInt32, lanes) if in_media else None,  # scatterings in media and crossed boundaries so far
         stays=dr.full(mi.Bool, False, lanes) if in_media else None,  # scattered since it entered the medium
+        sigma_a=dr.zeros(mi.Float, lanes) if view.absorbers is not None else None,  # along the ray, 1/m
     )
 
 
@@ -301,7 +306,7 @@ def walk(
     view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
     """The state of the lanes after at most so many turns of the loop, and the turns that each one took."""
-    scene, surfaces, camera, projector, maps, media, cutouts = view
+    scene, surfaces, camera, projector, maps, media, cutouts, absorbers = view
     # ---- The state, by name ------------------------------------------------------------------------
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
     origin, towards, previous = state.origin, state.direction, state.previous
@@ -310,7 +315,7 @@ def walk(
     depth, chain, throughput, length, ior = state.depth, state.chain, state.throughput, state.length, state.ior
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
-    inside, events, stays = state.inside, state.events, state.stays
+    inside, events, stays, sigma_a = state.inside, state.events, state.stays, state.sigma_a
     lanes = dr.width(sample)
     left = most + dr.zeros(mi.UInt32, lanes)  # turns
     active = (sample < at.samples) & (left > 0)
@@ -355,6 +360,9 @@ def walk(
             depth += 1
         # Not si.t: spawned rays start a little off the surface
         length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
+        if dr.hint(absorbers is not None, mode="scalar"):
+            distance = dr.select(hit, dr.norm(si.p - previous), ENDLESS)
+            throughput *= absorbers.transmittance(sigma_a, distance, inside)
         bsdf = si.bsdf(ray)
         may_connect = hit & (depth < settings.max_depth) & (scatters | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
 
@@ -417,9 +425,12 @@ def walk(
             if dr.hint(settings.lamps, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
                 if dr.hint(media is None, mode="scalar"):
-                    ambient += throughput * sampled_emission(scene, bsdf, si, xi, may_connect)
+                    lamp = sampled_emission(scene, bsdf, si, absorbers, sigma_a, xi, may_connect)
+                    ambient += throughput * lamp
                 else:
-                    lamp = emission_through(media, scene, bsdf, si, ray.d, inside, scatters, xi, may_connect)
+                    lamp = emission_through(
+                        media, scene, bsdf, si, ray.d, inside, scatters, absorbers, sigma_a, xi, may_connect
+                    )
                     ambient += throughput * lamp
 
         # ---- Next direction --------------------------------------------------------------------------
@@ -453,6 +464,8 @@ def walk(
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
             stays = scatters | (stays & ~crosses)
+        if dr.hint(absorbers is not None, mode="scalar"):
+            sigma_a = absorbers.beyond(si, wo, sigma_a, at_surface)
 
         # ---- Or next sample --------------------------------------------------------------------------
         # The last surface can only be seen to emit, so it is needed for ambient light alone
@@ -480,6 +493,8 @@ def walk(
             inside = inside.replaced(ends, media.none(lanes))
             events = dr.select(ends, 0, events)
             stays &= ~ends
+        if dr.hint(absorbers is not None, mode="scalar"):
+            sigma_a = dr.select(ends, 0, sigma_a)
         random, origin, towards = rng.state, ray.o, ray.d
         left -= 1
         active = (sample < at.samples) & (left > 0)
@@ -508,6 +523,7 @@ def walk(
         inside=inside,
         events=events,
         stays=stays,
+        sigma_a=sigma_a,
     ), most - left
 
 
@@ -575,12 +591,19 @@ def emission(scene: Any, si: Any, previous: Any, pdf: Any, alone: Any, active: A
     return dr.select(active, weight * mono(emitter.eval(si, active)), 0)
 
 
-def sampled_emission(scene: Any, bsdf: Any, si: Any, xi: Any, active: Any) -> Any:
-    """Reflected radiance of one sampled direction to a scene emitter, weighted against BSDF sampling."""
+def sampled_emission(
+    scene: Any, bsdf: Any, si: Any, absorbers: Absorbers | None, sigma_a: Any, xi: Any, active: Any
+) -> Any:
+    """Reflected radiance of one sampled direction to a scene emitter, weighted against BSDF sampling.
+
+    `sigma_a`: absorption coefficient along the ray that met `si`; None without absorbers.
+    """
     ds, radiance = scene.sample_emitter_direction(si, xi, True, active)
     active &= ds.pdf != 0
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
+    if absorbers is not None:
+        weight *= absorbers.transmittance(absorbers.beyond(si, ds.d, sigma_a, active), ds.dist)
     return dr.select(active, weight * mono(value) * mono(radiance), 0)
 
 
@@ -592,6 +615,8 @@ def emission_through(
     direction: Any,
     inside: Medium,
     scatters: Any,
+    absorbers: Absorbers | None,
+    sigma_a: Any,
     xi: Any,
     active: Any,
 ) -> Any:
@@ -603,7 +628,8 @@ def emission_through(
     active &= ds.pdf != 0
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)
     value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
-    share, crossed = media.transmittance(scene, si, ds.p, inside, active)
+    around = None if absorbers is None else absorbers.beyond(si, ds.d, sigma_a, active & ~scatters)
+    share, crossed = media.transmittance(scene, si, ds.p, inside, active, around)
     weight = dr.select(scatters | crossed, 0, power_heuristic(ds.pdf, pdf))
     weight = dr.select(ds.delta, 1, weight)
     return dr.select(active, weight * share * value * mono(radiance), 0)

@@ -4,7 +4,8 @@
 Inside, light travels exponentially distributed ways between scattering events (mean 1 / sigma_t), keeps the share
 `albedo` of itself at each, and turns by an angle of the phase function of Henyey and Greenstein (1941); g = 0 is
 isotropic. The boundary neither reflects nor refracts, so the way to the projector is straight, and what is left of the
-light along it is exp(-sigma_t times the way inside) (Beer-Lambert). See docs/subsurface.md.
+light along it is exp(-sigma_t times the way inside) (Beer-Lambert). See docs/subsurface.md. Media that absorb alone
+inside bodies that refract are another matter: `rangesim.light_transport.absorption`.
 """
 
 from __future__ import annotations
@@ -94,12 +95,16 @@ class Media:
         return Medium(*(dr.gather(mi.Float, column, shape, enters) for column in self.table))
 
     @dr.syntax
-    def transmittance(self, scene: Any, si: Any, target: Any, inside: Medium, active: Any) -> tuple[Any, Any]:
+    def transmittance(
+        self, scene: Any, si: Any, target: Any, inside: Medium, active: Any, around: Any = None
+    ) -> tuple[Any, Any]:
         """Share of the light that reaches `target` straight from `si`, which lies in the medium `inside`; 0 behind any
-        other surface. And whether the way crosses a boundary."""
+        other surface. And whether the way crosses a boundary. `around`: absorption coefficient outside the media."""
         start = mi.Point3f(si.p)
         ray = mi.Ray3f(si.spawn_ray_to(target))
         sigma_t, thickness = mi.Float(inside.sigma_t), dr.zeros(mi.Float, dr.width(active))
+        if dr.hint(around is not None, mode="scalar"):
+            sigma_t = dr.select(sigma_t > 0, sigma_t, around)
         free, crossed, going = mi.Bool(active), dr.zeros(mi.Bool, dr.width(active)), mi.Bool(active)
         while going:
             found = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=going)
@@ -109,6 +114,8 @@ class Media:
             end = dr.select(hit, found.p, target)
             thickness += dr.select(going, sigma_t * dr.norm(end - start), 0)
             sigma_t = dr.select(crosses, self.beyond(found, ray.d, crosses).sigma_t, sigma_t)
+            if dr.hint(around is not None, mode="scalar"):
+                sigma_t = dr.select(crosses & (sigma_t == 0), around, sigma_t)
             crossed |= crosses
             start = dr.select(crosses, found.p, start)
             ray = found.spawn_ray_to(target)
@@ -127,8 +134,9 @@ def bounded(media: Media | None, si: Any) -> Any:
 
 
 def is_boundary(shape: Any) -> bool:
-    """Whether a medium fills the shape."""
-    return bool(shape.is_medium_transition()) and shape.interior_medium() is not None
+    """Whether a medium fills the shape behind a boundary of matched index, so that light walks through it."""
+    has_interior = bool(shape.is_medium_transition()) and shape.interior_medium() is not None
+    return has_interior and _lobes(shape.bsdf()) == int(mi.BSDFFlags.Null)
 
 
 def medium_numbers(medium: Any) -> tuple[float, float, float]:
@@ -140,22 +148,49 @@ def medium_numbers(medium: Any) -> tuple[float, float, float]:
 
 
 def why_not_traced(shape: Any) -> str | None:
-    """What keeps the medium of a shape from being traced; None: nothing."""
+    """What keeps the media of a shape from being traced; None: nothing.
+
+    A medium that scatters fills a shape behind a boundary of matched index; one that absorbs alone may also fill a body
+    that refracts, or lie around either (`rangesim.light_transport.absorption`).
+    """
     if not shape.is_medium_transition():
         return None
-    medium = shape.interior_medium()
-    if shape.exterior_medium() is not None or medium is None:
-        return "has an exterior medium; only media inside closed shapes are traced"
-    if medium.class_name() != "HomogeneousMedium":
-        return f"is filled with a {medium.class_name()}; only homogeneous media are traced"
-    parameters = dict(mi.traverse(medium))
-    if {"albedo.value.value", "sigma_t.value.value"} <= set(parameters) and not medium_numbers(medium)[0] > 0:
+    interior, exterior = shape.interior_medium(), shape.exterior_medium()
+    for medium, holds in ((interior, "is filled with"), (exterior, "is surrounded by")):
+        varies = None if medium is None else _why_not_homogeneous(medium)
+        if varies is not None:
+            return f"{holds} a {varies}; only homogeneous media are traced"
+    if _lobes(shape.bsdf()) != int(mi.BSDFFlags.Null):
+        return _why_not_absorbing(shape.bsdf(), [m for m in (interior, exterior) if m is not None])
+    if interior is None or (exterior is not None and medium_numbers(exterior)[1] > 0):
+        return "has an exterior medium that scatters, or none inside; only media inside closed shapes are traced"
+    if not medium_numbers(interior)[0] > 0:
         return "is filled with a medium of no density; expected a positive sigma_t"
-    if not {"albedo.value.value", "sigma_t.value.value"} <= set(parameters):
-        return "is filled with a medium that varies from place to place; only homogeneous media are traced"
-    if medium.phase_function().class_name() not in ("IsotropicPhaseFunction", "HGPhaseFunction"):
-        return f"scatters by a {medium.phase_function().class_name()}; only isotropic and hg are traced"
-    flags = int(shape.bsdf().flags()) & ~int(mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide)
-    if flags != int(mi.BSDFFlags.Null):
-        return f"bounds a medium by a {shape.bsdf().class_name()}; only boundaries of matched index are traced (null)"
+    if interior.phase_function().class_name() not in ("IsotropicPhaseFunction", "HGPhaseFunction"):
+        return f"scatters by a {interior.phase_function().class_name()}; only isotropic and hg are traced"
     return None
+
+
+def _why_not_homogeneous(medium: Any) -> str | None:
+    if medium.class_name() != "HomogeneousMedium":
+        return str(medium.class_name())
+    is_constant = {"albedo.value.value", "sigma_t.value.value"} <= set(dict(mi.traverse(medium)))
+    return None if is_constant else "medium that varies from place to place"
+
+
+def _why_not_absorbing(bsdf: Any, media: list[Any]) -> str | None:
+    """What keeps media from being traced on the sides of a surface that is no boundary of matched index."""
+    if any(medium_numbers(medium)[1] > 0 for medium in media):
+        bounds = f"bounds a medium that scatters by a {bsdf.class_name()}"
+        return f"{bounds}; only boundaries of matched index are traced (null)"
+    refracts = int(mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission)
+    has_no_inside = int(mi.BSDFFlags.Null | mi.BSDFFlags.DiffuseTransmission)
+    if not _lobes(bsdf) & refracts or _lobes(bsdf) & has_no_inside:
+        bounds = f"bounds a medium that absorbs by a {bsdf.class_name()}"
+        return f"{bounds}; only bodies that refract light are traced (dielectric, roughdielectric)"
+    return None
+
+
+def _lobes(bsdf: Any) -> int:
+    """Bits of the components of a mitsuba.BSDF."""
+    return int(bsdf.flags()) & int(mi.BSDFFlags.All)

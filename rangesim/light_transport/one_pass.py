@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.adaptive_sampling import AdaptiveSampling
+from rangesim.light_transport.absorption import absorbers_of
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
@@ -122,7 +123,7 @@ def transport(
         adaptive = spp
     elif spp == "auto" and sensors and all(isinstance(s, Sensor) for s in sensors):
         adaptive = AdaptiveSampling.of([s for s in sensors if isinstance(s, Sensor)])
-    media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
+    media, surfaces, absorbers = media_of(scene.mitsuba), surfaces_of(scene.mitsuba), absorbers_of(scene.mitsuba)
     truth, guides = ground_truth(scene, rig, surfaces)
     if adaptive:
         samples = np.full(h * w, min(FIRST_SPP, adaptive.max_spp))
@@ -148,15 +149,19 @@ def transport(
         seed,
         memory_bytes,
         media,
+        absorbers,
         surfaces,
         partial(report, 0.0),
     )
     camera, projector, cutouts = Device.camera(rig), Device.projector(rig), cutouts_of(scene.mitsuba)
-    view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts)
+    view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts, absorbers)
     if keeps_apart and scene.has_matte_textures:
         seen = mean_reflectance(view, settings, rig, scene.has_cutouts, min(fewest, TEXTURE_SAMPLES))
         guides = guides._replace(reflectance=seen)
-    glints = trace_glint(scene.mitsuba, rig, responses, seed, media, surfaces, partial(report, 0.0)) if glint else None
+    glints = None
+    if glint:
+        of_pass = (media, absorbers, surfaces, partial(report, 0.0))
+        glints = trace_glint(scene.mitsuba, rig, responses, seed, *of_pass)
     estimate = Estimate(
         view, settings, rig, responses, keeps_apart, fewest >= FEWEST_FOR_HALVES, memory_bytes, launches
     )

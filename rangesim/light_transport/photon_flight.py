@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.absorption import ENDLESS, Absorbers
 from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.exact_point import on_its_line, spawn_close
@@ -40,6 +41,7 @@ def fly(
     number: np.ndarray,
     seed: int,
     media: Media | None = None,
+    absorbers: Absorbers | None = None,
 ) -> tuple[Landing, tuple[Any, ...]]:
     """Landings of photons sent through projector pixels, and the fates of each that `PhotonBalance` sums up."""
     pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(projector.size.x)
@@ -48,12 +50,19 @@ def fly(
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
     power, most = mi.Float(flux.astype(np.float32)), dr.opaque(mi.UInt32, MAX_CHAIN)
-    return _chain(surfaces, projector, uv, power, rng, most, media)
+    return _chain(surfaces, projector, uv, power, rng, most, media, absorbers)
 
 
 @dr.syntax
 def _chain(
-    surfaces: Any, projector: Device, uv: Any, power: Any, rng: Any, max_chain: Any, media: Any = None
+    surfaces: Any,
+    projector: Device,
+    uv: Any,
+    power: Any,
+    rng: Any,
+    max_chain: Any,
+    media: Any = None,
+    absorbers: Any = None,
 ) -> tuple[Landing, tuple[Any, ...]]:
     """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
     lanes = dr.width(power)
@@ -67,6 +76,7 @@ def _chain(
     ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
     chain = dr.zeros(mi.UInt32, lanes)  # delta interactions so far
     inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
+    sigma_a: Any = None if absorbers is None else dr.zeros(mi.Float, lanes)  # along the ray, 1/m
     left = max_chain + dr.zeros(mi.UInt32, lanes)  # surfaces and boundaries of media that may still be met
     previous = mi.Point3f(primary.origin)
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
@@ -86,6 +96,11 @@ def _chain(
         si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         point = dr.select(chain > 0, on_its_line(si, previous, ray.d), si.p)
+        if dr.hint(absorbers is not None, mode="scalar"):
+            distance = dr.select(hit, dr.norm(point - previous), ENDLESS)
+            lost = dr.select(active, flux * (1 - absorbers.transmittance(sigma_a, distance, inside)), 0)
+            flux -= lost
+            absorbed += lost
         escaped += dr.select(active & ~hit, flux, 0)
         if dr.hint(media is not None, mode="scalar"):
             crosses = hit & media.bounded_by(si, hit)
@@ -126,6 +141,8 @@ def _chain(
         ray = spawn_close(si, si.p, si.to_world(bs.wo))
         if dr.hint(media is not None, mode="scalar"):
             inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
+        if dr.hint(absorbers is not None, mode="scalar"):
+            sigma_a = absorbers.beyond(si, ray.d, sigma_a, goes_on)
         left -= dr.select(goes_on | crosses, mi.UInt32(1), mi.UInt32(0))
         truncated += dr.select(goes_on & (left == 0), flux, 0)
         active = goes_on & (left > 0)

@@ -4,7 +4,8 @@
 A photon leaves the projector through a pixel, follows delta interactions alone (dielectric, conductor, thin
 dielectric, hole), and lands on the first non-delta surface. Light that lands without any delta interaction is
 next-event estimation's (`rangesim.light_transport.loop`) and ends at once. A translucent object's medium weakens
-photons by what it scatters out of their way; that scattered light is not followed further.
+photons by what it scatters out of their way; that scattered light is not followed further. Glass that absorbs weakens
+them on their way inside (`rangesim.light_transport.absorption`).
 
 Only pixels whose light meets a delta surface first are worth photons. A pre-pass with one ray per pixel finds them and
 their neighbours; a small share of the photons goes to all other pixels, so that the estimate stays unbiased where
@@ -22,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from rangesim.light_transport.absorption import Absorbers
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.medium import Media, is_boundary
@@ -47,8 +49,8 @@ class PhotonBalance:
 
     emitted : of the pixels that photons were sent through. direct : landed without a delta surface, left to next-event
     estimation. stored : landed beyond delta surfaces. absorbed : by delta surfaces and by the parts of mixed ones that
-    scatter, and by media; by Russian roulette on average nothing. escaped : met no surface. truncated : still under way
-    after `MAX_CHAIN` surfaces.
+    scatter, by media, and inside glass; by Russian roulette on average nothing. escaped : met no surface.
+    truncated : still under way after `MAX_CHAIN` surfaces.
     """
 
     emitted: float
@@ -125,6 +127,7 @@ def trace_photons(
     seed: int,
     memory_bytes: int,
     media: Media | None = None,
+    absorbers: Absorbers | None = None,
     surfaces: Any = None,
     report: Callable[[], None] = lambda: None,
 ) -> Photons:
@@ -144,7 +147,7 @@ def trace_photons(
         number = np.arange(begin, end)
         chosen = stratified_choice(cumulative, number, per_map, shift)
         flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
-        landing, fate = fly(surfaces or scene, projector, pixels[chosen], flux, number, seed, media)
+        landing, fate = fly(surfaces or scene, projector, pixels[chosen], flux, number, seed, media, absorbers)
         launches.evaluate([list(landing), list(fate)], SURFACES_PER_PHOTON * (end - begin))
         kept = np.flatnonzero(landing.flux)
         landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])

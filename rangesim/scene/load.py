@@ -68,7 +68,8 @@ def load_scene(
     ------
     FileFormatError
         Missing, broken or empty file, a scene without a perspective sensor, or with shapes that cannot be traced
-        (instances; participating media other than homogeneous ones inside closed shapes with a `null` BSDF).
+        (instances; participating media other than homogeneous ones: those that scatter inside closed shapes with a
+        `null` BSDF, those that absorb alone also inside and around bodies that refract).
     ValueError
         Unknown material class, or one for a scene that names its own; no such sensor.
     """

@@ -1,0 +1,391 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Light that is absorbed inside glass: Beer-Lambert along specular chains, against closed forms and `volpath`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from delta_scenes import (
+    GLASS,
+    SlabPath,
+    fresnel_dielectric,
+    matte,
+    rig_of,
+    scene_of,
+    transform,
+    wall,
+)
+from plain_mitsuba import plain_scene, render, z_score
+
+from rangesim import Intrinsics, Rig, Scene, load_scene, transport
+from rangesim.errors import FileFormatError
+from rangesim.light_transport import surfaces
+from rangesim.light_transport.absorption import absorbers_of
+from rangesim.light_transport.device import Device
+from rangesim.light_transport.photons import Photons, trace_photons
+from rangesim.response import FirstReturn
+from rangesim.scene.moving import MovingScene
+
+CAMERA = Intrinsics.from_fov(64, 48, 60)
+PROJECTOR = Intrinsics.from_fov(160, 120, 60)
+NEAR, FAR = 0.3, 0.35
+D = FAR - NEAR
+"""Thickness of the slab, metres."""
+SIGMA_A = 12.0
+"""1/m; a pass at normal incidence leaves exp(-0.6) = 0.55."""
+SKY = {"type": "constant", "radiance": {"type": "spectrum", "value": 1.0}}
+ROUGH = {"type": "roughdielectric", "alpha": 0.15, "int_ior": 1.5, "ext_ior": 1.0}
+
+
+def absorbing(sigma_a: float, albedo: float = 0.0) -> dict[str, Any]:
+    return {"type": "homogeneous", "sigma_t": float(sigma_a), "albedo": float(albedo)}
+
+
+def filled(shape: dict[str, Any], sigma_a: float = SIGMA_A) -> dict[str, Any]:
+    """The shape, of glass that absorbs."""
+    return {**shape, "interior": absorbing(sigma_a)}
+
+
+def slab(near: float = NEAR, far: float = FAR, half_size: float = 5.0, bsdf: dict[str, Any] = GLASS) -> dict[str, Any]:
+    """Glass between two depths, turned so that no row of pixels runs along the seam of a face's two triangles."""
+    half = [half_size, half_size, (far - near) / 2]
+    place = transform().translate([0, 0, (near + far) / 2]).rotate([0, 0, 1], 20).scale(half)
+    return {"type": "cube", "to_world": place, "bsdf": bsdf}
+
+
+def ball(radius: float = 0.2, z: float = 1.0, bsdf: dict[str, Any] = GLASS, x: float = 0.0) -> dict[str, Any]:
+    return {"type": "sphere", "center": [x, 0.0, z], "radius": radius, "bsdf": bsdf}
+
+
+def lamp(z: float = 2.0, radiance: float = 1.0, half_size: float = 5.0) -> dict[str, Any]:
+    """A panel that shines towards the origin."""
+    emitter = {"type": "area", "radiance": {"type": "spectrum", "value": radiance}}
+    return {**wall(z, matte(0.0), half_size), "emitter": emitter}
+
+
+def tangents(camera: Intrinsics) -> np.ndarray:
+    """(h, w, 8, 8) tangents to the axis of rays all over each pixel."""
+    offsets = (np.arange(8) + 0.5) / 8 - 0.5
+    pixels = camera.pixel_centres()[..., None, None, :] + np.stack(np.meshgrid(offsets, offsets), axis=-1)
+    return np.asarray(np.linalg.norm(camera.normalise(pixels), axis=-1))
+
+
+def in_blocks(image: np.ndarray) -> np.ndarray:
+    """Means over blocks of 8 x 8 pixels."""
+    h, w = image.shape
+    return np.asarray(image.reshape(h // 8, 8, w // 8, 8).mean(axis=(1, 3)))
+
+
+def of_slab(t: Any, sigma_a: float = SIGMA_A) -> tuple[Any, Any]:
+    """Transmittance (1 - R)^2 e / (1 - R^2 e^2) and reflectance of a slab, e = exp(-sigma_a d / cos) inside."""
+    sine = t / np.hypot(1, t)
+    r, e = fresnel_dielectric(sine), np.exp(-sigma_a * D / np.sqrt(1 - (sine / 1.5) ** 2))
+    transmitted = (1 - r) ** 2 * e / (1 - (r * e) ** 2)
+    return transmitted, r + r * e * transmitted
+
+
+# ---- Camera paths -----------------------------------------------------------------------------------
+
+
+def test_a_lamp_seen_through_a_slab_is_as_bright_as_beer_lambert_and_fresnel_say() -> None:
+    """At normal incidence and up to 36 degrees off."""
+    scene = scene_of(slab=filled(slab()), lamp=lamp())
+    seen = transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=256, photons=0, glint=False).energy.ambient
+    expected, _ = of_slab(tangents(CAMERA))
+    np.testing.assert_allclose(in_blocks(seen), in_blocks(expected.mean(axis=(2, 3))), rtol=0.01)
+    assert seen.mean() == pytest.approx(expected.mean(), rel=1e-3)
+    assert of_slab(0.0)[0] == pytest.approx(0.96**2 * np.exp(-0.6) / (1 - 0.04**2 * np.exp(-1.2)))
+
+
+def test_the_sky_seen_through_a_slab_and_in_it() -> None:
+    scene = scene_of(slab=filled(slab(half_size=20.0)), sky=SKY)
+    seen = transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=256, photons=0, glint=False).energy.ambient
+    expected = sum(of_slab(tangents(CAMERA)))
+    assert seen.mean() == pytest.approx(expected.mean(), rel=2e-3)
+
+
+def test_what_the_projector_lights_is_seen_through_a_slab_weakened_and_as_far_away() -> None:
+    """The projector stands behind the slab and lights the wall straight."""
+    images = []
+    for sigma_a in (0.0, SIGMA_A):
+        scene = scene_of(slab=filled(slab(), sigma_a), wall=wall(1.0, matte()))
+        rig = rig_of(CAMERA, Intrinsics.from_fov(160, 120, 120), (0.0, 0.0, 0.5))
+        signals = transport(scene, rig, [FirstReturn()], spp=64, photons=0, max_depth=2)
+        weight, moment = signals.channels[FirstReturn()]
+        images.append((signals.energy.via_delta, moment / weight))
+    (clear, length), (dim, same_length) = images
+    # The light lands where it lands, whatever is absorbed; a pass to and fro inside is R^2 of it
+    t = tangents(CAMERA)
+    expected = of_slab(t)[0].mean(axis=(2, 3)) / of_slab(t, 0.0)[0].mean(axis=(2, 3))
+    np.testing.assert_allclose(in_blocks(dim / clear), in_blocks(expected), rtol=3e-3)
+    assert abs((same_length - length).mean()) < 3e-4  # fewer paths that went to and fro
+
+
+# ---- Photons ----------------------------------------------------------------------------------------
+
+
+POWER_W = 2.0
+
+
+def photons_of(scene: Scene, rig: Rig) -> Photons:
+    projector, absorbers = Device.projector(rig), absorbers_of(scene.mitsuba)
+    return trace_photons(scene.mitsuba, projector, POWER_W, 200_000, 4, 1, 2 << 30, absorbers=absorbers)
+
+
+def test_photons_into_an_absorbing_slab_land_are_absorbed_or_escape() -> None:
+    scene = scene_of(pane=filled(slab()), wall=wall(1.0, matte()))
+    balance = photons_of(scene, rig_of(CAMERA, PROJECTOR)).balance
+    fates = balance.direct + balance.stored + balance.absorbed + balance.escaped + balance.truncated
+    assert fates == pytest.approx(balance.emitted, rel=1e-6)
+    rays = PROJECTOR.normalise(PROJECTOR.pixel_centres())
+    passed, reflected = (x.mean() for x in of_slab(np.linalg.norm(rays, axis=-1)))
+    assert balance.stored == pytest.approx(POWER_W * passed, rel=2e-3)
+    assert balance.escaped == pytest.approx(POWER_W * reflected, rel=2e-2)
+    assert balance.absorbed == pytest.approx(POWER_W * (1 - passed - reflected), rel=3e-3)
+    assert balance.direct == balance.truncated == 0
+
+
+def test_a_photon_keeps_its_way_and_length_and_loses_by_the_way_inside() -> None:
+    clear, dim = (
+        photons_of(scene_of(pane=filled(slab(), a), wall=wall(1.0, matte())), rig_of(CAMERA, PROJECTOR))
+        for a in (0.0, SIGMA_A)
+    )
+    np.testing.assert_array_equal(clear.position, dim.position)
+    np.testing.assert_array_equal(clear.length_m, dim.length_m)
+    cosine = clear.direction[:, 2].astype(float)
+    inside = np.sqrt(1 - (1 - cosine**2) / 1.5**2)
+    passes = (clear.length_m - (1.0 - D) / cosine) / (1.5 * D / inside)
+    np.testing.assert_allclose(passes, np.round(passes), atol=1e-3)
+    np.testing.assert_allclose(dim.flux / clear.flux, np.exp(-SIGMA_A * D / inside * np.round(passes)), rtol=1e-4)
+    assert set(np.round(passes)) >= {1, 3}
+
+
+def test_caustics_behind_a_slab_are_as_bright_as_the_photons_that_land() -> None:
+    """The camera stands behind the slab; the light passes it once."""
+    images = []
+    for sigma_a in (0.0, SIGMA_A):
+        scene = scene_of(slab=filled(slab(), sigma_a), wall=wall(1.0, matte()))
+        rig = rig_of(Intrinsics.from_fov(64, 48, 20), PROJECTOR, camera_at=(0.0, 0.0, 0.6))
+        images.append(transport(scene, rig, [], spp=16, max_depth=2).energy.caustic)
+    path = SlabPath(1.0, D)
+    t = path.tangent(0.4 * np.linalg.norm(rig.camera.normalise(rig.camera.pixel_centres()), axis=-1))
+    expected = of_slab(t)[0] / of_slab(t, 0.0)[0]
+    assert (images[1] / images[0]).mean() == pytest.approx(expected.mean(), rel=2e-3)
+
+
+# ---- Glint ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slabs", [1, 2])
+def test_the_lens_seen_through_slabs_is_weakened_by_each(slabs: int) -> None:
+    close_up = Intrinsics.from_fov(64, 48, 5)  # so that a good part of a pixel's paths hit the lens
+    rig = rig_of(close_up, PROJECTOR, (0.0, 0.0, 1.5), looks_at=(0.0, 0.0, 0.0))
+    panes = [slab(near, near + D) for near in (0.3, 0.8)[:slabs]]
+    clear, dim = (
+        transport(scene_of(**{f"pane_{i}": filled(pane, a) for i, pane in enumerate(panes)}), rig, [], spp=1, seed=2)
+        for a in (0.0, SIGMA_A)
+    )
+    assert dim.energy.glint.sum() / clear.energy.glint.sum() == pytest.approx(np.exp(-slabs * SIGMA_A * D), rel=0.01)
+
+
+# ---- Against Mitsuba's own volumetric integrator ----------------------------------------------------
+
+
+def bodies(kind: str) -> dict[str, dict[str, Any]]:
+    """Scenes under a large lamp and a faint sky, before a wall."""
+    body = {
+        "ball": {"ball": filled(ball(), 5.0)},
+        "rough ball": {"ball": filled(ball(bsdf=ROUGH), 5.0)},
+        # A ball of glass in a tank of water: the ball's surface is where the one ends and the other begins
+        "glass in water": {
+            "tank": filled(slab(0.7, 1.3, 0.35, {**GLASS, "int_ior": 1.33}), 2.0),
+            "ball": {
+                **filled(ball(bsdf={**GLASS, "int_ior": 1.5, "ext_ior": 1.33}), 8.0),
+                "exterior": absorbing(2.0),
+            },
+        },
+        # Matte, with a lamp beside it, all in water
+        "lamp in water": {
+            "tank": filled(slab(0.7, 1.3, 0.35, {**GLASS, "int_ior": 1.33}), 2.0),
+            "ball": ball(0.1, bsdf=matte(0.7)),
+            "bulb": {
+                **ball(0.05, x=0.2, bsdf=matte(0.0)),
+                "emitter": {"type": "area", "radiance": {"type": "spectrum", "value": 5.0}},
+            },
+        },
+        "milk in glass": {
+            "ball": filled(ball(), 5.0),
+            "milk": milk(5.0),
+        },
+        "point lamp, milk and stone in water": {
+            "tank": filled(slab(0.7, 1.3, 0.35, {**GLASS, "int_ior": 1.33}), 2.0),
+            "milk": milk(2.0),
+            "stone": ball(0.08, bsdf=matte(0.7), x=-0.23),
+            "point": {"type": "point", "position": [0.0, 0.2, 0.9], "intensity": 0.5},
+        },
+    }[kind]
+    return {**body, "wall": wall(2.0, matte(0.8), 2.0), "lamp": {**lamp(), "to_world": over()}, "sky": SKY}
+
+
+def milk(around: float) -> dict[str, Any]:
+    """A scattering ball in an absorbing medium."""
+    return {
+        **ball(0.12, bsdf={"type": "null"}),
+        "interior": absorbing(20.0, 0.9),
+        "exterior": absorbing(around),
+    }
+
+
+def over() -> Any:
+    """Where a panel hangs above, facing down (y is up)."""
+    return transform().translate([0.0, 2.0, 1.0]).rotate([1, 0, 0], 90).scale(1.0)
+
+
+@pytest.mark.filterwarnings("ignore:.*lamp")
+@pytest.mark.parametrize(
+    "kind",
+    ["ball", "rough ball", "glass in water", "lamp in water", "milk in glass", "point lamp, milk and stone in water"],
+)
+def test_bodies_of_absorbing_glass_look_as_in_volpath(kind: str) -> None:
+    import mitsuba as mi
+
+    scene = scene_of(**bodies(kind))
+    rig = rig_of(Intrinsics.from_fov(48, 36, 30), PROJECTOR)
+    depth = {"max_depth": 200, "rr_depth": 100}
+    seen = transport(scene, rig, [], spp=512, photons=0, glint=False, seed=3, **depth).energy.ambient
+    points = {name: part for name, part in bodies(kind).items() if part["type"] == "point"}
+    plain = plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"}, **points)
+    params = mi.traverse(plain)
+    params["projector.scale"] = 0.0
+    params.update()
+    reference = render(plain, mi.load_dict({"type": "volpath", **depth}), spp=512, seed=11)
+    assert abs(z_score(seen, reference)) < 5
+    assert seen.mean() == pytest.approx(reference.mean(), rel=0.01)
+
+
+def test_indirect_light_through_a_slab_is_that_of_volpath() -> None:
+    """The far wall is lit straight, and once more by way of a near wall behind the slab: no caustics, as the near wall
+    gets none that would be seen."""
+    import mitsuba as mi
+
+    back = {"type": "rectangle", "to_world": transform().translate([0, 0, -0.5]).scale(2.0), "bsdf": matte(0.8)}
+    scene = scene_of(slab=filled(slab(0.5, 0.55, 20.0), 20.0), wall=wall(1.0, matte(0.8), 2.0), back=back)
+    rig = rig_of(CAMERA, PROJECTOR, (0.0, 0.0, 0.6), camera_at=(0.0, 0.0, 0.6))
+    depth = {"max_depth": 40, "rr_depth": 40}
+    energy = transport(scene, rig, [], spp=512, photons=0, glint=False, seed=3, indirect="raw", **depth).energy
+    plain = plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"})
+    reference = render(plain, mi.load_dict({"type": "volpath", **depth}), spp=512, seed=11)
+    assert abs(z_score(energy.projector, reference)) < 5
+    assert energy.projector.sum() - energy.direct.sum() == pytest.approx((reference - energy.direct).sum(), rel=0.05)
+
+
+# ---- What is promised -------------------------------------------------------------------------------
+
+
+def test_nothing_is_absorbed_outside() -> None:
+    """Where glass is black inside, direct light beside it is the same to the byte, and its front mirrors as ever."""
+    direct = []
+    for sigma_a in (0.0, 1e5):
+        scene = scene_of(ball=filled(ball(), sigma_a), wall=wall(2.0, matte()))
+        rig = rig_of(CAMERA, PROJECTOR, (0.1, 0.0, 0.0))
+        direct.append(transport(scene, rig, [], spp=16, max_depth=2, photons=0).energy.direct)
+    np.testing.assert_array_equal(*direct)
+    balance = photons_of(scene_of(pane=filled(slab(), 1e5), wall=wall(1.0, matte())), rig).balance
+    rays = PROJECTOR.normalise(PROJECTOR.pixel_centres())
+    _, reflected = of_slab(np.linalg.norm(rays, axis=-1), 1e5)
+    assert balance.escaped == pytest.approx(POWER_W * reflected.mean(), rel=0.02)
+    assert balance.absorbed == pytest.approx(POWER_W - balance.escaped, rel=1e-5)
+
+
+def test_glass_that_absorbs_nothing_is_the_same_to_the_byte() -> None:
+    images = []
+    for body in (ball(), filled(ball(), 0.0)):
+        scene = scene_of(ball=body, wall=wall(2.0, matte()), sky=SKY)
+        assert absorbers_of(scene.mitsuba) is None
+        images.append(transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=4, seed=5, photons=10_000).energy)
+    for name in ("direct", "multipath", "via_delta", "caustic", "glint", "ambient"):
+        assert getattr(images[0], name).tobytes() == getattr(images[1], name).tobytes()
+
+
+def test_holes_inside_the_glass_change_nothing() -> None:
+    hole = wall((NEAR + FAR) / 2, {"type": "mask", "opacity": 0.0, "bsdf": matte()})
+    scene = scene_of(slab=filled(slab()), lamp=lamp(), hole=hole)
+    seen = transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=256, photons=0, glint=False, max_depth=8).energy.ambient
+    assert seen.mean() == pytest.approx(of_slab(tangents(CAMERA))[0].mean(), rel=2e-3)
+
+
+def test_a_body_that_moves_takes_its_medium_along() -> None:
+    scene = scene_of(ball=filled(ball(x=0.3)), wall=wall(2.0, matte()), sky=SKY)
+    there = scene_of(ball=filled(ball(x=-0.3)), wall=wall(2.0, matte()), sky=SKY)
+    T = np.eye(4)
+    T[0, 3] = -0.6
+    moved = MovingScene(scene, ("ball",)).at({"ball": T})
+    images = [
+        transport(s, rig_of(CAMERA, PROJECTOR), [], spp=16, photons=50_000, glint=False).energy for s in (moved, there)
+    ]
+    for name, tolerance in (("ambient", 2e-3), ("caustic", 0.03), ("via_delta", 0.03)):
+        a, b = (getattr(energy, name) for energy in images)
+        assert a.sum() == pytest.approx(b.sum(), rel=tolerance)
+
+
+def test_the_same_seed_gives_the_same_bytes_in_tiles_and_for_joint_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def seen(memory_bytes: int) -> bytes:
+        parts = {f"ball_{i}": filled(ball(0.05, x=0.12 * i - 0.3), 5.0 * i) for i in range(6)}
+        scene = scene_of(**parts, wall=wall(2.0, matte()), sky=SKY)
+        energy = transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=4, photons=0, memory_bytes=memory_bytes).energy
+        return energy.ambient.tobytes() + energy.via_delta.tobytes() + energy.glint.tobytes()
+
+    images = [seen(1 << 30), seen(1 << 19)]
+    monkeypatch.setattr(surfaces, "MANY", 2)
+    images.append(seen(1 << 30))
+    assert len(set(images)) == 1
+
+
+def test_loops_with_absorbers_are_traced_once() -> None:
+    traced = 0
+
+    class Counted(FirstReturn):
+        def weights(self, path: Any, m: Any) -> list[Any]:
+            nonlocal traced
+            traced += 1
+            return super().weights(path, m)
+
+    scene = scene_of(ball=filled(ball()), wall=wall(2.0, matte()))
+    transport(scene, rig_of(CAMERA, PROJECTOR), [Counted()], spp=1, photons=20_000, glint=False)
+    assert traced == 2  # at the vertices of paths, and where photons are gathered
+
+
+def test_absorbing_glass_is_transparent_and_begins_at_its_surface() -> None:
+    scene = scene_of(slab=filled(slab()), wall=wall(2.0, matte()))
+    assert [i.material for i in scene.instances] == ["transparent", "matte"]
+    truth = transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=1, photons=0).truth
+    np.testing.assert_allclose(truth.z, NEAR, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"interior": absorbing(5.0, 0.2)}, "that scatters by a SmoothDielectric; only boundaries of matched"),
+        ({"exterior": absorbing(5.0, 0.2)}, "a medium that scatters by a"),
+        ({"exterior": {"type": "heterogeneous", "albedo": 0.0}}, "surrounded by a HeterogeneousMedium"),
+        (
+            {"bsdf": {"type": "thindielectric"}},
+            "that absorbs by a ThinDielectric; only bodies that refract",
+        ),
+        ({"bsdf": {"type": "mask", "opacity": 0.5, "bsdf": GLASS}}, "only bodies that refract"),
+        ({"bsdf": {"type": "diffuse"}}, "only bodies that refract"),
+        ({"bsdf": {"type": "conductor"}}, "only bodies that refract"),
+    ],
+)
+def test_what_cannot_hold_an_absorbing_medium_is_refused(change: dict[str, Any], message: str) -> None:
+    import mitsuba as mi
+
+    if change.get("exterior", {}).get("type") == "heterogeneous":
+        grid = mi.VolumeGrid(np.ones((2, 2, 2, 1), np.float32))
+        change["exterior"]["sigma_t"] = {"type": "gridvolume", "grid": grid}
+    with pytest.raises(FileFormatError, match=message):
+        load_scene(
+            {"type": "scene", "camera": {"type": "perspective", "fov": 20.0}, "body": {**filled(ball()), **change}}
+        )
