@@ -111,7 +111,8 @@ def transport(
     report = Progress(progress)
     launches = Launches(is_watched=progress is not None)
     media, surfaces = media_of(scene.mitsuba), surfaces_of(scene.mitsuba)
-    truth, guides = ground_truth(scene, rig, surfaces)
+    here = scene.in_renderer(rig)
+    truth, guides = ground_truth(scene, here, surfaces)
     shares = keeps_apart & (guides.instance.ravel() >= 0)
     samples = (np.where(shares, MATTE_SPP, OTHER_SPP) if spp == "auto" else np.full(h * w, spp)).astype(np.uint32)
     settings = Settings(
@@ -124,7 +125,7 @@ def transport(
     )
     maps = caustic_maps(
         scene,
-        rig,
+        here,
         photons,
         caustic_radius_m,
         int(samples.min()),
@@ -134,7 +135,7 @@ def transport(
         surfaces,
         partial(report, 0.0),
     )
-    camera, projector, cutouts = Device.camera(rig), Device.projector(rig), cutouts_of(scene.mitsuba)
+    camera, projector, cutouts = Device.camera(here), Device.projector(here), cutouts_of(scene.mitsuba)
     view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts)
     budget = Budget(samples, rig.projector_irradiance)
     for begin, end in _tiles(h * w, responses, memory_bytes, 1 + keeps_apart):
@@ -159,7 +160,7 @@ def transport(
     images = {r: parts[0] for r, parts in sums.items()}
     highlights = np.zeros((1, h, w), np.float32)
     if glint:
-        found = trace_glint(scene.mitsuba, rig, responses, seed, media, surfaces, partial(report, PATHS_SHARE))
+        found = trace_glint(scene.mitsuba, here, responses, seed, media, surfaces, partial(report, PATHS_SHARE))
         found.add_to(highlights, found.radiance[None])
         for response, values in zip(responses, found.channels, strict=True):
             found.add_to(images[response], values)
