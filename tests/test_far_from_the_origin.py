@@ -3,18 +3,32 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from delta_scenes import GLASS, matte
+from delta_scenes import GLASS, MIRROR, matte, rig_of, scene_of
+from delta_scenes import wall as wall_at
 
 from pcgraph import read_cloud
-from rangesim import AmcwToF, DirectToF, Scene, Signals, StructuredLight, decode, expose, load_scene, transport
+from rangesim import (
+    AmcwToF,
+    DirectToF,
+    Intrinsics,
+    Scene,
+    Signals,
+    StructuredLight,
+    decode,
+    expose,
+    load_scene,
+    transport,
+)
 from rangesim.errors import FileFormatError, RangesimWarning
 from rangesim.light_transport.backend import select_variant
 from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
+from rangesim.response import FirstReturn
 from rangesim.scene.origin import NEAR_M
 
 ROOM = (50.3, -30.6, 20.2)
@@ -49,17 +63,25 @@ def scene_at(by: tuple[float, ...], **parts: Any) -> dict[str, Any]:
 
 
 def room(by: tuple[float, ...], folder: Path) -> dict[str, Any]:
-    """One shape and one lamp of each kind, in a corner."""
+    """One shape and one lamp of each kind, in a corner with a wall whose reflectance is a function of place."""
     select_variant()
     import mitsuba as mi
 
     place, T = mi.ScalarTransform4d().translate(by), mi.ScalarTransform4d
     point = lambda x, y, z: np.add(by, (x, y, z)).tolist()  # noqa: E731
     grey = matte(0.5)
+    ramp = np.broadcast_to(np.linspace(0.1, 0.9, 8, dtype=np.float32)[:, None], (2, 2, 8, 1)).copy()
+    in_space = {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(ramp),
+        "raw": True,
+        "to_world": place @ T().translate([-1, 0, -1]).scale([2, 3, 2]),
+    }
+    ramped = {"type": "diffuse", "reflectance": {"type": "volume", "volume": in_space}}
     return scene_at(
         by,
         back={"type": "rectangle", "to_world": place @ T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(3),
-              "bsdf": grey},
+              "bsdf": {"type": "twosided", "bsdf": ramped}},
         side={"type": "rectangle", "to_world": place @ T().translate([0.8, 0, 0]).rotate([0, 1, 0], -90).scale(3),
               "bsdf": grey},
         floor={"type": "rectangle", "to_world": place @ T().translate([0, 0, -0.6]).scale(3), "bsdf": grey},
@@ -210,6 +232,43 @@ def test_what_moves_moves_in_the_world(tmp_path: Path) -> None:
         assert difference(there, here).max() < EXACT_M
 
 
+# ---- What single precision leaves, near the camera ------------------------------------------------------
+
+
+@pytest.mark.parametrize("distance_m", [1.0, 30.0, 1000.0])
+@pytest.mark.parametrize("through_mirror", [False, True])
+def test_half_a_path_length_errs_by_a_millionth_of_the_distance_at_most(distance_m: float, through_mirror: bool) -> None:
+    """A wall ahead, or one to the right that is seen in a mirror at 45 degrees; lit by a projector at the wall."""
+    select_variant()
+    import mitsuba as mi
+
+    d, T = distance_m, mi.ScalarTransform4d
+    ahead, right = np.array([0.0, 0.0, d]), np.array([d, 0.0, d])
+    if through_mirror:
+        mirror = {
+            "type": "rectangle",
+            "to_world": T().look_at(ahead, [d, 0, 0], [0, 1, 0]).scale(d / 2),
+            "bsdf": MIRROR,
+        }
+        wall = {"type": "rectangle", "to_world": T().look_at(right, ahead, [0, 1, 0]).scale(3 * d), "bsdf": matte(0.5)}
+        scene, at, looks_at = scene_of(mirror=mirror, wall=wall), (0.45 * d, 0.0, d), right
+    else:
+        scene, at, looks_at = scene_of(wall=wall_at(d, matte(0.5), 3 * d)), (0.1 * d, 0.0, 0.0), ahead
+    camera = Intrinsics.from_fov(64, 48, 30)
+    rig = rig_of(camera, Intrinsics.from_fov(1280, 800, 150), at, tuple(looks_at))
+    signals = transport(scene, rig, [FirstReturn()], spp=1, max_depth=2, photons=0, glint=False, indirect="raw")
+    radiance, moment = signals.channels[FirstReturn()].astype(np.float64)
+    rays = camera.directions(camera.pixel_centres())
+    points, unfolded = rays * d, rays * d  # of the wall ahead
+    if through_mirror:  # the wall stands behind the mirror at z = 2 d, x and z change places
+        unfolded = rays * 2 * d
+        points = np.stack([unfolded[..., 2] - d, unfolded[..., 1], unfolded[..., 0] + d], axis=-1)
+    expected = np.linalg.norm(unfolded, axis=-1) + np.linalg.norm(points - at, axis=-1)
+    lit = radiance > 0
+    assert lit.mean() > 0.5
+    assert np.abs(moment / np.where(lit, radiance, 1) - expected)[lit].max() < 2e-6 * d
+
+
 # ---- What cannot be saved -------------------------------------------------------------------------------
 
 
@@ -248,6 +307,24 @@ def test_a_bare_mesh_in_single_precision_is_warned_of_and_one_in_double_precisio
     with pytest.warns(RangesimWarning, match="the vertices of mesh 'scan'"):
         load_scene(far_mesh(tmp_path, offset, ".stl"))
     load_scene(far_mesh(tmp_path, offset, ".obj"))
+
+
+@pytest.mark.parametrize("coordinates", ["single", "double"])
+def test_a_transform_made_in_single_precision_is_warned_of(coordinates: str) -> None:
+    select_variant()
+    import mitsuba as mi
+
+    T = mi.ScalarTransform4f if coordinates == "single" else mi.ScalarTransform4d
+    wall = {"type": "rectangle", "to_world": T().translate(UTM).scale(0.3), "bsdf": matte(0.5)}
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        load_scene(scene_at(UTM, wall=wall))
+    if coordinates == "double":
+        assert not said
+    else:
+        (one,) = said
+        assert "to_world of 'wall' was made in single precision" in str(one.message)
+        assert "up to 3.1e+02 mm; make it with mitsuba.ScalarTransform4d" in str(one.message)
 
 
 def test_lamps_far_away_have_to_be_dictionaries() -> None:

@@ -27,7 +27,14 @@ from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
-from rangesim.scene.origin import coarsest_mesh, move_to_origin, origin_near, warn_of_coarse_mesh
+from rangesim.scene.origin import (
+    coarsest_mesh,
+    coarsest_transform,
+    move_to_origin,
+    origin_near,
+    warn_of_coarse_mesh,
+    warn_of_coarse_transform,
+)
 from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
 from rangesim.scene.sensor_band import (
@@ -123,11 +130,12 @@ def _instantiate(
             take_sensor_reflectances(state, label)
             check_properties(state, label)
             origin_m = origin_near(state, sensor)
+            transform = coarsest_transform(state) if advises else None
             move_to_origin(state, origin_m, label)
             coloured = coloured_materials(state) if advises else []
             loaded = mi.parser.instantiate(config, state)
             loaded = loaded[0] if isinstance(loaded, list) else loaded
-            coarse = coarsest_mesh(state, loaded) if advises else None
+            mesh = coarsest_mesh(state, loaded) if advises else None
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
         reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)[
@@ -135,7 +143,8 @@ def _instantiate(
         ]  # of a BSDF in Python
         raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     warn_of_colours(coloured, label)
-    warn_of_coarse_mesh(coarse, label)
+    warn_of_coarse_transform(transform, label)
+    warn_of_coarse_mesh(mesh, label)
     return loaded, ids, classes, origin_m
 
 

@@ -15,7 +15,7 @@ from rangesim import limits
 from rangesim.bounds import FARTHEST_M
 from rangesim.config import brief, nearest
 from rangesim.errors import FileFormatError
-from rangesim.scene.origin import CoarseMesh, rounding_of, warn_of_coarse_mesh
+from rangesim.scene.origin import Rounding, rounding_of, warn_of_coarse_mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 Y_UP_SUFFIXES = (".glb", ".gltf")
@@ -42,7 +42,7 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, ad
     vertices, faces = _read(path)
     if advises and np.array_equal(vertices, np.float32(vertices)):
         offset = np.clip(0, vertices.min(axis=0), vertices.max(axis=0))  # of the mesh from the origin of the file
-        warn_of_coarse_mesh(CoarseMesh(unit_m * rounding_of(offset), path.stem), str(path))
+        warn_of_coarse_mesh(Rounding(unit_m * rounding_of(offset), path.stem), str(path))
     vertices = vertices * unit_m
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]

@@ -20,7 +20,7 @@ NEAR_M = 10.0
 """Coordinates of a camera, in metres, up to which the renderer keeps the file's origin: Mitsuba starts rays
 0.09 mm (1 + c) off a surface with coordinates up to c, here a millimetre, and rounds coordinates to a micrometre."""
 COARSE_M = 1e-4
-"""Rounding of a mesh's vertices that is worth a warning."""
+"""Rounding of a mesh's vertices, or of a place, that is worth a warning."""
 PLACED_EMITTERS = ("point", "spot", "projector")
 CAMERAS = ("perspective", "thinlens")
 ENDS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
@@ -64,14 +64,14 @@ def move_to_origin(state: Any, origin_m: np.ndarray, label: str) -> None:
             _move(node, origin_m)
 
 
-class CoarseMesh(NamedTuple):
-    """A mesh whose vertices single precision rounds by up to `error_m` metres."""
+class Rounding(NamedTuple):
+    """How far single precision has moved something, at most, before it came here."""
 
     error_m: float
     name: str
 
 
-def coarsest_mesh(state: Any, scene: Any) -> CoarseMesh | None:
+def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
     """The mesh file whose vertices are rounded worst where they are nearest to the renderer's origin.
 
     Mitsuba reads vertices in single precision, whatever the file has, and before it applies `to_world`. `state` is what
@@ -85,7 +85,22 @@ def coarsest_mesh(state: Any, scene: Any) -> CoarseMesh | None:
             T, box = _matrix(node.props.get("to_world")), shape.bbox()
             nearest = np.clip(0, np.array(box.min), np.array(box.max))
             in_file = np.linalg.pinv(T[:3, :3]) @ (nearest - T[:3, 3])
-            found.append(CoarseMesh(rounding_of(in_file) * float(np.linalg.norm(T[:3, :3], 2)), shape.id()))
+            found.append(Rounding(rounding_of(in_file) * float(np.linalg.norm(T[:3, :3], 2)), shape.id()))
+    return max(found, default=None)
+
+
+def coarsest_transform(state: Any) -> Rounding | None:
+    """The `to_world` of a parsed scene, not moved yet, that was made in single precision and moves its node farthest.
+
+    Rotations and scales tell: their digits fill single precision, but not double.
+    """
+    found = []
+    for node in state.nodes:
+        T = _matrix(node.props.get("to_world"))
+        with np.errstate(over="ignore"):
+            single, half = (T[:3, :3].astype(kind) for kind in (np.float32, np.float16))
+        if np.array_equal(single, T[:3, :3]) and not np.array_equal(half, single):
+            found.append(Rounding(rounding_of(T[:3, 3]), node.props.id()))
     return max(found, default=None)
 
 
@@ -94,13 +109,22 @@ def rounding_of(coordinates: np.ndarray) -> float:
     return float(2.0**-24 * np.abs(coordinates).max())
 
 
-def warn_of_coarse_mesh(mesh: CoarseMesh | None, label: str) -> None:
+def warn_of_coarse_mesh(mesh: Rounding | None, label: str) -> None:
     """Warn once if the rounding of its vertices is worth it."""
     if mesh is not None and mesh.error_m > COARSE_M:
         warn(
             f"{label}: the vertices of mesh {mesh.name!r} are so far from the origin of its file that single "
             f"precision rounds them by up to {1e3 * mesh.error_m:.2g} mm; subtract an offset in double precision where "
             "the mesh is made, which a scene may state in the shape's to_world."
+        )
+
+
+def warn_of_coarse_transform(transform: Rounding | None, label: str) -> None:
+    """Warn once if the rounding of the places is worth it."""
+    if transform is not None and transform.error_m > COARSE_M:
+        warn(
+            f"{label}: to_world of {transform.name!r} was made in single precision, which rounds its place by up to "
+            f"{1e3 * transform.error_m:.2g} mm; make it with mitsuba.ScalarTransform4d."
         )
 
 
