@@ -237,7 +237,9 @@ def test_what_moves_moves_in_the_world(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("distance_m", [1.0, 30.0, 1000.0])
 @pytest.mark.parametrize("through_mirror", [False, True])
-def test_half_a_path_length_errs_by_a_millionth_of_the_distance_at_most(distance_m: float, through_mirror: bool) -> None:
+def test_half_a_path_length_errs_by_a_millionth_of_the_distance_at_most(
+    distance_m: float, through_mirror: bool
+) -> None:
     """A wall ahead, or one to the right that is seen in a mirror at 45 degrees; lit by a projector at the wall."""
     select_variant()
     import mitsuba as mi

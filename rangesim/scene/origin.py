@@ -30,10 +30,9 @@ ENDS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
 def origin_near(state: Any, sensor: int) -> np.ndarray:
     """(3,) float64, metres, world: the origin of the renderer for the parsed scene as seen by one of its sensors.
 
-    The camera's place; 0 where the camera is within `NEAR_M` of the file's origin.
+    The camera's place; 0 where it is within `NEAR_M` of the file's origin, or the camera is a loaded object.
     """
-    root = next(node for node in state.nodes if node.type == mi.ObjectType.Scene)
-    children = [value for _, value in root.props.items()]
+    children = [value for _, value in state.nodes[0].props.items()]
     sensors = [v for v in children if isinstance(v, mi.Sensor) or _type_of(state, v) == mi.ObjectType.Sensor]
     if not 0 <= sensor < len(sensors) or isinstance(sensors[sensor], mi.Sensor):
         return np.zeros(3)
