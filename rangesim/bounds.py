@@ -51,8 +51,8 @@ def whole(low: int, limit: str = "") -> Bounds:
     return Bounds(f"a whole number of at least {low}", low, limit=limit)
 
 
-FARTHEST_M = 1e6
-"""Metres: coordinates and lengths beyond have no millimetres in single precision."""
+FARTHEST_M = 1e7
+"""Metres: room for coordinates of maps, and of the globe; beyond, double precision has no nanometres."""
 Metres = Annotated[float, Bounds("positive and finite", 1e-9, FARTHEST_M)]
 Watts = Annotated[float, Bounds("positive and finite", 1e-12, 1e9)]
 HERTZ = Bounds("positive and finite", 1.0, 1e12)

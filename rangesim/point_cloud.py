@@ -14,6 +14,8 @@ from pcgraph.parallel import SMALLEST_ROWS, in_blocks
 from rangesim.range_image import RangeImage
 
 FRAMES = ("camera", "world")
+FAR_M = 100.0
+"""Coordinates of a camera, in metres, beyond which points in the world are double precision."""
 NORMAL_RADIUS = 2
 """Pixels; normals are fitted to a window of (2 r + 1)^2 pixels."""
 MAX_SLOPE = 4.0
@@ -28,7 +30,8 @@ class PointCloud:
 
     Parameters
     ----------
-    points : (h, w, 3) or (n, 3) float32, metres, in `frame`; NaN where there is none.
+    points : (h, w, 3) or (n, 3) float32, metres, in `frame`; NaN where there is none. float64 in a world whose
+        origin is more than `FAR_M` from the camera.
     frame : "camera" (OpenCV: x right, y down, z forward) or "world".
     normals : (..., 3) float32, unit, towards the camera, in `frame`; NaN where unknown. Or None.
     intensity : (...) float32, the capture's units. Or None.
@@ -109,11 +112,13 @@ def from_range_image(image: RangeImage, frame: str = "camera") -> PointCloud:
     rays = image.camera.directions(image.camera.pixel_centres())
     z = image.z.astype(np.float64)
     points, normals = rays * z[..., None], lattice_normals(z, rays)
+    kind: type[np.floating] = np.float32
     if frame == "world":
         rotation, origin = image.T_world_camera[:3, :3], image.T_world_camera[:3, 3]
         points, normals = points @ rotation.T + origin, normals @ rotation.T
+        kind = np.float64 if np.abs(origin).max() > FAR_M else kind
     return PointCloud(
-        points=points.astype(np.float32),
+        points=points.astype(kind),
         frame=frame,
         normals=normals.astype(np.float32),
         intensity=image.intensity,

@@ -2,7 +2,8 @@
 """Point clouds written as binary PLY and PCD files.
 
 Fields: x y z, and where present normals, intensity, colour and confidence, under the names that Open3D, PCL
-and MeshLab know. The frame goes into a comment line. `pcgraph.read_cloud` reads them back.
+and MeshLab know; in single precision, but points in double precision stay so. The frame goes into a comment line.
+`pcgraph.read_cloud` reads them back.
 """
 
 from __future__ import annotations
@@ -54,7 +55,11 @@ def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:
     for name in ("intensity", "confidence"):
         if name in cloud.attributes():
             columns[name] = cloud.attributes()[name]
-    kinds = [(name, "u1" if v.dtype == np.uint8 else "<f4") for name, v in columns.items()]
+    place = "<f8" if cloud.points.dtype == np.float64 else "<f4"
+    kinds = [
+        (name, place if name in ("x", "y", "z") else "u1" if v.dtype == np.uint8 else "<f4")
+        for name, v in columns.items()
+    ]
     table = np.empty(cloud.points.size // 3, dtype=kinds)
     for name, values in columns.items():
         table[name] = values.ravel()
@@ -74,12 +79,12 @@ def _pcd_bytes(cloud: PointCloud) -> bytes:
     table = _table(cloud, pcd=True)
     shape = cloud.points.shape[:-1]
     height, width = shape if len(shape) == 2 else (1, shape[0])
-    names = table.dtype.names or ()
+    names, sizes = zip(*((name, table.dtype[name].itemsize) for name in table.dtype.names or ()), strict=True)
     lines = [
         f"# .PCD v0.7 - frame {cloud.frame}, metres",
         "VERSION 0.7",
         "FIELDS " + " ".join(names),
-        "SIZE " + " ".join("4" for _ in names),
+        "SIZE " + " ".join(map(str, sizes)),
         "TYPE " + " ".join("F" for _ in names),
         "COUNT " + " ".join("1" for _ in names),
         f"WIDTH {width}",

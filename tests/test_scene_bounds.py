@@ -235,8 +235,8 @@ def test_bare_meshes_have_a_size(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_bytes(MESHES["good.obj"][0])
     with limits.raised(points=2), pytest.raises(FileFormatError, match="at most 2 "):
         load_scene(tmp_path / "a.obj")
-    (tmp_path / "b.obj").write_bytes(MESHES["good.obj"][0].replace(b"1 0 0", b"2 0 0"))
-    with pytest.raises(FileFormatError, match=r"b\.obj within 1e\+06 metres"):
+    (tmp_path / "b.obj").write_bytes(MESHES["good.obj"][0].replace(b"1 0 0", b"20 0 0"))
+    with pytest.raises(FileFormatError, match=r"b\.obj within 1e\+07 metres"):
         load_scene(tmp_path / "b.obj", unit_m=1e6)
     for wrong in (0, -1, math.nan, True, "mm", 1e300):
         with pytest.raises(ValueError, match="unit_m"):

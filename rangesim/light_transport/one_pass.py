@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import drjit as dr
 import mitsuba as mi
@@ -102,13 +102,9 @@ def transport(
     TruncationWarning
         By estimate (`Signals.truncation`), more than 2 % of the projector's light is left out.
     """
+    counts: dict[str, Any] = {"max_depth": max_depth, "rr_depth": rr_depth}
     _check(
-        scene,
-        rig,
-        sensors,
-        spp=spp if isinstance(spp, (int, np.integer)) else 1,
-        max_depth=max_depth,
-        rr_depth=rr_depth,
+        scene, rig, sensors, **counts if spp == "auto" or isinstance(spp, AdaptiveSampling) else counts | {"spp": spp}
     )
     seed = check_seed(seed)
     check_photons(photons, caustic_radius_m)
@@ -124,7 +120,8 @@ def transport(
     elif spp == "auto" and sensors and all(isinstance(s, Sensor) for s in sensors):
         adaptive = AdaptiveSampling.of([s for s in sensors if isinstance(s, Sensor)])
     media, surfaces, absorbers = media_of(scene.mitsuba), surfaces_of(scene.mitsuba), absorbers_of(scene.mitsuba)
-    truth, guides = ground_truth(scene, rig, surfaces)
+    here = scene.in_renderer(rig)
+    truth, guides = ground_truth(scene, here, surfaces)
     if adaptive:
         samples = np.full(h * w, min(FIRST_SPP, adaptive.max_spp))
     elif spp == "auto":
@@ -142,7 +139,7 @@ def transport(
     )
     maps = caustic_maps(
         scene,
-        rig,
+        here,
         photons,
         caustic_radius_m,
         fewest,
@@ -153,7 +150,7 @@ def transport(
         surfaces,
         partial(report, 0.0),
     )
-    camera, projector, cutouts = Device.camera(rig), Device.projector(rig), cutouts_of(scene.mitsuba)
+    camera, projector, cutouts = Device.camera(here), Device.projector(here), cutouts_of(scene.mitsuba)
     view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts, absorbers)
     if keeps_apart and scene.has_matte_textures:
         seen = mean_reflectance(view, settings, rig, scene.has_cutouts, min(fewest, TEXTURE_SAMPLES))
@@ -161,7 +158,7 @@ def transport(
     glints = None
     if glint:
         of_pass = (media, absorbers, surfaces, partial(report, 0.0))
-        glints = trace_glint(scene.mitsuba, rig, responses, seed, *of_pass)
+        glints = trace_glint(scene.mitsuba, here, responses, seed, *of_pass)
     estimate = Estimate(
         view, settings, rig, responses, keeps_apart, fewest >= FEWEST_FOR_HALVES, memory_bytes, launches
     )
@@ -214,7 +211,7 @@ def _energy(
     )
 
 
-def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], **counts: int) -> None:
+def _check(scene: Scene, rig: Rig, sensors: Sequence[Sensor | Response], **counts: Any) -> None:
     if not isinstance(scene, Scene):
         raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
     if not isinstance(rig, Rig):

@@ -20,13 +20,21 @@ from rangesim.catalogue import CATALOGUE, scene_file
 from rangesim.errors import FileFormatError
 from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.medium import is_boundary, why_not_traced
-from rangesim.rig import Intrinsics
+from rangesim.rig import Intrinsics, translation
 from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
+from rangesim.scene.origin import (
+    coarsest_mesh,
+    coarsest_transform,
+    move_to_origin,
+    origin_near,
+    warn_of_coarse_mesh,
+    warn_of_coarse_transform,
+)
 from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
 from rangesim.scene.sensor_band import (
@@ -87,42 +95,48 @@ def load_scene(
         check_number("unit_m", unit_m, Bounds("positive and finite metres per unit", 1e-9, 1e6))
     select_variant(variant)
     retroreflector.register()
-    instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, label)
-    loaded, ids, classes = instantiate(advises=True)
+    instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, sensor, label)
+    loaded, ids, classes, origin_m = instantiate(advises=True)
     _check(loaded, ids, sensor, label)
     warn_of_lamps_behind_glass(loaded, label)
     repeat_normals(loaded)
-    camera, T_world_camera = camera_of(loaded.sensors()[sensor], label)
+    camera, T_camera = camera_of(loaded.sensors()[sensor], label)
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
         mitsuba=loaded,
         instances=tuple(Instance(s.id(), classes.get(s.id()) or _class_of(s)) for s in loaded.shapes()),
         camera=camera,
-        T_world_camera=T_world_camera,
-        working_distance_m=_median_depth(loaded, camera, T_world_camera),
+        T_world_camera=translation(*origin_m) @ T_camera,
+        working_distance_m=_median_depth(loaded, camera, T_camera),
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
         has_matte_textures=any(map(has_texture, {s.bsdf() for s in loaded.shapes() if is_matte(s)})),
         source=None if isinstance(source, Mapping) else scene_file(source),
         reload=lambda: repeat_normals(instantiate()[0]),
+        origin_m=origin_m,
     )
 
 
 def _instantiate(
-    source: Source, material: str, unit_m: float, label: str, advises: bool = False
-) -> tuple[Any, set[str], dict[str, str]]:
-    """The Mitsuba scene, the ids of its shapes, and the material classes that the file states."""
+    source: Source, material: str, unit_m: float, sensor: int, label: str, advises: bool = False
+) -> tuple[Any, set[str], dict[str, str], np.ndarray]:
+    """The Mitsuba scene, the ids of its shapes, the material classes that the file states, and the scene's origin."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
     try:
         with tempfile.TemporaryDirectory() as folder, _own_file_resolver():
-            state = _parse(config, source, material, unit_m, Path(folder))
+            state = _parse(config, source, material, unit_m, Path(folder), advises)
             check_depth(state, label)
             mi.parser.transform_all(config, state)
             ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
             take_sensor_reflectances(state, label)
             check_properties(state, label)
+            origin_m = origin_near(state, sensor)
+            transform = coarsest_transform(state) if advises else None
+            move_to_origin(state, origin_m, label)
             coloured = coloured_materials(state) if advises else []
             loaded = mi.parser.instantiate(config, state)
+            loaded = loaded[0] if isinstance(loaded, list) else loaded
+            mesh = coarsest_mesh(state, loaded) if advises else None
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
         reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)[
@@ -130,16 +144,18 @@ def _instantiate(
         ]  # of a BSDF in Python
         raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     warn_of_colours(coloured, label)
-    return (loaded[0] if isinstance(loaded, list) else loaded), ids, classes
+    warn_of_coarse_transform(transform, label)
+    warn_of_coarse_mesh(mesh, label)
+    return loaded, ids, classes, origin_m
 
 
-def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Path) -> Any:
+def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Path, advises: bool) -> Any:
     if isinstance(source, Mapping):
         check_dictionary(source, "the scene dictionary")
         return mi.parser.parse_dict(config, dict(source))
     path = scene_file(source)
     if _is_mesh(path):
-        return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, folder))
+        return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, folder, advises))
     if path.suffix.lower() != ".xml":
         raise FileFormatError(f"expected a scene (.xml) or a mesh ({', '.join(MESH_SUFFIXES)}), got {path}.")
     resolver = mi.file_resolver()
@@ -193,11 +209,11 @@ def _is_mesh(source: Source) -> bool:
     return not isinstance(source, Mapping) and Path(source).suffix.lower() in MESH_SUFFIXES
 
 
-def _median_depth(scene: Any, camera: Intrinsics, T_world_camera: np.ndarray, columns: int = 64) -> float:
-    """Median z over a coarse grid of camera rays; 1 where the camera sees nothing."""
+def _median_depth(scene: Any, camera: Intrinsics, T_camera: np.ndarray, columns: int = 64) -> float:
+    """Median z over a coarse grid of camera rays; 1 where the camera sees nothing. `T_camera` is to the renderer."""
     grid = camera.resized(columns, max(1, round(columns * camera.height / camera.width)))
-    directions = grid.directions(grid.pixel_centres()).reshape(-1, 3) @ T_world_camera[:3, :3].T
-    ray = mi.Ray3f(o=mi.Point3f(*map(float, T_world_camera[:3, 3])), d=mi.Vector3f(directions.T.astype(np.float32)))
+    directions = grid.directions(grid.pixel_centres()).reshape(-1, 3) @ T_camera[:3, :3].T
+    ray = mi.Ray3f(o=mi.Point3f(*map(float, T_camera[:3, 3])), d=mi.Vector3f(directions.T.astype(np.float32)))
     si = scene.ray_intersect_preliminary(ray, coherent=True)
     z = np.array(dr.select(si.is_valid(), si.t, dr.nan))  # directions have z = 1, so t is depth
     return float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0

@@ -15,6 +15,7 @@ from rangesim import limits
 from rangesim.bounds import FARTHEST_M
 from rangesim.config import brief, nearest
 from rangesim.errors import FileFormatError
+from rangesim.scene.origin import Rounding, rounding_of, warn_of_coarse_mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 Y_UP_SUFFIXES = (".glb", ".gltf")
@@ -28,17 +29,20 @@ MESH_MATERIALS: dict[str, dict[str, Any]] = {
 }
 
 
-def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path) -> dict[str, Any]:
+def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, advises: bool = False) -> dict[str, Any]:
     """Mitsuba scene dictionary with the mesh standing on a table, camera 640 x 480, 57 degrees wide.
 
     `unit_m` is the length of the mesh's unit in metres; table and camera distance follow the size of the mesh.
     Mitsuba reads fewer formats than there are, so it gets a copy of the mesh in `folder`, which must live until the
-    scene is instantiated.
+    scene is instantiated. With `advises`, vertices that single precision has rounded are warned of.
     """
     if material not in MESH_MATERIALS:
         hint = nearest(material, MESH_MATERIALS)
         raise ValueError(f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{hint}.")
     vertices, faces = _read(path)
+    if advises and np.array_equal(vertices, np.float32(vertices)):
+        offset = np.clip(0, vertices.min(axis=0), vertices.max(axis=0))  # of the mesh from the origin of the file
+        warn_of_coarse_mesh(Rounding(unit_m * rounding_of(offset), path.stem), str(path))
     vertices = vertices * unit_m
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]

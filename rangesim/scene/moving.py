@@ -54,7 +54,7 @@ class MovingScene:
         moved = self._moved or self._load()
         normals = {}
         for name in self.names:
-            T = np.asarray(transforms.get(name, np.eye(4)))
+            T = self.scene.motion_in_renderer(np.asarray(transforms.get(name, np.eye(4))))
             if f"{name}.to_world" in self._rest:
                 pose = np.float32(T @ self._rest[f"{name}.to_world"])
                 self._parameters[f"{name}.to_world"] = mi.AffineTransform4f(pose)

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rangesim.bounds import Bounds, check_number, whole
-from rangesim.rig import Intrinsics, Rig, look_at, pose
+from rangesim.rig import Intrinsics, Rig, look_at, pose, translation
 
 BASELINE = Bounds("a positive baseline in metres", 1e-9, 1e6)
 PROJECTOR_PIXELS = (1280, 800)
@@ -30,7 +30,7 @@ class Scene:
     """Geometry and materials to measure.
 
     name : str
-    mitsuba : mitsuba.Scene of the active variant.
+    mitsuba : mitsuba.Scene of the active variant, in the renderer's frame: the world less `origin_m`.
     instances : one per shape, in the order of `mitsuba.shapes()`.
     camera, T_world_camera : the scene's own sensor.
     working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
@@ -38,6 +38,8 @@ class Scene:
     has_matte_textures : bool, whether the reflectance of some matte surface is not the same everywhere.
     source : Path of the file it was loaded from; None for a dictionary.
     reload : makes another mitsuba.Scene of the same source, for shapes to be moved in.
+    origin_m : (3,) float64, metres, world: where the renderer has its origin (`rangesim.scene.origin`); nothing else
+        here and nothing in a result is relative to it.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Scene:
     has_matte_textures: bool = False
     source: Path | None = None
     reload: Callable[[], Any] | None = None
+    origin_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __repr__(self) -> str:
         c = self.camera
@@ -64,6 +67,14 @@ class Scene:
     def has_lamps(self) -> bool:
         """Whether some of that light comes from somewhere, rather than evenly from all around."""
         return any(emitter.class_name() != "ConstantBackgroundEmitter" for emitter in self.mitsuba.emitters())
+
+    def in_renderer(self, rig: Rig) -> Rig:
+        """The rig in the renderer's frame."""
+        return replace(rig, T_world_camera=translation(*-self.origin_m) @ rig.T_world_camera)
+
+    def motion_in_renderer(self, T: np.ndarray) -> np.ndarray:
+        """(4, 4) in the renderer's frame of a world transform (4, 4) that moves a shape."""
+        return np.asarray(translation(*-self.origin_m) @ T @ translation(*self.origin_m))
 
     def rig(
         self,

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the renderer has its origin: near the camera, so that single precision is enough wherever the scene stands.
+
+The renderer computes in single precision: 5000 km from the origin, in metres of a map, coordinates are half a metre
+apart, and already at 50 m Mitsuba starts rays 4.5 mm off the surface that they leave. A scene file is parsed in double
+precision, so there a translation brings the camera near the origin before anything is rounded. Scenes whose camera is
+near it already keep their coordinates, and with them their bytes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+
+from rangesim.errors import FileFormatError, warn
+
+NEAR_M = 10.0
+"""Coordinates of a camera, in metres, up to which the renderer keeps the file's origin: Mitsuba starts rays
+0.09 mm (1 + c) off a surface with coordinates up to c, here a millimetre, and rounds coordinates to a micrometre."""
+COARSE_M = 1e-4
+"""Rounding of a mesh's vertices, or of a place, that is worth a warning."""
+PLACED_EMITTERS = ("point", "spot", "projector")
+CAMERAS = ("perspective", "thinlens")
+ENDS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
+"""Points, by the kind of shape, that place it besides its `to_world`."""
+
+
+def origin_near(state: Any, sensor: int) -> np.ndarray:
+    """(3,) float64, metres, world: the origin of the renderer for the parsed scene as seen by one of its sensors.
+
+    The camera's place; 0 where it is within `NEAR_M` of the file's origin, or the camera is a loaded object.
+    """
+    children = [value for _, value in state.nodes[0].props.items()]
+    sensors = [v for v in children if isinstance(v, mi.Sensor) or _type_of(state, v) == mi.ObjectType.Sensor]
+    if not 0 <= sensor < len(sensors) or isinstance(sensors[sensor], mi.Sensor):
+        return np.zeros(3)
+    place = _matrix(state.nodes[sensors[sensor].index()].props.get("to_world"))[:3, 3]
+    return place if np.abs(place).max() > NEAR_M else np.zeros(3)
+
+
+def move_to_origin(state: Any, origin_m: np.ndarray, label: str) -> None:
+    """Subtract `origin_m` (3,) from the place of everything in a parsed scene, in double precision.
+
+    Raises
+    ------
+    FileFormatError
+        A lamp or sensor is a loaded object, which cannot be moved any more.
+    """
+    if not origin_m.any():
+        return
+    for node in state.nodes:
+        for _, value in node.props.items():
+            if isinstance(value, mi.Sensor) or (isinstance(value, mi.Emitter) and not _is_infinite(value)):
+                raise FileFormatError(
+                    f"expected lamps and sensors of {label}, whose camera is far from the origin, as dictionaries, "
+                    "got a loaded object; give its dictionary."
+                )
+        if "position" in node.props and node.type == mi.ObjectType.Emitter:
+            node.props["position"] = mi.ScalarPoint3d(*(np.array(node.props["position"]) - origin_m))
+        elif "to_world" in node.props or _is_placed(node):
+            _move(node, origin_m)
+
+
+class Rounding(NamedTuple):
+    """How far single precision has moved something, at most, before it came here."""
+
+    error_m: float
+    name: str
+
+
+def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
+    """The mesh file whose vertices are rounded worst where they are nearest to the renderer's origin.
+
+    Mitsuba reads vertices in single precision, whatever the file has, and before it applies `to_world`. `state` is what
+    the mitsuba.Scene was made of.
+    """
+    nodes = {node.props.id(): node for node in state.nodes if node.type == mi.ObjectType.Shape}
+    found = []
+    for shape in scene.shapes() if isinstance(scene, mi.Scene) else ():
+        node = nodes.get(shape.id())
+        if node is not None and shape.is_mesh() and "filename" in node.props:
+            T, box = _matrix(node.props.get("to_world")), shape.bbox()
+            nearest = np.clip(0, np.array(box.min), np.array(box.max))
+            in_file = np.linalg.pinv(T[:3, :3]) @ (nearest - T[:3, 3])
+            found.append(Rounding(rounding_of(in_file) * float(np.linalg.norm(T[:3, :3], 2)), shape.id()))
+    return max(found, default=None)
+
+
+def coarsest_transform(state: Any) -> Rounding | None:
+    """The `to_world` of a parsed scene, not moved yet, that was made in single precision and moves its node farthest.
+
+    Rotations and scales tell: their digits fill single precision, but not double.
+    """
+    found = []
+    for node in state.nodes:
+        T = _matrix(node.props.get("to_world"))
+        with np.errstate(over="ignore"):
+            single, half = (T[:3, :3].astype(kind) for kind in (np.float32, np.float16))
+        if np.array_equal(single, T[:3, :3]) and not np.array_equal(half, single):
+            found.append(Rounding(rounding_of(T[:3, 3]), node.props.id()))
+    return max(found, default=None)
+
+
+def rounding_of(coordinates: np.ndarray) -> float:
+    """How far single precision rounds the largest of some coordinates, at most, in their unit."""
+    return float(2.0**-24 * np.abs(coordinates).max())
+
+
+def warn_of_coarse_mesh(mesh: Rounding | None, label: str) -> None:
+    """Warn once if the rounding of its vertices is worth it."""
+    if mesh is not None and mesh.error_m > COARSE_M:
+        warn(
+            f"{label}: the vertices of mesh {mesh.name!r} are so far from the origin of its file that single "
+            f"precision rounds them by up to {1e3 * mesh.error_m:.2g} mm; subtract an offset in double precision where "
+            "the mesh is made, which a scene may state in the shape's to_world."
+        )
+
+
+def warn_of_coarse_transform(transform: Rounding | None, label: str) -> None:
+    """Warn once if the rounding of the places is worth it."""
+    if transform is not None and transform.error_m > COARSE_M:
+        warn(
+            f"{label}: to_world of {transform.name!r} was made in single precision, which rounds its place by up to "
+            f"{1e3 * transform.error_m:.2g} mm; make it with mitsuba.ScalarTransform4d."
+        )
+
+
+def _move(node: Any, origin_m: np.ndarray) -> None:
+    """Subtract an origin from the place of one node. Ends of a shape are rounded by Mitsuba before it applies
+    `to_world`, so the first of them becomes zero and goes into `to_world`."""
+    T = mi.ScalarTransform4d
+    to_world = node.props.get("to_world", T())
+    ends = [key for key in ENDS.get(node.props.plugin_name(), ()) if key in node.props]
+    if ends:
+        first = np.array(node.props[ends[0]])
+        to_world = to_world @ T().translate(first)
+        for key in ends:
+            node.props[key] = mi.ScalarPoint3d(*(np.array(node.props[key]) - first))
+    node.props["to_world"] = T().translate(-origin_m) @ to_world
+
+
+def _is_placed(node: Any) -> bool:
+    """Whether a node without `to_world` stands in the world all the same."""
+    if node.type == mi.ObjectType.Shape:
+        return True
+    kinds = {mi.ObjectType.Emitter: PLACED_EMITTERS, mi.ObjectType.Volume: ("gridvolume",)}
+    return node.props.plugin_name() in (*kinds.get(node.type, ()), *CAMERAS)
+
+
+def _is_infinite(emitter: Any) -> bool:
+    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
+
+
+def _type_of(state: Any, value: Any) -> Any:
+    return state.nodes[value.index()].type if isinstance(value, mi.Properties.ResolvedReference) else None
+
+
+def _matrix(transform: Any) -> np.ndarray:
+    """(4, 4) float64 of a transform; the identity of None, and of what Mitsuba refuses."""
+    if not isinstance(transform, mi.ScalarTransform4d):
+        return np.eye(4)
+    return np.array(transform.matrix, dtype=np.float64).reshape(4, 4)
