@@ -89,7 +89,7 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]]) -> None:
     """
     noisy = []
     for name, rows in tables.items():
-        ratios = {r["material"]: _ratio(r) for r in rows if r["material"] != ALL and r["pixels"] >= ENOUGH_PIXELS}
+        ratios = {r["material"]: noise_ratio(r) for r in rows if r["material"] != ALL and r["pixels"] >= ENOUGH_PIXELS}
         if found := [f"{ratio:.1f} on {material}" for material, ratio in ratios.items() if ratio > SMALL]:
             noisy.append(f"{name}: {', '.join(found)}")
     if noisy:
@@ -97,8 +97,8 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]]) -> None:
         warnings.warn(SamplingWarning(sentence(text)), stacklevel=3)
 
 
-def _ratio(row: dict[str, Any]) -> float:
-    """Sampling noise over the detector's; 0 where either is not known, or there is none of the detector's."""
+def noise_ratio(row: dict[str, Any]) -> float:
+    """Sampling noise over the detector's, of a row; 0 where either is not known, or there is none."""
     sampling, detector = row["sampling_sigma_m"], row["detector_sigma_m"]
     return sampling / detector if sampling and detector else 0.0
 

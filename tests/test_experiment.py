@@ -126,7 +126,7 @@ def test_the_result_holds_every_stage() -> None:
         assert (np.isfinite(m.image.z) == (m.image.status == Status.OK)).all()
         assert m.segmentation is not None
         assert (m.segmentation.supervoxels >= 0).sum() == m.facts.points == m.image.valid.sum()
-        assert {"exposure", "decode", "causes", "points", "segmentation"} == set(m.facts.times_s)
+        assert {"exposure", "decode", "noise", "causes", "points", "segmentation"} == set(m.facts.times_s)
         assert m.rows[-1]["material"] == "all"
     acquired = {m.name: m.facts.acquisition_s for m in result.measurements}
     assert acquired["ideal"] is None

@@ -64,6 +64,7 @@ def context(result: Result) -> dict[str, Any]:
         "columns": tables.COLUMNS,
         "comparison": tables.comparison_table(measurements),
         "failures": tables.failure_table(measurements),
+        "noise": tables.noise_table(measurements),
         "tolerance_mm": f"{1e3 * measurements[0].causes.tolerance_m:g}",
         "definitions": tables.definitions(measurements),
         "maps": [_maps(m, limits, depth, error) for m in measurements],

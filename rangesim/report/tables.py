@@ -11,6 +11,7 @@ from typing import Any
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.errors import visible
 from rangesim.experiment import Experiment
+from rangesim.reading_noise import SMALL, noise_ratio
 from rangesim.report import palette
 from rangesim.report.figures import Share
 from rangesim.result_files import Measurement
@@ -49,14 +50,6 @@ COLUMNS = (
     Column("p95_abs_m", "95\N{NO-BREAK SPACE}% within", "mm", "95th percentile of |z − true z|"),
     Column("outlier_rate", "outliers", "%", "share of the measurements off by more than 10 mm"),
     Column("flying_rate", "flying", "%", "share of the measurements at depth edges that lie on neither side"),
-    Column("detector_sigma_m", "detector noise", "mm", "standard deviation of z by the noise of the detector", ""),
-    Column(
-        "sampling_sigma_m",
-        "sampling noise",
-        "mm",
-        "the same by the random light paths of the renderer, to be small against that of the detector",
-        "",
-    ),
 )
 
 
@@ -145,6 +138,18 @@ def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[t
     return table
 
 
+def noise_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[str], bool]]]]:
+    """Per material class, "all" first: name, noise of the detector, that of sampling and their ratio, and whether this
+    is large, of each instrument; nothing where none is known."""
+    table = []
+    for material in materials(measurements):
+        rows = [(m.name, row) for m in measurements for row in m.rows if row["material"] == material]
+        lines = [(name, [*_noise(row), _ratio(row)], noise_ratio(row) > SMALL) for name, row in rows]
+        table.append((material, lines))
+    known = any(row["sampling_sigma_m"] is not None for m in measurements for row in m.rows)
+    return table if known else []
+
+
 def definitions(measurements: Sequence[Measurement]) -> list[Definition]:
     """What the causes that occur mean, in the order of their families."""
     found = {name for m in measurements for row in m.rows for name in row["causes"]}
@@ -164,10 +169,15 @@ def materials(measurements: Sequence[Measurement]) -> list[str]:
 
 
 def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
-    """The same comparison in Markdown, one row per instrument and material: a table of errors, then one of failures."""
+    """The same comparison in Markdown, one row per instrument and material: tables of errors, failures and noise."""
     heads = [f"{c.title} ({c.unit})" for c in COLUMNS]
-    errors = _markdown(tables, heads, lambda row: [number(c, row[c.key]) for c in COLUMNS])
-    return errors + "\n" + _markdown(tables, ["failed (%)", "because (% of the pixels)"], _failures)
+    return "\n".join(
+        [
+            _markdown(tables, heads, lambda row: [number(c, row[c.key]) for c in COLUMNS]),
+            _markdown(tables, ["failed (%)", "because (% of the pixels)"], _failures),
+            _markdown(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise),
+        ]
+    )
 
 
 def cells(line: str) -> list[str]:
@@ -193,6 +203,17 @@ def _markdown(
 def _failures(row: dict[str, Any]) -> list[str]:
     """Failed pixels in percent, and their causes."""
     return [_percent(row["failed"]), ", ".join(f"{p.name} {p.text}" for p in parts(row)) or "–"]
+
+
+def _noise(row: dict[str, Any]) -> list[str]:
+    """Standard deviations by the detector's noise and by sampling, millimetres."""
+    sigmas = (row["detector_sigma_m"], row["sampling_sigma_m"])
+    return ["–" if sigma is None else millimetres(sigma) for sigma in sigmas]
+
+
+def _ratio(row: dict[str, Any]) -> str:
+    ratio = noise_ratio(row)
+    return f"{ratio:.2f}" if ratio else "–"
 
 
 def _percent(share: float | None) -> str:
@@ -246,7 +267,7 @@ def settings_line(experiment: Experiment, width: int, height: int) -> str:
 
 def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
     values = [row[column.key] for row in rows if row[column.key] is not None]
-    if len(rows) < 2 or not values or not column.better:
+    if len(rows) < 2 or not values:
         return None
     return float(max(values) if column.better == "high" else min(values, key=abs))
 

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise of the renderer beside that of the detector: estimated from two halves of the samples, and driven down."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rangesim import AmcwToF, IdealToF, Scene, StructuredLight, decode, expose, load_scene, transport
+from rangesim.adaptive_sampling import AdaptiveSampling, group_sigma, groups
+from rangesim.errors import SamplingWarning
+from rangesim.instrument import Instrument
+from rangesim.light_transport.estimate import Sums
+from rangesim.light_transport.loop import Budget
+from rangesim.reading_noise import reading_noise, robust_sigma, warn_of_sampling
+
+SMALL_IMAGE: dict[str, Any] = {"width": 96, "height": 72}
+
+
+@pytest.fixture(scope="module")
+def matte() -> Scene:
+    return load_scene("matte")
+
+
+# ---- Halves ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", [0, 16])
+def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
+    for n in range(3, 70):
+        count = np.array([n], np.uint32)
+        taken = []
+        for half in Budget(np.arange(1), count, count + first, 1.0, first, part=3).halves():
+            k = np.arange(half.samples[0])
+            taken.append(half.first + (k >> 1) * half.stride + (k & 1))  # as `Lanes.number`
+        assert np.array_equal(np.sort(np.concatenate(taken)), first + np.arange(n))
+        assert abs(len(taken[0]) - len(taken[1])) <= 2
+        for numbers in taken:
+            whole = numbers[numbers // 2 * 2 + 1 < first + n]
+            assert all((number ^ 1) in numbers for number in whole)
+
+
+def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean() -> None:
+    rng, p, q = np.random.default_rng(3), 5, 16
+    a, b = rng.normal(2, np.sqrt(p), (1, 1, 200, 300)), rng.normal(2, np.sqrt(q), (1, 1, 200, 300))  # sums, about
+    key: Any = "response"
+    one, two = (Sums({key: x.astype(np.float32)}, np.zeros((1, 200, 300), np.float32)) for x in (p * a, q * b))
+    one.channels[key] = (2 * p + rng.normal(0, np.sqrt(p), (1, 1, 200, 300))).astype(np.float32)
+    two.channels[key] = (2 * q + rng.normal(0, np.sqrt(q), (1, 1, 200, 300))).astype(np.float32)
+    one.average(two, np.full((200, 300), p, np.uint32), np.full((200, 300), q, np.uint32))
+    assert one.channels[key].mean() == pytest.approx(2, rel=0.01)
+    assert one.channels[key].std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
+    assert two.channels[key].std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
+    assert abs(two.channels[key].mean()) < 0.01
+
+
+@pytest.mark.parametrize("indirect", ["raw", "filtered"])
+def test_the_estimated_noise_of_a_reading_is_that_between_seeds(matte: Scene, indirect: Any) -> None:
+    """Both halves are stratified, and the whole is better still: the estimate errs on the safe side."""
+    for sensor, rig in ((StructuredLight(), matte.rig(**SMALL_IMAGE)), (AmcwToF(), matte.rig(0.03, **SMALL_IMAGE))):
+        z, estimated = [], []
+        for seed in range(8):
+            signals = transport(matte, rig, [sensor], spp=16, seed=seed, indirect=indirect)
+            capture = expose(signals, sensor)
+            image = decode(capture)
+            noise = reading_noise(image, capture, signals)
+            assert not np.isfinite(noise.detector).any()  # there is none
+            z.append(image.z)
+            estimated.append(robust_sigma(noise.sampling))
+        always = np.isfinite(z).all(axis=0)
+        of_pixel = np.array(z)[:, always]
+        spread = robust_sigma((of_pixel - np.median(of_pixel, axis=0)) * np.sqrt(8 / 7))
+        assert np.mean(estimated) == pytest.approx(spread, rel=0.25)
+
+
+def test_light_through_glass_knows_the_noise_of_its_photons() -> None:
+    """All pixels of a pass share its photons, but no photon serves both halves."""
+    scene = load_scene("glassware")
+    rig, sensor = scene.rig(0.03, **SMALL_IMAGE), AmcwToF()
+    signals = [transport(scene, rig, [sensor], spp=8, seed=seed, photons=50_000, glint=False) for seed in range(8)]
+    caustic = np.array([s.energy.caustic for s in signals])
+    lit = caustic.mean(axis=0) > 0.1 * signals[0].energy.direct.mean()
+    assert lit.sum() > 100
+    drawn = np.array([s.sampling.projector for s in signals if s.sampling])
+    between = np.array([s.energy.projector for s in signals]).std(axis=0, ddof=1)
+    ratio = np.median(np.sqrt((drawn**2).mean(axis=0))[lit]) / np.median(between[lit])
+    assert 0.75 < ratio < 1.5
+
+
+def test_two_samples_know_nothing_of_their_error(matte: Scene) -> None:
+    sensor = AmcwToF()
+    signals = transport(matte, matte.rig(0.03, width=32, height=24), [sensor], spp=2)
+    assert not signals.knows_sampling_error
+    capture = expose(signals, sensor)
+    with pytest.raises(ValueError, match="at least 3 samples"):
+        reading_noise(decode(capture), capture, signals)
+
+
+# ---- Adaptive sampling -----------------------------------------------------------------------------------------------
+
+
+def test_groups_are_the_pixels_of_an_instance_in_a_square_and_their_sigma_is_that_of_numpy() -> None:
+    rng = np.random.default_rng(1)
+    instance = rng.integers(-1, 3, (40, 50))
+    group = groups(instance)
+    errors = rng.normal(size=(40, 50))
+    errors[rng.random((40, 50)) < 0.3] = np.nan
+    errors[:16, :16] = np.nan
+    sigma = group_sigma(errors, group)
+    y, x = np.mgrid[:40, :50]
+    for number in range(group.max() + 1):
+        pixels = group == number
+        assert len(set(zip(y[pixels] // 16, x[pixels] // 16, instance[pixels], strict=True))) == 1
+        finite = np.sort(np.abs(errors[pixels & np.isfinite(errors)]))
+        assert sigma[number] == (pytest.approx(1.4826 * finite[len(finite) // 2]) if finite.size else 0)
+    assert not group_sigma(np.full((40, 50), np.nan), group).any()
+
+
+def test_more_samples_go_where_sampling_is_not_small_and_nowhere_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plane has no sampling noise at all; on glass there is plenty."""
+    asked: list[np.ndarray] = []
+    unfinished = AdaptiveSampling.unfinished
+
+    def spy(self: AdaptiveSampling, truth: Any, signals_of: Any) -> np.ndarray:
+        asked.append(unfinished(self, truth, signals_of))
+        return asked[-1]
+
+    monkeypatch.setattr(AdaptiveSampling, "unfinished", spy)
+    plane, glass, sensor = load_scene("plane"), load_scene("glassware"), StructuredLight()
+    transport(plane, plane.rig(**SMALL_IMAGE), [sensor])
+    assert len(asked) == 1
+    assert not asked[0].any()
+    asked.clear()
+    signals = transport(glass, glass.rig(**SMALL_IMAGE), [sensor])
+    of_class = {name: asked[0][mask].mean() for name, mask in signals.truth.classes().items()}
+    assert len(asked) == 1
+    assert of_class["transparent"] > 0.9
+    assert of_class["matte"] < 0.9
+    asked.clear()
+    adaptive = AdaptiveSampling((Instrument("one", sensor),), max_spp=256)
+    transport(glass, glass.rig(**SMALL_IMAGE), [sensor], spp=adaptive)
+    assert len(asked) == 2
+
+
+def test_noise_falls_below_the_share_that_was_asked_for(matte: Scene) -> None:
+    one = Instrument("amcw", AmcwToF())
+    rig = one.rig(matte, **SMALL_IMAGE)
+    ratios = []
+    for share in (0.5, 0.1):
+        adaptive = AdaptiveSampling((one,), max_spp=1024, share=share)
+        signals = transport(matte, rig, [one.sensor], spp=adaptive)
+        capture = expose(signals, one.sensor, one.detector)
+        noise = reading_noise(decode(capture), capture, signals)
+        row = noise.by_material(signals.truth)[-1]
+        ratios.append(row["sampling_sigma_m"] / row["detector_sigma_m"])
+        assert ratios[-1] < share
+    assert ratios[1] < 0.5 * ratios[0]
+
+
+def test_rounds_have_the_same_bytes_whatever_the_memory_budget(matte: Scene) -> None:
+    sensor = AmcwToF()
+    rig = matte.rig(0.03, width=48, height=36)
+    adaptive = AdaptiveSampling((Instrument("one", sensor),), share=0.1)
+    one, two = (transport(matte, rig, [sensor], spp=adaptive, memory_bytes=n) for n in (1 << 30, 1 << 20))
+    assert [a.tobytes() for a in one.channels.values()] == [b.tobytes() for b in two.channels.values()]
+    assert one.energy.multipath.tobytes() == two.energy.multipath.tobytes()
+
+
+def test_samples_that_are_no_number_are_refused(matte: Scene) -> None:
+    for spp in (2.5, 0, "many", None):
+        with pytest.raises(ValueError, match="spp"):
+            transport(matte, matte.rig(), [AmcwToF()], spp=spp)  # type: ignore[arg-type]
+
+
+# ---- What is said of it ----------------------------------------------------------------------------------------------
+
+
+def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -> None:
+    from rangesim.experiment import Experiment
+    from rangesim.pipeline import run
+    from rangesim.result_files import load_result
+
+    instruments = (Instrument("amcw", AmcwToF()), Instrument("ideal", IdealToF()))
+    experiment = Experiment("glassware", width=96, height=72, spp=4, instruments=instruments)
+    with pytest.warns(SamplingWarning, match="amcw: .* on transparent"):
+        run(experiment, tmp_path / "out")
+    amcw, ideal = load_result(tmp_path / "out").measurements
+    sigma = amcw.image.sampling_sigma_m
+    assert sigma is not None
+    rows = {row["material"]: row for row in amcw.rows}
+    of_glass = sigma[amcw.truth.classes()["transparent"]]
+    assert robust_sigma(of_glass) == pytest.approx(rows["transparent"]["sampling_sigma_m"], rel=1e-6)
+    assert rows["transparent"]["sampling_sigma_m"] > 0.5 * rows["transparent"]["detector_sigma_m"] > 0
+    assert all(row["detector_sigma_m"] is None for row in ideal.rows)
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "sampling noise" in report
+    assert "detector noise" in report
+
+
+def test_nothing_is_said_where_sampling_is_small_or_pixels_are_few() -> None:
+    row = {"material": "matte", "pixels": 5000, "sampling_sigma_m": 1e-4, "detector_sigma_m": 3e-4}
+    quiet = [row, row | {"sampling_sigma_m": None}, row | {"pixels": 20, "sampling_sigma_m": 1.0}]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_sampling({"amcw": [*quiet, row | {"material": "all", "sampling_sigma_m": 1.0}]})
+    with pytest.warns(SamplingWarning, match="gray: 2.0 on glossy"):
+        warn_of_sampling({"amcw": quiet, "gray": [row | {"material": "glossy", "sampling_sigma_m": 6e-4}]})
+
+
+def test_a_scan_of_something_that_moves_knows_its_sampling_error(matte: Scene) -> None:
+    from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
+
+    sensor, rig = AmcwToF(), matte.rig(0.03, width=48, height=36)
+    options: dict[str, Any] = {"spp": 16, "indirect": "raw"}
+    still = transport(matte, rig, [sensor], seed=1, **options)
+    hardly = Motion({"wall": SteadyTrack((1e-12, 0.0, 0.0))})
+    timing = Timing(frame_period_s=0.1, single_tap=True)
+    moving = transport_moving(matte, rig, {sensor: timing}, hardly, seed=1, **options)[sensor]
+    for errors in (1.0, -1.0):
+        np.testing.assert_allclose(
+            moving.frames(sensor, 0.0, errors), still.frames(sensor, 0.0, errors), rtol=1e-4, atol=1e-7
+        )
+    with pytest.raises(ValueError, match="AdaptiveSampling"):
+        transport_moving(matte, rig, {sensor: timing}, hardly, spp=AdaptiveSampling.of([sensor]))
