@@ -157,10 +157,12 @@ def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) 
         responses = dict.fromkeys(r for one in instruments for r in one.sensor.responses())
         channels = sum(r.channels for r in responses)
         tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light apart
-        signals = pixels * (4 * channels + TRUTH_BYTES)
+        of_one = max(sum(r.channels for r in one.sensor.responses()) for one in instruments)
         frames = max(one.sensor.n_frames for one in instruments)
-        tracing = tiles + 3 * signals + photons * PHOTON_BYTES  # tiles are joined, and filtered
-        exposing = signals + 14 * frames * pixels  # three times float32, and the digital numbers
+        exposed = pixels * 14 * frames  # three times float32, and the digital numbers
+        judged = pixels * 4 * 4 * of_one + exposed  # a copy of two halves, indirect light apart
+        tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES) + photons * PHOTON_BYTES
+        exposing = pixels * (2 * 4 * channels + 4 * of_one + TRUTH_BYTES) + exposed  # signals and their error
         at_once = max(at_once, tracing, exposing)
         report += pixels * sum(2 * one.sensor.n_frames + RESULT_BYTES for one in instruments)
     return int(BASE_BYTES + max(at_once, report))

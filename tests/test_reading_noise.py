@@ -46,11 +46,9 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
 
 def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean() -> None:
     rng, p, q = np.random.default_rng(3), 5, 16
-    a, b = rng.normal(2, np.sqrt(p), (1, 1, 200, 300)), rng.normal(2, np.sqrt(q), (1, 1, 200, 300))  # sums, about
     key: Any = "response"
-    one, two = (Sums({key: x.astype(np.float32)}, np.zeros((1, 200, 300), np.float32)) for x in (p * a, q * b))
-    one.channels[key] = (2 * p + rng.normal(0, np.sqrt(p), (1, 1, 200, 300))).astype(np.float32)
-    two.channels[key] = (2 * q + rng.normal(0, np.sqrt(q), (1, 1, 200, 300))).astype(np.float32)
+    sums = [(rng.normal(2 * n, np.sqrt(n), (1, 200, 300))).astype(np.float32) for n in (p, q)]
+    one, two = (Sums({key: x}, {}, np.zeros((1, 200, 300), np.float32)) for x in sums)
     one.average(two, np.full((200, 300), p, np.uint32), np.full((200, 300), q, np.uint32))
     assert one.channels[key].mean() == pytest.approx(2, rel=0.01)
     assert one.channels[key].std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)

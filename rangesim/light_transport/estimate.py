@@ -28,36 +28,44 @@ SMOOTH = [Radiance._fields.index("multipath"), Radiance._fields.index("faint")]
 class Sums:
     """Sums over samples of each pixel, or means.
 
-    channels : response -> (parts, c, h, w) float32; `parts` as of `Accumulators`. radiance : (6, h, w) float32, in the
-    order of `Radiance`.
+    channels : response -> (c, h, w) float32. smooth : the same of light that is kept apart; empty if none is.
+    radiance : (6, h, w) float32, in the order of `Radiance`.
     """
 
-    def __init__(self, channels: dict[Response, np.ndarray], radiance: np.ndarray) -> None:
-        self.channels, self.radiance = channels, radiance
+    def __init__(
+        self, channels: dict[Response, np.ndarray], smooth: dict[Response, np.ndarray], radiance: np.ndarray
+    ) -> None:
+        self.channels, self.smooth, self.radiance = channels, smooth, radiance
 
     @classmethod
-    def zeros(cls, responses: Iterable[Response], parts: int, h: int, w: int) -> Sums:
+    def zeros(cls, responses: Iterable[Response], keeps_apart: bool, h: int, w: int) -> Sums:
         """Sums over no samples."""
-        channels = {r: np.zeros((parts, r.channels, h, w), np.float32) for r in responses}
-        return cls(channels, np.zeros((len(Radiance._fields), h, w), np.float32))
+        channels, apart = (
+            {r: np.zeros((r.channels, h, w), np.float32) for r in kept}
+            for kept in (responses, responses if keeps_apart else ())
+        )
+        return cls(channels, apart, np.zeros((len(Radiance._fields), h, w), np.float32))
 
     def copy(self, responses: Iterable[Response]) -> Sums:
         """A copy of what these responses need."""
-        return Sums({r: self.channels[r].copy() for r in responses}, self.radiance.copy())
+        channels, apart = ({r: kept[r].copy() for r in responses if r in kept} for kept in (self.channels, self.smooth))
+        return Sums(channels, apart, self.radiance.copy())
 
     def add(self, pixels: np.ndarray, traced: Traced, accumulators: Accumulators) -> None:
         """Add the sums of pixels with these flat indices, in ascending order."""
         some: slice | np.ndarray = pixels
         if pixels[-1] - pixels[0] + 1 == len(pixels):
             some = slice(pixels[0], pixels[-1] + 1)
-        for image, values in zip(self.channels.values(), accumulators.images(), strict=True):
-            image.reshape(*image.shape[:2], -1)[..., some] += values
+        parts = [self.channels, self.smooth] if self.smooth else [self.channels]
+        for response, values in zip(self.channels, accumulators.images(), strict=True):
+            for part, of_part in zip(parts, values, strict=True):
+                part[response].reshape(response.channels, -1)[:, some] += of_part
         self.radiance.reshape(len(self.radiance), -1)[:, some] += traced.radiance
 
     def planes(self) -> Iterator[np.ndarray]:
         """Channels and radiance, one (h, w) view after the other."""
-        for image in (*self.channels.values(), self.radiance):
-            yield from image.reshape(-1, *image.shape[-2:])
+        for image in (*self.channels.values(), *self.smooth.values(), self.radiance):
+            yield from image
 
     def divide(self, samples: np.ndarray) -> None:
         """Make means of these sums over so many samples (h, w)."""
@@ -79,12 +87,13 @@ class Sums:
             b[:] = difference
 
     def share(self, guides: Guides) -> None:
-        """Let neighbouring pixels share smooth light, in place; the first parts then have all light."""
-        smooth_light = self.radiance[SMOOTH]
-        smooth([smooth_light, *(values[1] for values in self.channels.values())], guides)
-        self.radiance[SMOOTH] = smooth_light
-        for first, second in self.channels.values():
-            first += second
+        """Let neighbouring pixels share smooth light; the channels then have all light."""
+        radiance = self.radiance[SMOOTH]
+        smooth([radiance, *self.smooth.values()], guides)
+        self.radiance[SMOOTH] = radiance
+        while self.smooth:
+            response, light = self.smooth.popitem()
+            self.channels[response] += light
 
 
 class Estimate:
@@ -113,7 +122,7 @@ class Estimate:
         self.view, self.settings, self.launches, self.memory_bytes = view, settings, launches, memory_bytes
         self.responses, self.keeps_apart, self.irradiance = responses, keeps_apart, rig.projector_irradiance
         self.shape = rig.camera.height, rig.camera.width
-        self.halves = [Sums.zeros(responses, 1 + keeps_apart, *self.shape) for _ in range(1 + has_halves)]
+        self.halves = [Sums.zeros(responses, keeps_apart, *self.shape) for _ in range(1 + has_halves)]
         self.samples = [np.zeros(self.shape, np.uint32) for _ in self.halves]
         self.tally = np.zeros((len(Tally._fields), *self.shape), np.float32)
         self.rounds = 0
@@ -179,7 +188,7 @@ class Estimate:
 def _error(drawn: Sums) -> SamplingError:
     radiance = Radiance(*drawn.radiance)
     projector = radiance.direct + radiance.multipath + radiance.via_delta + radiance.caustic + radiance.faint
-    return SamplingError({r: parts[0] for r, parts in drawn.channels.items()}, projector)
+    return SamplingError(drawn.channels, projector)
 
 
 def _report(report: Report, before: float, share: float, of_tile: float) -> None:

@@ -165,8 +165,7 @@ def transport(
 
     def signals_of(some: Sequence[Response] | None) -> Signals:
         means, error = estimate.means(guides, some)
-        images = {r: parts[0] for r, parts in means.channels.items()}
-        return Signals(rig, images, _energy(means, glints, images, responses), truth, sampling=error)
+        return Signals(rig, means.channels, _energy(means, glints, responses), truth, sampling=error)
 
     left = 0.5 if adaptive else 0.0  # how many rounds follow is not known, so each makes half of what is left
     estimate.sample(np.arange(h * w), samples, partial(_report, report, 0.0, 1 - left))
@@ -190,17 +189,15 @@ def _report(report: Report, before: float, part: float, share: float) -> None:
     report(PATHS_SHARE * (before + part * share))
 
 
-def _energy(
-    means: Sums, glints: Glint | None, images: dict[Response, np.ndarray], responses: Sequence[Response]
-) -> EnergySplit:
-    """The energy split of means; glint is added to it and to the images."""
+def _energy(means: Sums, glints: Glint | None, responses: Sequence[Response]) -> EnergySplit:
+    """The energy split of means; glint, which has values for these responses, is added to it and to the channels."""
     radiance = Radiance(*means.radiance)
     highlights = np.zeros((1, *radiance.direct.shape), np.float32)
     if glints:
         glints.add_to(highlights, glints.radiance[None])
         for response, values in zip(responses, glints.channels, strict=True):
-            if response in images:
-                glints.add_to(images[response], values)
+            if response in means.channels:
+                glints.add_to(means.channels[response], values)
     return EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,

@@ -258,7 +258,7 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
 
 def settings_line(experiment: Experiment, width: int, height: int) -> str:
     """The settings of the light transport in one line."""
-    paths = "16 to 64" if experiment.spp is None else experiment.spp
+    paths = f"up to {experiment.max_spp}" if experiment.spp is None else experiment.spp
     return (
         f"{width} × {height} pixels, {paths} light paths per pixel of up to {experiment.max_depth} segments, "
         f"seed {experiment.seed}"
