@@ -160,7 +160,7 @@ def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) 
         of_one = max(sum(r.channels for r in one.sensor.responses()) for one in instruments)
         frames = max(one.sensor.n_frames for one in instruments)
         exposed = pixels * 14 * frames  # three times float32, and the digital numbers
-        judged = pixels * 4 * 4 * of_one + exposed  # a copy of two halves, indirect light apart
+        judged = pixels * 2 * 4 * of_one + exposed  # means and their error
         tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES) + photons * PHOTON_BYTES
         exposing = pixels * (2 * 4 * channels + 4 * of_one + TRUTH_BYTES) + exposed  # signals and their error
         at_once = max(at_once, tracing, exposing)

@@ -49,7 +49,7 @@ def test_memory_grows_with_pixels_and_bins() -> None:
     many = replace(few, instruments=(replace(few.instruments[0], sensor=DirectToF(6400)),))
     frames = 640 * 480 * 6400 * 4
     assert of(few).memory_bytes < 2e9
-    assert 3 * frames < of(many).memory_bytes < 6 * frames
+    assert 6 * frames < of(many).memory_bytes < 12 * frames  # two halves, smooth light apart, and a capture to judge by
 
 
 def test_what_exceeds_the_memory_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

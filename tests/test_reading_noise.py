@@ -14,7 +14,7 @@ from rangesim import AmcwToF, IdealToF, Scene, StructuredLight, decode, expose, 
 from rangesim.adaptive_sampling import AdaptiveSampling, group_sigma, groups
 from rangesim.errors import SamplingWarning
 from rangesim.instrument import Instrument
-from rangesim.light_transport.estimate import Sums
+from rangesim.light_transport.estimate import mean_and_error
 from rangesim.light_transport.loop import Budget
 from rangesim.reading_noise import reading_noise, robust_sigma, warn_of_sampling
 
@@ -46,14 +46,13 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
 
 def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean() -> None:
     rng, p, q = np.random.default_rng(3), 5, 16
-    key: Any = "response"
-    sums = [(rng.normal(2 * n, np.sqrt(n), (1, 200, 300))).astype(np.float32) for n in (p, q)]
-    one, two = (Sums({key: x}, {}, np.zeros((1, 200, 300), np.float32)) for x in sums)
-    one.average(two, np.full((200, 300), p, np.uint32), np.full((200, 300), q, np.uint32))
-    assert one.channels[key].mean() == pytest.approx(2, rel=0.01)
-    assert one.channels[key].std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
-    assert two.channels[key].std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
-    assert abs(two.channels[key].mean()) < 0.01
+    a, b = (rng.normal(2 * n, np.sqrt(n), (1, 200, 300)).astype(np.float32) for n in (p, q))
+    mean, error = np.empty_like(a), np.empty_like(a)
+    mean_and_error(a, b, [np.full((200, 300), n, np.uint32) for n in (p, q)], (mean, error))
+    assert mean.mean() == pytest.approx(2, rel=0.01)
+    assert mean.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
+    assert error.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
+    assert abs(error.mean()) < 0.01
 
 
 @pytest.mark.parametrize("indirect", ["raw", "filtered"])

@@ -12,7 +12,7 @@ import pytest
 
 from rangesim import AmcwToF, DirectToF, Signals, StructuredLight, decode, expose, load_scene, transport
 from rangesim.light_transport.backend import select_variant
-from rangesim.light_transport.indirect import Guides, level_weights, mixed_pixels, smooth
+from rangesim.light_transport.indirect import Guides, LightFilter, level_weights, mixed_pixels
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 
@@ -92,7 +92,7 @@ def two_instances() -> np.ndarray:
 
 def smoothed(light: np.ndarray, guides: Guides) -> np.ndarray:
     after = np.array(light, np.float32)
-    smooth([after], guides)
+    LightFilter(guides).apply(after)
     return after
 
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from rangesim.light_transport.indirect import Guides, smooth
+from rangesim.light_transport.indirect import CHANNELS_AT_ONCE, LightFilter
 from rangesim.light_transport.launches import Launches, Report
 from rangesim.light_transport.loop import Budget, Radiance, Settings, Traced, View, trace
 from rangesim.light_transport.responses import Accumulators
@@ -46,11 +46,6 @@ class Sums:
         )
         return cls(channels, apart, np.zeros((len(Radiance._fields), h, w), np.float32))
 
-    def copy(self, responses: Iterable[Response]) -> Sums:
-        """A copy of what these responses need."""
-        channels, apart = ({r: kept[r].copy() for r in responses if r in kept} for kept in (self.channels, self.smooth))
-        return Sums(channels, apart, self.radiance.copy())
-
     def add(self, pixels: np.ndarray, traced: Traced, accumulators: Accumulators) -> None:
         """Add the sums of pixels with these flat indices, in ascending order."""
         some: slice | np.ndarray = pixels
@@ -62,38 +57,27 @@ class Sums:
                 part[response].reshape(response.channels, -1)[:, some] += of_part
         self.radiance.reshape(len(self.radiance), -1)[:, some] += traced.radiance
 
-    def planes(self) -> Iterator[np.ndarray]:
-        """Channels and radiance, one (h, w) view after the other."""
-        for image in (*self.channels.values(), *self.smooth.values(), self.radiance):
-            yield from image
 
-    def divide(self, samples: np.ndarray) -> None:
-        """Make means of these sums over so many samples (h, w)."""
-        for plane in self.planes():
-            plane /= samples
+def mean_and_error(
+    a: np.ndarray, b: np.ndarray | None, samples: Sequence[np.ndarray], out: tuple[np.ndarray, np.ndarray | None]
+) -> None:
+    """Write the mean over all samples, and a draw of its error, of the sums of two halves, each (c, h, w), to `out`.
 
-    def average(self, other: Sums, own_samples: np.ndarray, other_samples: np.ndarray) -> None:
-        """Make means over all samples of these sums and the other; the other ones become a draw of the error of that.
-
-        With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all.
-        """
-        p, q = own_samples.astype(np.float32), other_samples.astype(np.float32)
-        n = p + q
-        of_own, of_other = np.sqrt(q / p) / n, np.sqrt(p / q) / n
-        for a, b in zip(self.planes(), other.planes(), strict=True):
-            difference = a * of_own - b * of_other
-            a += b
-            a /= n
-            b[:] = difference
-
-    def share(self, guides: Guides) -> None:
-        """Let neighbouring pixels share smooth light; the channels then have all light."""
-        radiance = self.radiance[SMOOTH]
-        smooth([radiance, *self.smooth.values()], guides)
-        self.radiance[SMOOTH] = radiance
-        while self.smooth:
-            response, light = self.smooth.popitem()
-            self.channels[response] += light
+    With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all. `samples`
+    are p and q, (h, w); `out` may be the sums themselves. Without b there is no error.
+    """
+    p = samples[0].astype(np.float32)
+    if b is None or out[1] is None:
+        np.divide(a, p, out=out[0])
+        return
+    q = samples[1].astype(np.float32)
+    n = p + q
+    of_a, of_b = np.sqrt(q / p) / n, np.sqrt(p / q) / n
+    for plane_a, plane_b, mean, error in zip(a, b, out[0], out[1], strict=True):
+        drawn = plane_a * of_a - plane_b * of_b
+        np.add(plane_a, plane_b, out=mean)
+        mean /= n
+        error[:] = drawn
 
 
 class Estimate:
@@ -159,20 +143,47 @@ class Estimate:
         """(6, h, w) float32, means over samples in the order of `Tally`."""
         return np.asarray(self.tally / self.total_samples.astype(np.float32))
 
-    def means(self, guides: Guides, responses: Sequence[Response] | None = None) -> tuple[Sums, SamplingError | None]:
-        """Means over all samples, and a draw of their error; light that is kept apart is shared as the guides say.
+    def means(
+        self, shared: LightFilter, responses: Sequence[Response] | None = None
+    ) -> tuple[dict[Response, np.ndarray], Radiance, SamplingError | None]:
+        """Means over all samples of channels and radiance, and a draw of their error; smooth light is shared.
 
-        With `responses` the means of these alone, and more samples may be taken; without, the sums are used up.
+        With `responses` the channels of these alone, and more samples may be taken; without, the sums are used up.
         """
-        sums = self.halves if responses is None else [half.copy(responses) for half in self.halves]
+        channels, errors = {}, {}
+        for r in self.responses if responses is None else responses:
+            sums = [half.channels[r] for half in self.halves]
+            out = sums if responses is None else [np.empty_like(x) for x in sums]
+            smooth = [half.smooth[r] for half in self.halves] if self.keeps_apart else None
+            for begin in range(0, r.channels, CHANNELS_AT_ONCE):
+                some = slice(begin, begin + CHANNELS_AT_ONCE)
+                self._mean([x[some] for x in sums], [x[some] for x in out])
+                if smooth:
+                    parts = [np.empty_like(x[some]) for x in smooth]
+                    self._mean([x[some] for x in smooth], parts)
+                    for x, part in zip(out, parts, strict=True):
+                        shared.apply(part)
+                        x[some] += part
+            channels[r] = out[0]
+            errors[r] = out[-1]
+            if responses is None:
+                for half in self.halves:
+                    half.smooth.pop(r, None)
+        sums = [half.radiance for half in self.halves]
+        out = [np.empty_like(x) for x in sums]
+        self._mean(sums, out)
+        for x in out if self.keeps_apart else ():
+            light = x[SMOOTH]
+            shared.apply(light)
+            x[SMOOTH] = light
+        error = SamplingError(errors, projector_light(Radiance(*out[1]))) if len(out) == 2 else None
+        return channels, Radiance(*out[0]), error
+
+    def _mean(self, sums: list[np.ndarray], out: list[np.ndarray]) -> None:
         if len(sums) == 1:
-            sums[0].divide(self.samples[0].astype(np.float32))
+            mean_and_error(sums[0], None, self.samples, (out[0], None))
         else:
-            sums[0].average(sums[1], *self.samples)
-        if self.keeps_apart:
-            for part in sums:
-                part.share(guides)
-        return sums[0], _error(sums[1]) if len(sums) == 2 else None
+            mean_and_error(sums[0], sums[1], self.samples, (out[0], out[1]))
 
     def _tiles(self, pixels: int) -> Iterator[tuple[int, int]]:
         """Ranges of pixels that fit the memory, of about equal size."""
@@ -185,10 +196,9 @@ class Estimate:
             yield begin, min(begin + size, pixels)
 
 
-def _error(drawn: Sums) -> SamplingError:
-    radiance = Radiance(*drawn.radiance)
-    projector = radiance.direct + radiance.multipath + radiance.via_delta + radiance.caustic + radiance.faint
-    return SamplingError(drawn.channels, projector)
+def projector_light(radiance: Radiance) -> np.ndarray:
+    """All light of the projector, without glint, (h, w)."""
+    return np.asarray(radiance.direct + radiance.multipath + radiance.via_delta + radiance.caustic + radiance.faint)
 
 
 def _report(report: Report, before: float, share: float, of_tile: float) -> None:

@@ -58,25 +58,31 @@ class Guides(NamedTuple):
     reflectance: NDArray[np.float32]
 
 
-def smooth(images: list[NDArray[np.float32]], guides: Guides, levels: int = LEVELS) -> None:
-    """Filter images (c, h, w) of indirect light in place."""
-    if not levels:
-        return
-    mixed = mixed_pixels(guides)
-    weights = [level_weights(guides, mixed, 3**level) for level in range(levels)]
-    reflectance = np.where(guides.instance >= 0, guides.reflectance, np.float32(1)).astype(np.float32)
-    _of_radiance(weights[0], weights[-1], reflectance)
-    h, w = reflectance.shape
-    scratch = [np.empty((CHANNELS_AT_ONCE, h, w), np.float32) for _ in range(min(levels, 2))]
-    for image in images:
+class LightFilter:
+    """Lets neighbouring pixels share indirect light, as the guides say.
+
+    levels : int, the window is 3^levels pixels wide; 0 leaves light as it is.
+    """
+
+    def __init__(self, guides: Guides, levels: int = LEVELS) -> None:
+        mixed = mixed_pixels(guides)
+        self.weights = [level_weights(guides, mixed, 3**level) for level in range(levels)]
+        reflectance = np.where(guides.instance >= 0, guides.reflectance, np.float32(1)).astype(np.float32)
+        if levels:
+            _of_radiance(self.weights[0], self.weights[-1], reflectance)
+        self.scratch = [np.empty((CHANNELS_AT_ONCE, *reflectance.shape), np.float32) for _ in range(min(levels, 2))]
+
+    def apply(self, image: NDArray[np.float32]) -> None:
+        """Filter an image (c, h, w) in place."""
         for begin in range(0, len(image), CHANNELS_AT_ONCE):
             some = image[begin : begin + CHANNELS_AT_ONCE]
             before = some
-            for level in range(levels):
-                after = scratch[level % 2][: len(some)]
-                in_blocks(_apply, h, weights[level], 3**level, before, after, smallest=SMALLEST_ROWS)
+            for level, weights in enumerate(self.weights):
+                after = self.scratch[level % 2][: len(some)]
+                in_blocks(_apply, image.shape[1], weights, 3**level, before, after, smallest=SMALLEST_ROWS)
                 before = after
-            some[:] = before
+            if self.weights:
+                some[:] = before
 
 
 def mixed_pixels(guides: Guides) -> NDArray[np.bool_]:

@@ -17,9 +17,10 @@ from rangesim.light_transport.absorption import absorbers_of
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.estimate import FEWEST_FOR_HALVES, Estimate, Sums
+from rangesim.light_transport.estimate import FEWEST_FOR_HALVES, Estimate
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
+from rangesim.light_transport.indirect import LightFilter
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Radiance, Settings, View
 from rangesim.light_transport.medium import media_of
@@ -155,6 +156,7 @@ def transport(
     if keeps_apart and scene.has_matte_textures:
         seen = mean_reflectance(view, settings, rig, scene.has_cutouts, min(fewest, TEXTURE_SAMPLES))
         guides = guides._replace(reflectance=seen)
+    shared = LightFilter(guides)
     glints = None
     if glint:
         of_pass = (media, absorbers, surfaces, partial(report, 0.0))
@@ -164,8 +166,8 @@ def transport(
     )
 
     def signals_of(some: Sequence[Response] | None) -> Signals:
-        means, error = estimate.means(guides, some)
-        return Signals(rig, means.channels, _energy(means, glints, responses), truth, sampling=error)
+        channels, radiance, error = estimate.means(shared, some)
+        return Signals(rig, channels, _energy(channels, radiance, glints, responses), truth, sampling=error)
 
     left = 0.5 if adaptive else 0.0  # how many rounds follow is not known, so each makes half of what is left
     estimate.sample(np.arange(h * w), samples, partial(_report, report, 0.0, 1 - left))
@@ -189,15 +191,16 @@ def _report(report: Report, before: float, part: float, share: float) -> None:
     report(PATHS_SHARE * (before + part * share))
 
 
-def _energy(means: Sums, glints: Glint | None, responses: Sequence[Response]) -> EnergySplit:
-    """The energy split of means; glint, which has values for these responses, is added to it and to the channels."""
-    radiance = Radiance(*means.radiance)
+def _energy(
+    channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None, responses: Sequence[Response]
+) -> EnergySplit:
+    """The energy split; glint, which has values for these responses, is added to it and to the channels."""
     highlights = np.zeros((1, *radiance.direct.shape), np.float32)
     if glints:
         glints.add_to(highlights, glints.radiance[None])
         for response, values in zip(responses, glints.channels, strict=True):
-            if response in means.channels:
-                glints.add_to(means.channels[response], values)
+            if response in channels:
+                glints.add_to(channels[response], values)
     return EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,
