@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -26,25 +26,16 @@ SMOOTH = [Radiance._fields.index("multipath"), Radiance._fields.index("faint")]
 
 
 class Sums:
-    """Sums over samples of each pixel, or means.
+    """Sums over samples of each pixel.
 
     channels : response -> (c, h, w) float32. smooth : the same of light that is kept apart; empty if none is.
     radiance : (6, h, w) float32, in the order of `Radiance`.
     """
 
-    def __init__(
-        self, channels: dict[Response, np.ndarray], smooth: dict[Response, np.ndarray], radiance: np.ndarray
-    ) -> None:
-        self.channels, self.smooth, self.radiance = channels, smooth, radiance
-
-    @classmethod
-    def zeros(cls, responses: Iterable[Response], keeps_apart: bool, h: int, w: int) -> Sums:
-        """Sums over no samples."""
-        channels, apart = (
-            {r: np.zeros((r.channels, h, w), np.float32) for r in kept}
-            for kept in (responses, responses if keeps_apart else ())
-        )
-        return cls(channels, apart, np.zeros((len(Radiance._fields), h, w), np.float32))
+    def __init__(self, responses: Sequence[Response], keeps_apart: bool, h: int, w: int) -> None:
+        self.channels = {r: np.zeros((r.channels, h, w), np.float32) for r in responses}
+        self.smooth = {r: np.zeros((r.channels, h, w), np.float32) for r in responses if keeps_apart}
+        self.radiance = np.zeros((len(Radiance._fields), h, w), np.float32)
 
     def add(self, pixels: np.ndarray, traced: Traced, accumulators: Accumulators) -> None:
         """Add the sums of pixels with these flat indices, in ascending order."""
@@ -58,19 +49,17 @@ class Sums:
         self.radiance.reshape(len(self.radiance), -1)[:, some] += traced.radiance
 
 
-def mean_and_error(
-    a: np.ndarray, b: np.ndarray | None, samples: Sequence[np.ndarray], out: tuple[np.ndarray, np.ndarray | None]
-) -> None:
-    """Write the mean over all samples, and a draw of its error, of the sums of two halves, each (c, h, w), to `out`.
+def mean_and_error(sums: Sequence[np.ndarray], samples: Sequence[np.ndarray], out: Sequence[np.ndarray]) -> None:
+    """Write the mean over all samples, and a draw of its error, of the sums of two halves, each (c, h, w), to `out`,
+    which may be the sums themselves. Of one half alone, the mean.
 
     With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all. `samples`
-    are p and q, (h, w); `out` may be the sums themselves. Without b there is no error.
+    are p and q, (h, w).
     """
-    p = samples[0].astype(np.float32)
-    if b is None or out[1] is None:
-        np.divide(a, p, out=out[0])
+    if len(sums) == 1:
+        np.divide(sums[0], samples[0].astype(np.float32), out=out[0])
         return
-    q = samples[1].astype(np.float32)
+    (a, b), (p, q) = sums, (n.astype(np.float32) for n in samples)
     n = p + q
     of_a, of_b = np.sqrt(q / p) / n, np.sqrt(p / q) / n
     for plane_a, plane_b, mean, error in zip(a, b, out[0], out[1], strict=True):
@@ -106,7 +95,7 @@ class Estimate:
         self.view, self.settings, self.launches, self.memory_bytes = view, settings, launches, memory_bytes
         self.responses, self.keeps_apart, self.irradiance = responses, keeps_apart, rig.projector_irradiance
         self.shape = rig.camera.height, rig.camera.width
-        self.halves = [Sums.zeros(responses, keeps_apart, *self.shape) for _ in range(1 + has_halves)]
+        self.halves = [Sums(responses, keeps_apart, *self.shape) for _ in range(1 + has_halves)]
         self.samples = [np.zeros(self.shape, np.uint32) for _ in self.halves]
         self.tally = np.zeros((len(Tally._fields), *self.shape), np.float32)
         self.rounds = 0
@@ -157,10 +146,10 @@ class Estimate:
             smooth = [half.smooth[r] for half in self.halves] if self.keeps_apart else None
             for begin in range(0, r.channels, CHANNELS_AT_ONCE):
                 some = slice(begin, begin + CHANNELS_AT_ONCE)
-                self._mean([x[some] for x in sums], [x[some] for x in out])
+                mean_and_error([x[some] for x in sums], self.samples, [x[some] for x in out])
                 if smooth:
                     parts = [np.empty_like(x[some]) for x in smooth]
-                    self._mean([x[some] for x in smooth], parts)
+                    mean_and_error([x[some] for x in smooth], self.samples, parts)
                     for x, part in zip(out, parts, strict=True):
                         shared.apply(part)
                         x[some] += part
@@ -171,19 +160,13 @@ class Estimate:
                     half.smooth.pop(r, None)
         sums = [half.radiance for half in self.halves]
         out = [np.empty_like(x) for x in sums]
-        self._mean(sums, out)
+        mean_and_error(sums, self.samples, out)
         for x in out if self.keeps_apart else ():
             light = x[SMOOTH]
             shared.apply(light)
             x[SMOOTH] = light
         error = SamplingError(errors, projector_light(Radiance(*out[1]))) if len(out) == 2 else None
         return channels, Radiance(*out[0]), error
-
-    def _mean(self, sums: list[np.ndarray], out: list[np.ndarray]) -> None:
-        if len(sums) == 1:
-            mean_and_error(sums[0], None, self.samples, (out[0], None))
-        else:
-            mean_and_error(sums[0], sums[1], self.samples, (out[0], out[1]))
 
     def _tiles(self, pixels: int) -> Iterator[tuple[int, int]]:
         """Ranges of pixels that fit the memory, of about equal size."""
