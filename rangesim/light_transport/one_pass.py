@@ -167,7 +167,11 @@ def transport(
 
     def signals_of(some: Sequence[Response] | None) -> Signals:
         channels, radiance, error = estimate.means(shared, some)
-        return Signals(rig, channels, _energy(channels, radiance, glints, responses), truth, sampling=error)
+        if glints and error:
+            glints.add_to(error.projector[None], glints.radiance_error[None])
+            for response, values in error.channels.items():
+                glints.add_to(values, glints.channels_error[response])
+        return Signals(rig, channels, _energy(channels, radiance, glints), truth, sampling=error)
 
     left = 0.5 if adaptive else 0.0  # how many rounds follow is not known, so each makes half of what is left
     estimate.sample(np.arange(h * w), samples, partial(_report, report, 0.0, 1 - left))
@@ -191,16 +195,13 @@ def _report(report: Report, before: float, part: float, share: float) -> None:
     report(PATHS_SHARE * (before + part * share))
 
 
-def _energy(
-    channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None, responses: Sequence[Response]
-) -> EnergySplit:
-    """The energy split; glint, which has values for these responses, is added to it and to the channels."""
+def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:
+    """The energy split; glint is added to it and to the channels."""
     highlights = np.zeros((1, *radiance.direct.shape), np.float32)
     if glints:
         glints.add_to(highlights, glints.radiance[None])
-        for response, values in zip(responses, glints.channels, strict=True):
-            if response in channels:
-                glints.add_to(channels[response], values)
+        for response, values in channels.items():
+            glints.add_to(values, glints.channels[response])
     return EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,
