@@ -23,6 +23,8 @@ def plain_scene(scene: Scene, rig: Rig, film: dict[str, Any], **plugins: dict[st
     """
     import mitsuba as mi
 
+    here = scene.in_renderer(rig)
+
     def device(intrinsics: Intrinsics, T_world_device: np.ndarray) -> dict[str, Any]:
         fov = np.degrees(2 * np.arctan(0.5 * intrinsics.width / intrinsics.fx))
         return {"fov": float(fov), "to_world": mi.ScalarTransform4f(T_world_device @ MITSUBA_FROM_OPENCV)}
@@ -38,13 +40,13 @@ def plain_scene(scene: Scene, rig: Rig, film: dict[str, Any], **plugins: dict[st
             **plugins,
             "projector": {
                 "type": "projector",
-                **device(rig.projector, rig.T_world_projector),
+                **device(rig.projector, here.T_world_projector),
                 "scale": rig.projector_irradiance / np.pi,
                 "irradiance": {"type": "bitmap", "bitmap": white, "raw": True, "filter_type": "nearest"},
             },
             "sensor": {
                 "type": "perspective",
-                **device(rig.camera, rig.T_world_camera),
+                **device(rig.camera, here.T_world_camera),
                 "near_clip": 1e-5,
                 "film": {"rfilter": {"type": "box"}, **size, **film},
             },

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from rangesim.ambient import Ambient
+from rangesim.bounds import Bounds, check_fields, whole
 from rangesim.decoding import decode
 from rangesim.exposure import expose
 from rangesim.instrument import Instrument
@@ -16,7 +18,6 @@ from rangesim.reading_noise import TO_SIGMA, reading_noise
 from rangesim.sensors import Sensor
 
 if TYPE_CHECKING:
-    from rangesim.ambient import Ambient
     from rangesim.signals import GroundTruth, Signals
 
 SHARE = 1 / 3
@@ -36,15 +37,18 @@ class AdaptiveSampling:
     Parameters
     ----------
     instruments : whose detectors, exposures and decoders decide; every one has to be content.
-    max_spp : int >= 1, samples of a pixel after which it is left as it is.
-    share : standard deviation of a reading by sampling, over that by the detector, that is small enough.
+    max_spp : int >= 1, samples that no pixel exceeds.
+    share : positive, standard deviation of a reading by sampling, over that by the detector, that is small enough.
     ambient : Ambient, as for `expose`.
     """
 
     instruments: tuple[Instrument, ...]
-    max_spp: int = 64
-    share: float = SHARE
+    max_spp: Annotated[int, whole(1, "spp")] = 64
+    share: Annotated[float, Bounds("positive and finite", 1e-6, 1e6)] = SHARE
     ambient: Ambient | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @classmethod
     def of(cls, sensors: Sequence[Sensor]) -> AdaptiveSampling:
@@ -61,8 +65,10 @@ class AdaptiveSampling:
             signals = signals_of(one.sensor)
             capture = expose(signals, one.sensor, one.detector, one.exposure_s, 0, self.ambient)
             noise = reading_noise(decode(capture), capture, signals)
-            sampling, detector = (group_sigma(errors, group) for errors in (noise.sampling, noise.detector))
-            result |= (sampling > np.maximum(self.share * detector, negligible))[group]
+            enough = np.full(group.max() + 1, negligible)
+            if capture.is_digital:  # where nothing can be read, samples are of no use
+                enough = np.maximum(enough, self.share * group_sigma(noise.detector, group, where_unknown=np.inf))
+            result |= (group_sigma(noise.sampling, group) > enough)[group]
         return result
 
 
@@ -75,14 +81,12 @@ def groups(instance: np.ndarray) -> np.ndarray:
     return np.asarray(number.reshape(h, w))
 
 
-def group_sigma(errors: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """(groups,) standard deviation about 0 of errors (h, w), from the median of the absolute values; 0 where a group
-    has none that is finite."""
-    count = int(group.max()) + 1
-    finite = np.isfinite(errors)
-    values, of = np.abs(errors[finite]), group[finite]
-    values = values[np.lexsort((values, of))]
-    n = np.bincount(of, minlength=count)
-    starts = np.cumsum(n) - n
-    middle = np.minimum(starts + n // 2, max(len(values) - 1, 0))
-    return np.asarray(np.where(n > 0, TO_SIGMA * values[middle], 0.0)) if len(values) else np.zeros(count)
+def group_sigma(errors: np.ndarray, group: np.ndarray, where_unknown: float = 0.0) -> np.ndarray:
+    """(groups,) standard deviation about 0 of errors (h, w), from the median of the absolute values that are not NaN;
+    `where_unknown` in groups without any."""
+    known = ~np.isnan(errors)
+    values, of = np.abs(errors[known]), group[known]
+    values = np.append(values[np.lexsort((values, of))], 0)
+    n = np.bincount(of, minlength=int(group.max()) + 1)
+    middle = np.where(n > 0, np.cumsum(n) - n + n // 2, -1)
+    return np.asarray(np.where(n > 0, TO_SIGMA * values[middle], where_unknown))

@@ -33,8 +33,8 @@ class RangeImage:
     projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
         integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
     sampling_sigma_m : (h, w) float32, metres, of a simulated reading: standard deviation of z by the sampling of light
-        paths, estimated from one pair of draws for each pixel, so take medians or mean squares over many; NaN where it
-        is not known. None: not known anywhere, see `rangesim.reading_noise`.
+        paths, estimated from one pair of draws for each pixel, so take medians over many; NaN where there is no
+        reading, infinite where sampling decides whether there is one. None: not known, see `rangesim.reading_noise`.
     """
 
     z: np.ndarray

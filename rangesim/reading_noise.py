@@ -35,10 +35,11 @@ ENOUGH_PIXELS = 100
 
 @dataclass(frozen=True, eq=False)
 class ReadingNoise:
-    """Errors of the readings of a range image, each (h, w) float32, metres, of z; NaN where one is not known.
+    """Errors of the readings of a range image, each (h, w) float32, metres, of z; NaN where there is no reading.
 
-    detector : the error that the detector's noise made of each reading.
+    detector : the error that the detector's noise made of each reading; NaN also where it is not known.
     sampling : a draw of the error that the sampling of light paths makes; of the same variance, not the error itself.
+        Infinite where sampling decides whether there is a reading at all.
     """
 
     detector: np.ndarray
@@ -47,7 +48,8 @@ class ReadingNoise:
     def by_material(self, truth: GroundTruth) -> list[dict[str, Any]]:
         """`detector_sigma_m` and `sampling_sigma_m` per material class of `truth` that occurs, "all" last.
 
-        Robust: 1.4826 times the median of the absolute error, metres; None where there is nothing to tell.
+        Robust: 1.4826 times the median of the absolute error, metres; None where there is nothing to tell, or half of
+        the errors are infinite.
         """
         return [
             {
@@ -73,7 +75,9 @@ def reading_noise(image: RangeImage, capture: Capture, signals: Signals) -> Read
         for error in (1.0, -1.0)
     )
     detector = image.z - (above + below) / 2 if capture.is_digital else np.full(image.z.shape, np.nan)
-    return ReadingNoise(detector.astype(np.float32), ((above - below) / 2).astype(np.float32))
+    sampling = np.where(np.isnan(above) | np.isnan(below), np.inf, (above - below) / 2)
+    sampling[~image.valid] = np.nan
+    return ReadingNoise(detector.astype(np.float32), sampling.astype(np.float32))
 
 
 def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]]) -> None:
@@ -104,6 +108,8 @@ def noise_ratio(row: dict[str, Any]) -> float:
 
 
 def robust_sigma(errors: np.ndarray) -> float | None:
-    """Standard deviation about 0 from the median of the absolute value; None if no error is finite."""
-    finite = errors[np.isfinite(errors)]
-    return TO_SIGMA * float(np.median(np.abs(finite))) if finite.size else None
+    """Standard deviation about 0 from the median of the absolute value of those errors that are not NaN; None if there
+    are none, or it is infinite."""
+    known = np.abs(errors[~np.isnan(errors)])
+    median = float(np.median(known)) if known.size else np.inf
+    return TO_SIGMA * median if np.isfinite(median) else None

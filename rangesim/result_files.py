@@ -167,7 +167,7 @@ _RANGE = {
     "T_world_camera": ArraySpec("float64", (4, 4), required=False),
     "projector_column": ArraySpec("float32", nan=True, required=False),
     "projector_row": ArraySpec("float32", nan=True, required=False),
-    "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, required=False),
+    "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
 }
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
 _SEGMENTATION = {

@@ -389,3 +389,25 @@ def test_what_cannot_hold_an_absorbing_medium_is_refused(change: dict[str, Any],
         load_scene(
             {"type": "scene", "camera": {"type": "perspective", "fov": 20.0}, "body": {**filled(ball()), **change}}
         )
+
+
+@pytest.mark.parametrize(
+    ("medium", "match"),
+    [
+        ({"sigma_a": 46.6, "albedo": 0.0}, "expected albedo and sigma_t"),
+        ({"material": "water"}, "expected albedo and sigma_t"),
+        (
+            {"sigma_t": {"type": "spectrum", "value": [(400, 46.6), (900, 2.0)]}, "albedo": 0.0},
+            "expected sigma_t to be one",
+        ),
+        ({"sigma_t": {"type": "rgb", "value": [20.0, 2.0, 0.2]}, "albedo": 0.0}, "expected sigma_t to be one"),
+        (
+            {"sigma_t": {"type": "constvolume", "value": {"type": "rgb", "value": [20.0, 2.0, 0.2]}}},
+            "expected sigma_t to be one",
+        ),
+    ],
+)
+def test_media_that_the_renderer_would_read_as_others_are_refused(medium: dict[str, Any], match: str) -> None:
+    ball = {"type": "sphere", "bsdf": {"type": "dielectric"}, "interior": {"type": "homogeneous", **medium}}
+    with pytest.raises(FileFormatError, match=match):
+        scene_of(ball=ball)

@@ -210,6 +210,19 @@ def test_the_renderer_s_origin_is_the_chosen_camera_and_that_of_the_file_nearby(
     assert first.rig().T_world_camera[:3, 3].tolist() == pytest.approx(UTM, abs=1e-8)
 
 
+def test_what_is_near_the_origin_stays_there_however_far_the_camera() -> None:
+    """So what it sees is rounded least."""
+    away = scene_at((0.0, -30.0, 0.0), wall={"type": "rectangle", "bsdf": matte(0.5)} | {"to_world": facing_y()})
+    np.testing.assert_array_equal(load_scene(away).origin_m, 0)
+
+
+def facing_y() -> Any:
+    select_variant()
+    import mitsuba as mi
+
+    return mi.ScalarTransform4d().rotate([1, 0, 0], 90).scale(20)
+
+
 def test_what_moves_moves_in_the_world(tmp_path: Path) -> None:
     """A ball on an arc about a place in the world, a mesh on a straight line, seen from a rig that turns."""
     sensor = AmcwToF((60e6,))
@@ -336,5 +349,20 @@ def test_lamps_far_away_have_to_be_dictionaries() -> None:
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4d().translate(UTM), "bsdf": matte(0.5)}
     lamps = {"spot": mi.load_dict({"type": "spot"}), "sky": mi.load_dict({"type": "constant"})}
     load_scene(scene_at(UTM, wall=wall, sky=lamps["sky"]))
-    with pytest.raises(FileFormatError, match=r"lamps and sensors .* as dictionaries"):
+    with pytest.raises(FileFormatError, match=r"lamps, sensors and grids .* as dictionaries"):
         load_scene(scene_at(UTM, wall=wall, **lamps))
+
+
+def test_what_is_loaded_already_and_cannot_be_moved_is_said() -> None:
+    select_variant()
+    import mitsuba as mi
+
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((2, 2, 2, 1), np.float32))}
+    loaded = mi.load_dict({"type": "diffuse", "reflectance": {"type": "volume", "volume": grid}})
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4d().translate(UTM), "bsdf": loaded}
+    with pytest.raises(FileFormatError, match=r"grids .* as dictionaries"):
+        load_scene(scene_at(UTM, wall=wall))
+    parts = scene_at(UTM, wall=wall | {"bsdf": matte(0.5)})
+    parts["sensor"] = mi.load_dict(parts["sensor"])
+    with pytest.warns(RangesimWarning, match="the camera is a loaded object 5.2e.06 m from the origin"):
+        load_scene(parts)

@@ -37,10 +37,12 @@ from rangesim.light_transport.exact_point import on_its_line, spawn_close
 from rangesim.light_transport.launches import Launches, Report, fewest_lanes
 from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
+from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
 from rangesim.light_transport.truncation import Tally
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
+from rangesim.scene import Scene
 
 NEIGHBOURS = 256
 """Pixels in a row that share a launch. Launches take such runs from all over the image: so their times are alike."""
@@ -64,6 +66,12 @@ class Settings(NamedTuple):
     delta: bool
     ambient: bool
     lamps: bool
+
+    @classmethod
+    def of(cls, scene: Scene, seed: int, max_depth: int, rr_depth: int) -> Settings:
+        """Those of a pass."""
+        most, rr = dr.opaque(mi.UInt32, max_depth), dr.opaque(mi.UInt32, rr_depth)
+        return cls(Seed.of(seed), most, rr, has_delta(scene.mitsuba), scene.has_ambient, scene.has_lamps)
 
 
 @dataclass(frozen=True, eq=False)

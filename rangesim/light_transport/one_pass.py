@@ -8,8 +8,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, get_args
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from rangesim.adaptive_sampling import AdaptiveSampling
@@ -24,8 +22,6 @@ from rangesim.light_transport.indirect import LightFilter
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Radiance, Settings, View
 from rangesim.light_transport.medium import media_of
-from rangesim.light_transport.photons import has_delta
-from rangesim.light_transport.sampling import Seed
 from rangesim.light_transport.surfaces import surfaces_of
 from rangesim.light_transport.truncation import estimate_truncation, warn_of_truncation
 from rangesim.response import Response
@@ -110,16 +106,15 @@ def transport(
     seed = check_seed(seed)
     check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
+    adaptive = _adaptive(spp, sensors)
+    for one in adaptive.instruments if adaptive else ():
+        if missing := set(one.sensor.responses()) - set(responses):
+            raise ValueError(f"expected sensors that have {missing.pop()}, for instrument {one.name!r} of spp.")
     h, w = rig.camera.height, rig.camera.width
     if indirect not in get_args(Indirect):
         raise ValueError(f"expected indirect to be one of {', '.join(get_args(Indirect))}, got {indirect!r}.")
     keeps_apart = indirect == "filtered"
     report, launches = Progress(progress), Launches(is_watched=progress is not None)
-    adaptive = None
-    if isinstance(spp, AdaptiveSampling):
-        adaptive = spp
-    elif spp == "auto" and sensors and all(isinstance(s, Sensor) for s in sensors):
-        adaptive = AdaptiveSampling.of([s for s in sensors if isinstance(s, Sensor)])
     media, surfaces, absorbers = media_of(scene.mitsuba), surfaces_of(scene.mitsuba), absorbers_of(scene.mitsuba)
     here = scene.in_renderer(rig)
     truth, guides = ground_truth(scene, here, surfaces)
@@ -130,37 +125,16 @@ def transport(
     else:
         samples = np.full(h * w, spp)
     fewest = int(samples.min())
-    settings = Settings(
-        seed=Seed.of(seed),
-        max_depth=dr.opaque(mi.UInt32, max_depth),
-        rr_depth=dr.opaque(mi.UInt32, rr_depth),
-        delta=has_delta(scene.mitsuba),
-        ambient=scene.has_ambient,
-        lamps=scene.has_lamps,
-    )
-    maps = caustic_maps(
-        scene,
-        here,
-        photons,
-        caustic_radius_m,
-        fewest,
-        seed,
-        memory_bytes,
-        media,
-        absorbers,
-        surfaces,
-        partial(report, 0.0),
-    )
+    settings = Settings.of(scene, seed, max_depth, rr_depth)
+    inside = (media, absorbers, surfaces, partial(report, 0.0))
+    maps = caustic_maps(scene, here, photons, caustic_radius_m, fewest, seed, memory_bytes, *inside)
     camera, projector, cutouts = Device.camera(here), Device.projector(here), cutouts_of(scene.mitsuba)
     view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts, absorbers)
     if keeps_apart and scene.has_matte_textures:
         seen = mean_reflectance(view, settings, rig, scene.has_cutouts, min(fewest, TEXTURE_SAMPLES))
         guides = guides._replace(reflectance=seen)
     shared = LightFilter(guides)
-    glints = None
-    if glint:
-        of_pass = (media, absorbers, surfaces, partial(report, 0.0))
-        glints = trace_glint(scene.mitsuba, here, responses, seed, *of_pass)
+    glints = trace_glint(scene.mitsuba, here, responses, seed, *inside) if glint else None
     estimate = Estimate(
         view, settings, rig, responses, keeps_apart, fewest >= FEWEST_FOR_HALVES, memory_bytes, launches
     )
@@ -175,7 +149,7 @@ def transport(
 
     left = 0.5 if adaptive else 0.0  # how many rounds follow is not known, so each makes half of what is left
     estimate.sample(np.arange(h * w), samples, partial(_report, report, 0.0, 1 - left))
-    while adaptive and adaptive.max_spp > samples.max():
+    while adaptive and adaptive.max_spp >= samples.max() + FEWEST_FOR_HALVES:
         needed = adaptive.unfinished(truth, lambda sensor: signals_of(sensor.responses())).ravel()
         pixels = np.flatnonzero(needed & (estimate.total_samples.ravel() == samples.max()))
         if not len(pixels):
@@ -189,6 +163,14 @@ def transport(
     truncation = estimate_truncation(estimate.mean_tally(), signals.energy, max_depth, maps.cut if maps else 0.0)
     warn_of_truncation(truncation, max_depth, stacklevel=3)  # where `transport` was called
     return replace(signals, truncation=truncation)
+
+
+def _adaptive(spp: Any, sensors: Sequence[Sensor | Response]) -> AdaptiveSampling | None:
+    """How the number of samples follows from readings; None: it does not."""
+    if isinstance(spp, AdaptiveSampling):
+        return spp
+    readers = [s for s in sensors if isinstance(s, Sensor)]
+    return AdaptiveSampling.of(readers) if spp == "auto" and readers and len(readers) == len(sensors) else None
 
 
 def _report(report: Report, before: float, part: float, share: float) -> None:

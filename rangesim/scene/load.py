@@ -28,14 +28,17 @@ from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
 from rangesim.scene.origin import (
+    AS_FAR,
+    camera_place,
     coarsest_mesh,
     coarsest_transform,
+    is_far,
     move_to_origin,
-    origin_near,
     warn_of_coarse_mesh,
     warn_of_coarse_transform,
+    warn_of_loaded_camera,
 )
-from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
+from rangesim.scene.properties import check_depth, check_dictionary, check_media, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
 from rangesim.scene.sensor_band import (
     coloured_materials,
@@ -122,30 +125,41 @@ def _instantiate(
     """The Mitsuba scene, the ids of its shapes, the material classes that the file states, and the scene's origin."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
+
+    def parsed(folder: str, advises: bool) -> tuple[Any, set[str], dict[str, str]]:
+        state = _parse(config, source, material, unit_m, Path(folder), advises)
+        check_depth(state, label)
+        mi.parser.transform_all(config, state)
+        ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
+        take_sensor_reflectances(state, label)
+        check_properties(state, label)
+        check_media(state, label)
+        return state, ids, classes
+
+    def made_of(state: Any) -> Any:
+        loaded = mi.parser.instantiate(config, state)
+        return loaded[0] if isinstance(loaded, list) else loaded
+
     try:
         with tempfile.TemporaryDirectory() as folder, _own_file_resolver():
-            state = _parse(config, source, material, unit_m, Path(folder), advises)
-            check_depth(state, label)
-            mi.parser.transform_all(config, state)
-            ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
-            take_sensor_reflectances(state, label)
-            check_properties(state, label)
-            origin_m = origin_near(state, sensor)
-            transform = coarsest_transform(state) if advises else None
-            move_to_origin(state, origin_m, label)
+            state, ids, classes = parsed(folder, advises)
+            place, transform = camera_place(state, sensor), coarsest_transform(state) if advises else None
             coloured = coloured_materials(state) if advises else []
-            loaded = mi.parser.instantiate(config, state)
-            loaded = loaded[0] if isinstance(loaded, list) else loaded
+            loaded, origin_m = made_of(state), np.zeros(3)
+            if is_far(place) and isinstance(loaded, mi.Scene) and _looks_elsewhere(loaded, sensor, place, label):
+                state, origin_m = parsed(folder, False)[0], place
+                move_to_origin(state, origin_m, label)
+                loaded = made_of(state)
             mesh = coarsest_mesh(state, loaded) if advises else None
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
-        reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)[
-            :400
-        ]  # of a BSDF in Python
+        reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)  # of a BSDF in Python
         raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     warn_of_colours(coloured, label)
     warn_of_coarse_transform(transform, label)
     warn_of_coarse_mesh(mesh, label)
+    if advises and isinstance(loaded, mi.Scene):
+        warn_of_loaded_camera(loaded.sensors(), sensor, place, label)
     return loaded, ids, classes, origin_m
 
 
@@ -207,6 +221,12 @@ def _class_of(shape: Any) -> str:
 
 def _is_mesh(source: Source) -> bool:
     return not isinstance(source, Mapping) and Path(source).suffix.lower() in MESH_SUFFIXES
+
+
+def _looks_elsewhere(scene: Any, sensor: int, place: np.ndarray, label: str) -> bool:
+    """Whether a camera is farther from the origin than from what it sees: that is far from the origin then, too."""
+    camera, T_camera = camera_of(scene.sensors()[sensor], label)
+    return bool(np.linalg.norm(place) > AS_FAR * _median_depth(scene, camera, T_camera))
 
 
 def _median_depth(scene: Any, camera: Intrinsics, T_camera: np.ndarray, columns: int = 64) -> float:

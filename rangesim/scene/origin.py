@@ -3,8 +3,8 @@
 
 The renderer computes in single precision: 5000 km from the origin, in metres of a map, coordinates are half a metre
 apart, and already at 50 m Mitsuba starts rays 4.5 mm off the surface that they leave. A scene file is parsed in double
-precision, so there a translation brings the camera near the origin before anything is rounded. Scenes whose camera is
-near it already keep their coordinates, and with them their bytes.
+precision, so there a translation brings the camera near the origin before anything is rounded. Scenes whose camera, or
+what it sees, is near it already keep their coordinates, and with them their bytes.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from rangesim.errors import FileFormatError, warn
 NEAR_M = 10.0
 """Coordinates of a camera, in metres, up to which the renderer keeps the file's origin: Mitsuba starts rays
 0.09 mm (1 + c) off a surface with coordinates up to c, here a millimetre, and rounds coordinates to a micrometre."""
+AS_FAR = 2.0
+"""Distance of the camera from the origin, over that from what it sees, above which this is far from the origin too."""
 COARSE_M = 1e-4
 """Rounding of a mesh's vertices, or of a place, that is worth a warning."""
 PLACED_EMITTERS = ("point", "spot", "projector")
@@ -27,17 +29,18 @@ ENDS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
 """Points, by the kind of shape, that place it besides its `to_world`."""
 
 
-def origin_near(state: Any, sensor: int) -> np.ndarray:
-    """(3,) float64, metres, world: the origin of the renderer for the parsed scene as seen by one of its sensors.
-
-    The camera's place; 0 where it is within `NEAR_M` of the file's origin, or the camera is a loaded object.
-    """
+def camera_place(state: Any, sensor: int) -> np.ndarray:
+    """(3,) float64, metres, world: the place of one of the sensors of a parsed scene; 0 if it is a loaded object."""
     children = [value for _, value in state.nodes[0].props.items()]
     sensors = [v for v in children if isinstance(v, mi.Sensor) or _type_of(state, v) == mi.ObjectType.Sensor]
     if not 0 <= sensor < len(sensors) or isinstance(sensors[sensor], mi.Sensor):
         return np.zeros(3)
-    place = _matrix(state.nodes[sensors[sensor].index()].props.get("to_world"))[:3, 3]
-    return place if np.abs(place).max() > NEAR_M else np.zeros(3)
+    return _matrix(state.nodes[sensors[sensor].index()].props.get("to_world"))[:3, 3]
+
+
+def is_far(place: np.ndarray) -> bool:
+    """Whether a camera is so far from the file's origin that what it sees may be, too."""
+    return bool(np.abs(place).max() > NEAR_M)
 
 
 def move_to_origin(state: Any, origin_m: np.ndarray, label: str) -> None:
@@ -46,21 +49,33 @@ def move_to_origin(state: Any, origin_m: np.ndarray, label: str) -> None:
     Raises
     ------
     FileFormatError
-        A lamp or sensor is a loaded object, which cannot be moved any more.
+        A lamp, a sensor or a grid of reflectances is a loaded object, which cannot be moved any more.
     """
     if not origin_m.any():
         return
     for node in state.nodes:
         for _, value in node.props.items():
-            if isinstance(value, mi.Sensor) or (isinstance(value, mi.Emitter) and not _is_infinite(value)):
+            is_lamp = isinstance(value, mi.Emitter) and not _is_infinite(value)
+            if isinstance(value, mi.Sensor) or is_lamp or (isinstance(value, mi.BSDF) and _has_grid(value)):
                 raise FileFormatError(
-                    f"expected lamps and sensors of {label}, whose camera is far from the origin, as dictionaries, "
-                    "got a loaded object; give its dictionary."
+                    f"expected lamps, sensors and grids of {label}, whose camera is far from the origin, as "
+                    "dictionaries, got a loaded object; give its dictionary."
                 )
         if "position" in node.props and node.type == mi.ObjectType.Emitter:
             node.props["position"] = mi.ScalarPoint3d(*(np.array(node.props["position"]) - origin_m))
         elif "to_world" in node.props or _is_placed(node):
             _move(node, origin_m)
+
+
+def warn_of_loaded_camera(sensors: Any, sensor: int, place: np.ndarray, label: str) -> None:
+    """Warn if a camera is far from the origin whose place is not known before it is loaded."""
+    if not place.any() and 0 <= sensor < len(sensors):
+        loaded_at = np.array(sensors[sensor].world_transform().matrix, np.float64).reshape(4, 4)[:3, 3]
+        if is_far(loaded_at):
+            warn(
+                f"{label}: the camera is a loaded object {np.abs(loaded_at).max():.2g} m from the origin, so single "
+                "precision rounds what it sees; give it as a dictionary."
+            )
 
 
 class Rounding(NamedTuple):
@@ -151,6 +166,11 @@ def _is_placed(node: Any) -> bool:
 
 def _is_infinite(emitter: Any) -> bool:
     return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
+
+
+def _has_grid(bsdf: Any) -> bool:
+    """Whether a loaded BSDF has values by place in the world (a `gridvolume`)."""
+    return any(part.class_name() == "GridVolume" for part in mi.traverse(bsdf).hierarchy)
 
 
 def _type_of(state: Any, value: Any) -> Any:

@@ -47,7 +47,7 @@ PROPERTIES: dict[str, dict[str, Bounds]] = {
     | {"exponent": NOT_NEGATIVE},
     "Emitter": dict.fromkeys(("radiance", "irradiance", "intensity", "scale"), NOT_NEGATIVE)
     | {"position": PLACE, "filename": NOT_NEGATIVE, "bitmap": NOT_NEGATIVE},
-    "Medium": {"albedo": FRACTION} | dict.fromkeys(("sigma_t", "sigma_a", "sigma_s", "scale"), NOT_NEGATIVE),
+    "Medium": {"albedo": FRACTION} | dict.fromkeys(("sigma_t", "scale"), NOT_NEGATIVE),
     "Unknown": {"falloff": Bounds("an exponent of at least 0", 0, 1000)},  # a BSDF in Python, such as retroreflector
     "PhaseFunction": {"g": Bounds("above -1 and below 1", -0.9999, 0.9999)},
     "Sensor": {"fov": Bounds("degrees between 0 and 180", 1e-3, 179.999)}
@@ -59,6 +59,8 @@ COLOURS = ("value", "color", "color0", "color1", "filename", "bitmap", "data")
 """Properties of a texture that hold what the property it stands for may be."""
 ENTRIES_PER_SHAPE = 20
 """Of a scene dictionary, at most, on average; one that holds the same dictionary again and again has more."""
+NOT_OF_MEDIA = ("sigma_a", "sigma_s", "material")
+"""Ways to state a medium that Mitsuba 3.9 does not know, and says nothing about."""
 BITMAP_SOURCES = ("filename", "bitmap", "data")
 """What a bitmap texture may be made of; without any, Mitsuba 3.9 crashes."""
 FLOAT_IMAGES = (".exr", ".pfm", ".hdr", ".rgbe")
@@ -126,6 +128,31 @@ def check_properties(state: Any, label: str) -> None:
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
+
+
+def check_media(state: Any, label: str) -> None:
+    """Raise FileFormatError where the coefficients of a homogeneous medium are none, or differ from colour to colour.
+
+    There is but one band, that of the sensor: Mitsuba would cut a spectrum of 1/m off at 1, and read colours for the
+    eye; and it passes over keys of other renderers.
+    """
+    for node in state.nodes:
+        if node.type != mi.ObjectType.Medium or node.props.plugin_name() != "homogeneous":
+            continue
+        place = f"{label}: medium {node.props.id()!r}"
+        for key in NOT_OF_MEDIA:
+            if key in node.props:
+                raise FileFormatError(f"{place}: expected albedo and sigma_t, in 1/m, which Mitsuba reads, got {key}.")
+        for key, value in node.props.items():
+            if key not in ("sigma_t", "albedo"):
+                continue
+            if isinstance(value, mi.Properties.ResolvedReference):
+                inside = state.nodes[value.index()].props
+                value = inside.get("value") if inside.plugin_name() == "constvolume" else None
+            if len(set(_numbers(value))) > 1 or (hasattr(value, "is_uniform") and not value.is_uniform()):
+                raise FileFormatError(
+                    f"{place}: expected {key} to be one number, that at the sensor's wavelength, got several colours."
+                )
 
 
 def check_vertices(scene: Any, label: str) -> None:
