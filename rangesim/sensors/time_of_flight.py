@@ -163,28 +163,26 @@ class DirectToF(Sensor):
         return (LengthBins(self.start_s * c, width_m, self.bins * fine, period_m, is_shared=has_pulse),)
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        from pcgraph.parallel import in_blocks
+        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from rangesim.histogram_filter import gaussian_filter
 
         variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
+        beyond: Literal["wrap", "constant"] = "wrap" if self.is_cyclic else "constant"
         fine = np.asarray(channels[0], dtype=np.float32)
         evenly = (ambient / self.bins).astype(np.float32)
         result = np.empty((self.bins, *fine.shape[1:]), dtype=np.float32)
 
         def of_rows(start: int, stop: int) -> None:
             for row in range(start, stop):
-                histogram = self._blurred(fine[:, row], variance) if variance > 0 else fine[:, row]
+                histogram = fine[:, row]
+                if variance > 0:
+                    histogram = gaussian_filter(histogram, np.sqrt(variance), beyond).astype(np.float32)
                 if self._fine > 1:
                     histogram = histogram.reshape(self.bins, self._fine, -1).sum(axis=1)
                 np.add(histogram, evenly[row], out=result[:, row])
 
-        in_blocks(of_rows, fine.shape[1], smallest=1)
+        in_blocks(of_rows, fine.shape[1], smallest=SMALLEST_ROWS)
         return result
-
-    def _blurred(self, histogram: np.ndarray, variance: float) -> np.ndarray:
-        from scipy.ndimage import gaussian_filter1d
-
-        mode = "wrap" if self.is_cyclic else "constant"
-        return np.asarray(gaussian_filter1d(histogram, np.sqrt(variance), axis=0, mode=mode))
 
     @property
     def sigma_bins(self) -> float:
