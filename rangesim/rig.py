@@ -68,9 +68,9 @@ class Intrinsics:
         cx, cy = (self.cx - self.width / 2) * scale + width / 2, (self.cy - self.height / 2) * scale + height / 2
         return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy, self.distortion)
 
-    def pixel_centres(self) -> Array:
-        """(height, width, 2) pixel coordinates (x, y) of all pixel centres."""
-        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+    def pixel_centres(self, rows: slice = slice(None)) -> Array:
+        """(height, width, 2) pixel coordinates (x, y) of the pixel centres, of all rows or some."""
+        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height)[rows] + 0.5)
         return np.stack([x, y], axis=-1)
 
     def normalise(self, pixels: ArrayLike) -> Array:
