@@ -21,7 +21,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rangesim import DirectToF, Intrinsics, Rig, Sensor, Signals, decode, default_detector, expose
+from rangesim import Intrinsics, Rig, Sensor, Signals, decode, default_detector, expose
 from rangesim.instrument import SENSORS
 from rangesim.response import LengthBins, LightPath, NumpyMath, Response
 from rangesim.rig import translation

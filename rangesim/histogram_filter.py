@@ -14,9 +14,7 @@ COLUMNS = 128
 """Histograms that are filtered together: they stay in a core's cache."""
 
 
-def gaussian_filter(
-    histograms: np.ndarray, sigma_bins: float, mode: Literal["wrap", "edge", "constant"]
-) -> np.ndarray:
+def gaussian_filter(histograms: np.ndarray, sigma_bins: float, mode: Literal["wrap", "edge", "constant"]) -> np.ndarray:
     """(k, n) float64 filtered histograms: those of `scipy.ndimage.gaussian_filter1d`, in a third of the time.
 
     Parameters

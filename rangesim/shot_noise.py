@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shot noise and read noise, drawn from their exact distributions in compiled loops.
 
-A photon count is the quantile of the Poisson distribution at a random number. For means of `SMALL_MEAN` or more that is a
-standard normal deviate w, and the quantile is floor(x(w)) of an expansion in 1 / sqrt(mean) whose error is bounded; where
-the bound does not tell the whole number (one draw in a hundred at a mean of 4, in a million at 1e4), the cumulative
-probability decides. So the distribution is exact, and the logarithms of a rejection method are never needed: a third
-of NumPy's time.
+A photon count is the quantile of Poisson's distribution at a random number. From a mean of `SMALL_MEAN` on that number is
+a standard normal deviate w, and the quantile floor(x), where x(w) is an expansion in 1 / sqrt(mean) whose error is bounded.
+Where the bound leaves two whole numbers (one draw in a hundred at a mean of 4, one in ten thousand at large ones), the
+cumulative probability decides. So the distribution is exact, in a third of the time of a rejection method.
 
 References
 ----------
@@ -30,8 +29,8 @@ _RECIPROCAL = 1 / np.arange(1.0, SUMMED + 1)
 NEGLIGIBLE = 1e-17
 """Of a sum of probabilities: what is smaller does not change it."""
 SPARSE = 5.0
-"""Square of the photons expected over the pulses, up to which `pulses_hit` draws photons: about twice those that share a
-pulse with an earlier one."""
+"""Square of the photons expected over the pulses, up to which `pulses_hit` draws photons: about twice the number that share
+a pulse with an earlier one."""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -77,9 +76,7 @@ def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[n
 def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
     """How many of `pulses` bring a photon, or more, each `mean` photons on average: binomial, 1 - exp(-mean) each.
 
-    Where few photons share a pulse, all are drawn, and those that fall into a pulse that has one are taken away. A photon
-    is a candidate with the probability 1 - exp(-rate), which is no less than that all before it leave it; gaps between
-    candidates are exponential.
+    Where few photons share a pulse, all are drawn, and those that fall into a pulse that has one are taken away.
     """
     expected = mean * pulses
     if expected * expected > SPARSE * pulses:
@@ -90,7 +87,11 @@ def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
-    """How many of `photons`, each in one of `pulses` by chance, fall into a pulse that has one before them."""
+    """How many of `photons`, each in one of `pulses` by chance, fall into a pulse that has one before them.
+
+    By thinning: a photon is a candidate with probability 1 - exp(-rate), which exceeds photons / pulses, so that the gaps
+    between candidates are exponential; of these, the share is taken that makes it the pulses hit so far / pulses.
+    """
     shared, number = 0, 1  # the first photon, number 0, finds all pulses empty
     rate = 2 * photons / pulses if photons < 0.75 * pulses else math.inf
     while True:
