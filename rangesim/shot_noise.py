@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shot noise and read noise, drawn from their exact distributions in compiled loops.
 
-A photon count is the quantile of Poisson's distribution at a random number. From a mean of `SMALL_MEAN` on that number is
-a standard normal deviate w, and the quantile floor(x), where x(w) is an expansion in 1 / sqrt(mean) whose error is bounded.
-Where the bound leaves two whole numbers (one draw in a hundred at a mean of 4, one in ten thousand at large ones), the
-cumulative probability decides. So the distribution is exact, in a third of the time of a rejection method.
+A photon count is the quantile of Poisson's distribution at a random number. From a mean of `SMALL_MEAN` on that number
+is a standard normal deviate w, and the quantile floor(x), where x(w) is an expansion in 1 / sqrt(mean) whose error is
+bounded. Where the bound leaves two whole numbers (one draw in a hundred at a mean of 4, one in ten thousand at large
+ones), the cumulative probability decides. So the distribution is exact, in a third of the time of a rejection method.
 
 References
 ----------
@@ -29,8 +29,8 @@ _RECIPROCAL = 1 / np.arange(1.0, SUMMED + 1)
 NEGLIGIBLE = 1e-17
 """Of a sum of probabilities: what is smaller does not change it."""
 SPARSE = 5.0
-"""Square of the photons expected over the pulses, up to which `pulses_hit` draws photons: about twice the number that share
-a pulse with an earlier one."""
+"""Square of the photons expected over the pulses, up to which `pulses_hit` draws photons: about twice the number that
+share a pulse with an earlier one."""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -89,8 +89,8 @@ def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
 def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
     """How many of `photons`, each in one of `pulses` by chance, fall into a pulse that has one before them.
 
-    By thinning: a photon is a candidate with probability 1 - exp(-rate), which exceeds photons / pulses, so that the gaps
-    between candidates are exponential; of these, the share is taken that makes it the pulses hit so far / pulses.
+    By thinning: a photon is a candidate with probability 1 - exp(-rate), which exceeds photons / pulses, so that the
+    gaps between candidates are exponential; of these, the share is taken that makes it the pulses hit so far / pulses.
     """
     shared, number = 0, 1  # the first photon, number 0, finds all pulses empty
     rate = 2 * photons / pulses if photons < 0.75 * pulses else math.inf
