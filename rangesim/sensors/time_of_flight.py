@@ -176,7 +176,7 @@ class DirectToF(Sensor):
             for row in range(start, stop):
                 histogram = fine[:, row]
                 if variance > 0:
-                    histogram = gaussian_filter(histogram, np.sqrt(variance), beyond).astype(np.float32)
+                    histogram = gaussian_filter(histogram, np.sqrt(variance), beyond)
                 if self._fine > 1:
                     histogram = histogram.reshape(self.bins, self._fine, -1).sum(axis=1)
                 np.add(histogram, evenly[row], out=result[:, row])
