@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -90,8 +90,24 @@ class PhotoDetector(ABC):
             )
 
 
+class LinearPixel(NamedTuple):
+    """What an exposure makes of radiance, in a `Detector`.
+
+    electrons : per W/m2/sr. dark_e, max_mean_e, read_noise_e : electrons; beyond max_mean_e the pixel is saturated,
+    whatever its noise. gain_dn_e : digital numbers per electron. offset_dn, max_dn : digital numbers.
+    """
+
+    electrons: float
+    dark_e: float
+    max_mean_e: float
+    read_noise_e: float
+    gain_dn_e: float
+    offset_dn: float
+    max_dn: int
+
+
 def streams(seed: int, n: int) -> list[np.random.Generator]:
-    """One independent random generator per frame; the same seed gives the same streams."""
+    """`n` independent random generators; the same seed gives the same ones."""
     return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(n)]
 
 
@@ -161,27 +177,35 @@ class Detector(PhotoDetector):
         return self.full_well_e
 
     def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
-        signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * exposure_s)
-        return np.asarray(signal + self.dark_current_e_s * exposure_s)
+        pixel = self._pixel(rig, exposure_s)
+        return np.asarray(pixel.electrons * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
 
     def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         if isinstance(sensor, DirectToF):
             raise ValueError("expected a SpadDetector for direct-tof, got an integrating Detector.")
-        result = np.empty(radiance.shape, dtype=self.dtype)
+        from pcgraph.parallel import in_blocks
+        from rangesim.shot_noise import read_frame
 
-        rngs = streams(seed, len(radiance))  # each frame has random numbers of its own
+        pixel, rngs = self._pixel(rig, exposure_s), streams(seed, len(radiance))
+        result = np.empty(radiance.shape, dtype=self.dtype)
 
         def read(start: int, stop: int) -> None:
             for k in range(start, stop):
-                mean = np.maximum(self.mean_electrons(radiance[k], sensor, rig, exposure_s), 0)
-                electrons = rngs[k].poisson(np.minimum(mean, 10 * self.full_well_e + 1000)).astype(np.float64)
-                electrons += self.read_noise_e * rngs[k].standard_normal(mean.shape)
-                result[k] = np.clip(np.rint(self.gain_dn_e * electrons + self.offset_dn), 0, self.max_dn)
-
-        from pcgraph.parallel import in_blocks
+                read_frame(rngs[k], np.ascontiguousarray(radiance[k], dtype=np.float32), pixel, result[k])
 
         in_blocks(read, len(radiance), smallest=1)
         return result
+
+    def _pixel(self, rig: Rig, exposure_s: float) -> LinearPixel:
+        return LinearPixel(
+            electrons=self.electrons_per_radiance(rig) * exposure_s,
+            dark_e=float(self.dark_current_e_s * exposure_s),
+            max_mean_e=10.0 * self.full_well_e + 1000,
+            read_noise_e=float(self.read_noise_e),
+            gain_dn_e=float(self.gain_dn_e),
+            offset_dn=float(self.offset_dn),
+            max_dn=self.max_dn,
+        )
 
     def noise_dn(self, dn: np.ndarray) -> np.ndarray:
         """Standard deviation of a pixel whose mean is `dn`, digital numbers: K^2 sigma_d^2 + 1/12 + K (mu - offset)."""

@@ -40,7 +40,8 @@ def expose(
         float32 radiance in W/m2/sr, unfiltered ambient light included. `IdealToF` has no noise model: its
         frames are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
-    seed : int, 0 to 2^64 - 1, of the noise. Every frame has its own stream; the same seed gives the same bytes.
+    seed : int, 0 to 2^64 - 1, of the noise. Every frame, of a SpadDetector every image row, has its own stream; the
+        same seed gives the same bytes on any number of threads.
     ambient : Ambient, what kind of light the scene's own emitters give, and how strong: the detector's
         band (`band_width_m`) then decides what counts of it. None: unknown, and the detector's
         `ambient_transmission` does. Other light needs no new pass.

@@ -8,6 +8,7 @@ from collections import ChainMap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,14 +130,14 @@ def estimate(experiment: Experiment) -> Cost:
 
 def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient: Ambient | None = None) -> None:
     """Expose, decode, compare, explain and segment for one instrument; write all to the new directory `folder`."""
+    from pcgraph.parallel import side_by_side
+
     folder.mkdir()
     times: dict[str, float] = {}
     moves = isinstance(signals, MovingSignals)
     with timed(times, "exposure"):
         detector = _in_time(one) if moves else one.detector
         capture = rangesim.expose(signals, one.sensor, detector, one.exposure_s, seed, ambient)
-    (folder / "capture").mkdir()
-    write_capture(capture, folder / "capture")
     with timed(times, "decode"):
         image = rangesim.decode(capture)
     noise = None
@@ -144,18 +145,25 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
         with timed(times, "noise"):
             noise = reading_noise(image, capture, signals)
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
-    save_range_image(image, folder / "range.npz")
     comparison = rangesim.compare(image, signals.truth)
     with timed(times, "causes"):
         causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
-    save_causes(causes, folder / "causes.npz")
     parts = [comparison.rows(), causes.shares(signals.truth), *([noise.by_material(signals.truth)] if noise else [])]
     rows = [dict(ChainMap(*parts_of_row)) for parts_of_row in zip(*parts, strict=True)]
-    save_rows(comparison.outlier_m, rows, folder)
     with timed(times, "points"):
         cloud = image.to_point_cloud()
-    if cloud.valid.sum() >= FEWEST_POINTS:
-        cloud.save(folder / "cloud.ply")
+    enough = bool(cloud.valid.sum() >= FEWEST_POINTS)
+
+    def write_readings() -> None:
+        save_range_image(image, folder / "range.npz")
+        save_causes(causes, folder / "causes.npz")
+        save_rows(comparison.outlier_m, rows, folder)
+        if enough:
+            cloud.save(folder / "cloud.ply")
+
+    (folder / "capture").mkdir()
+    side_by_side(partial(write_capture, capture, folder / "capture"), write_readings)
+    if enough:
         with timed(times, "segmentation"):
             segment(cloud, folder / "segmentation.npz")
     facts = acquisition(capture, one.timing, moves, int(cloud.valid.sum()), times)

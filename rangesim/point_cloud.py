@@ -139,46 +139,50 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
     ----------
     z : (h, w) float, metres, NaN where invalid. rays : (h, w, 3) float, directions with z = 1, camera frame.
     """
-    inverse = 1 / z
-    sums = np.zeros((9, *z.shape))
     steps = np.arange(-radius, radius + 1)
     limits = np.maximum(MAX_SLOPE * np.hypot(*np.meshgrid(steps, steps)) * _pixel_size(rays), STEP_FLOOR)
-    rays = np.ascontiguousarray(rays, dtype=np.float64)
-    in_blocks(_add_up, len(z), radius, limits, z, inverse, rays, sums, smallest=SMALLEST_ROWS)
-    return _normals_of_fit(sums, rays, inverse)
+    normals = np.empty((*z.shape, 3))
+    arguments = (radius, limits, z, 1 / z, np.ascontiguousarray(rays, dtype=np.float64), normals)
+    in_blocks(_fit_normals, len(z), *arguments, smallest=SMALLEST_ROWS)
+    return normals
 
 
-@njit(nogil=True, cache=True)
-def _add_up(start, stop, radius, limits, z, inverse, rays, sums):  # type: ignore[no-untyped-def]
-    """Of the rows from `start` to `stop`, the sums that `_normals_of_fit` takes."""
+@njit(nogil=True, cache=True, error_model="numpy")
+def _fit_normals(start, stop, radius, limits, z, inverse, rays, normals):  # type: ignore[no-untyped-def]
+    """Write the normals of the rows from `start` to `stop`."""
     h, w = z.shape
     for row in range(start, stop):
         for column in range(w):
+            n = x = y = v = xx = xy = yy = xv = yv = 0.0  # sums over the window, relative to its centre pixel
             for i in range(max(0, row - radius), min(h, row + radius + 1)):
                 for j in range(max(0, column - radius), min(w, column + radius + 1)):
                     limit = limits[i - row + radius, j - column + radius] * z[row, column]
                     if abs(z[i, j] - z[row, column]) <= limit:  # False with NaN
-                        x = rays[i, j, 0] - rays[row, column, 0]
-                        y = rays[i, j, 1] - rays[row, column, 1]
-                        value = inverse[i, j] - inverse[row, column]
-                        for k, term in enumerate((1.0, x, y, value, x * x, x * y, y * y, x * value, y * value)):
-                            sums[k, row, column] += term
-
-
-def _normals_of_fit(sums: np.ndarray, rays: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Normals from the sums n, x, y, v, xx, xy, yy, xv, yv over each window, relative to its centre pixel."""
-    n, x, y, v, xx, xy, yy, xv, yv = sums
-    count = np.maximum(n, 1)
-    sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
-    sxv, syv = xv - x * v / count, yv - y * v / count
-    determinant = sxx * syy - sxy**2
-    solvable = determinant > 1e-3 * np.maximum(sxx, syy) ** 2
-    safe = np.where(solvable, determinant, 1.0)
-    a, b = (sxv * syy - syv * sxy) / safe, (syv * sxx - sxv * sxy) / safe
-    centre = inverse + (v - a * x - b * y) / count
-    normal = -np.stack([a, b, centre - a * rays[..., 0] - b * rays[..., 1]], axis=-1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.where((solvable & (n >= 3))[..., None], normal, np.nan)
+                        dx = rays[i, j, 0] - rays[row, column, 0]
+                        dy = rays[i, j, 1] - rays[row, column, 1]
+                        dv = inverse[i, j] - inverse[row, column]
+                        n += 1
+                        x += dx
+                        y += dy
+                        v += dv
+                        xx += dx * dx
+                        xy += dx * dy
+                        yy += dy * dy
+                        xv += dx * dv
+                        yv += dy * dv
+            count = max(n, 1.0)
+            sxx, sxy, syy = xx - x * x / count, xy - x * y / count, yy - y * y / count
+            sxv, syv = xv - x * v / count, yv - y * v / count
+            determinant = sxx * syy - sxy * sxy
+            if n < 3 or not determinant > 1e-3 * max(sxx, syy) ** 2:
+                normals[row, column] = np.nan
+                continue
+            a, b = (sxv * syy - syv * sxy) / determinant, (syv * sxx - sxv * sxy) / determinant
+            centre = inverse[row, column] + (v - a * x - b * y) / count
+            c = centre - a * rays[row, column, 0] - b * rays[row, column, 1]
+            length = np.sqrt(a * a + b * b + c * c)
+            for k, component in enumerate((a, b, c)):
+                normals[row, column, k] = -component / length
 
 
 def _pixel_size(rays: np.ndarray) -> float:

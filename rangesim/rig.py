@@ -68,9 +68,9 @@ class Intrinsics:
         cx, cy = (self.cx - self.width / 2) * scale + width / 2, (self.cy - self.height / 2) * scale + height / 2
         return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy, self.distortion)
 
-    def pixel_centres(self) -> Array:
-        """(height, width, 2) pixel coordinates (x, y) of all pixel centres."""
-        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+    def pixel_centres(self, rows: slice = slice(None)) -> Array:
+        """(height, width, 2) pixel coordinates (x, y) of the pixel centres, of all rows or some."""
+        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height)[rows] + 0.5)
         return np.stack([x, y], axis=-1)
 
     def normalise(self, pixels: ArrayLike) -> Array:
@@ -78,10 +78,10 @@ class Intrinsics:
 
         NaN where the distortion has no inverse: beyond the radius at which its polynomial turns round.
         """
-        distorted = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        pixels = np.asarray(pixels, dtype=np.float64)
+        target_x, target_y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
         if not any(self.distortion):
-            return distorted
-        target_x, target_y = np.ascontiguousarray(distorted[..., 0]), np.ascontiguousarray(distorted[..., 1])
+            return np.stack([target_x, target_y], axis=-1)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = undistort(self.coefficients, target_x, target_y)
             image = distort(self.coefficients, x, y)
@@ -106,7 +106,9 @@ class Intrinsics:
         """(..., 3) ray directions with z = 1 (not unit length) through pixel coordinates (..., 2); NaN where
         `normalise` is."""
         xy = self.normalise(pixels)
-        return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+        result = np.ones((*xy.shape[:-1], 3))
+        result[..., :2] = xy
+        return result
 
     @property
     def coefficients(self) -> tuple[float, float, float, float, float]:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,22 @@ from rangesim.sensors import DirectToF, Sensor
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
+
+
+MAX_MEAN = 1e9
+"""Photons of a bin, on average: more are drawn as this many, which saturates every counter."""
+
+
+class CountingPixel(NamedTuple):
+    """What an exposure makes of radiance, in one bin of a `SpadDetector`.
+
+    photons : per W/m2/sr. dark, max_mean : counts. max_dn : digital numbers.
+    """
+
+    photons: float
+    dark: float
+    max_mean: float
+    max_dn: int
 
 
 @dataclass(frozen=True)
@@ -66,23 +82,35 @@ class SpadDetector(PhotoDetector):
         return super().ambient_share(sensor, ambient) * open_s / period_s
 
     def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
-        pulses, (period_s, open_s) = self.pulses(sensor, exposure_s), _gate_s(sensor)
-        signal = np.asarray(radiance, dtype=np.float64) * (self.electrons_per_radiance(rig) * pulses * period_s)
-        return np.asarray(signal + self.dark_counts_hz * pulses * open_s / sensor.n_frames)
+        pixel = self._pixel(sensor, rig, exposure_s)
+        return np.asarray(pixel.photons * np.asarray(radiance, dtype=np.float64) + pixel.dark)
 
     def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
-        pulses = self.pulses(sensor, exposure_s)
-        result = np.empty(radiance.shape, dtype=self.dtype)
-        unused = np.full(radiance.shape[1:], pulses, dtype=np.int64)
-        for frame, out, rng in zip(radiance, result, streams(seed, len(radiance)), strict=True):
-            mean = np.maximum(self.mean_electrons(frame, sensor, rig, exposure_s), 0)
-            if self.pile_up:
-                counts = rng.binomial(unused, -np.expm1(-mean / pulses))
-                unused -= counts
-            else:
-                counts = rng.poisson(np.minimum(mean, 1e9))
-            out[:] = np.minimum(counts, self.max_dn)
+        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from rangesim.shot_noise import count_first_photons, count_photons
+
+        pixel, pulses, height = self._pixel(sensor, rig, exposure_s), self.pulses(sensor, exposure_s), radiance.shape[1]
+        result, rngs = np.empty(radiance.shape, dtype=self.dtype), streams(seed, height)
+
+        def read(start: int, stop: int) -> None:
+            for row in range(start, stop):
+                means = np.ascontiguousarray(radiance[:, row], dtype=np.float32)
+                if self.pile_up:
+                    count_first_photons(rngs[row], means, pixel, pulses, result[:, row])
+                else:
+                    count_photons(rngs[row], means, pixel, result[:, row])
+
+        in_blocks(read, height, smallest=SMALLEST_ROWS)
         return result
+
+    def _pixel(self, sensor: Sensor, rig: Rig, exposure_s: float) -> CountingPixel:
+        pulses, (period_s, open_s) = self.pulses(sensor, exposure_s), _gate_s(sensor)
+        return CountingPixel(
+            photons=self.electrons_per_radiance(rig) * pulses * period_s,
+            dark=float(self.dark_counts_hz * pulses * open_s / sensor.n_frames),
+            max_mean=MAX_MEAN,
+            max_dn=self.max_dn,
+        )
 
 
 def _gate_s(sensor: Sensor) -> tuple[float, float]:

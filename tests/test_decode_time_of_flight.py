@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter1d
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
 from rangesim.decoding import decode
 from rangesim.decoding.amcw import decode_amcw, tap_phase
-from rangesim.decoding.histogram import coates, decode_direct
+from rangesim.decoding.histogram import coates, decode_direct, find_peak, window_reach
 from rangesim.decoding.path_length import range_from_path_length
 from rangesim.detector import Detector
 from rangesim.exposure import expose
+from rangesim.histogram_filter import gaussian_filter
 from rangesim.response import SPEED_OF_LIGHT, LengthBins, LightPath, NumpyMath
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF
@@ -196,6 +198,34 @@ def test_coates_undoes_pile_up() -> None:
     restored = coates(capture.frames.astype(np.float64), pulses)
     assert abs(restored.sum() / mean.sum() - 1) < 0.01
     assert capture.frames.sum() < 0.99 * mean.sum()
+
+
+@pytest.mark.parametrize(("mode", "scipys"), [("wrap", "wrap"), ("edge", "nearest"), ("constant", "constant")])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_filter_of_histograms_is_scipys(mode: Any, scipys: str, dtype: type) -> None:
+    """Also of histograms shorter than the filter."""
+    for bins, columns, sigma_bins in ((256, 300, 4.25), (5, 3, 4.25), (80, 128, 0.7)):
+        histograms = np.random.default_rng(0).random((bins, columns)).astype(dtype)
+        expected = gaussian_filter1d(histograms, sigma_bins, axis=0, mode=scipys)
+        found = gaussian_filter(histograms, sigma_bins, mode)
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found, expected, rtol=4 * np.finfo(dtype).eps)
+
+
+def test_a_peak_is_where_brute_force_finds_it() -> None:
+    """A Gaussian pulse on an even background: its place to a fifth of a bin, its window's sum, the background."""
+    bins, sigma_bins = 64, 2.0
+    places = np.linspace(0, bins, 41)
+    away = (np.arange(bins)[:, None] + 0.5 - places + bins / 2) % bins - bins / 2
+    histograms = 3.0 + 1000 * np.exp(-0.5 * (away / sigma_bins) ** 2) / (sigma_bins * np.sqrt(2 * np.pi))
+    place, height, background = find_peak(histograms, sigma_bins, is_cyclic=True)
+    width = 2 * window_reach(bins, sigma_bins, True) + 1
+    assert np.abs((place - places + bins / 2) % bins - bins / 2).max() < 0.2
+    window = np.stack([np.roll(np.arange(bins), -int(p)) for p in np.floor(place)], axis=1)
+    reach = width // 2
+    inside = np.take_along_axis(histograms, np.concatenate([window[-reach:], window[: reach + 1]]), axis=0).sum(axis=0)
+    np.testing.assert_allclose(height + background, inside, rtol=1e-12)
+    np.testing.assert_allclose(background / width, 3.0, rtol=0.2)
 
 
 # ---- A laser that fires again and again -------------------------------------------------------------

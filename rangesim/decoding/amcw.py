@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture
+from rangesim.decoding.bands import bands
 from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.decoding.phase_shift import Phase, modulation_is_weak, phase_sigma
 from rangesim.range_image import RangeImage
@@ -61,20 +62,23 @@ def decode_amcw(capture: Capture, correct_wiggling: bool = True) -> RangeImage:
         raise ValueError(f"expected an amcw-tof capture, got {sensor.type_name}.")
     exact_square = sensor.waveform == "square" and correct_wiggling
     groups = np.split(capture.frames, len(sensor.modulation_hz))
-    phases = [tap_phase(taps, exact_square) for taps in groups]
-    weights = [_weight(capture, phase, f) for phase, f in zip(phases, sensor.modulation_hz, strict=True)]
-    unwrapped = unwrap([p.turns for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
-
-    status = np.zeros(capture.frames.shape[1:], dtype=np.uint8)
-    contradiction = (unwrapped.residual_turns > MAX_RESIDUAL_TURNS) | (unwrapped.ambiguity > MAX_AMBIGUITY)
-    status[contradiction] = Status.WRAPPED
-    for phase in phases:
-        status[modulation_is_weak(capture, phase, TAPS)] = Status.LOW_SIGNAL
-    status[capture.saturated(capture.frames)] = Status.SATURATED
-    amplitude = np.mean([p.modulation for p in phases], axis=0)
-    intensity = np.mean([p.mean for p in phases], axis=0) - capture.black_level
+    shape = capture.frames.shape[1:]
+    status, length = np.zeros(shape, dtype=np.uint8), np.empty(shape)
+    amplitude, mean = np.empty((2, *shape), dtype=np.float32)
+    for rows in bands(len(status)):
+        phases = [tap_phase(taps[:, rows], exact_square) for taps in groups]
+        weights = [_weight(capture, phase, f) for phase, f in zip(phases, sensor.modulation_hz, strict=True)]
+        unwrapped = unwrap([p.turns for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
+        contradiction = (unwrapped.residual_turns > MAX_RESIDUAL_TURNS) | (unwrapped.ambiguity > MAX_AMBIGUITY)
+        status[rows][contradiction] = Status.WRAPPED
+        for phase in phases:
+            status[rows][modulation_is_weak(capture, phase, TAPS)] = Status.LOW_SIGNAL
+        status[rows][capture.saturated(capture.frames[:, rows])] = Status.SATURATED
+        length[rows] = unwrapped.length_m
+        amplitude[rows] = np.mean([p.modulation for p in phases], axis=0)
+        mean[rows] = np.mean([p.mean for p in phases], axis=0)
     confidence = 2 * amplitude / capture.full_scale
-    return range_image_from_path_length(capture, unwrapped.length_m, status, confidence, intensity)
+    return range_image_from_path_length(capture, length, status, confidence, mean - capture.black_level)
 
 
 def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
+from rangesim.decoding.bands import bands
 from rangesim.status import Status
 
 WHITE_BLACK_SHARE = 40 / 255
@@ -66,18 +67,18 @@ def decode_gray(capture: Capture, frames: np.ndarray, shift: int, size: int) -> 
     shift : int, finest bits left out. size : int, projector pixels along the axis.
     """
     contrast, bright = direct_contrast(capture)
-    code, uncertain = _classify(capture, frames, contrast)
-    low, high = _binary(code), _binary(code ^ uncertain)
-    on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
     cell = 1 << shift
-    coordinate = (0.5 * (low + high) + 0.5) * cell
-
-    status = np.zeros(contrast.shape, dtype=np.uint8)
-    status[coordinate >= size + cell / 2] = Status.CODE_ERROR
-    failed = ~bright | ~on_edge
-    status[failed] = Status.LOW_SIGNAL
-    status[failed & capture.saturated(capture.frames)] = Status.SATURATED
-    return GrayCode(coordinate.astype(np.float32), status, cell)
+    coordinate, status = np.empty(contrast.shape, dtype=np.float32), np.zeros(contrast.shape, dtype=np.uint8)
+    for rows in bands(len(contrast)):
+        code, uncertain = _classify(capture, frames[:, rows], contrast[rows])
+        low, high = _binary(code), _binary(code ^ uncertain)
+        on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
+        coordinate[rows] = (0.5 * (low + high) + 0.5) * cell
+        status[rows][coordinate[rows] >= size + cell / 2] = Status.CODE_ERROR
+        failed = ~bright[rows] | ~on_edge
+        status[rows][failed] = Status.LOW_SIGNAL
+        status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
+    return GrayCode(coordinate, status, cell)
 
 
 def _classify(capture: Capture, frames: np.ndarray, contrast: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -106,7 +107,7 @@ def _bit_threshold(
 
 def _difference_noise(capture: Capture, a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     noise_a, noise_b = capture.noise(a), capture.noise(b)
-    return None if noise_a is None or noise_b is None else np.hypot(noise_a, noise_b)
+    return None if noise_a is None or noise_b is None else np.sqrt(noise_a**2 + noise_b**2)
 
 
 def _binary(gray: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
+from rangesim.decoding.bands import bands
 from rangesim.range_image import RangeImage
 from rangesim.rig import Rig
 from rangesim.status import Status
@@ -43,20 +44,22 @@ def range_image_from_path_length(
     ----------
     length_m : (h, w) float, metres. status : (h, w) uint8. confidence, intensity : (h, w) float.
     """
-    rig = capture.rig
-    if rig is None:
-        range_m, z = length_m / 2, np.full(length_m.shape, np.nan)
-    else:
-        directions = rig.camera.directions(rig.camera.pixel_centres())
-        range_m = range_from_path_length(length_m, directions, rig)
-        z = range_m / np.linalg.norm(directions, axis=-1)
-    status = status.astype(np.uint8)
-    in_front = np.nan_to_num(range_m, nan=-1.0) > 0
-    status[(status == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
-    ok = status == Status.OK
+    rig, status = capture.rig, status.astype(np.uint8)
+    z_m, range_m = np.empty((2, *status.shape), dtype=np.float32)
+    for rows in bands(len(status)):
+        if rig is None:
+            along_ray, z = length_m[rows] / 2, np.float64(np.nan)
+        else:
+            directions = rig.camera.directions(rig.camera.pixel_centres(rows))
+            along_ray = range_from_path_length(length_m[rows], directions, rig)
+            z = along_ray / np.linalg.norm(directions, axis=-1)
+        in_front = np.nan_to_num(along_ray, nan=-1.0) > 0
+        status[rows][(status[rows] == Status.OK) & ~in_front] = Status.OUT_OF_RANGE
+        ok = status[rows] == Status.OK
+        z_m[rows], range_m[rows] = np.where(ok, z, np.nan), np.where(ok, along_ray, np.nan)
     return RangeImage(
-        z=np.where(ok, z, np.nan).astype(np.float32),
-        range_m=np.where(ok, range_m, np.nan).astype(np.float32),
+        z=z_m,
+        range_m=range_m,
         confidence=np.clip(confidence, 0, 1).astype(np.float32),
         status=status,
         intensity=np.asarray(intensity, dtype=np.float32),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture
+from rangesim.decoding.bands import bands
 from rangesim.decoding.gray import RELATIVE_BIT, GrayCode, direct_contrast
 from rangesim.status import Status
 
@@ -77,21 +78,16 @@ def refine_by_phase(capture: Capture, gray: GrayCode, frames: np.ndarray, period
     ----------
     frames : (N, h, w) fringe frames of the same axis. period_px : float, projector pixels.
     """
-    phase = phase_of(frames)
-    periods = np.rint(gray.coordinate / np.float32(period_px) - phase.turns)
-    coordinate = (periods + phase.turns) * np.float32(period_px)
-
-    status = gray.status.copy()
-    ok = status == Status.OK
-    contradiction = np.abs(coordinate - gray.coordinate) > gray.cell_px / 2 + period_px / 8
-    status[ok & contradiction] = Status.CODE_ERROR
-    status[ok & modulation_is_weak(capture, phase, len(frames))] = Status.LOW_SIGNAL
-    status[ok & _is_washed_out(capture, phase)] = Status.LOW_SIGNAL
-    status[ok & capture.saturated(frames)] = Status.SATURATED
-    return GrayCode(coordinate, status, gray.cell_px)
-
-
-def _is_washed_out(capture: Capture, phase: Phase) -> np.ndarray:
-    """(h, w) bool, where the fringes are much fainter than white - black, as those seen by interreflection alone."""
+    coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
     contrast, _ = direct_contrast(capture)
-    return np.asarray(2 * phase.modulation < RELATIVE_BIT * contrast)
+    for rows in bands(len(status)):
+        phase, whole, refused = phase_of(frames[:, rows]), gray.coordinate[rows], status[rows]
+        periods = np.rint(whole / np.float32(period_px) - phase.turns)
+        coordinate[rows] = (periods + phase.turns) * np.float32(period_px)
+        ok = refused == Status.OK
+        contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
+        washed_out = 2 * phase.modulation < RELATIVE_BIT * contrast[rows]  # as those seen by interreflection alone
+        refused[ok & contradiction] = Status.CODE_ERROR
+        refused[ok & (modulation_is_weak(capture, phase, len(frames)) | washed_out)] = Status.LOW_SIGNAL
+        refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
+    return GrayCode(coordinate, status, gray.cell_px)

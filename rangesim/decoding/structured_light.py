@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rangesim.capture import Capture
+from rangesim.decoding.bands import bands
 from rangesim.decoding.gray import GrayCode, decode_gray, direct_contrast
 from rangesim.decoding.phase_shift import refine_by_phase
 from rangesim.decoding.triangulate import triangulate
@@ -52,9 +53,16 @@ def decode_structured_light(
     z = np.full(status.shape, np.nan, dtype=np.float32)
     range_m = z.copy()
     if capture.rig is not None:
-        z[decoded], range_m[decoded], status[decoded] = _depth(
-            capture.rig, decoded, column, row, epipolar_tolerance_px, max_relative_error
-        )
+        for rows in bands(len(status)):
+            y, x = np.nonzero(decoded[rows])
+            z[rows][y, x], range_m[rows][y, x], status[rows][y, x] = _depth(
+                np.stack([x + 0.5, y + rows.start + 0.5], axis=-1),
+                capture.rig,
+                None if column is None else column[rows][y, x],
+                None if row is None else row[rows][y, x],
+                epipolar_tolerance_px,
+                max_relative_error,
+            )
     contrast, _ = direct_contrast(capture)
     return RangeImage(
         z=z,
@@ -115,21 +123,16 @@ def _masked(code: GrayCode | None, decoded: np.ndarray) -> np.ndarray | None:
 
 
 def _depth(
+    pixels: np.ndarray,
     rig: Rig,
-    decoded: np.ndarray,
     column: np.ndarray | None,
     row: np.ndarray | None,
     tolerance_px: float,
     max_relative_error: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """z, range and status of the decoded pixels, (n,) each."""
-    directions = rig.camera.directions(rig.camera.pixel_centres()[decoded])
-    result = triangulate(
-        directions,
-        rig,
-        None if column is None else column[decoded],
-        None if row is None else row[decoded],
-    )
+    """z, range and status of decoded camera pixels (n, 2), (n,) each."""
+    directions = rig.camera.directions(pixels)
+    result = triangulate(directions, rig, column, row)
     status = np.zeros(len(directions), dtype=np.uint8)
     usable = result.relative_error * COORDINATE_ERROR_PX <= max_relative_error
     status[~(np.isfinite(result.z) & usable)] = Status.OUT_OF_RANGE

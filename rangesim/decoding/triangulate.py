@@ -51,38 +51,44 @@ def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row
     if column is None and row is None:
         raise ValueError("expected projector columns, rows or both, got neither.")
     rotation, t = rig.T_camera_projector[:3, :3], rig.T_camera_projector[:3, 3]
-    a, b = directions @ rotation, -t @ rotation
+    a, b = rotation.T @ np.asarray(directions).T, -t @ rotation
     projector = rig.projector
     both = column is not None and row is not None
-    u = np.full(len(a), projector.cx) if column is None else np.asarray(column, dtype=np.float64)
-    v = np.full(len(a), projector.cy) if row is None else np.asarray(row, dtype=np.float64)
+    u = np.full(len(directions), projector.cx) if column is None else np.asarray(column, dtype=np.float64)
+    v = np.full(len(directions), projector.cy) if row is None else np.asarray(row, dtype=np.float64)
     rounds = 1 if both or not any(projector.distortion) else ITERATIONS
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for _ in range(rounds):
-            xy = projector.normalise(np.stack([u, v], axis=-1))
-            w, slope = _inverse_depth(a, b, xy, projector, column is not None, row is not None)
+            x, y = projector.normalise(np.stack([u, v], axis=-1)).T
+            w, slope = _inverse_depth(a, b, None if column is None else x, None if row is None else y, projector)
             if rounds == 1:
                 break
-            u, v, change = _complete(a + w[:, None] * b, projector, u, v, column is None)
+            u, v, change = _complete(_point(a, b, w), projector, u, v, column is None)
             if change < CONVERGED_PX:
                 break
-        point = a + w[:, None] * b
-        z = np.where((w > 0) & np.isfinite(w) & (point[:, 2] > 0), 1 / w, np.nan)
-        error = (point[:, :2] / point[:, 2:] - xy) * [projector.fx, projector.fy]
-        epipolar = np.hypot(error[:, 0], error[:, 1]) if both else np.zeros(len(a))
-        relative_error = z * point[:, 2] / slope
+        point = _point(a, b, w)
+        z = np.where((w > 0) & np.isfinite(w) & (point[2] > 0), 1 / w, np.nan)
+        epipolar = np.zeros(len(z))
+        if both:
+            epipolar = np.hypot(projector.fx * (point[0] / point[2] - x), projector.fy * (point[1] / point[2] - y))
+        relative_error = z * point[2] / slope
     return Triangulation(z, epipolar, relative_error)
 
 
+def _point(a: np.ndarray, b: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """(3, n) a + w b, times depth the points in the projector frame."""
+    return a + w * b[:, None]
+
+
 def _inverse_depth(
-    a: np.ndarray, b: np.ndarray, xy: np.ndarray, projector: Intrinsics, columns: bool, rows: bool
+    a: np.ndarray, b: np.ndarray, x: np.ndarray | None, y: np.ndarray | None, projector: Intrinsics
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n,) w of the linear equations w (b_x - x b_z) = x a_z - a_x, in projector pixels; norm of their slopes."""
-    numerator, denominator = np.zeros(len(a)), np.zeros(len(a))
-    for axis, used, focal in ((0, columns, projector.fx), (1, rows, projector.fy)):
-        if used:
-            slope = b[axis] - xy[:, axis] * b[2]
-            numerator += focal**2 * slope * (xy[:, axis] * a[:, 2] - a[:, axis])
+    numerator, denominator = np.zeros(a.shape[1]), np.zeros(a.shape[1])
+    for axis, coordinate, focal in ((0, x, projector.fx), (1, y, projector.fy)):
+        if coordinate is not None:
+            slope = b[axis] - coordinate * b[2]
+            numerator += focal**2 * slope * (coordinate * a[2] - a[axis])
             denominator += focal**2 * slope**2
     return numerator / denominator, np.sqrt(denominator)
 
@@ -90,9 +96,9 @@ def _inverse_depth(
 def _complete(
     point: np.ndarray, projector: Intrinsics, u: np.ndarray, v: np.ndarray, columns_missing: bool
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """(u, v) with the undecoded one replaced by where `point` (n, 3), projector frame, projects to; largest change."""
+    """(u, v) with the undecoded one replaced by where `point` (3, n), projector frame, projects to; largest change."""
     old = u if columns_missing else v
-    new = projector.project(point)[:, 0 if columns_missing else 1]
+    new = projector.project(point.T)[:, 0 if columns_missing else 1]
     new = np.where(np.isfinite(new), new, old)
     change = float(np.abs(new - old).max(initial=0))
     return (new, v, change) if columns_missing else (u, new, change)

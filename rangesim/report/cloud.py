@@ -14,6 +14,8 @@ from rangesim.result_files import Measurement, Segmentation
 
 NO_ERROR = -32768
 ERROR_STEP_M = 1e-5
+DEFLATE_LEVEL = 4
+"""The usual 6 makes a page of 7 MB 1 % smaller, in twice the time."""
 FAR = 1.5
 """Points beyond this multiple of the farthest true depth are not drawn."""
 
@@ -21,7 +23,7 @@ FAR = 1.5
 def pack(array: np.ndarray) -> str:
     """Base64 of the deflated bytes of an array, little-endian, row by row."""
     little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-    return base64.b64encode(zlib.compress(little.tobytes())).decode("ascii")
+    return base64.b64encode(zlib.compress(little.tobytes(), DEFLATE_LEVEL)).decode("ascii")
 
 
 def packed_measurement(m: Measurement, title: str, far_m: float) -> dict[str, Any]:

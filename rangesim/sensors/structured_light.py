@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
@@ -72,16 +73,23 @@ class StructuredLight(Sensor):
         return tuple(response for _, response in self._coded())
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        result: list[np.ndarray] = []
+        result = np.empty((self.n_frames, *steady.shape), dtype=np.float32)
+        for frame, lit in zip(result, self._lit(channels, steady), strict=True):
+            np.add(lit, ambient, out=frame, casting="same_kind")
+        return result
+
+    def _lit(self, channels: Sequence[np.ndarray], steady: np.ndarray) -> Iterator[np.ndarray]:
+        """The frames one after another, without ambient light."""
         for (_, response), values in zip(self._coded(), channels, strict=True):
             if isinstance(response, GrayBits):
                 for bit in values:
-                    result += [bit, steady - bit]
+                    yield bit
+                    yield steady - bit
             else:
-                shifts = 2 * np.pi * np.arange(self.steps) / self.steps
-                result += [0.5 * (steady + np.cos(s) * values[0] + np.sin(s) * values[1]) for s in shifts]
-        result += [steady, np.zeros_like(steady)]
-        return np.stack(result).astype(np.float32) + ambient.astype(np.float32)
+                for shift in (2 * math.pi * s / self.steps for s in range(self.steps)):
+                    yield 0.5 * (steady + math.cos(shift) * values[0] + math.sin(shift) * values[1])
+        yield steady
+        yield np.zeros_like(steady)
 
     def check(self, width: int, height: int) -> None:
         if (width, height) != (self.projector_width, self.projector_height):

@@ -97,8 +97,11 @@ class AmcwToF(Sensor):
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         offset = steady + ambient
-        taps = [s * self.contrast * c[i] for c in channels for s, i in ((1, 0), (1, 1), (-1, 0), (-1, 1))]
-        return np.stack([0.5 * (offset + t) for t in taps]).astype(np.float32)
+        taps = ((s * self.contrast, c[i]) for c in channels for s, i in ((1, 0), (1, 1), (-1, 0), (-1, 1)))
+        result = np.empty((self.n_frames, *offset.shape), dtype=np.float32)
+        for frame, (factor, phasor) in zip(result, taps, strict=True):
+            np.multiply(0.5, offset + factor * phasor, out=frame, casting="same_kind")
+        return result
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:
         return 1 if single_tap else TAPS
@@ -160,16 +163,26 @@ class DirectToF(Sensor):
         return (LengthBins(self.start_s * c, width_m, self.bins * fine, period_m, is_shared=has_pulse),)
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        histogram = np.asarray(channels[0], dtype=np.float32)
-        variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
-        if variance > 0:
-            from scipy.ndimage import gaussian_filter1d
+        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from rangesim.histogram_filter import gaussian_filter
 
-            mode = "wrap" if self.is_cyclic else "constant"
-            histogram = gaussian_filter1d(histogram, np.sqrt(variance), axis=0, mode=mode)
-        if self._fine > 1:
-            histogram = histogram.reshape(self.bins, self._fine, *histogram.shape[1:]).sum(axis=1)
-        return np.asarray(histogram + (ambient / self.bins).astype(np.float32), dtype=np.float32)
+        variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
+        beyond: Literal["wrap", "constant"] = "wrap" if self.is_cyclic else "constant"
+        fine = np.asarray(channels[0], dtype=np.float32)
+        evenly = (ambient / self.bins).astype(np.float32)
+        result = np.empty((self.bins, *fine.shape[1:]), dtype=np.float32)
+
+        def of_rows(start: int, stop: int) -> None:
+            for row in range(start, stop):
+                histogram = fine[:, row]
+                if variance > 0:
+                    histogram = gaussian_filter(histogram, np.sqrt(variance), beyond)
+                if self._fine > 1:
+                    histogram = histogram.reshape(self.bins, self._fine, -1).sum(axis=1)
+                np.add(histogram, evenly[row], out=result[:, row])
+
+        in_blocks(of_rows, fine.shape[1], smallest=SMALLEST_ROWS)
+        return result
 
     @property
     def sigma_bins(self) -> float:
