@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cause_scenes
@@ -30,6 +29,7 @@ from rangesim.response import (
     LightPath,
     NumpyMath,
 )
+from rangesim.signals import GroundTruth
 from rangesim.status import Status
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -239,9 +239,14 @@ def test_right_readings_and_empty_pixels_have_no_cause() -> None:
 
 def test_shares_are_of_the_pixels_of_a_material() -> None:
     cause = np.array([[0, 1, 7, 7], [7, 0, 0, 4]], dtype=np.uint8)
-    truth: Any = SimpleNamespace(
-        z=np.array([[1, 1, 1, 1], [1, 1, np.nan, 1]]),
-        material=np.array([[0, 0, 0, 0], [0, 0, -1, 1]]),
+    truth = GroundTruth(
+        z=np.array([[1, 1, 1, 1], [1, 1, np.nan, 1]], np.float32),
+        range_m=np.ones((2, 4), np.float32),
+        normal=np.zeros((2, 4, 3), np.float32),
+        instance=np.zeros((2, 4), np.int32),
+        material=np.array([[0, 0, 0, 0], [0, 0, -1, 1]], np.int32),
+        projector_uv=np.zeros((2, 4, 2), np.float32),
+        projector_visible=np.ones((2, 4), bool),
         material_names=("matte", "mirror"),
     )
     matte, mirror, everything = CauseMap(cause, 0.01).shares(truth)
