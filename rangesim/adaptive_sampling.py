@@ -20,6 +20,8 @@ from rangesim.sensors import Sensor
 if TYPE_CHECKING:
     from rangesim.signals import GroundTruth, Signals
 
+FIRST_SPP = 8
+"""Samples that all pixels get."""
 SHARE = 1 / 3
 """Of the detector's noise, that of sampling at most: together they are then a twentieth above the detector's alone."""
 NEGLIGIBLE = 1e-5
@@ -30,13 +32,17 @@ BLOCK_PX = 16
 
 @dataclass(frozen=True)
 class AdaptiveSampling:
-    """Samples in rounds, each of three times as many as were taken before, until sampling adds little to the noise.
+    """Some samples of every pixel, and then as many more as the noise of its readings asks for.
+
+    The variance of a mean falls with the number of samples, so the first ones tell how many there have to be (two-stage
+    sampling: Stein, Ann. Math. Statist. 16, 1945). Pixels are judged in groups, for every instrument; the noisiest one
+    decides.
 
     Where an instrument has no detector, all noise is the renderer's, and only what is negligible is small.
 
     Parameters
     ----------
-    instruments : whose detectors, exposures and decoders decide; every one has to be content.
+    instruments : whose detectors, exposures and decoders decide.
     max_spp : int >= 1, samples that no pixel exceeds.
     share : positive, standard deviation of a reading by sampling, over that by the detector, that is small enough.
     ambient : Ambient, as for `expose`.
@@ -55,21 +61,28 @@ class AdaptiveSampling:
         """For sensors with their usual detectors."""
         return cls(tuple(Instrument(f"sensor-{i}", sensor) for i, sensor in enumerate(sensors)))
 
-    def unfinished(self, truth: GroundTruth, signals_of: Callable[[Sensor], Signals]) -> np.ndarray:
-        """(h, w) bool, pixels that need more samples; `signals_of` gives the signals of one sensor so far."""
+    @property
+    def first_spp(self) -> int:
+        """Samples that all pixels get."""
+        return min(FIRST_SPP, self.max_spp)
+
+    def samples(self, truth: GroundTruth, signals_of: Callable[[Sensor], Signals]) -> np.ndarray:
+        """(h, w) int, samples that pixels should have; `signals_of` gives a sensor's signals after the first ones."""
         group = groups(truth.instance)
-        result = np.zeros(truth.instance.shape, bool)
+        excess = np.zeros(group.max() + 1)  # of the variance, over what is small enough
         z = truth.z[np.isfinite(truth.z)]
         negligible = NEGLIGIBLE * float(np.median(z)) if z.size else 0.0
         for one in self.instruments:
             signals = signals_of(one.sensor)
             capture = expose(signals, one.sensor, one.detector, one.exposure_s, 0, self.ambient)
             noise = reading_noise(decode(capture), capture, signals)
-            enough = np.full(group.max() + 1, negligible)
+            enough = np.full(len(excess), negligible)
             if capture.is_digital:  # where nothing can be read, samples are of no use
                 enough = np.maximum(enough, self.share * group_sigma(noise.detector, group, where_unknown=np.inf))
-            result |= (group_sigma(noise.sampling, group) > enough)[group]
-        return result
+            with np.errstate(divide="ignore", invalid="ignore"):
+                excess = np.fmax(excess, (group_sigma(noise.sampling, group) / enough) ** 2)
+        wanted = 4 * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / 4)  # whole pairs in both halves
+        return np.clip(wanted, self.first_spp, max(self.first_spp, self.max_spp // 4 * 4)).astype(np.int64)[group]
 
 
 def groups(instance: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ class Experiment:
     material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
     unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
     width, height : pixels of the camera; None: as in the scene. The field of view is kept.
-    spp : light paths per pixel; None: 16, and up to `max_spp` where these leave noise that is not small against that
+    spp : light paths per pixel; None: 8, and up to `max_spp` where these leave noise that is not small against that
         of the detectors, see `rangesim.adaptive_sampling`.
     max_spp : light paths per pixel, at most, where `spp` is None.
     max_depth : longest path, in segments between surfaces that scatter it, up to the light; 2 is direct light alone.

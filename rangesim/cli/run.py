@@ -43,7 +43,7 @@ def run_command(
         ),
     ] = None,
     spp: Annotated[
-        int | None, typer.Option(help="Light paths per pixel. (default: 16, more where the detector needs it)")
+        int | None, typer.Option(help="Light paths per pixel. (default: 8, more where the detector needs it)")
     ] = None,
     max_spp: Annotated[int | None, typer.Option(help="At most so many where --spp is not given. (default: 64)")] = None,
     width: Annotated[int | None, typer.Option(help="Camera width, pixels. (default: the scene's)")] = None,

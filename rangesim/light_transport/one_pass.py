@@ -32,10 +32,8 @@ from rangesim.sensors import Sensor
 from rangesim.signals import EnergySplit, Signals
 
 Indirect = Literal["filtered", "raw"]
-FIRST_SPP, ROUND_FACTOR = 16, 4
-"""Samples of a pixel in the first round of adaptive sampling, and their growth from round to round."""
-OTHER_SPP = 64
-"""Samples of a pixel that shares no light, where no sensor says how many it needs."""
+MATTE_SPP, OTHER_SPP = 16, 64
+"""Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
 PATHS_SHARE = 0.95
 """Of the progress, that the samples make."""
 TEXTURE_SAMPLES = 64
@@ -66,10 +64,10 @@ def transport(
     scene : Scene
     rig : Rig
     sensors : sensors, or bare responses; none for energy split and ground truth alone.
-    spp : int >= 1, samples (camera paths) per pixel. Or AdaptiveSampling: 16, and then up to 64 where the readings of
-        some instrument would have noise of the renderer that is not small against that of the detector. "auto": this,
-        for the sensors with their usual detectors; for bare responses, 16 where pixels share their indirect light and
-        64 elsewhere.
+    spp : int >= 1, samples (camera paths) per pixel. Or AdaptiveSampling: 8, and then up to 64, as many as it takes
+        until the renderer's noise in the readings of its instruments is small against that of their detectors. "auto":
+        this, for the sensors with their usual detectors; for bare responses, 16 where pixels share their indirect light
+        and 64 elsewhere.
     max_depth : int >= 1, segments of a path between surfaces that scatter it, up to the light: 2 is direct light alone,
         as in Mitsuba. Delta interactions (glass, mirrors, thin panes, coats, holes) do not count; they have a limit of
         their own, `rangesim.light_transport.delta_chain.MAX_CHAIN` in a row.
@@ -119,9 +117,9 @@ def transport(
     here = scene.in_renderer(rig)
     truth, guides = ground_truth(scene, here, surfaces)
     if adaptive:
-        samples = np.full(h * w, min(FIRST_SPP, adaptive.max_spp))
+        samples = np.full(h * w, adaptive.first_spp)
     elif spp == "auto":
-        samples = np.where(keeps_apart & (guides.instance.ravel() >= 0), FIRST_SPP, OTHER_SPP)
+        samples = np.where(keeps_apart & (guides.instance.ravel() >= 0), MATTE_SPP, OTHER_SPP)
     else:
         samples = np.full(h * w, spp)
     fewest = int(samples.min())
@@ -147,17 +145,13 @@ def transport(
                 glints.add_to(values, glints.channels_error[response])
         return Signals(rig, channels, _energy(channels, radiance, glints), truth, sampling=error)
 
-    left = 0.5 if adaptive else 0.0  # how many rounds follow is not known, so each makes half of what is left
+    left = 0.5 if adaptive else 0.0  # how much follows is not known
     estimate.sample(np.arange(h * w), samples, partial(_report, report, 0.0, 1 - left))
-    while adaptive and adaptive.max_spp >= samples.max() + FEWEST_FOR_HALVES:
-        needed = adaptive.unfinished(truth, lambda sensor: signals_of(sensor.responses())).ravel()
-        pixels = np.flatnonzero(needed & (estimate.total_samples.ravel() == samples.max()))
-        if not len(pixels):
-            break
-        more = min(ROUND_FACTOR * samples.max(), adaptive.max_spp) - samples.max()
-        part = partial(_report, report, 1 - left, left := left / 2)
-        estimate.sample(pixels, np.full(len(pixels), more), part)
-        samples[pixels] += more
+    if adaptive and adaptive.max_spp > fewest:
+        more = adaptive.samples(truth, lambda sensor: signals_of(sensor.responses())).ravel() - samples
+        pixels = np.flatnonzero(more)
+        if len(pixels):
+            estimate.sample(pixels, more[pixels], partial(_report, report, 1 - left, left))
     signals = signals_of(None)
     report(1.0)
     truncation = estimate_truncation(estimate.mean_tally(), signals.energy, max_depth, maps.cut if maps else 0.0)
