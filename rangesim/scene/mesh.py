@@ -40,7 +40,9 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, ad
         hint = nearest(material, MESH_MATERIALS)
         raise ValueError(f"expected a material out of {', '.join(MESH_MATERIALS)}, got {material!r}{hint}.")
     vertices, faces = _read(path)
-    if advises and np.array_equal(vertices, np.float32(vertices)):
+    with np.errstate(over="ignore"):  # what is too large is refused below
+        is_single = np.array_equal(vertices, np.float32(vertices))
+    if advises and is_single:
         offset = np.clip(0, vertices.min(axis=0), vertices.max(axis=0))  # of the mesh from the origin of the file
         warn_of_coarse_mesh(Rounding(unit_m * rounding_of(offset), path.stem), str(path))
     vertices = vertices * unit_m
