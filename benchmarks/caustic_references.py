@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projector light through glass and off mirrors against references that share no code with the pass.
 
-    make     computes the references (about 9 minutes on two busy cores) and writes benchmarks/references/*.npz
+    make     computes the references (about 9 minutes on two busy cores) and writes benchmarks/references/*.npz; those
+             of one case with `--case pane`
     compare  renders the same cases with `transport` and compares (the default)
 
 Two references. `ptracer` is Mitsuba's particle tracer with its `projector` plugin: it is the reference for all that
@@ -32,6 +33,8 @@ from rangesim import StructuredLight, transport
 
 HERE = Path(__file__).resolve().parent / "references"
 MAX_DEPTH = 12
+REFERENCE_DEPTH = 130
+"""Of the references, where glass counts: a pane guides light along for dozens of reflections."""
 PTRACER_SPP = 12_000
 PATH_SAMPLES = 400_000_000
 """Camera paths per case of the path tracer with the aperture of the case; a quarter of that with twice the radius."""
@@ -65,7 +68,7 @@ def ptracer(case: Case, scale: float) -> Reference:
     import mitsuba as mi
 
     plain = plain_scene(case.scene, case.rig, {"type": "hdrfilm", "pixel_format": "luminance"})
-    integrator = mi.load_dict({"type": "ptracer", "max_depth": MAX_DEPTH, "rr_depth": MAX_DEPTH})
+    integrator = mi.load_dict({"type": "ptracer", "max_depth": REFERENCE_DEPTH, "rr_depth": REFERENCE_DEPTH})
     light, frames = stripes()
     halves = np.empty((2, len(frames), case.rig.camera.height, case.rig.camera.width))
     for i, frame in enumerate(frames):
@@ -113,10 +116,12 @@ def _reference(halves: np.ndarray, masks: dict[str, np.ndarray], aperture: dict[
 METHODS = {"ptracer": ptracer, "path": path}
 
 
-def make(scale: float) -> None:
-    """Compute and write all references."""
+def make(scale: float, chosen: str | None = None) -> None:
+    """Compute and write all references, or those of one case."""
     HERE.mkdir(exist_ok=True)
     for case_name, case in cases().items():
+        if chosen not in (None, case_name):
+            continue
         for name, method in METHODS.items():
             start = time.perf_counter()
             reference = method(case, scale)
@@ -184,9 +189,10 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=2048)
     parser.add_argument("--photons", type=int, default=8_000_000)
     parser.add_argument("--scale", type=float, default=1.0, help="of the samples of `make`")
+    parser.add_argument("--case", help="of `make`, alone")
     args = parser.parse_args()
     if args.what == "make":
-        make(args.scale)
+        make(args.scale, args.case)
     else:
         print(json.dumps(compare(args.spp, args.photons)))
 

@@ -11,6 +11,7 @@ process, after warm-up, in turns, so that other load on the machine hits both al
     speedup                 naive_s / one_pass_s
     patterns_vs_one_render  one pass over ONE plain render (medians)
     cost_vs_one_render      one pass with all patterns, 3 x 4 AMCW taps and 256 time bins over ONE plain render
+    default_vs_one_render   the same with the sampling error and with light that neighbours share, as by default
     max_abs_z               largest |z| over the frames; z = mean difference over its standard error
     max_abs_tile_z          largest |z| over all lit tiles of 40 x 40 pixels of all frames (about 4 by chance)
 
@@ -49,17 +50,19 @@ def main() -> None:
     integrator = mi.load_dict({"type": "path", "max_depth": args.max_depth, "rr_depth": 5})
     # Mitsuba's path integrator finds no projector light through glass
     one_pass = partial(transport, scene, rig, spp=args.spp, max_depth=args.max_depth, photons=0, glint=False)
+    default, one_pass = one_pass, partial(one_pass, indirect="raw", sampling_error=False)
 
     frames = one_pass([light], seed=1).frames(light)
-    one_pass(everything), render(plain, integrator, args.spp, seed=0)  # warm-up
+    one_pass(everything), default([light]), render(plain, integrator, args.spp, seed=0)  # warm-up
 
-    patterns_s, everything_s, naive_s, scores, tiles = [], [], [], [], []
+    patterns_s, everything_s, default_s, naive_s, scores, tiles = [], [], [], [], [], []
     for k, pattern in enumerate(light.patterns()):
         show(plain, pattern)
         reference, seconds = timed(partial(render, plain, integrator, args.spp, seed=1000 + k))
         naive_s.append(seconds)
         if k % 4 == 0:
             patterns_s.append(timed(partial(one_pass, [light], seed=k))[1])
+            default_s.append(timed(partial(default, [light], seed=k))[1])
             everything_s.append(timed(partial(one_pass, everything, seed=k))[1])
         scores.append(z_score(frames[k], reference))
         tiles.append(tile_z(frames[k], reference))
@@ -76,6 +79,7 @@ def main() -> None:
         "speedup": round(float(sum(naive_s) / one_pass_s), 1),
         "patterns_vs_one_render": round(float(one_pass_s / render_s), 3),
         "cost_vs_one_render": round(float(np.median(everything_s) / render_s), 3),
+        "default_vs_one_render": round(float(np.median(default_s) / render_s), 3),
         "max_abs_z": round(float(np.abs(scores).max()), 2),
         "max_abs_tile_z": round(max(tiles), 2),
     }

@@ -204,6 +204,19 @@ def test_a_reading_that_sampling_takes_away_counts_as_infinitely_noisy(matte: Sc
     assert np.isfinite(noise.sampling[6:]).all()
 
 
+def test_the_sampling_error_may_be_left_out(matte: Scene) -> None:
+    """It costs memory and time; the signals differ by the order of their sums alone."""
+    sensor, rig = AmcwToF(), matte.rig(0.03, width=32, height=24)
+    options: dict[str, Any] = {"spp": 16, "indirect": "raw", "seed": 1}
+    without = transport(matte, rig, [sensor], sampling_error=False, max_depth=2, **options)
+    known = transport(matte, rig, [sensor], max_depth=2, **options)
+    assert not without.knows_sampling_error
+    assert known.knows_sampling_error
+    np.testing.assert_allclose(without.frames(sensor), known.frames(sensor), rtol=1e-4, atol=1e-7)
+    with pytest.raises(ValueError, match="sampling_error=True"):
+        transport(matte, rig, [sensor], spp=AdaptiveSampling.of([sensor]), sampling_error=False)
+
+
 def test_samples_that_are_no_number_are_refused(matte: Scene) -> None:
     for spp in (2.5, 0, "many", None):
         with pytest.raises(ValueError, match="spp"):

@@ -32,9 +32,10 @@ class Sums:
     radiance : (6, h, w) float32, in the order of `Radiance`.
     """
 
-    def __init__(self, responses: Sequence[Response], keeps_apart: bool, h: int, w: int) -> None:
-        self.channels = {r: np.zeros((r.channels, h, w), np.float32) for r in responses}
-        self.smooth = {r: np.zeros((r.channels, h, w), np.float32) for r in responses if keeps_apart}
+    def __init__(self, h: int, w: int) -> None:
+        self.shape = h, w
+        self.channels: dict[Response, np.ndarray] = {}
+        self.smooth: dict[Response, np.ndarray] = {}
         self.radiance = np.zeros((len(Radiance._fields), h, w), np.float32)
 
     def add(self, pixels: np.ndarray, traced: Traced, accumulators: Accumulators) -> None:
@@ -42,9 +43,16 @@ class Sums:
         some: slice | np.ndarray = pixels
         if pixels[-1] - pixels[0] + 1 == len(pixels):
             some = slice(pixels[0], pixels[-1] + 1)
-        parts = [self.channels, self.smooth] if self.smooth else [self.channels]
-        for response, values in zip(self.channels, accumulators.images(), strict=True):
-            for part, of_part in zip(parts, values, strict=True):
+        is_whole = len(pixels) == self.shape[0] * self.shape[1]
+        for response, values in zip(accumulators.responses, accumulators.images(), strict=True):
+            for part, of_part in zip((self.channels, self.smooth), values, strict=False):
+                if response not in part and is_whole:  # a copy only where a view would keep the other part in memory
+                    is_own = of_part.base is None or (len(values) == 1 and of_part.flags.writeable)
+                    whole = of_part if is_own else of_part.copy()
+                    part[response] = whole.reshape(-1, *self.shape)
+                    continue
+                if response not in part:
+                    part[response] = np.zeros((response.channels, *self.shape), np.float32)
                 part[response].reshape(response.channels, -1)[:, some] += of_part
         self.radiance.reshape(len(self.radiance), -1)[:, some] += traced.radiance
 
@@ -95,7 +103,7 @@ class Estimate:
         self.view, self.settings, self.launches, self.memory_bytes = view, settings, launches, memory_bytes
         self.responses, self.keeps_apart, self.irradiance = responses, keeps_apart, rig.projector_irradiance
         self.shape = rig.camera.height, rig.camera.width
-        self.halves = [Sums(responses, keeps_apart, *self.shape) for _ in range(1 + has_halves)]
+        self.halves = [Sums(*self.shape) for _ in range(1 + has_halves)]
         self.samples = [np.zeros(self.shape, np.uint32) for _ in self.halves]
         self.tally = np.zeros((len(Tally._fields), *self.shape), np.float32)
         self.rounds = 0

@@ -65,7 +65,7 @@ class LightFilter:
     """
 
     def __init__(self, guides: Guides, levels: int = LEVELS) -> None:
-        mixed = mixed_pixels(guides)
+        mixed = mixed_pixels(guides) if levels else np.zeros((0, 0), np.bool_)
         self.weights = [level_weights(guides, mixed, 3**level) for level in range(levels)]
         reflectance = np.where(guides.instance >= 0, guides.reflectance, np.float32(1)).astype(np.float32)
         if levels:

@@ -18,7 +18,7 @@ from rangesim.light_transport.device import Device
 from rangesim.light_transport.estimate import FEWEST_FOR_HALVES, Estimate
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
-from rangesim.light_transport.indirect import LightFilter
+from rangesim.light_transport.indirect import LEVELS, LightFilter
 from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
 from rangesim.light_transport.loop import Radiance, Settings, View
 from rangesim.light_transport.medium import media_of
@@ -54,6 +54,7 @@ def transport(
     caustic_radius_m: float | None = None,
     glint: bool = True,
     indirect: Indirect = "filtered",
+    sampling_error: bool = True,
     memory_bytes: int = 2 << 30,
     progress: Callable[[float], None] | None = None,
 ) -> Signals:
@@ -80,6 +81,8 @@ def transport(
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and far less
         noise (`rangesim.light_transport.indirect`); "raw": the unbiased sum over each pixel's own paths.
+    sampling_error : whether `Signals.sampling` is estimated, which takes as much memory again as the signals and some
+        time; adaptive sampling needs it.
     seed : int, 0 to 2^64 - 1; the same seed gives the same bytes, whatever the number of threads and the memory
         budget, and each its own noise.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed
@@ -104,11 +107,13 @@ def transport(
     seed = check_seed(seed)
     check_photons(photons, caustic_radius_m)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
-    adaptive = _adaptive(spp, sensors)
+    adaptive = _adaptive(spp, sensors) if sampling_error else None
     for one in adaptive.instruments if adaptive else ():
         if missing := set(one.sensor.responses()) - set(responses):
             raise ValueError(f"expected sensors that have {missing.pop()}, for instrument {one.name!r} of spp.")
     h, w = rig.camera.height, rig.camera.width
+    if isinstance(spp, AdaptiveSampling) and not sampling_error:
+        raise ValueError("expected sampling_error=True with AdaptiveSampling, which goes by it.")
     if indirect not in get_args(Indirect):
         raise ValueError(f"expected indirect to be one of {', '.join(get_args(Indirect))}, got {indirect!r}.")
     keeps_apart = indirect == "filtered"
@@ -131,11 +136,10 @@ def transport(
     if keeps_apart and scene.has_matte_textures:
         seen = mean_reflectance(view, settings, rig, scene.has_cutouts, min(fewest, TEXTURE_SAMPLES))
         guides = guides._replace(reflectance=seen)
-    shared = LightFilter(guides)
+    shared = LightFilter(guides, LEVELS if keeps_apart else 0)
     glints = trace_glint(scene.mitsuba, here, responses, seed, *inside) if glint else None
-    estimate = Estimate(
-        view, settings, rig, responses, keeps_apart, fewest >= FEWEST_FOR_HALVES, memory_bytes, launches
-    )
+    has_halves = sampling_error and fewest >= FEWEST_FOR_HALVES
+    estimate = Estimate(view, settings, rig, responses, keeps_apart, has_halves, memory_bytes, launches)
 
     def signals_of(some: Sequence[Response] | None) -> Signals:
         channels, radiance, error = estimate.means(shared, some)

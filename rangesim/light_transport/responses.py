@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 import drjit as dr
@@ -52,7 +52,7 @@ class Accumulators:
             r: dr.zeros(mi.Float, pixels * r.channels * self.parts) for r in responses if isinstance(r, SparseResponse)
         }
         dense = [r for r in responses if isinstance(r, DenseResponse)]
-        self.dense = {r: np.empty((self.parts * r.channels, pixels), np.float32) for r in dense}
+        self.dense = {r: [np.empty((r.channels, pixels), np.float32) for _ in range(self.parts)] for r in dense}
 
     def zeros(self, lanes: int) -> list[list[Any]]:
         """Fresh dense channels, the loop variable that `add` updates."""
@@ -93,10 +93,14 @@ class Accumulators:
         """Keep the evaluated dense channels of the pixels with these numbers (a slice or (lanes,) int)."""
         for response, values in zip(self.responses, channels, strict=True):
             if isinstance(response, DenseResponse):
-                for image, value in zip(self.dense[response], values, strict=True):
+                for image, value in zip(chain.from_iterable(self.dense[response]), values, strict=True):
                     image[places] = value.numpy()
 
-    def images(self) -> list[np.ndarray]:
-        """(parts, c, pixels) float32 of each response."""
-        flat = [self.dense[r] if isinstance(r, DenseResponse) else self.bins[r].numpy() for r in self.responses]
-        return [values.reshape(self.parts, -1, self.pixels) for values in flat]
+    def images(self) -> list[list[np.ndarray]]:
+        """Of each response, its parts: (c, pixels) float32 each."""
+        return [
+            self.dense[r]
+            if isinstance(r, DenseResponse)
+            else list(self.bins[r].numpy().reshape(self.parts, -1, self.pixels))
+            for r in self.responses
+        ]
