@@ -57,7 +57,8 @@ def main() -> None:
         return np.array(steady).squeeze(), np.moveaxis(np.array(transient).squeeze(), -1, 0)
 
     def ours(seed: int) -> Any:
-        return transport(scene, rig, [bins], spp=args.spp, max_depth=args.max_depth, seed=seed)
+        alike = {"indirect": "raw", "sampling_error": False}  # neither is part of what mitransient does
+        return transport(scene, rig, [bins], spp=args.spp, max_depth=args.max_depth, seed=seed, **alike)  # type: ignore[arg-type]
 
     ours(0), theirs(0)
     ours_s, theirs_s = [], []
