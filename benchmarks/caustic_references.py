@@ -33,8 +33,6 @@ from rangesim import StructuredLight, transport
 
 HERE = Path(__file__).resolve().parent / "references"
 MAX_DEPTH = 12
-REFERENCE_DEPTH = 130
-"""Of the references, where glass counts: a pane guides light along for dozens of reflections."""
 PTRACER_SPP = 12_000
 PATH_SAMPLES = 400_000_000
 """Camera paths per case of the path tracer with the aperture of the case; a quarter of that with twice the radius."""
@@ -66,9 +64,10 @@ def seen(name: str, case: Case) -> dict[str, np.ndarray]:
 def ptracer(case: Case, scale: float) -> Reference:
     """Mitsuba's particle tracer, in two independent halves."""
     import mitsuba as mi
+    from finite_aperture import MOST_SURFACES
 
     plain = plain_scene(case.scene, case.rig, {"type": "hdrfilm", "pixel_format": "luminance"})
-    integrator = mi.load_dict({"type": "ptracer", "max_depth": REFERENCE_DEPTH, "rr_depth": REFERENCE_DEPTH})
+    integrator = mi.load_dict({"type": "ptracer", "max_depth": MOST_SURFACES, "rr_depth": MOST_SURFACES})
     light, frames = stripes()
     halves = np.empty((2, len(frames), case.rig.camera.height, case.rig.camera.width))
     for i, frame in enumerate(frames):

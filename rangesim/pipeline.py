@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections import ChainMap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -148,8 +147,9 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     comparison = rangesim.compare(image, signals.truth)
     with timed(times, "causes"):
         causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
-    parts = [comparison.rows(), causes.shares(signals.truth), *([noise.by_material(signals.truth)] if noise else [])]
-    rows = [dict(ChainMap(*parts_of_row)) for parts_of_row in zip(*parts, strict=True)]
+    rows = [row | failures for row, failures in zip(comparison.rows(), causes.shares(signals.truth), strict=True)]
+    if noise is not None:
+        rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]
     with timed(times, "points"):
         cloud = image.to_point_cloud()
     enough = bool(cloud.valid.sum() >= FEWEST_POINTS)

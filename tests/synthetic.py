@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from rangesim.response import DenseResponse, LightPath, NumpyMath, Response, SparseResponse
+from rangesim.response import DenseResponse, FirstReturn, LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import Sensor
 from rangesim.signals import EnergySplit, GroundTruth, Signals
@@ -77,3 +78,15 @@ def _channels(response: Response, path: LightPath, radiance: np.ndarray) -> np.n
         return np.stack([sum(np.where(i == b, radiance * w, 0) for i, w in shares) for b in bins]).astype(np.float32)
     assert isinstance(response, DenseResponse)
     return np.stack([radiance * w for w in response.weights(path, NumpyMath())]).astype(np.float32)
+
+
+def counted_return() -> tuple[FirstReturn, list[None]]:
+    """A first return, and a list that grows by one whenever a kernel with it is traced."""
+    traces: list[None] = []
+
+    class Counted(FirstReturn):
+        def weights(self, path: Any, m: Any) -> list[Any]:
+            traces.append(None)
+            return super().weights(path, m)
+
+    return Counted(), traces

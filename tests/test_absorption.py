@@ -18,6 +18,7 @@ from delta_scenes import (
     wall,
 )
 from plain_mitsuba import plain_scene, render, z_score
+from synthetic import counted_return
 
 from rangesim import Intrinsics, Rig, Scene, load_scene, transport
 from rangesim.errors import FileFormatError
@@ -344,17 +345,10 @@ def test_the_same_seed_gives_the_same_bytes_in_tiles_and_for_joint_shapes(monkey
 
 
 def test_loops_with_absorbers_are_traced_once() -> None:
-    traced = 0
-
-    class Counted(FirstReturn):
-        def weights(self, path: Any, m: Any) -> list[Any]:
-            nonlocal traced
-            traced += 1
-            return super().weights(path, m)
-
+    counted, traces = counted_return()
     scene = scene_of(ball=filled(ball()), wall=wall(2.0, matte()))
-    transport(scene, rig_of(CAMERA, PROJECTOR), [Counted()], spp=1, photons=20_000, glint=False)
-    assert traced == 2  # at the vertices of paths, and where photons are gathered
+    transport(scene, rig_of(CAMERA, PROJECTOR), [counted], spp=1, photons=20_000, glint=False)
+    assert len(traces) == 2  # at the vertices of paths, and where photons are gathered
 
 
 def test_absorbing_glass_is_transparent_and_begins_at_its_surface() -> None:

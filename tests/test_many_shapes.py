@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from many_shapes import balls
+from synthetic import counted_return
 
 from rangesim import Scene, load_scene, transport
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.surfaces import Surfaces, surfaces_of
-from rangesim.response import FirstReturn
 
 MANY = 3000
 
@@ -52,18 +52,11 @@ def test_what_meets_a_delta_surface_is_found_without_asking_each_shape(crowd: Sc
 @pytest.mark.parametrize("materials", ["one", "glass"])
 def test_loops_are_traced_once(materials: str) -> None:
     """Each time costs a virtual call for each shape: 10 000 of them take a second."""
-    traced = 0
-
-    class Counted(FirstReturn):
-        def weights(self, path: Any, m: Any) -> list[Any]:
-            nonlocal traced
-            traced += 1
-            return super().weights(path, m)
-
+    counted, traces = counted_return()
     scene = load_scene(balls(20, materials))
     rig = scene.rig(width=16, height=12)
-    transport(scene, rig, [Counted()], spp=1, photons=20_000, glint=False)
-    assert traced == {"one": 1, "glass": 2}[materials]  # at the vertices of paths, and where photons are gathered
+    transport(scene, rig, [counted], spp=1, photons=20_000, glint=False)
+    assert len(traces) == {"one": 1, "glass": 2}[materials]  # at the vertices of paths, and where photons are gathered
 
 
 def test_the_pixels_before_glass_are_those_of_the_shapes_that_are_glass() -> None:

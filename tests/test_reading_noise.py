@@ -14,7 +14,7 @@ from rangesim import AmcwToF, IdealToF, Scene, StructuredLight, decode, expose, 
 from rangesim.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
 from rangesim.errors import SamplingWarning
 from rangesim.instrument import Instrument
-from rangesim.light_transport.estimate import mean_and_error
+from rangesim.light_transport.estimate import Halves
 from rangesim.light_transport.loop import Budget
 from rangesim.reading_noise import reading_noise, robust_sigma, warn_of_sampling
 
@@ -48,7 +48,7 @@ def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean(
     rng, p, q = np.random.default_rng(3), 5, 16
     a, b = (rng.normal(2 * n, np.sqrt(n), (1, 200, 300)).astype(np.float32) for n in (p, q))
     mean, error = np.empty_like(a), np.empty_like(a)
-    mean_and_error((a, b), [np.full((200, 300), n, np.uint32) for n in (p, q)], (mean, error))
+    Halves([np.full((200, 300), n, np.uint32) for n in (p, q)]).mean_and_error((a, b), (mean, error))
     assert mean.mean() == pytest.approx(2, rel=0.01)
     assert mean.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
     assert error.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from rangesim.light_transport.indirect import CHANNELS_AT_ONCE, LightFilter
-from rangesim.light_transport.launches import Launches, Report
+from rangesim.light_transport.launches import Launches, Report, report_part
 from rangesim.light_transport.loop import Budget, Radiance, Settings, Traced, View, trace
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.truncation import Tally
@@ -57,24 +57,33 @@ class Sums:
         self.radiance.reshape(len(self.radiance), -1)[:, some] += traced.radiance
 
 
-def mean_and_error(sums: Sequence[np.ndarray], samples: Sequence[np.ndarray], out: Sequence[np.ndarray]) -> None:
-    """Write the mean over all samples, and a draw of its error, of the sums of two halves, each (c, h, w), to `out`,
-    which may be the sums themselves. Of one half alone, the mean.
+class Halves:
+    """Makes means and errors of sums over samples in two halves; of sums over all of them in one, means.
 
-    With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all. `samples`
-    are p and q, (h, w).
+    With means a and b over p and q samples, (a - b) sqrt(p q) / (p + q) has the variance of the mean of all.
+
+    samples : p and q, (h, w) each, or the one.
     """
-    if len(sums) == 1:
-        np.divide(sums[0], samples[0].astype(np.float32), out=out[0])
-        return
-    (a, b), (p, q) = sums, (n.astype(np.float32) for n in samples)
-    n = p + q
-    of_a, of_b = np.sqrt(q / p) / n, np.sqrt(p / q) / n
-    for plane_a, plane_b, mean, error in zip(a, b, out[0], out[1], strict=True):
-        drawn = plane_a * of_a - plane_b * of_b
-        np.add(plane_a, plane_b, out=mean)
-        mean /= n
-        error[:] = drawn
+
+    def __init__(self, samples: Sequence[np.ndarray]) -> None:
+        counts = [n.astype(np.float32) for n in samples]
+        self.total = counts[0]
+        if len(counts) == 2:
+            p, q = counts
+            self.total = p + q
+            self.of_a, self.of_b = np.sqrt(q / p) / self.total, np.sqrt(p / q) / self.total
+
+    def mean_and_error(self, sums: Sequence[np.ndarray], out: Sequence[np.ndarray]) -> None:
+        """Write the mean over all samples, and a draw of its error, of the sums of the halves, each (c, h, w), to
+        `out`, which may be the sums themselves."""
+        if len(sums) == 1:
+            np.divide(sums[0], self.total, out=out[0])
+            return
+        for a, b, mean, error in zip(*sums, *out, strict=True):
+            drawn = a * self.of_a - b * self.of_b
+            np.add(a, b, out=mean)
+            mean /= self.total
+            error[:] = drawn
 
 
 class Estimate:
@@ -123,7 +132,7 @@ class Estimate:
                 budget = part.of(slice(begin, end))
                 of_tile = int(budget.samples.sum(dtype=np.int64))
                 accumulators = Accumulators(self.responses, end - begin, self.keeps_apart)
-                so_far = partial(_report, report, done / total, of_tile / total)
+                so_far = partial(report_part, report, done / total, of_tile / total)
                 traced = trace(self.view, self.settings, budget, accumulators, self.launches, so_far)
                 sums.add(budget.pixels, traced, accumulators)
                 taken.ravel()[budget.pixels] += budget.samples
@@ -131,33 +140,29 @@ class Estimate:
                 done += of_tile
         self.rounds += 1
 
-    @property
-    def total_samples(self) -> np.ndarray:
-        """(h, w) uint32, samples taken of each pixel."""
-        return np.asarray(sum(self.samples))
-
     def mean_tally(self) -> np.ndarray:
         """(6, h, w) float32, means over samples in the order of `Tally`."""
-        return np.asarray(self.tally / self.total_samples.astype(np.float32))
+        return np.asarray(self.tally / np.asarray(sum(self.samples)).astype(np.float32))
 
     def means(
-        self, shared: LightFilter, responses: Sequence[Response] | None = None
+        self, shared: LightFilter | None, responses: Sequence[Response] | None = None
     ) -> tuple[dict[Response, np.ndarray], Radiance, SamplingError | None]:
-        """Means over all samples of channels and radiance, and a draw of their error; smooth light is shared.
+        """Means over all samples of channels and radiance, and a draw of their error.
 
-        With `responses` the channels of these alone, and more samples may be taken; without, the sums are used up.
+        `shared` filters the light that is kept apart; None if none is. With `responses` the channels of these alone,
+        and more samples may be taken; without, the sums are used up.
         """
-        channels, errors = {}, {}
+        channels, errors, halves = {}, {}, Halves(self.samples)
         for r in self.responses if responses is None else responses:
             sums = [half.channels[r] for half in self.halves]
             out = sums if responses is None else [np.empty_like(x) for x in sums]
-            smooth = [half.smooth[r] for half in self.halves] if self.keeps_apart else None
             for begin in range(0, r.channels, CHANNELS_AT_ONCE):
                 some = slice(begin, begin + CHANNELS_AT_ONCE)
-                mean_and_error([x[some] for x in sums], self.samples, [x[some] for x in out])
-                if smooth:
-                    parts = [np.empty_like(x[some]) for x in smooth]
-                    mean_and_error([x[some] for x in smooth], self.samples, parts)
+                halves.mean_and_error([x[some] for x in sums], [x[some] for x in out])
+                if shared:
+                    smooth = [half.smooth[r][some] for half in self.halves]
+                    parts = [np.empty_like(x) for x in smooth]
+                    halves.mean_and_error(smooth, parts)
                     for x, part in zip(out, parts, strict=True):
                         shared.apply(part)
                         x[some] += part
@@ -168,11 +173,12 @@ class Estimate:
                     half.smooth.pop(r, None)
         sums = [half.radiance for half in self.halves]
         out = [np.empty_like(x) for x in sums]
-        mean_and_error(sums, self.samples, out)
-        for x in out if self.keeps_apart else ():
-            light = x[SMOOTH]
-            shared.apply(light)
-            x[SMOOTH] = light
+        halves.mean_and_error(sums, out)
+        if shared:
+            for x in out:
+                light = x[SMOOTH]
+                shared.apply(light)
+                x[SMOOTH] = light
         error = SamplingError(errors, projector_light(Radiance(*out[1]))) if len(out) == 2 else None
         return channels, Radiance(*out[0]), error
 
@@ -190,7 +196,3 @@ class Estimate:
 def projector_light(radiance: Radiance) -> np.ndarray:
     """All light of the projector, without glint, (h, w)."""
     return np.asarray(radiance.direct + radiance.multipath + radiance.via_delta + radiance.caustic + radiance.faint)
-
-
-def _report(report: Report, before: float, share: float, of_tile: float) -> None:
-    report(before + share * of_tile)

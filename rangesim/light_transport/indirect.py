@@ -59,29 +59,24 @@ class Guides(NamedTuple):
 
 
 class LightFilter:
-    """Lets neighbouring pixels share indirect light, as the guides say.
+    """Lets neighbouring pixels share indirect light, as the guides say."""
 
-    levels : int, the window is 3^levels pixels wide; 0 leaves light as it is.
-    """
-
-    def __init__(self, guides: Guides, levels: int = LEVELS) -> None:
-        mixed = mixed_pixels(guides) if levels else np.zeros((0, 0), np.bool_)
-        self.weights = [level_weights(guides, mixed, 3**level) for level in range(levels)]
+    def __init__(self, guides: Guides) -> None:
+        mixed = mixed_pixels(guides)
+        self.weights = [level_weights(guides, mixed, 3**level) for level in range(LEVELS)]
         reflectance = np.where(guides.instance >= 0, guides.reflectance, np.float32(1)).astype(np.float32)
-        if levels:
-            _of_radiance(self.weights[0], self.weights[-1], reflectance)
-        self.scratch = [np.empty((CHANNELS_AT_ONCE, *reflectance.shape), np.float32) for _ in range(min(levels, 2))]
+        _of_radiance(self.weights[0], self.weights[-1], reflectance)
+        self.scratch = np.empty((CHANNELS_AT_ONCE, *reflectance.shape), np.float32)
 
     def apply(self, image: NDArray[np.float32]) -> None:
         """Filter an image (c, h, w) in place."""
         for begin in range(0, len(image), CHANNELS_AT_ONCE):
             some = image[begin : begin + CHANNELS_AT_ONCE]
-            before = some
+            before, after = some, self.scratch[: len(some)]
             for level, weights in enumerate(self.weights):
-                after = self.scratch[level % 2][: len(some)]
                 in_blocks(_apply, image.shape[1], weights, 3**level, before, after, smallest=SMALLEST_ROWS)
-                before = after
-            if self.weights:
+                before, after = after, before
+            if before is not some:
                 some[:] = before
 
 

@@ -146,6 +146,11 @@ def fewest_lanes() -> int:
     return 1 << 18 if mi.variant().startswith("cuda") else max(4096, 512 * dr.thread_count())
 
 
+def report_part(report: Report, before: float, part: float, share: float) -> None:
+    """Report the share done of a part of the work, which begins where `before` of it is done."""
+    report(before + part * share)
+
+
 class Progress:
     """Reports to a caller who may not want any, at most ten times a second; the last report is always made."""
 

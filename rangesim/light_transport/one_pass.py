@@ -18,8 +18,8 @@ from rangesim.light_transport.device import Device
 from rangesim.light_transport.estimate import FEWEST_FOR_HALVES, Estimate
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
-from rangesim.light_transport.indirect import LEVELS, LightFilter
-from rangesim.light_transport.launches import Launches, Progress, Report, raised_as_it_is
+from rangesim.light_transport.indirect import LightFilter
+from rangesim.light_transport.launches import Launches, Progress, raised_as_it_is, report_part
 from rangesim.light_transport.loop import Radiance, Settings, View
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.surfaces import surfaces_of
@@ -136,7 +136,7 @@ def transport(
     if keeps_apart and scene.has_matte_textures:
         seen = mean_reflectance(view, settings, rig, scene.has_cutouts, min(fewest, TEXTURE_SAMPLES))
         guides = guides._replace(reflectance=seen)
-    shared = LightFilter(guides, LEVELS if keeps_apart else 0)
+    shared = LightFilter(guides) if keeps_apart else None
     glints = trace_glint(scene.mitsuba, here, responses, seed, *inside) if glint else None
     has_halves = sampling_error and fewest >= FEWEST_FOR_HALVES
     estimate = Estimate(view, settings, rig, responses, keeps_apart, has_halves, memory_bytes, launches)
@@ -149,13 +149,13 @@ def transport(
                 glints.add_to(values, glints.channels_error[response])
         return Signals(rig, channels, _energy(channels, radiance, glints), truth, sampling=error)
 
-    left = 0.5 if adaptive else 0.0  # how much follows is not known
-    estimate.sample(np.arange(h * w), samples, partial(_report, report, 0.0, 1 - left))
+    left = 0.5 * PATHS_SHARE if adaptive else 0.0  # how much follows is not known
+    estimate.sample(np.arange(h * w), samples, partial(report_part, report, 0.0, PATHS_SHARE - left))
     if adaptive and adaptive.max_spp > fewest:
         more = adaptive.samples(truth, lambda sensor: signals_of(sensor.responses())).ravel() - samples
         pixels = np.flatnonzero(more)
         if len(pixels):
-            estimate.sample(pixels, more[pixels], partial(_report, report, 1 - left, left))
+            estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_SHARE - left, left))
     signals = signals_of(None)
     report(1.0)
     truncation = estimate_truncation(estimate.mean_tally(), signals.energy, max_depth, maps.cut if maps else 0.0)
@@ -169,10 +169,6 @@ def _adaptive(spp: Any, sensors: Sequence[Sensor | Response]) -> AdaptiveSamplin
         return spp
     readers = [s for s in sensors if isinstance(s, Sensor)]
     return AdaptiveSampling.of(readers) if spp == "auto" and readers and len(readers) == len(sensors) else None
-
-
-def _report(report: Report, before: float, part: float, share: float) -> None:
-    report(PATHS_SHARE * (before + part * share))
 
 
 def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:

@@ -38,7 +38,7 @@ from rangesim.scene.origin import (
     warn_of_coarse_transform,
     warn_of_loaded_camera,
 )
-from rangesim.scene.properties import check_depth, check_dictionary, check_media, check_properties, check_vertices
+from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
 from rangesim.scene.sensor_band import (
     coloured_materials,
@@ -133,7 +133,6 @@ def _instantiate(
         ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
         take_sensor_reflectances(state, label)
         check_properties(state, label)
-        check_media(state, label)
         return state, ids, classes
 
     def made_of(state: Any) -> Any:

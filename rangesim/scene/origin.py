@@ -104,13 +104,16 @@ def coarsest_mesh(state: Any, scene: Any) -> Rounding | None:
 
 
 def coarsest_transform(state: Any) -> Rounding | None:
-    """The `to_world` of a parsed scene, not moved yet, that was made in single precision and moves its node farthest.
+    """The `to_world` of a parsed scene, not moved yet, that was made in single precision and moves its node farthest;
+    None if none moves it by what is worth a warning.
 
     Rotations and scales tell: their digits fill single precision, but not double.
     """
     found = []
     for node in state.nodes:
         T = _matrix(node.props.get("to_world"))
+        if rounding_of(T[:3, 3]) <= COARSE_M:  # most: spare them the rest
+            continue
         with np.errstate(over="ignore"):
             single, half = (T[:3, :3].astype(kind) for kind in (np.float32, np.float16))
         if np.array_equal(single, T[:3, :3]) and not np.array_equal(half, single):

@@ -123,36 +123,13 @@ def check_properties(state: Any, label: str) -> None:
             problem = checked.problem(value)
             if problem:
                 raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
+        if node.type == mi.ObjectType.Medium and (problem := _problem_of_medium(state, node)):
+            raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
         if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
-
-
-def check_media(state: Any, label: str) -> None:
-    """Raise FileFormatError where the coefficients of a homogeneous medium are none, or differ from colour to colour.
-
-    There is but one band, that of the sensor: Mitsuba would cut a spectrum of 1/m off at 1, and read colours for the
-    eye; and it passes over keys of other renderers.
-    """
-    for node in state.nodes:
-        if node.type != mi.ObjectType.Medium or node.props.plugin_name() != "homogeneous":
-            continue
-        place = f"{label}: medium {node.props.id()!r}"
-        for key in NOT_OF_MEDIA:
-            if key in node.props:
-                raise FileFormatError(f"{place}: expected albedo and sigma_t, in 1/m, which Mitsuba reads, got {key}.")
-        for key, value in node.props.items():
-            if key not in ("sigma_t", "albedo"):
-                continue
-            if isinstance(value, mi.Properties.ResolvedReference):
-                inside = state.nodes[value.index()].props
-                value = inside.get("value") if inside.plugin_name() == "constvolume" else None
-            if len(set(_numbers(value))) > 1 or (hasattr(value, "is_uniform") and not value.is_uniform()):
-                raise FileFormatError(
-                    f"{place}: expected {key} to be one number, that at the sensor's wavelength, got several colours."
-                )
 
 
 def check_vertices(scene: Any, label: str) -> None:
@@ -230,6 +207,27 @@ class _Property:
     def _problem_of_array(self, values: np.ndarray, name: str) -> str:
         wrong = ~((values >= self.bounds.low) & (values <= self.bounds.high))
         return f"expected {name} to be {self.bounds}, got {values[wrong][0]:g}" if wrong.any() else ""
+
+
+def _problem_of_medium(state: Any, node: Any) -> str:
+    """What is wrong with how a homogeneous medium states its coefficients; empty: nothing.
+
+    There is but one band, that of the sensor: Mitsuba would cut a spectrum of 1/m off at 1, and read colours for the
+    eye; and it passes over keys of other renderers.
+    """
+    if node.props.plugin_name() != "homogeneous":
+        return ""
+    for key in NOT_OF_MEDIA:
+        if key in node.props:
+            return f"expected albedo and sigma_t, in 1/m, which Mitsuba reads, got {key}"
+    for key in ("sigma_t", "albedo"):
+        value = node.props.get(key)
+        if isinstance(value, mi.Properties.ResolvedReference):
+            inside = state.nodes[value.index()].props
+            value = inside.get("value") if inside.plugin_name() == "constvolume" else None
+        if len(set(_numbers(value))) > 1 or (hasattr(value, "is_uniform") and not value.is_uniform()):
+            return f"expected {key} to be one number, that at the sensor's wavelength, got several colours"
+    return ""
 
 
 def _numbers(value: Any) -> Iterable[float]:
