@@ -17,11 +17,13 @@ demo: $(VENV)/.installed ## set up if needed, run the comparison on the tabletop
 	$(BIN)/rangesim run $(DEMO_SCENE) --out $(DEMO_OUT)
 	@echo "Report: $(CURDIR)/$(DEMO_OUT)/report.html"
 
+# Each worker traces with all cores for a part of its time: more than four workers gain nothing.
+PARALLEL := -n auto --maxprocesses=4 --dist loadfile
 test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run every test with coverage
-	$(BIN)/python -m pytest --cov --cov-report=term
+	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term
 
 test-quick: $(VENV)/.installed-test ## the tests without those marked slow, without coverage
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 N := 20000
 SEED := $(shell date +%Y%m%d)

@@ -36,12 +36,12 @@ from rangesim import Capture, Signals, decode, expose, load_scene, transport
 from rangesim.experiment import Experiment
 from rangesim.instrument import Instrument, instrument
 from rangesim.pipeline import group_by_rig
+from rangesim.reading_noise import robust_sigma
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
 
 ROOT = Path(__file__).resolve().parent.parent
 SENSORS = ("gray-phase", "amcw", "direct-tof")
-TO_SIGMA = 1.4826
 
 
 def main() -> None:
@@ -85,9 +85,9 @@ def ratio_of(one: Instrument, scene: Scene, references: list[Signals], passes: l
     first, second = (noise_free(one, signals) for signals in references)
     converged = (first + second) / 2
     errors = [noise_free(one, signals) - converged for signals in passes]
-    left_over = sigma((first - second)[matte] / 2)
-    sampling = float(np.sqrt(max(0.0, np.mean([sigma(e[matte]) ** 2 for e in errors]) - left_over**2)))
-    detector = sigma((depth_mm(expose(references[0], one.sensor, one.detector, one.exposure_s, 1)) - first)[matte])
+    left_over = spread((first - second)[matte] / 2)
+    sampling = float(np.sqrt(max(0.0, np.mean([spread(e[matte]) ** 2 for e in errors]) - left_over**2)))
+    detector = spread((depth_mm(expose(references[0], one.sensor, one.detector, one.exposure_s, 1)) - first)[matte])
     bias = statistics.mean(float(np.nanmedian(e[matte])) for e in errors)
     print(
         f"{scene.name:9} {one.name:11} sampling {sampling:7.4f} mm  detector {detector:7.4f} mm  "
@@ -98,6 +98,12 @@ def ratio_of(one: Instrument, scene: Scene, references: list[Signals], passes: l
     return sampling / max(detector, 1e-9)
 
 
+def spread(errors: np.ndarray) -> float:
+    """Robust standard deviation about 0; infinite without any reading."""
+    sigma = robust_sigma(errors)
+    return np.inf if sigma is None else sigma
+
+
 def noise_free(one: Instrument, signals: Signals) -> np.ndarray:
     return depth_mm(expose(signals, one.sensor, None))
 
@@ -105,11 +111,6 @@ def noise_free(one: Instrument, signals: Signals) -> np.ndarray:
 def depth_mm(capture: Capture) -> np.ndarray:
     """(h, w) float64; NaN where nothing was measured."""
     return 1e3 * decode(capture).z.astype(np.float64)
-
-
-def sigma(errors: np.ndarray) -> float:
-    """Robust standard deviation about 0."""
-    return TO_SIGMA * float(np.nanmedian(np.abs(errors)))
 
 
 def demo_ratio(before: str, repeats: int = 5) -> float:
