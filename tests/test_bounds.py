@@ -190,12 +190,12 @@ def test_every_value_of_a_field_works_or_is_refused_in_one_sentence(
     base: Any, name: str, use: Callable[[Any], None]
 ) -> None:
     for value in NONSENSE:
-        start = time.monotonic()
+        start = time.process_time()
         message = refusal(lambda: use(dataclasses.replace(base, **{name: value})))  # noqa: B023 (called at once)
         assert not message or message.startswith("expected")
         assert len(message) < 500
         assert "\n" not in message
-        assert time.monotonic() - start < (1 if message else 5)
+        assert time.process_time() - start < (2 if message else 10)  # hangs, whatever else the machine does
 
 
 def ends(hint: Any) -> list[Any]:

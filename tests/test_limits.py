@@ -42,10 +42,10 @@ TOO_LARGE: dict[str, tuple[str, Callable[[], Any]]] = {
 @pytest.mark.parametrize("case", TOO_LARGE)
 def test_what_is_too_large_is_one_sentence_at_once(case: str) -> None:
     limit, make = TOO_LARGE[case]
-    start = time.monotonic()
+    start = time.process_time()
     with pytest.raises(ValueError, match=rf"expected at most .*, got .*RANGESIM_LIMITS={limit}=N"):
         make()
-    assert time.monotonic() - start < 1
+    assert time.process_time() - start < 1
 
 
 def test_a_frequency_beyond_any_modulator_is_refused() -> None:

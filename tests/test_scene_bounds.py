@@ -28,9 +28,9 @@ XML_CAMERA = '<sensor type="perspective"><film type="hdrfilm"><integer name="wid
 
 @pytest.fixture(autouse=True)
 def _at_once() -> Iterator[None]:
-    start = time.monotonic()
+    start = time.process_time()
     yield
-    assert time.monotonic() - start < 5
+    assert time.process_time() - start < 5
 
 
 def scene(camera: dict[str, Any] | None = None, **things: Any) -> dict[str, Any]:

@@ -295,10 +295,10 @@ def test_a_hundred_thousand_leaves_take_a_second(shape):
     )
     for call in calls:
         call()  # compiled
-    start = time.perf_counter()
+    start = time.process_time()
     for call in calls:
         call()
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
 
 
 def test_one_leaf_is_a_tree():

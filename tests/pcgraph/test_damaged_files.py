@@ -32,7 +32,7 @@ FILES = {name: (READERS[name[:3]], content) for name, content in CORPUS.items()}
 
 def read_or_refused(reader, content):
     """The cloud or None; fails on anything that is neither a cloud whose arrays agree nor one sentence."""
-    start = time.perf_counter()
+    start = time.process_time()
     try:
         cloud = reader(bytes(content))
     except CloudReadError as error:
@@ -40,7 +40,7 @@ def read_or_refused(reader, content):
         assert message
         assert len(message.splitlines()) == 1
         cloud = None
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
     if cloud is None:
         return None
     shape = cloud.points.shape[:-1]

@@ -147,9 +147,9 @@ def test_normals_on_a_ball_turn_smoothly():
 def test_a_million_points_in_one_place_cost_next_to_nothing():
     rng = np.random.default_rng(1)
     cloud = rng.random((20_000, 3)) * (1.0, 1.0, 0.0) + (0.0, 0.0, 1.0)
-    start = time.perf_counter()
+    start = time.process_time()
     with_zeros = median_spacing(np.vstack([cloud, np.zeros((1_000_000, 3))]))
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
     assert with_zeros == pytest.approx(median_spacing(cloud), rel=0.05)
     assert median_spacing(np.zeros((200_000, 3))) == 0.01
 
