@@ -21,10 +21,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from rangesim import Intrinsics, Rig, Sensor, Signals, decode, default_detector, expose
-from rangesim.instrument import SENSORS
+from rangesim import Intrinsics, Rig, Sensor, Signals, decode, expose
 from rangesim.response import LengthBins, LightPath, NumpyMath, Response
 from rangesim.rig import translation
+from rangesim.sensors import presets
 from rangesim.signals import EnergySplit, GroundTruth
 
 NORMAL = (0.2, 0.1, -1.0)
@@ -44,14 +44,14 @@ def main() -> None:
 
     result = {}
     for name in args.sensors:
-        result[name] = times(SENSORS[name], plane(args.width, args.height, name), args.repeats)
+        result[name] = times(presets()[name], plane(args.width, args.height, name), args.repeats)
         print(name, result[name], flush=True)
     print(json.dumps(result))
 
 
 def times(sensor: Sensor, signals: Signals, repeats: int) -> dict[str, float]:
     """Seconds of each stage."""
-    capture, expose_s = fastest(partial(expose, signals, sensor, default_detector(sensor)), repeats)
+    capture, expose_s = fastest(partial(expose, signals, sensor, sensor.default_detector), repeats)
     image, decode_s = fastest(partial(decode, capture), repeats)
     _, points_s = fastest(image.to_point_cloud, repeats)
     return {"expose": expose_s, "decode": decode_s, "to_point_cloud": points_s}
@@ -69,7 +69,7 @@ def fastest(call: Callable[[], T], repeats: int) -> tuple[T, float]:
 
 def plane(width: int, height: int, name: str) -> Signals:
     """Signals of a tilted matte plane for the sensor of that name: direct light alone."""
-    sensor = SENSORS[name]
+    sensor = presets()[name]
     camera, projector = Intrinsics.from_fov(width, height, 45), Intrinsics.from_fov(1280, 800, 70)
     rig = Rig(camera=camera, projector=projector, T_camera_projector=translation(BASELINE_M[name], 0.0, 0.0))
     rays = camera.directions(camera.pixel_centres())

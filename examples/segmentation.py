@@ -16,7 +16,7 @@ from matplotlib.colors import hsv_to_rgb
 
 import pcgraph
 from pcgraph.detection import find_planes, objects_on
-from rangesim import StructuredLight, decode, default_detector, expose, load_scene, transport
+from rangesim import StructuredLight, decode, expose, load_scene, transport
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "tabletop.xml"
 GOLDEN = 0.618
@@ -34,7 +34,7 @@ def main() -> None:
 
     scene, sensor = load_scene(SCENE), StructuredLight(code="gray-phase")
     rig = scene.rig(baseline_m=0.2, width=arguments.width, height=3 * arguments.width // 4)
-    capture = expose(transport(scene, rig, [sensor], spp=16), sensor, default_detector(sensor))
+    capture = expose(transport(scene, rig, [sensor], spp=16), sensor, sensor.default_detector)
     cloud = decode(capture).to_point_cloud()
     result = pcgraph.segment(cloud.points, cloud.colors)
     print(f"{(result.supervoxels >= 0).sum()} points, {result.graph.n_nodes} supervoxels")

@@ -15,7 +15,7 @@ from rangesim.decoding import decode
 from rangesim.exposure import expose
 from rangesim.instrument import Instrument
 from rangesim.reading_noise import TO_SIGMA, reading_noise
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 
 if TYPE_CHECKING:
     from rangesim.signals import GroundTruth, Signals
@@ -75,7 +75,7 @@ class AdaptiveSampling:
         for one in self.instruments:
             signals = signals_of(one.sensor)
             capture = expose(signals, one.sensor, one.detector, one.exposure_s, 0, self.ambient)
-            noise = reading_noise(decode(capture), capture, signals)
+            noise = reading_noise(decode(capture, one.decoder), capture, signals)
             enough = np.full(len(excess), negligible)
             if capture.is_digital:  # where nothing can be read, samples are of no use
                 enough = np.maximum(enough, self.share * group_sigma(noise.detector, group, where_unknown=np.inf))

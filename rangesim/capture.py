@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesim.detector import Detector, PhotoDetector
+from rangesim.detector import PhotoDetector
 from rangesim.rig import Rig
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -73,7 +73,7 @@ class Capture:
     @property
     def black_level(self) -> float:
         """Digital number without light; 0 if unknown or noise-free."""
-        return self.detector.offset_dn if isinstance(self.detector, Detector) else 0.0
+        return self.detector.black_level_dn if self.detector else 0.0
 
     @property
     def full_scale(self) -> float:
@@ -94,7 +94,7 @@ class Capture:
 
     def noise(self, frame: np.ndarray) -> np.ndarray | None:
         """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown."""
-        return self.detector.noise_dn(frame) if isinstance(self.detector, Detector) else None
+        return self.detector.noise_dn(frame) if self.detector else None
 
     def save(self, directory: str | Path) -> None:
         """Write the capture as a directory of images and a sidecar; see `rangesim.capture_files`."""

@@ -20,7 +20,7 @@ from rangesim.errors import FileFormatError
 from rangesim.image_files import SUFFIXES, read_stack, write_grey
 from rangesim.rig import Rig
 from rangesim.schema import write_json
-from rangesim.sensors import Sensor
+from rangesim.sensors import Sensor, sensor_from_dict
 from rangesim.spad import SpadDetector
 from rangesim.text_files import read_json
 
@@ -101,7 +101,7 @@ def load_capture(directory: str | Path) -> Capture:
         )
     try:
         check_keys(settings, _KEYS, str(sidecar))
-        sensor = from_dict(Sensor, settings.get("sensor"), "sensor")  # type: ignore[type-abstract]
+        sensor = sensor_from_dict(settings.get("sensor"), "sensor")
         rig = from_dict(Rig, settings["rig"], "rig") if settings.get("rig") is not None else None
         given = settings.get("detector")
         detector = from_dict(PhotoDetector, given, "detector") if given is not None else None  # type: ignore[type-abstract]

@@ -113,7 +113,9 @@ def _required(field: dataclasses.Field[Any]) -> bool:
 
 def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     """`cls` itself, or the subclass that the key `type` names; removes that key from `values`."""
-    choices: dict[str, type[T]] = {sub.type_name: sub for sub in cls.__subclasses__() if hasattr(sub, "type_name")}  # type: ignore[attr-defined]
+    choices: dict[str, type[T]] = {}
+    for kind in named_subclasses(cls):
+        choices.setdefault(kind.type_name, kind)  # type: ignore[attr-defined]
     own = getattr(cls, "type_name", None)
     if own:
         choices[own] = cls
@@ -125,6 +127,14 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
             f"{place}: expected 'type' to be one of {', '.join(choices)}, got {shown(tag)}{nearest(str(tag), choices)}."
         )
     return choices[tag]
+
+
+def named_subclasses(cls: type[T]) -> typing.Iterator[type[T]]:
+    """Subclasses that have a `type_name`, at any depth, in the order of their definition."""
+    for kind in cls.__subclasses__():
+        if hasattr(kind, "type_name"):
+            yield kind
+        yield from named_subclasses(kind)
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -17,7 +17,6 @@ import numpy as np
 
 from rangesim.bounds import Bounds, Fraction, Metres, PositiveFraction, Seconds, Wavelength, check_fields
 from rangesim.rig import Rig
-from rangesim.sensors import DirectToF, Sensor
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -31,8 +30,23 @@ BandWidth = Annotated[float, Bounds("0 or positive", 1e-12, 2e-2, or_zero=True)]
 """Metres."""
 
 
+class Gate(NamedTuple):
+    """When a sensor counts photons: those of one bin after another, again and again with each pulse of its laser.
+
+    period_s : from pulse to pulse. open_s : how much of it the bins cover. bins : as many as frames.
+    """
+
+    period_s: float
+    open_s: float
+    bins: int
+
+
 class PhotoDetector(ABC):
-    """What turns the radiance of a sensor's frames into digital numbers. Subclasses are frozen dataclasses."""
+    """What turns the radiance of a sensor's frames into digital numbers. Subclasses are frozen dataclasses.
+
+    Where a method takes a `gate`, it is `Sensor.gate`: when photons are counted; None for a sensor whose frames
+    integrate all light of an exposure.
+    """
 
     type_name: ClassVar[str]
     wavelength_m: float
@@ -49,14 +63,33 @@ class PhotoDetector(ABC):
         """Electrons (counts) at which a pixel saturates."""
 
     @abstractmethod
-    def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
+    def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
         """(..., h, w) expected electrons (counts) of frames of `radiance` in W/m2/sr, dark ones included."""
 
     @abstractmethod
-    def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
-        """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr."""
+    def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
+        """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr.
 
-    def ambient_share(self, sensor: Sensor, ambient: Ambient | None = None) -> float:
+        Raises
+        ------
+        ValueError
+            The detector integrates and the sensor counts, or the other way round.
+        """
+
+    @property
+    def black_level_dn(self) -> float:
+        """Digital number without light."""
+        return 0.0
+
+    def own_noise_e2(self, dark_e: float) -> float:
+        """Variance, electrons squared, of what the detector itself adds to a frame with so many dark electrons."""
+        return dark_e
+
+    def noise_dn(self, dn: np.ndarray) -> np.ndarray | None:
+        """Standard deviation of a pixel whose mean is `dn`, digital numbers; None where that says too little."""
+        return None
+
+    def ambient_share(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
         """Factor on the scene's ambient light for the part that counts: what passes the filter.
 
         ambient : what kind of light it is, and how strong: the filter's band decides. None: unknown, so
@@ -176,13 +209,20 @@ class Detector(PhotoDetector):
     def capacity_e(self) -> float:
         return self.full_well_e
 
-    def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
+    @property
+    def black_level_dn(self) -> float:
+        return self.offset_dn
+
+    def own_noise_e2(self, dark_e: float) -> float:
+        return dark_e + self.read_noise_e**2 + 1 / (12 * self.gain_dn_e**2)
+
+    def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
         pixel = self._pixel(rig, exposure_s)
         return np.asarray(pixel.electrons * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
 
-    def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
-        if isinstance(sensor, DirectToF):
-            raise ValueError("expected a SpadDetector for direct-tof, got an integrating Detector.")
+    def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
+        if gate is not None:
+            raise ValueError("expected a SpadDetector for a sensor that counts photons, got an integrating Detector.")
         from pcgraph.parallel import in_blocks
         from rangesim.shot_noise import read_frame
 

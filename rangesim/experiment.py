@@ -95,7 +95,7 @@ def load_experiment(path: str | Path) -> Experiment:
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; expected an experiment (.toml).")
     try:
-        experiment = experiment_from_dict(read_toml(path))
+        experiment = experiment_from_dict(read_toml(path), path.parent)
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
     beside = path.parent / experiment.scene
@@ -103,8 +103,11 @@ def load_experiment(path: str | Path) -> Experiment:
     return experiment if comes_along else replace(experiment, scene=str(beside))
 
 
-def experiment_from_dict(data: Mapping[str, Any]) -> Experiment:
-    """The experiment of plain data; each table under `instrument` is one instrument. ValueError as `from_dict`."""
+def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> Experiment:
+    """The experiment of plain data; each table under `instrument` is one instrument. ValueError as `from_dict`.
+
+    files_in : as for `rangesim.instrument.instrument_from_dict`.
+    """
     check_keys(data, ["instrument" if f.name == "instruments" else f.name for f in fields(Experiment)], "experiment")
     rest = {key: value for key, value in data.items() if key not in ("instrument", "motion")}
     experiment = from_dict(Experiment, rest)
@@ -116,7 +119,8 @@ def experiment_from_dict(data: Mapping[str, Any]) -> Experiment:
     if not isinstance(tables, list):
         raise ValueError("expected instruments as tables headed [[instrument]], with two brackets.")
     return replace(
-        experiment, instruments=tuple(instrument_from_dict(t, f"instrument[{i}]") for i, t in enumerate(tables))
+        experiment,
+        instruments=tuple(instrument_from_dict(t, f"instrument[{i}]", files_in) for i, t in enumerate(tables)),
     )
 
 

@@ -12,7 +12,7 @@ from rangesim.capture import Capture, bright_level
 from rangesim.detector import PhotoDetector
 from rangesim.rig import Rig
 from rangesim.seeds import check_seed
-from rangesim.sensors import IdealToF, Sensor
+from rangesim.sensor import Sensor
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -37,8 +37,8 @@ def expose(
     signals : Signals of a transport pass that this sensor was part of.
     sensor : Sensor.
     detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: a noise-free capture,
-        float32 radiance in W/m2/sr, unfiltered ambient light included. `IdealToF` has no noise model: its
-        frames are always noise-free.
+        float32 radiance in W/m2/sr, unfiltered ambient light included. The frames of an ideal sensor
+        (`Sensor.is_ideal`) are always noise-free.
     exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
     seed : int, 0 to 2^64 - 1, of the noise. Every frame, of a SpadDetector every image row, has its own stream; the
         same seed gives the same bytes on any number of threads.
@@ -59,12 +59,12 @@ def expose(
         check_number("exposure_s", exposure_s, SECONDS)
     if ambient is not None:
         ambient.check_emitters(bool(signals.energy.ambient.any()))
-    if detector is None or isinstance(sensor, IdealToF):
+    if detector is None or sensor.is_ideal:
         return noise_free_capture(signals, sensor, ambient)
-    radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor, ambient)), signals.rig)
+    radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor.gate, ambient)), signals.rig)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
-    frames = detector.read_out(radiance, sensor, signals.rig, exposure_s, seed)
+    frames = detector.read_out(radiance, sensor.gate, signals.rig, exposure_s, seed)
     return Capture(frames, sensor, signals.rig, detector, exposure_s, ambient)
 
 

@@ -6,21 +6,19 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rangesim.bounds import Exponent, Metres, Seconds, Watts, check_fields
-from rangesim.config import check_keys, from_dict, nearest, shown, to_dict
-from rangesim.detector import Detector, PhotoDetector
+from rangesim.config import check_keys, from_dict, shown, to_dict
+from rangesim.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
-from rangesim.spad import SpadDetector
+from rangesim.sensors import Decoder, Sensor, presets, sensor_from_dict, sensor_of
 
 if TYPE_CHECKING:
     from rangesim.rig import Rig
     from rangesim.scene import Scene
 
-TOF_BASELINE_M = 0.03
-"""Metres from the camera's lens to the lamp beside it, of a time-of-flight camera."""
 LONGEST_NAME = 100
 """Characters; the name becomes that of a directory."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -49,10 +47,11 @@ class Instrument:
     ----------
     name : names its directory in the results: letters, digits, hyphens and underscores.
     sensor : Sensor, the measuring principle.
-    detector : PhotoDetector; None: the usual one of the sensor, see `default_detector`.
+    detector : PhotoDetector; None: `Sensor.default_detector`.
     noise : bool; False: noise-free float frames, no detector at all.
-    baseline_m : metres between camera and emitter; None: a fifth of the working distance for structured light,
-        0.03 m for time of flight.
+    decoder : Decoder, with its thresholds; None: `Sensor.default_decoder`.
+    baseline_m : metres between camera and emitter; None: as the sensor comes, a fifth of the working distance for
+        structured light, 0.03 m for time of flight.
     power_w : watts, mean radiant power of the emitter when it is fully on.
     exposure_s : seconds per frame; None: automatic.
     optics : Optics, aperture, focus and vignetting of camera and projector.
@@ -63,6 +62,7 @@ class Instrument:
     sensor: Sensor
     detector: PhotoDetector | None = None
     noise: bool = True
+    decoder: Decoder | None = None
     baseline_m: Metres | None = None
     power_w: Watts = 1.0
     exposure_s: Seconds | None = None
@@ -75,74 +75,56 @@ class Instrument:
             raise ValueError(
                 f"expected a name of letters, digits, - and _, at most {LONGEST_NAME}, got {shown(self.name)}."
             )
-        usual = self.detector or default_detector(self.sensor)
-        object.__setattr__(self, "detector", usual if self.noise else None)
+        detector = self.detector or self.sensor.default_detector
+        object.__setattr__(self, "detector", detector if self.noise else None)
 
     def rig(self, scene: Scene, width: int | None = None, height: int | None = None) -> Rig:
         """The scene's camera, `width` x `height` pixels, and this instrument's emitter, which covers its view."""
-        if isinstance(self.sensor, StructuredLight):
-            size = (self.sensor.projector_width, self.sensor.projector_height)
-            rig = scene.rig(self.baseline_m, size, self.power_w, width, height)
-        else:
-            baseline = TOF_BASELINE_M if self.baseline_m is None else self.baseline_m
-            rig = scene.rig(baseline, power_w=self.power_w, width=width, height=height)
+        size, baseline_m = self.sensor.emitter
+        if self.baseline_m is not None:
+            baseline_m = self.baseline_m
+        rig = scene.rig(baseline_m, size, self.power_w, width, height)
         return replace(rig, **vars(self.optics))
 
-
-def default_detector(sensor: Sensor) -> PhotoDetector | None:
-    """An industrial camera for structured light, a lock-in pixel for AMCW, a SPAD for direct time of flight."""
-    if isinstance(sensor, StructuredLight):
-        return Detector()
-    if isinstance(sensor, AmcwToF):
-        return Detector.time_of_flight()
-    return SpadDetector() if isinstance(sensor, DirectToF) else None
-
-
-SENSORS: dict[str, Sensor] = {
-    "gray": StructuredLight(code="gray"),
-    "gray-phase": StructuredLight(code="gray-phase"),
-    "amcw": AmcwToF(),
-    "direct-tof": DirectToF(),
-    "ideal-tof": IdealToF(),
-}
-"""Short names of sensors with their usual settings, as on the command line."""
 
 DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
 """Structured light against time of flight, and the reference that says what no time-of-flight camera can better."""
 
 
 def instrument(name: str, **settings: Any) -> Instrument:
-    """The instrument of a short name in `SENSORS`; ValueError with the nearest valid name if there is none."""
-    if name not in SENSORS:
-        raise ValueError(_unknown(name))
-    return Instrument(name, SENSORS[name], **settings)
+    """The instrument with the sensor of a name, see `rangesim.sensors.sensor_of`; errors as there."""
+    sensor = sensor_of(name)
+    return Instrument(name if name in presets() else sensor.type_name, sensor, **settings)
 
 
-def _unknown(name: str) -> str:
-    return f"expected a sensor out of {', '.join(SENSORS)}, got {shown(name)}{nearest(name, SENSORS)}."
+def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -> Instrument:
+    """An instrument; its sensor is the name of a preset, or a table with a `type`.
 
-
-def instrument_from_dict(table: Any, place: str) -> Instrument:
-    """An instrument; its sensor is a table with a `type`, or a short name out of `SENSORS`."""
+    Parameters
+    ----------
+    files_in : folder from which a sensor named as FILE.py:NAME is loaded, see `rangesim.sensors.sensor_of`; None:
+        no file is, as in what is read back of results.
+    """
     if not isinstance(table, Mapping):
         raise ValueError(f"{place}: expected a table of settings, got {shown(table)}.")
     values = dict(table)
     check_keys(values, [f.name for f in fields(Instrument)], place)
-    sensor = values.get("sensor")
-    if isinstance(sensor, str):
-        if sensor not in SENSORS:
-            raise ValueError(f"{place}: {_unknown(sensor)}")
-        values = {"name": sensor, **values, "sensor": SENSORS[sensor]}
-    elif sensor is not None:
-        values["sensor"] = from_dict(Sensor, sensor, f"{place}.sensor")  # type: ignore[type-abstract]
-    if values.get("detector") is not None:
-        values["detector"] = _detector(values["detector"], values.get("sensor"), f"{place}.detector")
+    given, sensor = values.get("sensor"), None
+    if given is not None:
+        values["sensor"] = sensor = sensor_from_dict(given, f"{place}.sensor", files_in)
+        if isinstance(given, str):
+            values.setdefault("name", given if given in presets() else sensor.type_name)
+    for key, kind, default in (
+        ("detector", PhotoDetector, getattr(sensor, "default_detector", None)),
+        ("decoder", Decoder, getattr(sensor, "default_decoder", None)),
+    ):
+        if values.get(key) is not None:
+            values[key] = _on_top_of(default, kind, values[key], f"{place}.{key}")
     return from_dict(Instrument, values, place)
 
 
-def _detector(table: Any, sensor: Any, place: str) -> PhotoDetector:
-    """The detector of a table: the usual one of the sensor, but for what the table says."""
-    usual = default_detector(sensor) if isinstance(sensor, Sensor) else None
-    if isinstance(table, Mapping) and usual is not None and table.get("type", usual.type_name) == usual.type_name:
-        table = {**to_dict(usual), **table}
-    return from_dict(PhotoDetector, table, place)  # type: ignore[type-abstract]
+def _on_top_of(default: Any, kind: type, table: Any, place: str) -> Any:
+    """Settings of a table: those of the default, but for what the table says."""
+    if isinstance(table, Mapping) and default is not None and table.get("type", default.type_name) == default.type_name:
+        table = {**to_dict(default), **table}
+    return from_dict(kind, table, place)

@@ -138,7 +138,7 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
         detector = _in_time(one) if moves else one.detector
         capture = rangesim.expose(signals, one.sensor, detector, one.exposure_s, seed, ambient)
     with timed(times, "decode"):
-        image = rangesim.decode(capture)
+        image = rangesim.decode(capture, one.decoder)
     noise = None
     if signals.knows_sampling_error:
         with timed(times, "noise"):

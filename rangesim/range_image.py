@@ -13,6 +13,7 @@ from rangesim.status import Status
 
 if TYPE_CHECKING:
     from rangesim.point_cloud import PointCloud
+    from rangesim.sensor import Decoder
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,7 @@ class RangeImage:
     sampling_sigma_m : (h, w) float32, metres, of a simulated reading: standard deviation of z by the sampling of light
         paths, estimated from one pair of draws for each pixel, so take medians over many; NaN where there is no
         reading, infinite where sampling decides whether there is one. None: not known, see `rangesim.reading_noise`.
+    decoder : Decoder it comes from; None: not known.
     """
 
     z: np.ndarray
@@ -47,6 +49,7 @@ class RangeImage:
     projector_column: np.ndarray | None = None
     projector_row: np.ndarray | None = None
     sampling_sigma_m: np.ndarray | None = None
+    decoder: Decoder | None = None
 
     @property
     def valid(self) -> np.ndarray:

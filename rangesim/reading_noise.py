@@ -71,7 +71,7 @@ def reading_noise(image: RangeImage, capture: Capture, signals: Signals) -> Read
     from rangesim.decoding import decode
 
     above, below = (
-        decode(noise_free_capture(signals, capture.sensor, capture.ambient, error)).z.astype(np.float64)
+        decode(noise_free_capture(signals, capture.sensor, capture.ambient, error), image.decoder).z.astype(np.float64)
         for error in (1.0, -1.0)
     )
     detector = image.z - (above + below) / 2 if capture.is_digital else np.full(image.z.shape, np.nan)

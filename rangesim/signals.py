@@ -11,7 +11,7 @@ import numpy as np
 from rangesim.array_files import write_arrays
 from rangesim.response import Response
 from rangesim.rig import Rig
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 
 ALL = "all"
 """Stands for all material classes."""

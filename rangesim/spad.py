@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 import numpy as np
 
 from rangesim.bounds import Bounds, Fraction, PositiveFraction, Seconds, Wavelength
-from rangesim.detector import BandWidth, Bits, PhotoDetector, streams
+from rangesim.detector import BandWidth, Bits, Gate, PhotoDetector, streams
 from rangesim.rig import Rig
-from rangesim.sensors import DirectToF, Sensor
 
 if TYPE_CHECKING:
     from rangesim.ambient import Ambient
@@ -37,7 +36,7 @@ class CountingPixel(NamedTuple):
 class SpadDetector(PhotoDetector):
     """Single-photon counter with a histogram memory per pixel.
 
-    An exposure holds as many pulses of the laser's mean power as there are periods in it (`DirectToF.period_s`).
+    An exposure holds as many pulses of the laser's mean power as there are periods in it (`Gate.period_s`).
     Ambient light and dark counts spread evenly over the bins; before start_s nothing is counted.
 
     Parameters
@@ -71,25 +70,25 @@ class SpadDetector(PhotoDetector):
     def capacity_e(self) -> float:
         return float(self.max_dn)
 
-    def pulses(self, sensor: Sensor, exposure_s: float) -> int:
+    def pulses(self, gate: Gate | None, exposure_s: float) -> int:
         """Number of laser pulses in an exposure."""
-        period_s, _ = _gate_s(sensor)
-        return max(1, round(exposure_s / period_s))
+        return max(1, round(exposure_s / _counting(gate).period_s))
 
-    def ambient_share(self, sensor: Sensor, ambient: Ambient | None = None) -> float:
+    def ambient_share(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
         """Factor on the scene's ambient light: what passes the filter while the histogram is open."""
-        period_s, open_s = _gate_s(sensor)
-        return super().ambient_share(sensor, ambient) * open_s / period_s
+        gate = _counting(gate)
+        return super().ambient_share(gate, ambient) * gate.open_s / gate.period_s
 
-    def mean_electrons(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float) -> np.ndarray:
-        pixel = self._pixel(sensor, rig, exposure_s)
+    def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
+        pixel = self._pixel(_counting(gate), rig, exposure_s)
         return np.asarray(pixel.photons * np.asarray(radiance, dtype=np.float64) + pixel.dark)
 
-    def read_out(self, radiance: np.ndarray, sensor: Sensor, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
+    def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         from pcgraph.parallel import SMALLEST_ROWS, in_blocks
         from rangesim.shot_noise import count_first_photons, count_photons
 
-        pixel, pulses, height = self._pixel(sensor, rig, exposure_s), self.pulses(sensor, exposure_s), radiance.shape[1]
+        gate, height = _counting(gate), radiance.shape[1]
+        pixel, pulses = self._pixel(gate, rig, exposure_s), self.pulses(gate, exposure_s)
         result, rngs = np.empty(radiance.shape, dtype=self.dtype), streams(seed, height)
 
         def read(start: int, stop: int) -> None:
@@ -103,18 +102,18 @@ class SpadDetector(PhotoDetector):
         in_blocks(read, height, smallest=SMALLEST_ROWS)
         return result
 
-    def _pixel(self, sensor: Sensor, rig: Rig, exposure_s: float) -> CountingPixel:
-        pulses, (period_s, open_s) = self.pulses(sensor, exposure_s), _gate_s(sensor)
+    def _pixel(self, gate: Gate, rig: Rig, exposure_s: float) -> CountingPixel:
+        pulses = self.pulses(gate, exposure_s)
         return CountingPixel(
-            photons=self.electrons_per_radiance(rig) * pulses * period_s,
-            dark=float(self.dark_counts_hz * pulses * open_s / sensor.n_frames),
+            photons=self.electrons_per_radiance(rig) * pulses * gate.period_s,
+            dark=float(self.dark_counts_hz * pulses * gate.open_s / gate.bins),
             max_mean=MAX_MEAN,
             max_dn=self.max_dn,
         )
 
 
-def _gate_s(sensor: Sensor) -> tuple[float, float]:
-    """Seconds from pulse to pulse, and seconds of them during which photons are counted."""
-    if not isinstance(sensor, DirectToF):
-        raise ValueError(f"expected a direct-tof sensor for a SpadDetector, got {sensor.type_name}.")
-    return sensor.period_s, sensor.bins * sensor.bin_s
+def _counting(gate: Gate | None) -> Gate:
+    """The gate; ValueError if there is none."""
+    if gate is None:
+        raise ValueError("expected a sensor that counts photons, such as DirectToF, for a SpadDetector.")
+    return gate

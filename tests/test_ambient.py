@@ -146,7 +146,7 @@ def test_ambient_light_brings_its_shot_noise(width_m: float) -> None:
     dark = signals_of_depth(rig, np.full((300, 400), 1.0), [SENSOR], albedo=0.0, ambient=1.0)
     ambient_e = ambient.in_band(850e-9, width_m) * per_radiance
     frames = np.stack([(signal_e / per_radiance + ambient.in_band(850e-9, width_m)) * flat])
-    lit = detector.read_out(frames, SENSOR, rig, exposure, seed=5)[0].astype(float) / detector.gain_dn_e
+    lit = detector.read_out(frames, SENSOR.gate, rig, exposure, seed=5)[0].astype(float) / detector.gain_dn_e
     noise = np.sqrt(signal_e + ambient_e + detector.read_noise_e**2)
     assert signal_e / lit.std() == pytest.approx(signal_e / noise, rel=0.01)
     black = electrons(expose(dark, SENSOR, detector, exposure, ambient=ambient))[-1]

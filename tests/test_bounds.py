@@ -15,7 +15,11 @@ import pytest
 from synthetic import plane_signals, stereo_rig
 
 import rangesim
+from rangesim import decode, explain, expose
 from rangesim.ambient import Ambient, Tungsten
+from rangesim.decoding.gray import GrayCode, GrayThresholds
+from rangesim.decoding.phase_shift import Phase, PhaseThresholds
+from rangesim.decoding.triangulate import Triangulation, TriangulationLimits
 from rangesim.detector import Detector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.instrument import Optics, instrument
@@ -32,7 +36,18 @@ from rangesim.response import (
     Phasor,
 )
 from rangesim.rig import Intrinsics, Rig, translation
-from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
+from rangesim.sensors import (
+    AmcwDecoder,
+    AmcwToF,
+    Decoder,
+    DirectToF,
+    DirectToFDecoder,
+    IdealToF,
+    IdealToFDecoder,
+    Sensor,
+    StructuredLight,
+    StructuredLightDecoder,
+)
 from rangesim.spad import SpadDetector
 
 NONSENSE = (
@@ -72,6 +87,21 @@ def use_response(response: Any) -> None:
         else:
             values = np.stack(np.broadcast_arrays(*response.weights(path, NumpyMath())))
         assert np.isfinite(values).all()
+
+
+def use_decoder(decoder: Decoder) -> None:
+    sensor = {
+        StructuredLightDecoder: StructuredLight(axes=("columns", "rows")),
+        AmcwDecoder: AmcwToF(waveform="square"),
+        DirectToFDecoder: DirectToF(bins=32),
+        IdealToFDecoder: IdealToF(),
+    }[type(decoder)]
+    for detector in (None, sensor.default_detector):
+        signals = plane_signals(RIG, sensor, ambient=0.1)
+        capture = expose(signals, sensor, detector)
+        image = decode(capture, decoder)
+        assert image.decoder == decoder
+        explain(image, capture, signals)
 
 
 def use_rig(rig: Any) -> None:
@@ -143,6 +173,13 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (DirectToF(), use_sensor),
     (DirectToF(pulse_fwhm_s=400e-12), use_sensor),
     (IdealToF(), use_sensor),
+    (StructuredLightDecoder(), use_decoder),
+    (GrayThresholds(), lambda t: use_decoder(StructuredLightDecoder(gray=t))),
+    (PhaseThresholds(), lambda t: use_decoder(StructuredLightDecoder(phase=t))),
+    (TriangulationLimits(), lambda t: use_decoder(StructuredLightDecoder(triangulation=t))),
+    (AmcwDecoder(), use_decoder),
+    (DirectToFDecoder(), use_decoder),
+    (IdealToFDecoder(), use_decoder),
     (Detector(), use_detector),
     (SpadDetector(), use_detector),
     (SpadDetector(pile_up=True), use_detector),
@@ -223,7 +260,9 @@ def test_numbers_are_no_bools(name: str) -> None:
 
 
 MODULES = ("ambient", "detector", "experiment", "instrument", "motion.timing", "motion.track", "response.lengths",
-           "response.patterns", "rig", "sensors.structured_light", "sensors.time_of_flight", "spad")  # fmt: skip
+           "response.patterns", "rig", "sensors.structured_light", "sensors.amcw", "sensors.direct_tof",
+           "sensors.ideal_tof", "decoding.gray", "decoding.phase_shift", "decoding.triangulate", "spad")  # fmt: skip
+RESULTS = {GrayCode, Phase, Triangulation}
 
 
 def test_every_setting_has_a_case() -> None:
@@ -231,4 +270,4 @@ def test_every_setting_has_a_case() -> None:
     for module in MODULES:
         for thing in vars(import_module(f"rangesim.{module}")).values():
             if isinstance(thing, type) and dataclasses.is_dataclass(thing) and thing.__module__ == f"rangesim.{module}":
-                assert thing in covered, f"{thing.__name__} needs a case in CASES"
+                assert thing in covered | RESULTS, f"{thing.__name__} needs a case in CASES"

@@ -13,11 +13,22 @@ import pytest
 from synthetic import plane_signals, stereo_rig
 
 import rangesim
-from rangesim import AmcwToF, Detector, DirectToF, IdealToF, Sensor, SpadDetector, StructuredLight, decode, expose
+from rangesim import (
+    AmcwToF,
+    Capture,
+    Detector,
+    DirectToF,
+    IdealToF,
+    Sensor,
+    SpadDetector,
+    StructuredLight,
+    decode,
+    expose,
+)
 from rangesim.causes import Cause, CauseMap, explain
 from rangesim.causes.cause import DEFINITIONS, TITLES
 from rangesim.causes.light_budget import light_budget, white_radiance
-from rangesim.causes.reading import single_path_depth
+from rangesim.causes.light_paths import single_path_frames
 from rangesim.response import (
     CAUSTIC,
     DIRECT,
@@ -137,7 +148,7 @@ def test_the_least_signal_is_where_decoders_begin_to_refuse(name: str, ambient: 
 def _power_at_threshold(rig: Any, sensor: Sensor, detector: Any, exposure_s: float, ambient: float) -> float:
     """Watts at which the median pixel's signal is what it needs: the need does not depend on the power."""
     signals = plane_signals(replace(rig, projector_power_w=1.0), sensor, ambient=ambient)
-    budget = light_budget(signals, expose(signals, sensor, detector, exposure_s))
+    budget = light_budget(signals, expose(signals, sensor, detector, exposure_s), sensor.default_decoder)
     return float(np.median((budget.needed / budget.signal)[signals.truth.projector_visible]))
 
 
@@ -147,7 +158,7 @@ def test_a_lens_that_darkens_the_corners_asks_for_more_light_there(noise: bool) 
     sensor, detector = SENSORS["gray"]
     rig = replace(stereo_rig(), camera_vignetting=4.0)
     even, darkened = (
-        light_budget(signals, expose(signals, sensor, detector if noise else None, 2e-3))
+        light_budget(signals, expose(signals, sensor, detector if noise else None, 2e-3), sensor.default_decoder)
         for signals in (plane_signals(replace(rig, camera_vignetting=n), sensor, ambient=0.0) for n in (0.0, 4.0))
     )
     np.testing.assert_array_equal(darkened.signal, even.signal)
@@ -170,7 +181,8 @@ def test_a_single_path_is_read_right(name: str) -> None:
     sensor, _ = SENSORS[name]
     signals = plane_signals(stereo_rig(), sensor)
     lit = signals.truth.projector_visible
-    error = np.abs(single_path_depth(sensor, signals.rig, signals.truth, lit) - signals.truth.z[lit])
+    frames = single_path_frames(sensor, signals.rig, signals.truth)
+    error = np.abs(decode(Capture(frames, sensor, signals.rig)).z - signals.truth.z)[lit]
     assert np.nanmax(error) < (0.02 if name == "histogram" else 0.005)  # bins of 30 mm in range
     assert np.isfinite(error).mean() > 0.99
 

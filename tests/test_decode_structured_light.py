@@ -15,12 +15,11 @@ from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 from rangesim.capture import Capture
 from rangesim.decoding import decode
 from rangesim.decoding.phase_shift import phase_of
-from rangesim.decoding.structured_light import decode_structured_light
-from rangesim.decoding.triangulate import triangulate
+from rangesim.decoding.triangulate import TriangulationLimits, triangulate
 from rangesim.detector import Detector
 from rangesim.exposure import expose
 from rangesim.rig import Intrinsics, Rig, translation
-from rangesim.sensors import IdealToF, StructuredLight
+from rangesim.sensors import IdealToF, StructuredLight, StructuredLightDecoder
 from rangesim.status import Status
 
 BOTH = ("columns", "rows")
@@ -173,13 +172,17 @@ def test_triangulation_undoes_projection_through_distorted_lenses(axes: tuple[st
     np.testing.assert_allclose(result.epipolar_px, 0, atol=1e-5)
 
 
+def decoder_within(**limits: float) -> StructuredLightDecoder:
+    return StructuredLightDecoder(triangulation=TriangulationLimits(**limits))
+
+
 def test_points_behind_and_off_the_epipolar_line_are_refused() -> None:
     rig, sensor = stereo_rig(), StructuredLight(code="gray", axes=BOTH)
     capture = expose(plane_signals(rig, sensor), sensor)
     rolled = dataclasses.replace(capture, frames=np.roll(capture.frames, 30, axis=1))
     lit = rolled.frames[-2] > 0
     assert (decode(rolled).status[lit] == Status.CODE_ERROR).mean() > 0.9
-    assert decode_structured_light(rolled, epipolar_tolerance_px=1e6).valid[lit].mean() > 0.9
+    assert decode(rolled, decoder_within(epipolar_tolerance_px=1e6)).valid[lit].mean() > 0.9
 
     single = StructuredLight(code="gray")
     capture = expose(plane_signals(rig, single), single)
@@ -218,7 +221,7 @@ def test_depth_ends_where_half_a_projector_pixel_means_five_per_cent(axes: tuple
     z = np.tile(np.concatenate([np.linspace(2, 0.98 * limit, 80), np.linspace(1.02 * limit, 150, 80)]), (120, 1))
     capture = expose(signals_of_depth(rig, z, [sensor]), sensor)
     np.testing.assert_array_equal(decode(capture).status, np.where(z < limit, Status.OK, Status.OUT_OF_RANGE))
-    assert decode_structured_light(capture, max_relative_error=np.inf).valid.all()
+    assert decode(capture, decoder_within(max_relative_error=1e9)).valid.all()
 
 
 def test_wrong_sensor_and_wrong_projector_are_refused() -> None:
@@ -226,7 +229,7 @@ def test_wrong_sensor_and_wrong_projector_are_refused() -> None:
     with pytest.raises(ValueError, match="projector of 640 x 400"):
         decode(Capture(np.ones((sensor.n_frames, 120, 160), np.float32), sensor, rig))
     with pytest.raises(ValueError, match="structured-light"):
-        decode_structured_light(Capture(np.ones((2, 4, 4), np.float32), IdealToF()))
+        decode(Capture(np.ones((2, 4, 4), np.float32), IdealToF()), StructuredLightDecoder())
 
 
 def test_nothing_in_view_is_low_signal_not_a_warning() -> None:

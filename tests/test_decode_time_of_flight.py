@@ -15,15 +15,15 @@ from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
 from rangesim.decoding import decode
-from rangesim.decoding.amcw import decode_amcw, tap_phase
-from rangesim.decoding.histogram import coates, decode_direct, find_peak, window_reach
+from rangesim.decoding.histogram import coates, find_peak, window_reach
 from rangesim.decoding.path_length import range_from_path_length
+from rangesim.decoding.phase_shift import tap_phase
 from rangesim.detector import Detector
 from rangesim.exposure import expose
 from rangesim.histogram_filter import gaussian_filter
 from rangesim.response import SPEED_OF_LIGHT, LengthBins, LightPath, NumpyMath
 from rangesim.rig import Intrinsics, Rig, translation
-from rangesim.sensors import AmcwToF, DirectToF, IdealToF
+from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder, IdealToF
 from rangesim.signals import Signals
 from rangesim.spad import SpadDetector
 from rangesim.status import Status
@@ -100,10 +100,10 @@ def test_square_waves_wiggle_unless_corrected() -> None:
     rig, sensor = stereo_rig(baseline_m=0.0), AmcwToF((20e6,), waveform="square")
     z = np.tile(np.linspace(0.3, 6, 160), (120, 1))
     capture = expose(signals_of_depth(rig, z, [sensor]), sensor)
-    raw = decode_amcw(capture, correct_wiggling=False)
+    raw = decode(capture, AmcwDecoder(correct_wiggling=False))
     wiggle = np.nanmax(np.abs(raw.z - z)) * 2 * 20e6 / SPEED_OF_LIGHT
     assert 0.008 < wiggle < 0.0125  # turns; largest |atan2 - triangle| is 0.0113
-    assert np.nanmax(np.abs(decode_amcw(capture).z - z)) < 1e-4
+    assert np.nanmax(np.abs(decode(capture).z - z)) < 1e-4
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -115,7 +115,7 @@ def test_noise_of_amcw_is_that_of_theory(seed: int) -> None:
     capture = expose(signals, sensor, detector, seed=seed)
     image = decode(capture)
     taps = detector.mean_electrons(
-        signals.frames(sensor, detector.ambient_transmission), sensor, rig, capture.exposure_s
+        signals.frames(sensor, detector.ambient_transmission), sensor.gate, rig, capture.exposure_s
     )
     phase = tap_phase(taps)
     variance = phase.mean + detector.read_noise_e**2 + 1 / 12 / detector.gain_dn_e**2
@@ -191,9 +191,9 @@ def test_coates_undoes_pile_up() -> None:
     detector = SpadDetector(pile_up=True, bits=16, ambient_transmission=1.0, quantum_efficiency=0.6)
     exposure = 2e-4
     capture = expose(signals, sensor, detector, exposure_s=exposure)
-    radiance = signals.frames(sensor, detector.ambient_share(sensor))
-    mean = detector.mean_electrons(radiance, sensor, rig, exposure)
-    pulses = detector.pulses(sensor, exposure)
+    radiance = signals.frames(sensor, detector.ambient_share(sensor.gate))
+    mean = detector.mean_electrons(radiance, sensor.gate, rig, exposure)
+    pulses = detector.pulses(sensor.gate, exposure)
     assert capture.frames.sum(axis=0).max() <= pulses
     restored = coates(capture.frames.astype(np.float64), pulses)
     assert abs(restored.sum() / mean.sum() - 1) < 0.01
@@ -287,10 +287,10 @@ def test_the_ghost_piles_up_before_what_it_comes_before() -> None:
     ghost, near = walls_at(np.full(2000, 1.2 * most_m), sensor), walls_at(np.full(2000, 0.5 * most_m), sensor)
     (response,) = sensor.responses()
     detector, exposure_s, photons = SpadDetector(dark_counts_hz=0.0, bits=16), 2e-4, np.array([0.7, 0.4])  # a period
-    pulses = detector.pulses(sensor, exposure_s)
+    pulses = detector.pulses(sensor.gate, exposure_s)
     channel = 0
     for signals, n in zip((ghost, near), photons, strict=True):
-        brought = detector.mean_electrons(signals.frames(sensor), sensor, ghost.rig, exposure_s).sum(axis=0)
+        brought = detector.mean_electrons(signals.frames(sensor), sensor.gate, ghost.rig, exposure_s).sum(axis=0)
         channel = channel + signals.channels[response] * (n * pulses / brought)
     capture = expose(dataclasses.replace(ghost, channels={response: channel}), sensor, detector, exposure_s)
     bins = np.flatnonzero(capture.frames.any(axis=(1, 2)))
@@ -363,6 +363,6 @@ def test_histogram_of_darkness_is_low_signal() -> None:
 def test_wrong_sensors_are_refused() -> None:
     capture = Capture(np.ones((2, 4, 4), np.float32), IdealToF())
     with pytest.raises(ValueError, match="amcw-tof"):
-        decode_amcw(capture)
+        decode(capture, AmcwDecoder())
     with pytest.raises(ValueError, match="direct-tof"):
-        decode_direct(capture)
+        decode(capture, DirectToFDecoder())

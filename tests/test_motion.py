@@ -17,8 +17,7 @@ import pytest
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, Scene, Sensor, Signals, StructuredLight, transport
 from rangesim.causes import Cause
-from rangesim.decoding.amcw import tap_phase
-from rangesim.decoding.phase_shift import phase_of
+from rangesim.decoding.phase_shift import phase_of, tap_phase
 from rangesim.experiment import experiment_from_dict, experiment_to_dict
 from rangesim.motion import Motion, MovingSignals, PoseTrack, SteadyTrack, Timing, transport_moving
 from rangesim.motion.passes import plan

@@ -68,7 +68,18 @@ def test_a_crafted_result_runs_no_script(page: Page, tmp_path: Path) -> None:
     """Past every reader: sensors and instruments of hostile names as well."""
     write_report(_crafted_result(), tmp_path / "report.html")
     text = _explore(page, tmp_path / "report.html")
-    for what in ("scene", "sensor", "instrument 0", "instrument 1", "frame", "material", "row", "setting", "version"):
+    for what in (
+        "scene",
+        "sensor",
+        "details",
+        "instrument 0",
+        "instrument 1",
+        "frame",
+        "material",
+        "row",
+        "setting",
+        "version",
+    ):
         assert f"{what} {SHOWN}" in text, what
 
 
@@ -219,7 +230,14 @@ def _crafted(m: Measurement, name: str, sensor_as_well: bool) -> Measurement:
     capture: Any = m.capture
     if sensor_as_well:
         frames = [f"frame {HOSTILE}"] * len(capture.frames)
-        sensor = SimpleNamespace(type_name=f"sensor {HOSTILE}", frame_names=lambda: frames)
+        sensor = SimpleNamespace(
+            type_name=f"sensor {HOSTILE}",
+            title=f"sensor {HOSTILE}",
+            details=f"details {HOSTILE}",
+            is_ideal=False,
+            frame_names=lambda: frames,
+            representative_frames=lambda _: [0],
+        )
         capture = copy.copy(m.capture)
         object.__setattr__(capture, "sensor", sensor)
     truth = replace(m.truth, material_names=tuple(f"material {HOSTILE}" for _ in m.truth.material_names))

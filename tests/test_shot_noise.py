@@ -113,7 +113,7 @@ def frames_of(mean_e: float, seed: int) -> np.ndarray:
     detector, rig = Detector(bits=16, full_well_e=65_000.0), stereo_rig(400, 300)
     level = mean_e / detector.electrons_per_radiance(rig) / 1e-3
     radiance = np.full((6, 300, 400), level, dtype=np.float32)
-    frames = detector.read_out(radiance, StructuredLight(), rig, 1e-3, seed).astype(np.float64)
+    frames = detector.read_out(radiance, StructuredLight().gate, rig, 1e-3, seed).astype(np.float64)
     return frames - frames.mean()
 
 
@@ -138,6 +138,6 @@ def test_any_number_of_threads_gives_the_same_bytes(pile_up: bool, monkeypatch: 
         frames = []
         for threads in (1, 2, 5):
             monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", threads)
-            frames.append(detector.read_out(radiance, sensor, rig, exposure_s, seed=3))
+            frames.append(detector.read_out(radiance, sensor.gate, rig, exposure_s, seed=3))
         assert all(np.array_equal(frames[0], other) for other in frames)
         assert len(np.unique(frames[0])) > 5

@@ -12,13 +12,14 @@ import numpy as np
 from rangesim.capture import Capture
 from rangesim.causes.edges import depth_edges, error_off_edge
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
-from rangesim.causes.range_limits import is_beyond_range, is_wrong_period
-from rangesim.causes.reading import clean_depth, points_in_projector, single_path_depth
+from rangesim.causes.light_paths import clean_frames, points_in_projector, single_path_frames
 from rangesim.comparison import neighbours
+from rangesim.decoding import decode
 from rangesim.range_image import RangeImage
 from rangesim.response import DIRECT, KINDS, MULTIPATH
-from rangesim.sensors import IdealToF
+from rangesim.sensor import Decoder
 from rangesim.signals import GroundTruth
+from rangesim.status import Status
 
 if TYPE_CHECKING:
     from rangesim.signals import Signals
@@ -44,6 +45,11 @@ class Evidence:
     def truth(self) -> GroundTruth:
         return self.signals.truth
 
+    @property
+    def decoder(self) -> Decoder:
+        """The decoder that the reading comes from."""
+        return self.image.decoder or self.capture.sensor.default_decoder
+
     # ---- The reading ---------------------------------------------------------------------------------
 
     @cached_property
@@ -64,7 +70,7 @@ class Evidence:
     @cached_property
     def optical(self) -> np.ndarray:
         """Without noise, ambient light and saturation the pixel fails as well, or is off by half as much or more."""
-        return self._wrong(clean_depth(self.signals, self.capture.sensor, self.failed))
+        return self._wrong(self._read(clean_frames(self.signals, self.capture.sensor)))
 
     @cached_property
     def saturated(self) -> np.ndarray:
@@ -120,7 +126,7 @@ class Evidence:
     @cached_property
     def budget(self) -> LightBudget:
         """What light there is, and what is needed."""
-        return light_budget(self.signals, self.capture)
+        return light_budget(self.signals, self.capture, self.decoder)
 
     @cached_property
     def enough(self) -> np.ndarray:
@@ -140,7 +146,7 @@ class Evidence:
     @cached_property
     def mostly_ambient(self) -> np.ndarray:
         """Ambient light makes most of the noise, hence most of what the detector collects."""
-        return np.asarray(self.budget.ambient_share > 0.5)
+        return np.asarray(self.budget.ambient_fraction > 0.5)
 
     @cached_property
     def faint(self) -> np.ndarray:
@@ -164,7 +170,7 @@ class Evidence:
     def _kinds(self) -> list[np.ndarray]:
         """Radiance of each of `KINDS`; none of those that come after the first return for a sensor that stops there."""
         light = [getattr(self.signals.energy, kind) for kind in KINDS]
-        if isinstance(self.capture.sensor, IdealToF):
+        if self.capture.sensor.first_return_frame is not None:
             light[MULTIPATH] = np.zeros_like(light[MULTIPATH])
         return light
 
@@ -173,18 +179,22 @@ class Evidence:
     @cached_property
     def coarse(self) -> np.ndarray:
         """The straight path to the surface, alone, is not read to the tolerance, or makes half of the error or more."""
-        return self._wrong(single_path_depth(self.capture.sensor, self.signals.rig, self.truth, self.failed))
+        return self._wrong(self._read(single_path_frames(self.capture.sensor, self.signals.rig, self.truth)))
 
     @cached_property
     def beyond_range(self) -> np.ndarray:
         """Path length that a time-of-flight sensor takes for another, or has no bin for."""
         length = self.truth.range_m[self.failed] + np.linalg.norm(self._in_projector, axis=-1)
-        return self._of_failed(is_beyond_range(self.capture.sensor, length))
+        return self._of_failed(self.capture.sensor.is_beyond_range(length))
 
     @cached_property
     def wrong_period(self) -> np.ndarray:
-        """Phases of several frequencies that agree on no distance, or on one that is off by half a period."""
-        return is_wrong_period(self.capture.sensor, self.image, self.truth)
+        """Of sensors that read a phase: no distance, as phases contradict each other, or one off by half a period."""
+        period_m = self.capture.sensor.shortest_period_m
+        if period_m is None:
+            return np.zeros(self.failed.shape, dtype=bool)
+        refused = np.isin(self.image.status, [Status.WRAPPED, Status.OUT_OF_RANGE])
+        return np.asarray(refused | (np.abs(self.image.range_m - self.truth.range_m) > period_m / 2))
 
     # ---- Helpers -------------------------------------------------------------------------------------
 
@@ -192,6 +202,11 @@ class Evidence:
     def _half_of_error(self) -> np.ndarray:
         """Half of the error, of which what exceeds it made most; the tolerance where there is no reading."""
         return np.asarray(np.where(self.missing, self.tolerance_m, np.abs(self.error) / 2))
+
+    def _read(self, frames: np.ndarray) -> np.ndarray:
+        """(n,) depths that the decoder reads of noise-free frames (k, h, w) in the failed pixels, metres."""
+        clean = Capture(frames, self.capture.sensor, self.signals.rig)
+        return decode(clean, self.decoder).z[self.failed].astype(np.float64)
 
     def _wrong(self, z: np.ndarray) -> np.ndarray:
         """Where depths z (n,) of the failed pixels are off by half of their error or more."""

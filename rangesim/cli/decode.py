@@ -127,10 +127,8 @@ def _full_scale(capture: Capture, bits: int) -> Capture:
 def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float) -> Capture:
     """The capture with the rig of a calibration file."""
     from rangesim.calibration_files import load_calibration
-    from rangesim.sensors import StructuredLight
 
-    sensor = capture.sensor
-    size = (sensor.projector_width, sensor.projector_height) if isinstance(sensor, StructuredLight) else None
+    size = capture.sensor.emitter.size
     return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
 
 

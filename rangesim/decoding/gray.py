@@ -4,25 +4,49 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from rangesim.bounds import Bounds, check_fields
 from rangesim.capture import Capture, bright_level
 from rangesim.decoding.bands import bands
 from rangesim.status import Status
 
-WHITE_BLACK_SHARE = 40 / 255
-PATTERN_INVERSE_SHARE = 5 / 255
-"""OpenCV's thresholds on white - black and |pattern - inverse|, of full scale: for digital captures of an
-unknown detector, where the noise is not known."""
-CONTRAST_SIGMAS = 5.0
-BIT_SIGMAS = 3.0
-"""The same in standard deviations of the difference, where the detector is known."""
-RELATIVE_CONTRAST = 1e-4
-"""Least white - black of noise-free captures, as a share of that of the bright pixels."""
-RELATIVE_BIT = 0.1
-"""Least |pattern - inverse| as a share of the pixel's white - black, unless the detector is unknown: pixels in shadow
-that see the patterns by interreflection alone show fine stripes fainter than that, at whatever exposure."""
+Threshold = Annotated[float, Bounds("0 or positive", 0, 1e6)]
+
+
+@dataclass(frozen=True)
+class GrayThresholds:
+    """Least differences of frames that count.
+
+    Where the detector is known, they are multiples of the noise; in digital captures of an unknown one, fractions of
+    full scale, as OpenCV's; in noise-free captures, fractions of brightness.
+
+    contrast_sigmas, bit_sigmas : of white - black and of pattern - inverse, in standard deviations of the difference.
+    contrast_of_scale, bit_of_scale : the same as fractions of full scale, for digital captures of unknown detectors.
+    relative_contrast : white - black of noise-free captures, as a fraction of that of the bright pixels.
+    relative_bit : pattern - inverse as a fraction of the pixel's white - black, unless the detector is unknown: pixels
+        in shadow that see the patterns by interreflection alone show fine stripes fainter than that, at whatever
+        exposure.
+    """
+
+    contrast_sigmas: Threshold = 5.0
+    bit_sigmas: Threshold = 3.0
+    contrast_of_scale: Threshold = 40 / 255
+    bit_of_scale: Threshold = 5 / 255
+    relative_contrast: Threshold = 1e-4
+    relative_bit: Threshold = 0.1
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+class Contrast(NamedTuple):
+    """values : (h, w) float32, white - black in the capture's units. is_enough : (h, w) bool."""
+
+    values: np.ndarray
+    is_enough: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +64,23 @@ class GrayCode:
     cell_px: int
 
 
-def direct_contrast(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w) float32 white - black in the capture's units, and (h, w) bool where it is strong enough to decode."""
-    white, black = capture.frames[-2].astype(np.float32), capture.frames[-1].astype(np.float32)
+def direct_contrast(capture: Capture, white: np.ndarray, black: np.ndarray, thresholds: GrayThresholds) -> Contrast:
+    """White - black of frames (h, w) of a capture, and where it is enough to decode."""
+    white, black = white.astype(np.float32), black.astype(np.float32)
     contrast = white - black
     noise = _difference_noise(capture, white, black)
     if noise is not None:
-        threshold: np.ndarray | float = CONTRAST_SIGMAS * noise
+        least: np.ndarray | float = thresholds.contrast_sigmas * noise
     elif capture.is_digital:
-        threshold = WHITE_BLACK_SHARE * capture.full_scale
+        least = thresholds.contrast_of_scale * capture.full_scale
     else:
-        threshold = RELATIVE_CONTRAST * bright_level(contrast)
-    return contrast, np.asarray(contrast > threshold)
+        least = thresholds.relative_contrast * bright_level(contrast)
+    return Contrast(contrast, np.asarray(contrast > least))
 
 
-def decode_gray(capture: Capture, frames: np.ndarray, shift: int, size: int) -> GrayCode:
+def decode_gray(
+    capture: Capture, frames: np.ndarray, shift: int, size: int, contrast: Contrast, thresholds: GrayThresholds
+) -> GrayCode:
     """Projector coordinate of each pixel from Gray bits.
 
     A bit is the sign of pattern - inverse; it is uncertain where the difference drowns in noise. One
@@ -65,23 +91,28 @@ def decode_gray(capture: Capture, frames: np.ndarray, shift: int, size: int) -> 
     ----------
     frames : (2 b, h, w), pattern and inverse by turns, most significant bit first.
     shift : int, finest bits left out. size : int, projector pixels along the axis.
+    contrast : of the same capture.
     """
-    contrast, bright = direct_contrast(capture)
     cell = 1 << shift
-    coordinate, status = np.empty(contrast.shape, dtype=np.float32), np.zeros(contrast.shape, dtype=np.uint8)
-    for rows in bands(len(contrast)):
-        code, uncertain = _classify(capture, frames[:, rows], contrast[rows])
+    coordinate, status = (
+        np.empty(contrast.values.shape, dtype=np.float32),
+        np.zeros(contrast.values.shape, dtype=np.uint8),
+    )
+    for rows in bands(len(status)):
+        code, uncertain = _classify(capture, frames[:, rows], contrast.values[rows], thresholds)
         low, high = _binary(code), _binary(code ^ uncertain)
         on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
         coordinate[rows] = (0.5 * (low + high) + 0.5) * cell
         status[rows][coordinate[rows] >= size + cell / 2] = Status.CODE_ERROR
-        failed = ~bright[rows] | ~on_edge
+        failed = ~contrast.is_enough[rows] | ~on_edge
         status[rows][failed] = Status.LOW_SIGNAL
         status[rows][failed & capture.saturated(capture.frames[:, rows])] = Status.SATURATED
     return GrayCode(coordinate, status, cell)
 
 
-def _classify(capture: Capture, frames: np.ndarray, contrast: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _classify(
+    capture: Capture, frames: np.ndarray, contrast: np.ndarray, thresholds: GrayThresholds
+) -> tuple[np.ndarray, np.ndarray]:
     """(h, w) int32 each: the code, and the set of its bits that are uncertain."""
     code = np.zeros(contrast.shape, dtype=np.int32)
     uncertain = np.zeros_like(code)
@@ -89,20 +120,20 @@ def _classify(capture: Capture, frames: np.ndarray, contrast: np.ndarray) -> tup
         pattern, inverse = pattern.astype(np.float32), inverse.astype(np.float32)
         difference = pattern - inverse
         code = (code << 1) | (difference > 0)
-        threshold = _bit_threshold(capture, pattern, inverse, contrast)
-        uncertain = (uncertain << 1) | (np.abs(difference) < threshold)
+        least = _least_bit(capture, pattern, inverse, contrast, thresholds)
+        uncertain = (uncertain << 1) | (np.abs(difference) < least)
     return code, uncertain
 
 
-def _bit_threshold(
-    capture: Capture, pattern: np.ndarray, inverse: np.ndarray, contrast: np.ndarray
+def _least_bit(
+    capture: Capture, pattern: np.ndarray, inverse: np.ndarray, contrast: np.ndarray, thresholds: GrayThresholds
 ) -> np.ndarray | float:
     noise = _difference_noise(capture, pattern, inverse)
     if noise is not None:
-        return np.maximum(BIT_SIGMAS * noise, RELATIVE_BIT * contrast)
+        return np.maximum(thresholds.bit_sigmas * noise, thresholds.relative_bit * contrast)
     if capture.is_digital:
-        return PATTERN_INVERSE_SHARE * capture.full_scale
-    return RELATIVE_BIT * contrast
+        return thresholds.bit_of_scale * capture.full_scale
+    return thresholds.relative_bit * contrast
 
 
 def _difference_noise(capture: Capture, a: np.ndarray, b: np.ndarray) -> np.ndarray | None:

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Path lengths to ranges, for an emitter at any pose; and ideal time of flight."""
+"""Path lengths to ranges, for an emitter at any pose."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rangesim.capture import Capture, bright_level
+from rangesim.capture import Capture
 from rangesim.decoding.bands import bands
 from rangesim.range_image import RangeImage
 from rangesim.rig import Rig
+from rangesim.sensor import Decoder
 from rangesim.status import Status
 
 
@@ -33,7 +34,13 @@ def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Ri
 
 
 def range_image_from_path_length(
-    capture: Capture, length_m: np.ndarray, status: np.ndarray, confidence: np.ndarray, intensity: np.ndarray
+    capture: Capture,
+    length_m: np.ndarray,
+    *,
+    status: np.ndarray,
+    confidence: np.ndarray,
+    intensity: np.ndarray,
+    decoder: Decoder,
 ) -> RangeImage:
     """Range image of decoded path lengths; lengths that lead to no point in front of the camera are
     OUT_OF_RANGE.
@@ -65,14 +72,5 @@ def range_image_from_path_length(
         intensity=np.asarray(intensity, dtype=np.float32),
         camera=rig.camera if rig else None,
         T_world_camera=rig.T_world_camera if rig else None,
+        decoder=decoder,
     )
-
-
-def decode_ideal(capture: Capture) -> RangeImage:
-    """Range image of an `IdealToF` capture: path length = radiance_x_length / radiance; no radiance is LOW_SIGNAL."""
-    radiance, weighted = (frame.astype(np.float64) for frame in capture.frames)
-    dark = ~(radiance > 0)
-    length = weighted / np.where(dark, 1.0, radiance)
-    status = np.where(dark, Status.LOW_SIGNAL, Status.OK)
-    confidence = radiance / (bright_level(radiance) or 1.0)
-    return range_image_from_path_length(capture, length, status, confidence, radiance)

@@ -4,20 +4,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from rangesim.bounds import Bounds, check_fields
 from rangesim.capture import Capture
 from rangesim.decoding.bands import bands
-from rangesim.decoding.gray import RELATIVE_BIT, GrayCode, direct_contrast
+from rangesim.decoding.gray import GrayCode, Threshold
+from rangesim.sensor import Background, FrameContent, least_signal_for
 from rangesim.status import Status
 
-MAX_PHASE_SIGMA = 0.2
-"""Radians: a phase with a larger standard deviation is refused as low signal."""
-MODULATION_SHARE = 2.5 / 255
-"""Least modulation of full scale for digital captures of an unknown detector."""
-RELATIVE_MODULATION = 0.01
-"""Least modulation of a pixel's own brightness for noise-free captures."""
+
+@dataclass(frozen=True)
+class PhaseThresholds:
+    """Phases that count.
+
+    max_sigma_rad : a phase with a larger standard deviation is refused, where the detector is known.
+    modulation_of_scale : least modulation as a fraction of full scale, for digital captures of unknown detectors.
+    relative_modulation : least modulation as a fraction of the pixel's own brightness, for noise-free captures.
+    """
+
+    max_sigma_rad: Annotated[float, Bounds("positive and finite", 1e-6, 1e6)] = 0.2
+    modulation_of_scale: Threshold = 2.5 / 255
+    relative_modulation: Threshold = 0.01
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def least_signal(self, steps: int, visibility: float, content: FrameContent, background: Background) -> np.ndarray:
+        """(h, w) least light S of the projector at full power that the phase of `steps` frames takes.
+
+        With a modulation of `visibility` times S, sigma = sqrt(2 / steps) noise / (visibility S), see `phase_sigma`.
+        """
+        ambient = content.ambient * background.ambient
+        if background.noise2 is None:
+            return np.asarray(self.relative_modulation * ambient / visibility)
+        sigmas2 = 2.0 / (steps * (visibility * self.max_sigma_rad) ** 2)
+        return least_signal_for(sigmas2, content.signal, ambient + background.noise2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +81,47 @@ def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None
     return np.asarray(np.sqrt(2 / steps) * noise / np.maximum(phase.modulation, np.finfo(np.float32).tiny))
 
 
-def modulation_is_weak(capture: Capture, phase: Phase, steps: int) -> np.ndarray:
+def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
+    """Phase of taps (4, h, w) at 0, 90, 180, 270 degrees, mean + modulation cos(phi - theta).
+
+    C = tap 0 - tap 180 and S = tap 90 - tap 270 give phi = atan2(S, C), modulation = hypot(C, S) / 2. For a
+    triangle correlation (`exact_square`) |C| + |S| is constant, and the phase is piecewise linear in S / (|C|
+    + |S|).
+
+    References
+    ----------
+    Lange: "3D time-of-flight distance measurement with custom solid-state image sensors in CMOS/CCD technology",
+    thesis, Siegen (2000): phase, amplitude and offset of four taps, and their shot noise.
+    """
+    tap = taps.astype(np.float32)
+    cosine, sine = tap[0] - tap[2], tap[1] - tap[3]
+    if exact_square:
+        diagonal = np.maximum(np.abs(cosine) + np.abs(sine), np.finfo(np.float32).tiny)
+        quarter = sine / diagonal
+        turns = 0.25 * np.where(cosine >= 0, quarter, 2 - quarter)
+    else:
+        turns = np.arctan2(sine, cosine) * np.float32(1 / (2 * np.pi))
+    return Phase(turns - np.floor(turns), 0.5 * np.hypot(cosine, sine), tap.mean(axis=0))
+
+
+def modulation_is_weak(capture: Capture, phase: Phase, steps: int, thresholds: PhaseThresholds) -> np.ndarray:
     """(h, w) bool, where the phase is not to be trusted."""
     sigma = phase_sigma(capture, phase, steps)
     if sigma is not None:
-        return np.asarray(sigma > MAX_PHASE_SIGMA)
+        return np.asarray(sigma > thresholds.max_sigma_rad)
     if capture.is_digital:
-        return np.asarray(phase.modulation < MODULATION_SHARE * capture.full_scale)
-    return np.asarray(phase.modulation <= RELATIVE_MODULATION * np.maximum(phase.mean, 0))
+        return np.asarray(phase.modulation < thresholds.modulation_of_scale * capture.full_scale)
+    return np.asarray(phase.modulation <= thresholds.relative_modulation * np.maximum(phase.mean, 0))
 
 
-def refine_by_phase(capture: Capture, gray: GrayCode, frames: np.ndarray, period_px: float) -> GrayCode:
+def refine_by_phase(
+    capture: Capture,
+    gray: GrayCode,
+    frames: np.ndarray,
+    period_px: float,
+    least_swing: np.ndarray,
+    thresholds: PhaseThresholds,
+) -> GrayCode:
     """Sub-pixel coordinate: of all places with this phase, the one nearest to the Gray coordinate.
 
     Gray cells are half a period at most, so the right place lies at most a quarter of a period off the centre
@@ -77,17 +131,17 @@ def refine_by_phase(capture: Capture, gray: GrayCode, frames: np.ndarray, period
     Parameters
     ----------
     frames : (N, h, w) fringe frames of the same axis. period_px : float, projector pixels.
+    least_swing : (h, w) float, least brightest - darkest of the fringes, in the capture's units.
     """
     coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
-    contrast, _ = direct_contrast(capture)
     for rows in bands(len(status)):
         phase, whole, refused = phase_of(frames[:, rows]), gray.coordinate[rows], status[rows]
         periods = np.rint(whole / np.float32(period_px) - phase.turns)
         coordinate[rows] = (periods + phase.turns) * np.float32(period_px)
         ok = refused == Status.OK
         contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
-        washed_out = 2 * phase.modulation < RELATIVE_BIT * contrast[rows]  # as those seen by interreflection alone
+        washed_out = 2 * phase.modulation < least_swing[rows]  # as those seen by interreflection alone
         refused[ok & contradiction] = Status.CODE_ERROR
-        refused[ok & (modulation_is_weak(capture, phase, len(frames)) | washed_out)] = Status.LOW_SIGNAL
+        refused[ok & (modulation_is_weak(capture, phase, len(frames), thresholds) | washed_out)] = Status.LOW_SIGNAL
         refused[ok & capture.saturated(frames[:, rows])] = Status.SATURATED
     return GrayCode(coordinate, status, gray.cell_px)

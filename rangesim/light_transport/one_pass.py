@@ -28,7 +28,7 @@ from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.seeds import check_seed
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 from rangesim.signals import EnergySplit, Signals
 
 Indirect = Literal["filtered", "raw"]

@@ -12,7 +12,7 @@ from rangesim.motion.displacement import displacement
 from rangesim.motion.passes import Pass
 from rangesim.motion.timing import Timing
 from rangesim.rig import Rig
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 from rangesim.signals import NO_SAMPLING_ERROR, Signals
 
 

@@ -12,7 +12,7 @@ from rangesim.motion.timing import Instant, Timing, Window
 from rangesim.motion.track import Motion, Placement
 from rangesim.rig import Rig
 from rangesim.seeds import derived_seed
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 from rangesim import limits
 from rangesim.bounds import Bounds, Pause, check_fields, whole
 from rangesim.rig import Array, Intrinsics
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 
 
 class Window(NamedTuple):

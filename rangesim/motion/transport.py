@@ -13,7 +13,7 @@ from rangesim.motion.timing import Timing
 from rangesim.motion.track import Motion
 from rangesim.rig import Rig
 from rangesim.seeds import check_seed
-from rangesim.sensors import Sensor
+from rangesim.sensor import Sensor
 from rangesim.signals import Signals
 
 if TYPE_CHECKING:

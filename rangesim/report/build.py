@@ -101,7 +101,7 @@ def _frames(m: Measurement) -> dict[str, Any]:
     return {
         "name": m.name,
         "taken": taken,
-        "details": tables.details(m.capture.sensor),
+        "details": m.capture.sensor.details,
         "frames": figures.captured_frames(m.capture),
     }
 

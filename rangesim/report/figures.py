@@ -13,7 +13,6 @@ from rangesim.capture import Capture
 from rangesim.image_files import PNG_STRATEGY
 from rangesim.report import palette
 from rangesim.result_files import Measurement
-from rangesim.sensors import AmcwToF, DirectToF, StructuredLight
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2
@@ -110,28 +109,12 @@ def cause_map(measurement: Measurement) -> tuple[str, list[Share]]:
 
 
 def captured_frames(capture: Capture) -> list[Picture]:
-    """A few telling frames, all with the same white."""
+    """A few representative frames, all with the same white."""
     names = capture.sensor.frame_names()
-    chosen = telling_frames(capture)
+    chosen = capture.sensor.representative_frames(capture.frames)
     white = max(float(np.percentile(capture.frames[i], 99.5)) for i in chosen)
     black = capture.black_level
     return [Picture(grey(capture.frames[i], white, black), names[i].replace("_", " "), names[i]) for i in chosen]
-
-
-def telling_frames(capture: Capture) -> list[int]:
-    """Indices of three frames that show how the sensor works."""
-    sensor, names = capture.sensor, capture.sensor.frame_names()
-    if isinstance(sensor, StructuredLight):
-        bits = [i for i, n in enumerate(names) if "_bit" in n and "inverse" not in n]
-        phases = [i for i, n in enumerate(names) if "_phase" in n]
-        return [names.index("white"), bits[len(bits) // 2], *(phases[:1] or bits[-1:])]
-    if isinstance(sensor, AmcwToF):
-        last = 4 * (len(sensor.modulation_hz) - 1)
-        return sorted({0, last, last + 1})
-    if isinstance(sensor, DirectToF):
-        energy = np.cumsum(capture.frames.reshape(len(names), -1).sum(axis=1, dtype=np.float64))
-        return sorted({int(np.searchsorted(energy, share * energy[-1])) for share in (0.25, 0.5, 0.75)})
-    return [0]
 
 
 def light_pictures(energy: EnergySplit) -> list[Picture]:

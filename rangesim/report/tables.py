@@ -15,7 +15,6 @@ from rangesim.reading_noise import SMALL, noise_ratio
 from rangesim.report import palette
 from rangesim.report.figures import Share
 from rangesim.result_files import Measurement
-from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 
 Rows = list[dict[str, Any]]
 
@@ -70,39 +69,15 @@ class Cell:
     bar: float | None = None
 
 
-def title(sensor: Sensor) -> str:
-    """What a sensor is called in running text."""
-    if isinstance(sensor, StructuredLight):
-        return "Structured light" if sensor.code == "gray-phase" else "Structured light (Gray code)"
-    if isinstance(sensor, AmcwToF):
-        return "Time of flight (AMCW)"
-    if isinstance(sensor, DirectToF):
-        return "Time of flight (direct)"
-    return "Ideal time of flight" if isinstance(sensor, IdealToF) else sensor.type_name
-
-
 def titles(measurements: Sequence[Measurement]) -> dict[str, str]:
     """Title of each instrument by name; with the name added where two would share a title."""
-    plain = {m.name: title(m.capture.sensor) for m in measurements}
+    plain = {m.name: m.capture.sensor.title for m in measurements}
     return {n: t if list(plain.values()).count(t) == 1 else f"{t}, {n}" for n, t in plain.items()}
-
-
-def details(sensor: Sensor) -> str:
-    """The settings of a sensor in a few words."""
-    if isinstance(sensor, StructuredLight):
-        fringes = f" and {sensor.steps}-step fringes of {sensor.period_px:g} px" if sensor.code == "gray-phase" else ""
-        size = f"{sensor.projector_width} × {sensor.projector_height}"
-        return f"Gray code{fringes} along {' and '.join(sensor.axes)}, projector {size}"
-    if isinstance(sensor, AmcwToF):
-        return f"{', '.join(f'{f / 1e6:g}' for f in sensor.modulation_hz)} MHz, 4 taps, {sensor.waveform} wave"
-    if isinstance(sensor, DirectToF):
-        return f"{sensor.bins} bins of {sensor.bin_s * 1e12:g} ps"
-    return "no noise, first return alone"
 
 
 def is_reference(measurement: Measurement) -> bool:
     """Whether the instrument is an ideal that nobody can buy."""
-    return isinstance(measurement.capture.sensor, IdealToF)
+    return measurement.capture.sensor.is_ideal
 
 
 def missing_share(row: dict[str, Any]) -> float:

@@ -79,7 +79,7 @@ class Scene:
     def rig(
         self,
         baseline_m: float | None = None,
-        projector_size: tuple[int, int] = PROJECTOR_PIXELS,
+        projector_size: tuple[int, int] | None = None,
         power_w: float = 1.0,
         width: int | None = None,
         height: int | None = None,
@@ -90,7 +90,7 @@ class Scene:
         ----------
         baseline_m : metres; default a fifth of the working distance. The projector turns towards the point that the
             optical axis meets at the working distance.
-        projector_size : (width, height) in projector pixels.
+        projector_size : (width, height) in projector pixels; default 1280 x 800.
         power_w : radiant power of white.
         width, height : camera pixels; default as in the scene file; one alone keeps the aspect ratio. The
             horizontal field of view is kept.
@@ -109,7 +109,7 @@ class Scene:
         target = (0.0, 0.0, self.working_distance_m)
         return Rig(
             camera=camera,
-            projector=covering(camera, *projector_size),
+            projector=covering(camera, *(projector_size or PROJECTOR_PIXELS)),
             T_world_camera=pose(self.T_world_camera, "T_world_camera"),
             T_camera_projector=look_at((baseline_m, 0.0, 0.0), target, up=(0.0, -1.0, 0.0)),
             projector_power_w=power_w,

@@ -1,8 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Range sensors as measuring principles."""
+"""The sensors that come with the package, each with its decoder; the interface is in `rangesim.sensor`."""
 
-from rangesim.sensors.base import Sensor
-from rangesim.sensors.structured_light import StructuredLight
-from rangesim.sensors.time_of_flight import AmcwToF, DirectToF, IdealToF
+from rangesim.sensor import Decoder, Emitter, Sensor
+from rangesim.sensors.amcw import AmcwDecoder, AmcwToF
+from rangesim.sensors.direct_tof import DirectToF, DirectToFDecoder
+from rangesim.sensors.ideal_tof import IdealToF, IdealToFDecoder
+from rangesim.sensors.registry import presets, sensor_from_dict, sensor_of
+from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder
 
-__all__ = ["AmcwToF", "DirectToF", "IdealToF", "Sensor", "StructuredLight"]
+__all__ = [
+    "AmcwDecoder",
+    "AmcwToF",
+    "Decoder",
+    "DirectToF",
+    "DirectToFDecoder",
+    "Emitter",
+    "IdealToF",
+    "IdealToFDecoder",
+    "Sensor",
+    "StructuredLight",
+    "StructuredLightDecoder",
+    "presets",
+    "sensor_from_dict",
+    "sensor_of",
+]

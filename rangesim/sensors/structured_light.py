@@ -1,22 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Temporally coded structured light: Gray code, alone or with N-step phase shift."""
+"""Temporally coded structured light: Gray code, alone or with N-step phase shift; and its decoder."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from rangesim import limits
 from rangesim.bounds import Bounds, check_fields, whole
+from rangesim.capture import Capture
+from rangesim.decoding.gray import GrayCode, GrayThresholds, decode_gray, direct_contrast
+from rangesim.decoding.phase_shift import PhaseThresholds, refine_by_phase
+from rangesim.decoding.triangulate import TriangulationLimits, range_image_from_coordinates
+from rangesim.range_image import RangeImage
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
-from rangesim.sensors.base import Sensor
+from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for
+from rangesim.status import Status
 
-CODES = ("gray", "gray-phase")
 AXES = ("columns", "rows")
+WHITE, BLACK = -2, -1
+"""Indices of the last two frames."""
+
+
+class CodedFrames(NamedTuple):
+    """A run of frames that code one axis. response : what they are made of. frames : where they stand."""
+
+    axis: str
+    response: GrayBits | Fringes
+    frames: slice
 
 
 @dataclass(frozen=True)
@@ -63,33 +78,43 @@ class StructuredLight(Sensor):
         """Projector pixels along `axis`."""
         return self.projector_width if axis == "columns" else self.projector_height
 
-    def gray_response(self, axis: str) -> GrayBits:
+    def layout(self) -> tuple[CodedFrames, ...]:
+        """The runs of frames before white and black, in order."""
+        runs, start = [], 0
+        for axis in self.axes:
+            coded: list[tuple[GrayBits | Fringes, int]] = [(self._gray(axis), 2 * self._gray(axis).channels)]
+            if self.code == "gray-phase":
+                coded.append((Fringes(AXES.index(axis), self.period_px), self.steps))
+            for response, length in coded:
+                runs.append(CodedFrames(axis, response, slice(start, start + length)))
+                start += length
+        return tuple(runs)
+
+    def _gray(self, axis: str) -> GrayBits:
         """Gray bits shown along `axis`."""
         bits = int(np.ceil(np.log2(self.size(axis))))
         shift = 0 if self.code == "gray" else max(0, min(bits - 1, int(np.floor(np.log2(self.period_px / 2)))))
         return GrayBits(AXES.index(axis), bits, shift)
 
     def responses(self) -> tuple[DenseResponse, ...]:
-        return tuple(response for _, response in self._coded())
+        return tuple(run.response for run in self.layout())
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         result = np.empty((self.n_frames, *steady.shape), dtype=np.float32)
-        for frame, lit in zip(result, self._lit(channels, steady), strict=True):
-            np.add(lit, ambient, out=frame, casting="same_kind")
-        return result
-
-    def _lit(self, channels: Sequence[np.ndarray], steady: np.ndarray) -> Iterator[np.ndarray]:
-        """The frames one after another, without ambient light."""
-        for (_, response), values in zip(self._coded(), channels, strict=True):
-            if isinstance(response, GrayBits):
-                for bit in values:
-                    yield bit
-                    yield steady - bit
+        for run, values in zip(self.layout(), channels, strict=True):
+            lit = result[run.frames]
+            if isinstance(run.response, GrayBits):
+                for bit, pattern, inverse in zip(values, lit[0::2], lit[1::2], strict=True):
+                    np.add(bit, ambient, out=pattern, casting="same_kind")
+                    np.add(steady - bit, ambient, out=inverse, casting="same_kind")
             else:
-                for shift in (2 * math.pi * s / self.steps for s in range(self.steps)):
-                    yield 0.5 * (steady + math.cos(shift) * values[0] + math.sin(shift) * values[1])
-        yield steady
-        yield np.zeros_like(steady)
+                for s, fringe in enumerate(lit):
+                    shift = 2 * math.pi * s / self.steps
+                    shown = 0.5 * (steady + math.cos(shift) * values[0] + math.sin(shift) * values[1])
+                    np.add(shown, ambient, out=fringe, casting="same_kind")
+        np.add(steady, ambient, out=result[WHITE], casting="same_kind")
+        np.add(np.zeros_like(steady), ambient, out=result[BLACK], casting="same_kind")
+        return result
 
     def check(self, width: int, height: int) -> None:
         if (width, height) != (self.projector_width, self.projector_height):
@@ -100,13 +125,41 @@ class StructuredLight(Sensor):
 
     def frame_names(self) -> list[str]:
         names: list[str] = []
-        for axis, response in self._coded():
+        for axis, response, _ in self.layout():
             if isinstance(response, GrayBits):
                 bits = range(response.shift, response.bits)
                 names += [f"{axis}_bit{b}{suffix}" for b in reversed(bits) for suffix in ("", "_inverse")]
             else:
                 names += [f"{axis}_phase{s}" for s in range(self.steps)]
         return [*names, "white", "black"]
+
+    @property
+    def emitter(self) -> Emitter:
+        return Emitter((self.projector_width, self.projector_height))
+
+    @property
+    def default_decoder(self) -> StructuredLightDecoder:
+        return StructuredLightDecoder()
+
+    @classmethod
+    def presets(cls) -> dict[str, Sensor]:
+        return {"gray": cls(code="gray"), "gray-phase": cls()}
+
+    @property
+    def title(self) -> str:
+        return "Structured light" if self.code == "gray-phase" else "Structured light (Gray code)"
+
+    @property
+    def details(self) -> str:
+        fringes = f" and {self.steps}-step fringes of {self.period_px:g} px" if self.code == "gray-phase" else ""
+        size = f"{self.projector_width} × {self.projector_height}"
+        return f"Gray code{fringes} along {' and '.join(self.axes)}, projector {size}"
+
+    def representative_frames(self, frames: np.ndarray) -> list[int]:
+        """White, a bit of middle fineness, and a fringe or the finest bit."""
+        bits = [i for run in self.layout() if isinstance(run.response, GrayBits) for i in _indices(run.frames)[0::2]]
+        fringes = [run.frames.start for run in self.layout() if isinstance(run.response, Fringes)]
+        return [len(frames) + WHITE, bits[len(bits) // 2], *(fringes[:1] or bits[-1:])]
 
     def patterns(self) -> np.ndarray:
         """(k, projector_height, projector_width) float32 in 0..1: the patterns as shown, at pixel centres."""
@@ -117,9 +170,81 @@ class StructuredLight(Sensor):
         weights = [np.stack(r.weights(path, NumpyMath())) for r in self.responses()]  # type: ignore[arg-type]
         return self.frames(weights, np.ones_like(x), np.zeros_like(x))
 
-    def _coded(self) -> Iterator[tuple[str, GrayBits | Fringes]]:
-        """Axis and response of each run of frames before white and black."""
-        for axis in self.axes:
-            yield axis, self.gray_response(axis)
-            if self.code == "gray-phase":
-                yield axis, Fringes(AXES.index(axis), self.period_px)
+
+def _indices(frames: slice) -> range:
+    return range(frames.start, frames.stop)
+
+
+@dataclass(frozen=True)
+class StructuredLightDecoder(Decoder):
+    """Decodes Gray code, with or without phase shift, to projector coordinates, and triangulates them.
+
+    Without a rig, only the projector coordinates are decoded: z is NaN everywhere, `status` is that of the code.
+
+    Parameters
+    ----------
+    gray : GrayThresholds. phase : PhaseThresholds. triangulation : TriangulationLimits.
+    """
+
+    gray: GrayThresholds = field(default_factory=GrayThresholds)
+    phase: PhaseThresholds = field(default_factory=PhaseThresholds)
+    triangulation: TriangulationLimits = field(default_factory=TriangulationLimits)
+
+    type_name: ClassVar[str] = "structured-light"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def decode(self, capture: Capture) -> RangeImage:
+        """Range image of a `StructuredLight` capture; ValueError also if the rig's projector is not of its size."""
+        sensor = _structured_light(capture.sensor)
+        if capture.rig is not None:
+            sensor.check(capture.rig.projector.width, capture.rig.projector.height)
+        contrast = direct_contrast(capture, capture.frames[WHITE], capture.frames[BLACK], self.gray)
+        codes: dict[str, GrayCode] = {}
+        for axis, response, frames in sensor.layout():
+            if isinstance(response, GrayBits):
+                shift, size = response.shift, sensor.size(axis)
+                codes[axis] = decode_gray(capture, capture.frames[frames], shift, size, contrast, self.gray)
+            else:
+                fringes, least_swing = capture.frames[frames], self.gray.relative_bit * contrast.values
+                period_px = response.period_px
+                codes[axis] = refine_by_phase(capture, codes[axis], fringes, period_px, least_swing, self.phase)
+        for axis, code in codes.items():
+            outside = (code.coordinate < -0.5) | (code.coordinate > sensor.size(axis) + 0.5)
+            code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
+        column, row = (codes[axis].coordinate if axis in codes else None for axis in AXES)
+        return range_image_from_coordinates(
+            capture,
+            column,
+            row,
+            status=_worst([code.status for code in codes.values()]),
+            confidence=contrast.values / np.float32(capture.full_scale),
+            intensity=capture.frames[WHITE].astype(np.float32) - np.float32(capture.black_level),
+            limits=self.triangulation,
+            decoder=self,
+        )
+
+    def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
+        sensor, ambient, noise2 = _structured_light(sensor), background.ambient, background.noise2
+        if noise2 is None:
+            least = background.floor(self.gray.relative_contrast)
+        else:  # white - black holds the noise of two frames
+            least = least_signal_for(self.gray.contrast_sigmas**2, 1.0, 2 * (ambient + noise2))
+        if sensor.code == "gray-phase":
+            least = np.maximum(least, self.phase.least_signal(sensor.steps, 0.5, FrameContent(), background))
+        return least
+
+
+def _structured_light(sensor: Sensor) -> StructuredLight:
+    if not isinstance(sensor, StructuredLight):
+        raise ValueError(f"expected a structured-light capture, got {sensor.type_name}.")
+    return sensor
+
+
+def _worst(statuses: list[np.ndarray]) -> np.ndarray:
+    """The first status that is not OK, per pixel."""
+    result = statuses[0].copy()
+    for status in statuses[1:]:
+        result = np.where(result == Status.OK, status, result)
+    return result

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Direct time of flight: a photon histogram per pixel, and the decoder that finds its strongest peak."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+
+from rangesim import limits
+from rangesim.bounds import Bounds, check_fields, whole
+from rangesim.capture import Capture, bright_level
+from rangesim.decoding.gray import Threshold
+from rangesim.decoding.histogram import coates, find_peak, window_reach
+from rangesim.decoding.path_length import range_image_from_path_length
+from rangesim.detector import Gate
+from rangesim.range_image import RangeImage
+from rangesim.response import SPEED_OF_LIGHT, LengthBins, Response
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
+from rangesim.spad import SpadDetector
+from rangesim.status import Status
+
+OVERSAMPLING = (1, 2, 4)
+"""Bins of the transport pass per bin of a sensor with a pulse: so many that its sigma is at least one of them."""
+SHARED_VARIANCE = 1 / 6
+"""Mean variance in bins squared of light that is shared by two bins, which the blur leaves out."""
+
+
+@dataclass(frozen=True)
+class DirectToF(Sensor):
+    """Pulsed time of flight with a photon histogram per pixel (SPAD and TDC). Frames: the bins.
+
+    The laser fires again as soon as the histogram is full, every `period_s`. So light that comes back later is counted
+    with that of a later pulse: a wall at 1.2 times the range is a ghost at 0.2 times. Ambient light spreads evenly over
+    the bins.
+
+    Parameters
+    ----------
+    bins : int, number of time bins.
+    bin_s : float, seconds, width of a bin.
+    start_s : float, seconds, delay of the first bin after the pulse.
+    pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response; 0 for none. With a
+        pulse, a path is shared by the two bins next to it, so that its place within a bin is kept; bins of the pass are
+        up to four times as fine where the pulse is narrow (`OVERSAMPLING`).
+    laser : "periodic", or "single-shot": light that comes back after the histogram is full is lost.
+    """
+
+    bins: Annotated[int, whole(2, "bins")] = 256
+    bin_s: Annotated[float, Bounds("positive and finite", 1e-15, 1e-3)] = 100e-12
+    start_s: Annotated[float, Bounds("0 or positive", 1e-15, 1e-3, or_zero=True)] = 0.0
+    pulse_fwhm_s: Annotated[float, Bounds("0 or positive", 1e-15, 1e-3, or_zero=True)] = 1e-9
+    laser: Literal["periodic", "single-shot"] = "periodic"
+
+    type_name: ClassVar[str] = "direct-tof"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        limits.check("bins", self.bins * self._fine, f"bins, {self._fine} of the pass for each of the sensor")
+        if self.pulse_fwhm_s > self.bins * self.bin_s:
+            raise ValueError(
+                f"expected pulse_fwhm_s to be within the histogram of {self.bins * self.bin_s:g} s, "
+                f"got {self.pulse_fwhm_s:g}."
+            )
+
+    @property
+    def period_s(self) -> float:
+        """Seconds from pulse to pulse."""
+        return self.start_s + self.bins * self.bin_s
+
+    @property
+    def is_cyclic(self) -> bool:
+        """Whether the first bin follows on the last one."""
+        return self.laser == "periodic" and self.start_s == 0
+
+    def responses(self) -> tuple[Response, ...]:
+        fine, c = self._fine, SPEED_OF_LIGHT
+        period_m = self.period_s * c if self.laser == "periodic" else None
+        width_m, has_pulse = self.bin_s * c / fine, self.pulse_fwhm_s > 0
+        return (LengthBins(self.start_s * c, width_m, self.bins * fine, period_m, is_shared=has_pulse),)
+
+    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from rangesim.histogram_filter import gaussian_filter
+
+        variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
+        beyond: Literal["wrap", "constant"] = "wrap" if self.is_cyclic else "constant"
+        fine = np.asarray(channels[0], dtype=np.float32)
+        evenly = (ambient / self.bins).astype(np.float32)
+        result = np.empty((self.bins, *fine.shape[1:]), dtype=np.float32)
+
+        def of_rows(start: int, stop: int) -> None:
+            for row in range(start, stop):
+                histogram = fine[:, row]
+                if variance > 0:
+                    histogram = gaussian_filter(histogram, np.sqrt(variance), beyond)
+                if self._fine > 1:
+                    histogram = histogram.reshape(self.bins, self._fine, -1).sum(axis=1)
+                np.add(histogram, evenly[row], out=result[:, row])
+
+        in_blocks(of_rows, fine.shape[1], smallest=SMALLEST_ROWS)
+        return result
+
+    @property
+    def sigma_bins(self) -> float:
+        """Standard deviation of the pulse, in bins."""
+        return float(self.pulse_fwhm_s / self.bin_s / np.sqrt(8 * np.log(2)))
+
+    @property
+    def _fine(self) -> int:
+        if self.pulse_fwhm_s == 0:
+            return 1
+        return next((n for n in OVERSAMPLING if n * self.sigma_bins >= 1), OVERSAMPLING[-1])
+
+    @property
+    def gate(self) -> Gate:
+        return Gate(self.period_s, self.bins * self.bin_s, self.bins)
+
+    def frames_per_exposure(self, single_tap: bool = False) -> int:
+        return self.n_frames
+
+    def frame_names(self) -> list[str]:
+        return [f"bin{b:04d}" for b in range(self.bins)]
+
+    @property
+    def emitter(self) -> Emitter:
+        return Emitter(baseline_m=TOF_BASELINE_M)
+
+    @property
+    def default_decoder(self) -> DirectToFDecoder:
+        return DirectToFDecoder()
+
+    @property
+    def default_detector(self) -> SpadDetector:
+        return SpadDetector()
+
+    def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
+        start_m, bins_m = self.start_s * SPEED_OF_LIGHT, self.bins * self.bin_s * SPEED_OF_LIGHT
+        return np.asarray((path_length_m < start_m) | (path_length_m > start_m + bins_m))
+
+    @property
+    def title(self) -> str:
+        return "Time of flight (direct)"
+
+    @property
+    def details(self) -> str:
+        return f"{self.bins} bins of {self.bin_s * 1e12:g} ps"
+
+    def representative_frames(self, frames: np.ndarray) -> list[int]:
+        """The bins at the quartiles of the light."""
+        energy = np.cumsum(frames.reshape(len(frames), -1).sum(axis=1, dtype=np.float64))
+        return sorted({int(np.searchsorted(energy, share * energy[-1])) for share in (0.25, 0.5, 0.75)})
+
+
+@dataclass(frozen=True)
+class DirectToFDecoder(Decoder):
+    """The strongest return of each histogram.
+
+    Pile-up is undone if the detector has it (Coates 1968, see `coates`). A filter matched to the instrument response
+    finds the peak; the centroid of the counts above the background around it, re-centred once, gives the place within
+    a bin.
+
+    Parameters
+    ----------
+    peak_sigmas, min_counts : least height of a peak over the background: standard deviations of the counts in its
+        window, and counts.
+    relative_peak : least peak as a fraction of the bright ones of the image, for noise-free captures.
+    """
+
+    peak_sigmas: Threshold = 5.0
+    min_counts: Threshold = 5.0
+    relative_peak: Threshold = 1e-4
+
+    type_name: ClassVar[str] = "direct-tof"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def decode(self, capture: Capture) -> RangeImage:
+        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+
+        sensor = _direct(capture.sensor)
+        height, width = capture.frames.shape[1:]
+        position, peak, background, intensity = np.empty((4, height, width))
+
+        def measure(start: int, stop: int) -> None:
+            for row in range(start, stop):
+                frames = capture.frames[:, row]
+                found = find_peak(_histogram(capture, frames), sensor.sigma_bins, sensor.is_cyclic)
+                position[row], peak[row], background[row] = found
+                intensity[row] = frames.sum(axis=0, dtype=np.float64)
+
+        in_blocks(measure, height, smallest=SMALLEST_ROWS)
+        length = (sensor.start_s + position * sensor.bin_s) * SPEED_OF_LIGHT
+        bright = bright_level(peak)
+        is_strong = peak >= self._least_counts(background) if capture.is_digital else peak > self.relative_peak * bright
+        status = np.where(is_strong, Status.OK, Status.LOW_SIGNAL)
+        status[capture.saturated(capture.frames)] = Status.SATURATED
+        return range_image_from_path_length(
+            capture, length, status=status, confidence=peak / (bright or 1.0), intensity=intensity, decoder=self
+        )
+
+    def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
+        if background.noise2 is None:
+            return background.floor(self.relative_peak)
+        window, bins = _window_bins(_direct(sensor)), _direct(sensor).bins
+        return self._least_counts(window * (background.dark + background.ambient / bins))
+
+    def _least_counts(self, background: np.ndarray) -> np.ndarray:
+        """Least height of a peak over so many counts of background in its window."""
+        return np.asarray(np.maximum(self.min_counts, self.peak_sigmas * np.sqrt(background)))
+
+    def content(self, sensor: Sensor) -> FrameContent:
+        """What the window of a peak holds."""
+        window = _window_bins(_direct(sensor))
+        return FrameContent(signal=1.0, ambient=window / _direct(sensor).bins, dark=window)
+
+
+def _direct(sensor: Sensor) -> DirectToF:
+    if not isinstance(sensor, DirectToF):
+        raise ValueError(f"expected a direct-tof capture, got {sensor.type_name}.")
+    return sensor
+
+
+def _window_bins(sensor: DirectToF) -> int:
+    """Bins in the window of a peak."""
+    return 2 * window_reach(sensor.bins, sensor.sigma_bins, sensor.is_cyclic) + 1
+
+
+def _histogram(capture: Capture, frames: np.ndarray) -> np.ndarray:
+    if isinstance(capture.detector, SpadDetector) and capture.detector.pile_up:
+        return coates(frames, capture.detector.pulses(capture.sensor.gate, capture.exposure_s))
+    return frames.astype(np.float64)

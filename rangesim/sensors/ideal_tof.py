@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ideal time of flight: the path length of the first return, and its decoder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from rangesim.capture import Capture, bright_level
+from rangesim.decoding.path_length import range_image_from_path_length
+from rangesim.range_image import RangeImage
+from rangesim.response import FirstReturn, Response
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
+from rangesim.status import Status
+
+
+@dataclass(frozen=True)
+class IdealToF(Sensor):
+    """Range from the path length of the first return alone: the best any time of flight sensor could do.
+
+    Frames: `radiance` of the first return, and `radiance_x_length`, the same times its path length in metres.
+    """
+
+    type_name: ClassVar[str] = "ideal-tof"
+    is_ideal: ClassVar[bool] = True
+    first_return_frame: ClassVar[int | None] = 0
+
+    def responses(self) -> tuple[Response, ...]:
+        return (FirstReturn(),)
+
+    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        return np.asarray(channels[0], dtype=np.float32)
+
+    def frames_per_exposure(self, single_tap: bool = False) -> int:
+        return self.n_frames
+
+    def frame_names(self) -> list[str]:
+        return ["radiance", "radiance_x_length"]
+
+    @property
+    def emitter(self) -> Emitter:
+        return Emitter(baseline_m=TOF_BASELINE_M)
+
+    @property
+    def default_decoder(self) -> IdealToFDecoder:
+        return IdealToFDecoder()
+
+    @property
+    def default_detector(self) -> None:
+        return None
+
+    @property
+    def title(self) -> str:
+        return "Ideal time of flight"
+
+    @property
+    def details(self) -> str:
+        return "no noise, first return alone"
+
+    def representative_frames(self, frames: np.ndarray) -> list[int]:
+        return [0]
+
+
+@dataclass(frozen=True)
+class IdealToFDecoder(Decoder):
+    """Path length = radiance_x_length / radiance; no radiance is LOW_SIGNAL."""
+
+    type_name: ClassVar[str] = "ideal-tof"
+
+    def decode(self, capture: Capture) -> RangeImage:
+        if not isinstance(capture.sensor, IdealToF):
+            raise ValueError(f"expected an ideal-tof capture, got {capture.sensor.type_name}.")
+        radiance, weighted = (frame.astype(np.float64) for frame in capture.frames)
+        dark = ~(radiance > 0)
+        length = weighted / np.where(dark, 1.0, radiance)
+        status = np.where(dark, Status.LOW_SIGNAL, Status.OK)
+        confidence = radiance / (bright_level(radiance) or 1.0)
+        return range_image_from_path_length(
+            capture, length, status=status, confidence=confidence, intensity=radiance, decoder=self
+        )
+
+    def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
+        return background.floor(0.0)
+
+    def content(self, sensor: Sensor) -> FrameContent:
+        return FrameContent(signal=1.0, ambient=0.0)
