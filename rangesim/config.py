@@ -130,11 +130,11 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
 
 
 def named_subclasses(cls: type[T]) -> typing.Iterator[type[T]]:
-    """Subclasses that have a `type_name`, at any depth, in the order of their definition."""
-    for kind in cls.__subclasses__():
-        if hasattr(kind, "type_name"):
-            yield kind
-        yield from named_subclasses(kind)
+    """Subclasses that have a `type_name`, at any depth, the nearest first, then in the order of their definition."""
+    level = cls.__subclasses__()
+    while level:
+        yield from (kind for kind in level if hasattr(kind, "type_name"))
+        level = [deeper for kind in level for deeper in kind.__subclasses__()]
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -15,10 +15,11 @@ from rangesim.cli.progress import say_where
 if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.range_image import RangeImage
-    from rangesim.sensors import StructuredLight
+    from rangesim.sensors import Sensor, StructuredLight
 
 CODES = ("gray", "gray-phase")
-OF_BARE_IMAGES = ("code", "projector", "axes", "period", "steps", "bits")
+OF_PATTERNS = ("code", "projector", "axes", "period", "steps")
+OF_BARE_IMAGES = (*OF_PATTERNS, "bits")
 OF_XML_CALIBRATIONS = ("code_step", "unit")
 
 
@@ -28,6 +29,10 @@ def decode_command(
         Path, typer.Argument(help="A capture that rangesim wrote, or a folder of images.", show_default=False)
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory for the maps and the cloud.")] = ...,  # type: ignore[assignment]
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="A sensor of your own that took it, as FILE.py:NAME; the file is run.", show_default=False),
+    ] = None,
     code: Annotated[str, typer.Option(help="Of bare images: gray or gray-phase.")] = "gray",
     projector: Annotated[
         str | None, typer.Option(help="Of bare images: projector pixels, for example 1024x768.")
@@ -55,6 +60,8 @@ def decode_command(
 
       rangesim decode out/tabletop/gray-phase/capture --out out/decoded
 
+      rangesim decode out/gated/gated-camera/capture --sensor examples/own_sensor.py:GatedCamera --out out/decoded
+
       rangesim decode images --projector 1024x768 --calibration board.xml --code-step 2 --out out/board
     """
     import rangesim
@@ -63,8 +70,10 @@ def decode_command(
 
     _refuse_what_would_be_ignored(context, capture, calibration)
     say_where(out, check_directory(out, DECODED, inputs=[capture]))
-    sensor = None if projector is None else _sensor(code, projector, axes, period, steps)
-    loaded = _load(capture, sensor, bits)
+    taken_with = _own_sensor(sensor) if sensor else None
+    if taken_with is None and projector is not None:
+        taken_with = _structured_light(code, projector, axes, period, steps)
+    loaded = _load(capture, taken_with, bits)
     if calibration:
         loaded = _calibrated(loaded, calibration, code_step, unit)
     image = rangesim.decode(loaded)
@@ -79,6 +88,8 @@ def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibra
     given = {name for name in context.params if _from_command_line(context, name)}
     if (capture / SIDECAR).is_file() and (surplus := _options(OF_BARE_IMAGES, given)):
         raise ValueError(f"{capture} is a capture whose {SIDECAR} says how it was taken: leave out {surplus}.")
+    if "sensor" in given and (surplus := _options(OF_PATTERNS, given)):
+        raise ValueError(f"expected either --sensor or {surplus}.")
     if calibration is None and (surplus := _options(OF_XML_CALIBRATIONS, given)):
         raise ValueError(f"expected --calibration FILE.xml with {surplus}.")
 
@@ -93,7 +104,7 @@ def _options(names: tuple[str, ...], given: set[str]) -> str:
     return ", ".join(f"--{name.replace('_', '-')}" for name in names if name in given)
 
 
-def _load(folder: Path, sensor: StructuredLight | None, bits: int | None) -> Capture:
+def _load(folder: Path, sensor: Sensor | None, bits: int | None) -> Capture:
     """The capture of a directory with a sidecar, or of bare images."""
     import rangesim
     from rangesim.capture_files import SIDECAR
@@ -105,7 +116,8 @@ def _load(folder: Path, sensor: StructuredLight | None, bits: int | None) -> Cap
         return rangesim.load_capture(folder)
     if sensor is None:
         raise ValueError(
-            f"{folder} has no {SIDECAR}, so it holds bare images: expected --projector WIDTHxHEIGHT as well."
+            f"{folder} has no {SIDECAR}, so it holds bare images: expected --projector WIDTHxHEIGHT as well, or "
+            "--sensor FILE.py:NAME."
         )
     loaded = rangesim.import_capture(folder, sensor)
     return loaded if bits is None else _full_scale(loaded, bits)
@@ -132,7 +144,17 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
     return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
 
 
-def _sensor(code: str, projector: str, axes: str, period: float, steps: int) -> StructuredLight:
+def _own_sensor(name: str) -> Sensor:
+    """The sensor of FILE.py:NAME."""
+    from rangesim.config import shown
+    from rangesim.sensors import is_file_name, sensor_of
+
+    if not is_file_name(name):
+        raise ValueError(f"expected --sensor as FILE.py:NAME, got {shown(name)}; a capture says itself what took it.")
+    return sensor_of(name)
+
+
+def _structured_light(code: str, projector: str, axes: str, period: float, steps: int) -> StructuredLight:
     from rangesim.config import nearest, shown
     from rangesim.sensors import StructuredLight
 

@@ -36,6 +36,10 @@ def compare_command(
 
 def report_command(
     result: Annotated[Path, typer.Argument(help="A directory that `rangesim run` wrote.", show_default=False)],
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(help="Sensors of your own in the result, as FILE.py:NAME; the files are run.", show_default=False),
+    ] = None,
 ) -> None:
     """Write report.html anew from the files of a result.
 
@@ -46,7 +50,10 @@ def report_command(
     from pcgraph.output import replace_listed_file
     from rangesim.report import render_report
     from rangesim.result_files import RESULT, load_result, read_settings
+    from rangesim.sensors import sensor_of
 
+    for name in sensor or ():
+        sensor_of(name)
     read_settings(result)  # says what it is, if it is no result
     replace_listed_file(result, "report.html", lambda: render_report(load_result(result)).encode(), RESULT)
     typer.echo(f"{result / 'report.html'}")

@@ -37,8 +37,8 @@ def run_command(
         typer.Option(
             "--sensor",
             "-s",
-            help="gray, gray-phase, amcw, direct-tof or ideal-tof; repeat for more. "
-            "(default: gray-phase, amcw, ideal-tof)",
+            help="gray, gray-phase, amcw, direct-tof or ideal-tof, or FILE.py:NAME for one of your own; "
+            "repeat for more. (default: gray-phase, amcw, ideal-tof)",
             show_default=False,
         ),
     ] = None,

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sensor and a decoder from outside the package: one file each, and every command and every stage takes them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from synthetic import plane_signals, signals_of_depth, stereo_rig
+
+from rangesim import (
+    AmcwToF,
+    Capture,
+    Decoder,
+    Detector,
+    RangeImage,
+    Sensor,
+    Status,
+    StructuredLight,
+    decode,
+    explain,
+    expose,
+)
+from rangesim.causes import Cause
+from rangesim.decoding.gray import GrayThresholds
+from rangesim.errors import FileFormatError
+from rangesim.experiment import experiment_from_dict, load_experiment
+from rangesim.instrument import Instrument
+from rangesim.sensor import Background
+from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, sensor_from_dict, sensor_of
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+GATED = f"{EXAMPLES / 'own_sensor.py'}:GatedCamera"
+FRINGES = f"{EXAMPLES / 'own_code.py'}:MultiFrequency"
+
+
+# ---- Every command takes them ---------------------------------------------------------------------------------------
+
+
+def command(*arguments: object, fails: bool = False) -> str:
+    """What `rangesim` says, on stderr if it fails; each call is a process of its own, and knows no other's sensors."""
+    line = [sys.executable, "-m", "rangesim", *map(str, arguments)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
+    assert done.returncode == int(fails), done.stderr
+    return done.stderr if fails else done.stdout
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory of a run with both sensors, which an experiment file names."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "both.toml").write_text(
+        f"""
+        scene = "tabletop"
+        width = 80
+        height = 60
+        spp = 4
+
+        [[instrument]]
+        sensor = "{GATED}"
+
+        [[instrument]]
+        name = "fringes"
+        sensor = {{ type = "{FRINGES}", width = 320, height = 200 }}
+        decoder = {{ phase = {{ max_sigma_rad = 0.3 }} }}
+        """
+    )
+    command("run", "--config", folder / "both.toml", "--out", folder / "result")
+    return folder / "result"
+
+
+def test_a_result_holds_every_stage_of_them(result: Path) -> None:
+    for name, frames in (("gated-camera", 9), ("fringes", 12)):
+        assert len(list((result / name / "capture").glob("*.png"))) == frames
+        rows = json.loads((result / name / "comparison.json").read_text())["rows"]
+        matte = next(row for row in rows if row["material"] == "matte")
+        assert matte["completeness"] > 0.9
+        assert matte["median_abs_m"] < 0.01
+        assert matte["failed"] > 0
+        assert sum(matte["causes"].values()) == pytest.approx(matte["failed"])
+        assert (result / name / "segmentation.npz").is_file()
+    report = (result / "report.html").read_text()
+    for shown in ("Range-gated camera", "8 gates of 2 ns", "fringes of several periods", "320, 40, 5 px"):
+        assert shown in report
+    assert json.loads((result / "experiment.json").read_text())["experiment"]["instrument"][1]["decoder"] == {
+        "type": "temporal-unwrapping",
+        "phase": {"max_sigma_rad": 0.3, "modulation_of_scale": 2.5 / 255, "relative_modulation": 0.01},
+        "triangulation": {"epipolar_tolerance_px": 5.0, "max_relative_error": 0.05},
+    }
+
+
+def test_other_commands_take_their_results_once_the_file_is_named(result: Path, tmp_path: Path) -> None:
+    assert "gated-camera" in command("compare", result, "--markdown")
+    assert "as they were written" in command("verify", result)
+    before = (result / "report.html").read_bytes()
+    assert "--sensor FILE.py:NAME" in command("report", result, fails=True)
+    command("report", result, "--sensor", GATED, "--sensor", FRINGES)
+    assert (result / "report.html").read_bytes() == before
+    capture = result / "gated-camera" / "capture"
+    assert "--sensor FILE.py:NAME" in command("decode", capture, "--out", tmp_path / "decoded", fails=True)
+    command("decode", capture, "--sensor", GATED, "--out", tmp_path / "decoded")
+    with np.load(tmp_path / "decoded" / "range.npz") as again, np.load(capture.parent / "range.npz") as first:
+        np.testing.assert_array_equal(again["z"], first["z"])
+
+
+def test_the_command_line_names_them_too(tmp_path: Path) -> None:
+    size = ("--width", 40, "--height", 30, "--spp", 4)
+    command("run", "plane", "--sensor", GATED, "--sensor", "amcw", *size, "--out", tmp_path / "run")
+    assert (tmp_path / "run" / "gated-camera" / "cloud.ply").is_file()
+    assert "did you mean 'amcw'" in command("run", "plane", "--sensor", "amwc", "--out", tmp_path / "no", fails=True)
+
+
+# ---- The two examples are right -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "tolerance_m"), [(GATED, 1e-5), (FRINGES, 2e-5)])
+def test_without_noise_they_read_a_plane_as_it_is(name: str, tolerance_m: float) -> None:
+    sensor = sensor_of(name)
+    rig = stereo_rig()
+    signals = plane_signals(rig, sensor)
+    image = decode(expose(signals, sensor))
+    lit = signals.truth.projector_visible
+    assert image.valid[lit].mean() > 0.999
+    assert np.nanmax(np.abs(image.z - signals.truth.z)[lit]) < tolerance_m
+    assert image.decoder == sensor.default_decoder
+
+
+@pytest.mark.parametrize("name", [GATED, FRINGES])
+def test_their_least_signal_is_where_they_begin_to_refuse(name: str) -> None:
+    """As of the decoders of the package, see tests/test_cause.py."""
+    from rangesim.causes.light_budget import light_budget
+
+    sensor, detector, exposure_s = sensor_of(name), Detector(full_well_e=30_000.0, read_noise_e=10.0), 2e-3
+    rig = stereo_rig()
+    signals = plane_signals(rig, sensor, ambient=0.3)
+    budget = light_budget(signals, expose(signals, sensor, detector, exposure_s), sensor.default_decoder)
+    lit = signals.truth.projector_visible
+    power = float(np.median((budget.needed / budget.signal)[lit]))
+    refused = {}
+    for factor in (0.5, 2.0):
+        dim = plane_signals(replace(rig, projector_power_w=factor * power), sensor, ambient=0.3)
+        status = decode(expose(dim, sensor, detector, exposure_s, seed=3)).status
+        refused[factor] = np.mean(status[lit] == Status.LOW_SIGNAL)
+    assert refused[0.5] > 0.9
+    assert refused[2.0] < 0.1
+
+
+# ---- The causes ask the decoder that was used -----------------------------------------------------------------------
+
+
+def test_what_a_strict_decoder_refuses_is_low_signal_and_not_something_else() -> None:
+    sensor = StructuredLight(code="gray")
+    signals = plane_signals(stereo_rig(), sensor)
+    capture = expose(signals, sensor, Detector(), seed=1)
+    strict = decode(capture, StructuredLightDecoder(gray=GrayThresholds(contrast_sigmas=200.0)))
+    refused = (strict.status == Status.LOW_SIGNAL) & signals.truth.projector_visible
+    assert refused.sum() > 1000
+    assert (explain(strict, capture, signals).cause[refused] == Cause.LOW_SIGNAL).all()
+    seen = explain(strict, capture, signals, tolerance_m=0.1)
+    assert (seen.cause[refused] == Cause.LOW_SIGNAL).all()
+
+
+@dataclass(frozen=True)
+class Smoothed(Decoder):
+    """Looks at neighbours: the median of 3 x 3 readings, where all of them are there."""
+
+    inner: AmcwDecoder = field(default_factory=AmcwDecoder)
+    type_name: ClassVar[str] = "smoothed"
+    shapes: ClassVar[list[tuple[int, ...]]] = []
+
+    def decode(self, capture: Capture) -> RangeImage:
+        from scipy.ndimage import median_filter
+
+        self.shapes.append(capture.frames.shape)
+        image = self.inner.decode(capture)
+        z = median_filter(image.z, 3)
+        status = np.where(np.isfinite(z), image.status, Status.LOW_SIGNAL).astype(np.uint8)
+        z = np.where(status == Status.OK, z, np.nan)
+        return replace(image, z=z, range_m=image.range_m * z / image.z, status=status, decoder=self)
+
+    def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
+        return self.inner.least_signal(sensor, background)
+
+
+def test_a_decoder_that_looks_at_neighbours_sees_whole_images() -> None:
+    """A pin that it smooths away is so without noise too: too coarse, and no noise, as of pixels decoded one by one."""
+    sensor, rig = AmcwToF((50e6,)), stereo_rig(baseline_m=0.03)
+    z = np.full((120, 160), 1.0)
+    z[::12, ::12] = 0.97  # pins a pixel wide
+    signals = signals_of_depth(rig, z, [sensor])
+    capture = expose(signals, sensor, Detector.time_of_flight(), seed=2)
+    Smoothed.shapes.clear()
+    image = decode(capture, Smoothed())
+    causes = explain(image, capture, signals, tolerance_m=0.02)
+    pins = z < 1
+    assert set(Smoothed.shapes) == {capture.frames.shape}
+    assert (causes.cause[pins] == Cause.RESOLUTION).mean() > 0.9
+    assert not causes.failed[~pins].any()
+
+
+# ---- Files that are no sensors --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "message"),
+    [
+        (None, "Thing", "does not exist; expected a Python file with a sensor"),
+        ("1 / 0", "Thing", "fails: ZeroDivisionError"),
+        ("import no_such_module", "Thing", "fails: ModuleNotFoundError"),
+        ("class Thing: pass", "Thing", "expected Thing to be a sensor or a class of sensors, got <class"),
+        ("", "Thing", "expected Thing to be a sensor or a class of sensors, got None"),
+        ("from rangesim import Sensor\nclass Thing(Sensor): pass", "Thing", "cannot be made without arguments"),
+    ],
+)
+def test_a_file_without_a_sensor_is_refused_in_one_sentence(
+    text: str | None, name: str, message: str, tmp_path: Path
+) -> None:
+    if text is not None:
+        (tmp_path / "mine.py").write_text(text)
+    with pytest.raises(FileFormatError, match=message) as error:
+        sensor_of(f"mine.py:{name}", tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "twin.py").write_text(
+        "from rangesim.sensors import AmcwToF\nclass Twin(AmcwToF):\n    type_name = 'direct-tof'\n"
+    )
+    with pytest.raises(FileFormatError, match="'direct-tof' of Twin is taken"):
+        sensor_of("twin.py:Twin", tmp_path)
+    assert type(sensor_from_dict({"type": "direct-tof"}, "sensor")).__name__ == "DirectToF"
+
+
+def test_what_is_read_back_runs_no_file(tmp_path: Path) -> None:
+    """A result or a capture from elsewhere may name any file: only what a user names is run."""
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    name = f"{tmp_path / 'evil.py'}:Thing"
+    for sensor in (name, {"type": name}):
+        with pytest.raises(ValueError, match="expected"):
+            sensor_from_dict(sensor, "sensor")
+        with pytest.raises(ValueError, match="expected"):
+            experiment_from_dict({"scene": "plane", "instrument": [{"name": "a", "sensor": sensor}]})
+    assert not (tmp_path / "ran").exists()
+
+
+def test_an_experiment_names_files_from_its_own_folder(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text((EXAMPLES / "own_sensor.py").read_text().replace("gated-camera", "my-gates"))
+    (tmp_path / "mine.toml").write_text('scene = "plane"\n[[instrument]]\nsensor = "mine.py:GatedCamera"\n')
+    (one,) = load_experiment(tmp_path / "mine.toml").instruments
+    assert one.name == "my-gates"
+    assert one.detector == one.sensor.default_detector
+    assert Instrument("x", one.sensor) == replace(one, name="x")
