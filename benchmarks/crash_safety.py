@@ -29,7 +29,7 @@ from pathlib import Path
 
 from pcgraph.output import verify_directory
 from rangesim.errors import FileFormatError
-from rangesim.result_files import RESULT, read_settings
+from rangesim.experiment.result_files import RESULT, read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ["run", str(ROOT / "scenes" / "plane.xml"), "--sensor", "gray", "--sensor", "ideal-tof", "--width", "48",

@@ -25,7 +25,7 @@ from finite_aperture import Lamp, finite_aperture
 from reference_scenes import GLASS, MATTE, Guide
 
 from rangesim import Intrinsics, Rig, Scene, Signals, StructuredLight, decode, expose, load_scene, look_at, transport
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.response import Fringes
 
 BOARD_M, PERIOD_PX, MAX_DEPTH = 0.6, 16.0, 12

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from rangesim import AmcwToF, Scene, load_scene, transport
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 
 COUNTS = (500, 2000, 10_000)
 MATERIALS = ("one", "own", "glass")

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from rangesim import Intrinsics, Rig, Scene, load_scene, look_at
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.scene.camera import MITSUBA_FROM_OPENCV
 
 CAMERA_PIXELS = (96, 72)

@@ -33,10 +33,10 @@ from typing import Any
 import numpy as np
 
 from rangesim import Capture, Signals, decode, expose, load_scene, transport
+from rangesim.evaluation.reading_noise import robust_sigma
 from rangesim.experiment import Experiment
-from rangesim.instrument import Instrument, instrument
-from rangesim.pipeline import group_by_rig
-from rangesim.reading_noise import robust_sigma
+from rangesim.experiment.instrument import Instrument, instrument
+from rangesim.experiment.pipeline import group_by_rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES
 

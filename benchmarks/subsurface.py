@@ -15,7 +15,7 @@ from plain_mitsuba import plain_scene, render, timed
 
 import rangesim
 from rangesim import AmcwToF, Detector, decode, expose, load_scene, transport
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.response import Fringes
 
 MEDIA = sorted(p.stem for p in (Path(__file__).parents[1] / "scenes" / "materials" / "media").glob("*.xml"))

@@ -24,7 +24,7 @@ import numpy as np
 from rangesim import Capture, Decoder, RangeImage, Sensor, Status, compare, decode, expose, load_scene, transport
 from rangesim.capture import bright_level
 from rangesim.decoding.path_length import range_image_from_path_length
-from rangesim.detector import Detector
+from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, DenseResponse, LightPath, Math
 from rangesim.sensor import Background, Emitter, FrameContent, least_signal_for
 

@@ -20,7 +20,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
-from rangesim.config import check_keys, shown
+from rangesim.settings.config import check_keys, shown
 
 VARIABLE = "RANGESIM_LIMITS"
 """Environment variable with limits for the whole process, such as "pixels=1e9,bins=1e5"."""

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from rangesim.detector import Detector, Gate, PhotoDetector
+from rangesim.electronics.detector import Detector, Gate, PhotoDetector
 from rangesim.response import Response
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
-    from rangesim.range_image import RangeImage
+    from rangesim.decoding.range_image import RangeImage
 
 
 TOF_BASELINE_M = 0.03

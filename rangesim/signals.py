@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesim.array_files import write_arrays
+from rangesim.files.array_files import write_arrays
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor

@@ -82,8 +82,8 @@ def llvm_problem() -> str | None:
     package = types.ModuleType("rangesim")  # stands for the package, whose dependencies are not there yet
     package.__path__ = [str(Path(__file__).resolve().parents[1] / "rangesim")]
     sys.modules["rangesim"] = package
+    from rangesim.environment.llvm import find_llvm
     from rangesim.errors import EnvironmentProblem
-    from rangesim.llvm import find_llvm
 
     try:
         find_llvm()

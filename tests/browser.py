@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rangesim.doctor import find_browser
+from rangesim.environment.doctor import find_browser
 
 BROWSER = find_browser()
 QUIET = ("disable-background-networking", "disable-component-update", "disable-sync", "no-first-run", "no-sandbox")

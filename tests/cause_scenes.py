@@ -15,7 +15,7 @@ import numpy as np
 import rangesim
 from rangesim import AmcwToF, Capture, Detector, RangeImage, Rig, Scene, Signals, StructuredLight, transport
 from rangesim.causes import Cause
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rangesim.environment.llvm import ensure_llvm
 from rangesim.errors import EnvironmentProblem
-from rangesim.llvm import ensure_llvm
 
 with suppress(EnvironmentProblem):  # tests that render say it again; those of decoders need no LLVM
     ensure_llvm()

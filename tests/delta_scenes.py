@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rangesim import Intrinsics, Rig, Scene, load_scene, look_at
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.response import DenseResponse, LightPath
 
 SILVER = (0.04, 5.8)

@@ -13,10 +13,10 @@ from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim import Ambient, AmcwToF, Capture, Detector, DirectToF, SpadDetector, StructuredLight, expose
 from rangesim import load_capture as load
-from rangesim.ambient import LUMINOUS_EFFICACY, Sun, Tungsten, WhiteLed, photopic
-from rangesim.config import from_dict, to_dict
-from rangesim.detector import PhotoDetector
-from rangesim.sunlight import EDGES_NM, SPECTRAL_W_M2_NM, TOTAL_W_M2
+from rangesim.electronics.ambient import LUMINOUS_EFFICACY, Sun, Tungsten, WhiteLed, photopic
+from rangesim.electronics.detector import PhotoDetector
+from rangesim.electronics.sunlight import EDGES_NM, SPECTRAL_W_M2_NM, TOTAL_W_M2
+from rangesim.settings.config import from_dict, to_dict
 
 SENSOR = StructuredLight(code="gray")
 

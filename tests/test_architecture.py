@@ -9,13 +9,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 import rangesim
 
 ROOT = Path(__file__).resolve().parent.parent
 RENDERER = {"mitsuba", "drjit"}
-RENDERING_PACKAGES = ("rangesim/light_transport/", "rangesim/scene/")
+RENDERING_PACKAGES = ("rangesim/light_transport/", "rangesim/scene/", "rangesim/environment/backend.py")
 
 
 def modules(package: str) -> list[Path]:
@@ -78,6 +79,40 @@ def test_nobody_in_pcgraph_imports_from_above(path: Path) -> None:
     else:
         assert own in ON_TOP or own in ("", "__init__", "__main__")
         assert "metrics" not in above
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported_modules(path: Path, known: set[str]) -> Iterator[str]:
+    """Modules out of `known` that are loaded when this one is, packages around them included."""
+    for node in ast.parse(path.read_text()).body:
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inner = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if name in known else node.module for name in inner]
+        for name in names:
+            parts = name.split(".")
+            yield from known & {".".join(parts[:n]) for n in range(2, len(parts) + 1)}
+
+
+def test_no_imports_go_in_a_circle() -> None:
+    """Between files and between rooms; imports for type checks alone, and inside functions, load nothing."""
+    paths = {module_of(path): path for path in modules("rangesim")}
+    files = nx.DiGraph()
+    for module, path in paths.items():
+        known = {m for m in paths if m != module and not module.startswith(f"{m}.")}
+        files.add_edges_from((module, other) for other in imported_modules(path, known))
+    assert [c for c in nx.strongly_connected_components(files) if len(c) > 1] == []
+    room = {module: module.split(".")[1] for module in files}
+    rooms = nx.DiGraph([(room[a], room[b]) for a, b in files.edges if room[a] != room[b]])
+    circles = [sorted(c) for c in nx.strongly_connected_components(rooms) if len(c) > 1]
+    # Limits are a setting of their own, at the top for their users; what a capture's files hold is a sensor
+    assert circles == [["limits", "settings"], ["capture", "decoding", "sensors"]]
 
 
 @pytest.mark.parametrize("path", modules("rangesim"), ids=relative)

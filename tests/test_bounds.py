@@ -16,13 +16,14 @@ from synthetic import plane_signals, stereo_rig
 
 import rangesim
 from rangesim import decode, explain, expose
-from rangesim.ambient import Ambient, Tungsten
 from rangesim.decoding.gray import GrayCode, GrayThresholds
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds
 from rangesim.decoding.triangulate import Triangulation, TriangulationLimits
-from rangesim.detector import Detector
+from rangesim.electronics.ambient import Ambient, Tungsten
+from rangesim.electronics.detector import Detector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
-from rangesim.instrument import Optics, instrument
+from rangesim.experiment.instrument import Optics, instrument
 from rangesim.motion import Motion, PoseTrack, SteadyTrack, Timing
 from rangesim.response import (
     FirstReturn,
@@ -48,7 +49,6 @@ from rangesim.sensors import (
     StructuredLight,
     StructuredLightDecoder,
 )
-from rangesim.spad import SpadDetector
 
 NONSENSE = (
     *(math.nan, math.inf, -math.inf, -1, 0, True, 1e300, 1e-300, -1e300, 10**30, 10**400, 1 << 63, 1j),

@@ -16,16 +16,16 @@ import pytest
 from PIL import Image
 from synthetic import plane_signals, stereo_rig
 
-from rangesim.calibration_files import load_calibration, save_calibration
 from rangesim.capture import Capture
-from rangesim.capture_files import SIDECAR, import_capture, load_capture
-from rangesim.detector import Detector, PhotoDetector
+from rangesim.capture.capture_files import SIDECAR, import_capture, load_capture
+from rangesim.capture.exposure import expose
+from rangesim.electronics.detector import Detector, PhotoDetector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
-from rangesim.exposure import expose
-from rangesim.image_files import write_grey
+from rangesim.files.image_files import write_grey
 from rangesim.rig import Intrinsics
+from rangesim.rig.calibration_files import load_calibration, save_calibration
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
-from rangesim.spad import SpadDetector
 
 SMALL = StructuredLight(8, 4, "gray")
 
@@ -155,7 +155,7 @@ def test_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytes
         raise OSError("No space left on device")
 
     small_capture().save(tmp_path / "old")
-    monkeypatch.setattr("rangesim.capture_files.write_json", full)
+    monkeypatch.setattr("rangesim.capture.capture_files.write_json", full)
     for name in ("c", "not/yet/there", "old"):
         with pytest.raises(OSError, match="No space"):
             small_capture(Detector()).save(tmp_path / name)
@@ -256,7 +256,7 @@ def test_images_on_a_disk_that_takes_no_more_are_an_error_of_the_system(tmp_path
     pytest.importorskip("resource")
     code = (
         "import errno, resource, signal, sys; from pathlib import Path; import numpy as np\n"
-        "from rangesim.image_files import write_grey\n"
+        "from rangesim.files.image_files import write_grey\n"
         "image = (1e4 * np.random.default_rng(1).random((200, 300))).astype(sys.argv[2])\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"

@@ -29,6 +29,7 @@ from rangesim.causes import Cause, CauseMap, explain
 from rangesim.causes.cause import DEFINITIONS, TITLES
 from rangesim.causes.light_budget import light_budget, white_radiance
 from rangesim.causes.light_paths import single_path_frames
+from rangesim.decoding.status import Status
 from rangesim.response import (
     CAUSTIC,
     DIRECT,
@@ -41,7 +42,6 @@ from rangesim.response import (
     NumpyMath,
 )
 from rangesim.signals import GroundTruth
-from rangesim.status import Status
 
 ROOT = Path(__file__).resolve().parent.parent
 SENSORS: dict[str, tuple[Sensor, Any]] = {

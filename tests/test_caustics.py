@@ -26,8 +26,8 @@ from delta_scenes import (
 
 import rangesim
 from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight, transport
+from rangesim.environment.backend import select_variant
 from rangesim.light_transport import photon_maps
-from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photon_maps import ALPHA, GatheringRadius, Level, radii_of_maps
 from rangesim.light_transport.photons import PhotonBalance, Photons, shift_of, stratified_choice, trace_photons

@@ -17,9 +17,9 @@ from PIL import Image
 from small_result import ROOT, SCENES, SENSORS, small_result
 
 import rangesim
-from rangesim.calibration_files import save_calibration
 from rangesim.cli import main
 from rangesim.cli.progress import progress_bar
+from rangesim.rig.calibration_files import save_calibration
 
 PLANE = str(SCENES / "plane.xml")
 TINY = ("--width", "48", "--height", "36", "--spp", "1")

@@ -10,10 +10,10 @@ import math
 import numpy as np
 import pytest
 
-from rangesim.comparison import compare
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
+from rangesim.evaluation.comparison import compare
 from rangesim.signals import GroundTruth
-from rangesim.status import Status
 
 
 def truth_of(z: np.ndarray, material: np.ndarray, visible: np.ndarray | None = None) -> GroundTruth:

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from small_result import ROOT
 
-from rangesim import cost, limits, load_scene, pipeline
+from rangesim import limits, load_scene
 from rangesim.cli import main
-from rangesim.cost import Cost, available_memory_bytes, estimate_cost
-from rangesim.experiment import Experiment
-from rangesim.instrument import instrument
+from rangesim.experiment import Experiment, cost, pipeline
+from rangesim.experiment.cost import Cost, available_memory_bytes, estimate_cost
+from rangesim.experiment.instrument import instrument
 from rangesim.motion import Motion, SteadyTrack, Timing
 from rangesim.sensors import DirectToF
 

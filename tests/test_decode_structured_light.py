@@ -13,14 +13,14 @@ from scipy.ndimage import gaussian_filter
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
+from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.phase_shift import phase_of
+from rangesim.decoding.status import Status
 from rangesim.decoding.triangulate import TriangulationLimits, triangulate
-from rangesim.detector import Detector
-from rangesim.exposure import expose
+from rangesim.electronics.detector import Detector
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import IdealToF, StructuredLight, StructuredLightDecoder
-from rangesim.status import Status
 
 BOTH = ("columns", "rows")
 

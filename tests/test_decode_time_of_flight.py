@@ -14,19 +14,19 @@ from scipy.ndimage import gaussian_filter1d
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
+from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.histogram import coates, find_peak, window_reach
+from rangesim.decoding.histogram_filter import gaussian_filter
 from rangesim.decoding.path_length import range_from_path_length
 from rangesim.decoding.phase_shift import tap_phase
-from rangesim.detector import Detector
-from rangesim.exposure import expose
-from rangesim.histogram_filter import gaussian_filter
+from rangesim.decoding.status import Status
+from rangesim.electronics.detector import Detector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, LengthBins, LightPath, NumpyMath
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder, IdealToF
 from rangesim.signals import Signals
-from rangesim.spad import SpadDetector
-from rangesim.status import Status
 
 
 @given(st.floats(0.1, 10), st.lists(st.floats(-2, 2), min_size=3, max_size=3), st.floats(-0.5, 0.5))

@@ -12,13 +12,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from synthetic import plane_signals, stereo_rig
 
-from rangesim.capture_files import load_capture
-from rangesim.config import from_dict, to_dict
-from rangesim.exposure import expose
+from rangesim.capture.capture_files import load_capture
+from rangesim.capture.exposure import expose
 from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
 from rangesim.response.defocus import SWITCH, blurred_stripes
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensors import IdealToF
+from rangesim.settings.config import from_dict, to_dict
 
 MATH = NumpyMath()
 STRONG = (-0.3, 0.12, 2e-3, -1e-3, 0.01)

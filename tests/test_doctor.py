@@ -10,9 +10,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rangesim import doctor
-from rangesim.doctor import Check, doctor_command, run_checks
-from rangesim.llvm import VARIABLE
+from rangesim.environment import doctor
+from rangesim.environment.doctor import Check, doctor_command, run_checks
+from rangesim.environment.llvm import VARIABLE
 
 NAMES = ["Python", "LLVM", "Mitsuba", "kernel", "CUDA", "Open3D", "fonts", "browser"]
 

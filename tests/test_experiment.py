@@ -15,16 +15,16 @@ import pytest
 from small_result import ROOT, SENSORS, small_experiment, small_result
 
 import rangesim
-from rangesim.detector import Detector
+from rangesim.decoding.status import Status
+from rangesim.electronics.detector import Detector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment
-from rangesim.instrument import DEFAULT_SENSORS, Instrument, Optics, instrument
+from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, Optics, instrument
+from rangesim.experiment.pipeline import group_by_rig, noise_seed, run
+from rangesim.experiment.result_files import load_result
 from rangesim.motion import Motion, SteadyTrack, Timing
-from rangesim.pipeline import group_by_rig, noise_seed, run
-from rangesim.result_files import load_result
 from rangesim.sensors import DirectToF, IdealToF
-from rangesim.spad import SpadDetector
-from rangesim.status import Status
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
 

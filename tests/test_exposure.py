@@ -10,13 +10,13 @@ import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import BRIGHT_PERCENTILE
-from rangesim.config import from_dict, to_dict
-from rangesim.detector import Detector, PhotoDetector
-from rangesim.exposure import TARGET_SHARE, expose
+from rangesim.capture.exposure import TARGET_SHARE, expose
+from rangesim.electronics.detector import Detector, PhotoDetector
+from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
-from rangesim.spad import SpadDetector
+from rangesim.settings.config import from_dict, to_dict
 
 SENSOR = StructuredLight(code="gray")
 

@@ -25,8 +25,8 @@ from rangesim import (
     load_scene,
     transport,
 )
+from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError, RangesimWarning
-from rangesim.light_transport.backend import select_variant
 from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
 from rangesim.response import FirstReturn
 from rangesim.scene.origin import NEAR_M

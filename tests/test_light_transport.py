@@ -12,7 +12,7 @@ from delta_scenes import GLASS, MIRROR, matte, rig_of, scene_of, wall
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, StructuredLight, look_at, transport
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.response import FirstReturn, Images, LengthBins
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"

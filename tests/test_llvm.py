@@ -12,9 +12,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from rangesim import llvm
+from rangesim.environment import llvm
+from rangesim.environment.llvm import MINIMUM, NEWEST_TESTED, VARIABLE, ensure_llvm, find_llvm
 from rangesim.errors import EnvironmentProblem
-from rangesim.llvm import MINIMUM, NEWEST_TESTED, VARIABLE, ensure_llvm, find_llvm
 
 
 @pytest.fixture(autouse=True)
@@ -154,7 +154,7 @@ def test_a_bad_library_that_drjit_already_holds_is_an_error(
 
 
 def test_the_search_is_quick_and_imports_no_renderer() -> None:
-    code = "import sys, rangesim.llvm as l; l.find_llvm(); sys.exit('drjit' in sys.modules)"
+    code = "import sys, rangesim.environment.llvm as l; l.find_llvm(); sys.exit('drjit' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
     durations = []
     for _ in range(3):

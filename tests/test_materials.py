@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rangesim
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.scene import retroreflector
 from rangesim.scene.materials import material_class
 

@@ -13,7 +13,7 @@ from scipy.ndimage import binary_erosion, map_coordinates
 
 import rangesim
 from rangesim import Detector, IdealToF, Intrinsics, Rig, StructuredLight, decode, expose, look_at, transport
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.response import FirstReturn, Fringes, GrayBits, Images, LightPath, NumpyMath
 from rangesim.rig import translation
 

@@ -31,7 +31,7 @@ from rangesim.causes import Cause
 from rangesim.decoding.gray import GrayThresholds
 from rangesim.errors import FileFormatError
 from rangesim.experiment import experiment_from_dict, load_experiment
-from rangesim.instrument import Instrument
+from rangesim.experiment.instrument import Instrument
 from rangesim.sensor import Background
 from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, sensor_from_dict, sensor_of
 

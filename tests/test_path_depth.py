@@ -12,9 +12,9 @@ from delta_scenes import GLASS, fresnel_dielectric, matte, rig_of, scene_of, sla
 from scipy.spatial import ConvexHull
 
 from rangesim import Intrinsics, Rig, Scene, load_scene, transport
+from rangesim.environment.backend import select_variant
 from rangesim.errors import TruncationWarning
 from rangesim.light_transport import delta_chain, loop, photon_flight
-from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import PhotonBalance, trace_photons
 

@@ -11,11 +11,11 @@ import pytest
 from synthetic import plane_depth, plane_signals, signals_of_depth, stereo_rig
 
 import pcgraph
+from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
-from rangesim.detector import Detector
-from rangesim.exposure import expose
+from rangesim.decoding.range_image import RangeImage
+from rangesim.electronics.detector import Detector
 from rangesim.point_cloud import PointCloud
-from rangesim.range_image import RangeImage
 from rangesim.rig import Rig, look_at
 from rangesim.sensors import IdealToF, StructuredLight
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from rangesim import AmcwToF, IdealToF, Scene, StructuredLight, decode, expose, load_scene, transport
-from rangesim.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
 from rangesim.errors import SamplingWarning
-from rangesim.instrument import Instrument
+from rangesim.evaluation.reading_noise import reading_noise, robust_sigma, warn_of_sampling
+from rangesim.experiment.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
+from rangesim.experiment.instrument import Instrument
 from rangesim.light_transport.estimate import Halves
 from rangesim.light_transport.loop import Budget
-from rangesim.reading_noise import reading_noise, robust_sigma, warn_of_sampling
 
 SMALL_IMAGE: dict[str, Any] = {"width": 96, "height": 72}
 
@@ -228,8 +228,8 @@ def test_samples_that_are_no_number_are_refused(matte: Scene) -> None:
 
 def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -> None:
     from rangesim.experiment import Experiment
-    from rangesim.pipeline import run
-    from rangesim.result_files import load_result
+    from rangesim.experiment.pipeline import run
+    from rangesim.experiment.result_files import load_result
 
     instruments = (Instrument("amcw", AmcwToF()), Instrument("ideal", IdealToF()))
     experiment = Experiment("glassware", width=96, height=72, spp=4, instruments=instruments)

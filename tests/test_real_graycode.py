@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rangesim.calibration_files import load_calibration
 from rangesim.capture import Capture
-from rangesim.capture_files import import_capture
+from rangesim.capture.capture_files import import_capture
 from rangesim.decoding import decode
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
 from rangesim.rig import Rig
+from rangesim.rig.calibration_files import load_calibration
 from rangesim.sensors import StructuredLight
 
 SENSOR = StructuredLight(1024, 768, code="gray", axes=("columns", "rows"))

@@ -18,11 +18,11 @@ from PIL import Image
 from small_result import SENSORS, small_result
 
 from rangesim.causes import Cause
-from rangesim.doctor import find_browser
+from rangesim.decoding.status import Status
+from rangesim.environment.doctor import find_browser
+from rangesim.experiment.result_files import load_result
 from rangesim.report import cloud, palette, tables
 from rangesim.report.verdict import verdict
-from rangesim.result_files import load_result
-from rangesim.status import Status
 
 BROWSER = find_browser()
 CANVAS = (16, 21, 29)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from synthetic import plane_signals, stereo_rig
 
+from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
-from rangesim.exposure import expose
+from rangesim.decoding.status import Status
 from rangesim.point_cloud import from_range_image
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
-from rangesim.status import Status
 
 FOLDED = Intrinsics(640, 480, 500, 500, 320, 240, (-0.45,))
 """r (1 - 0.45 r^2) turns round at r = 0.861, where the image ends: 0.5738 f = 286.9 px from the centre."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rangesim import AmcwToF, DirectToF, Signals, StructuredLight, decode, expose, load_scene, transport
-from rangesim.light_transport.backend import select_variant
+from rangesim.environment.backend import select_variant
 from rangesim.light_transport.indirect import Guides, LightFilter, level_weights, mixed_pixels
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import rangesim
-from rangesim.catalogue import scene_names
+from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError, RangesimWarning
-from rangesim.light_transport.backend import select_variant
+from rangesim.files.catalogue import scene_names
 from rangesim.scene.materials import material_class
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"

@@ -15,7 +15,7 @@ import pytest
 
 from rangesim import limits
 from rangesim.errors import FileFormatError
-from rangesim.image_files import write_grey
+from rangesim.files.image_files import write_grey
 from rangesim.scene import load_scene
 
 CAMERA: dict[str, Any] = {

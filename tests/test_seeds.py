@@ -18,11 +18,11 @@ from delta_scenes import GLASS, matte, scene_of, wall
 import rangesim
 from rangesim import AmcwToF, Detector, DirectToF, Scene, SpadDetector, expose, transport
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
+from rangesim.experiment.pipeline import noise_seed
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.photons import trace_photons
 from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
-from rangesim.pipeline import noise_seed
 
 SEEDS = tuple(
     dict.fromkeys(

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from rangesim import Scene, load_scene, transport
-from rangesim.catalogue import scene_names
+from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError, RangesimWarning
-from rangesim.light_transport.backend import select_variant
+from rangesim.files.catalogue import scene_names
 
 RED = {"type": "rgb", "value": [0.8, 0.1, 0.1]}
 

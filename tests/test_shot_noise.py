@@ -11,10 +11,10 @@ from scipy import stats
 from scipy.special import gammainc, gammaincc, ndtr
 from synthetic import stereo_rig
 
-from rangesim.detector import Detector
+from rangesim.electronics.detector import Detector
+from rangesim.electronics.shot_noise import MAX_DEVIATE, SMALL_MEAN, poisson, pulses_hit, quantile
+from rangesim.electronics.spad import SpadDetector
 from rangesim.sensors import DirectToF, StructuredLight
-from rangesim.shot_noise import MAX_DEVIATE, SMALL_MEAN, poisson, pulses_hit, quantile
-from rangesim.spad import SpadDetector
 
 DRAWS = 1_000_000
 MEANS = (0.01, 0.1, 0.5, 1.0, 2.5, 3.99, 4.0, 4.5, 6.0, 9.5, 20.0, 70.0, 300.0, 1e3, 1e4, 1e5)

@@ -16,8 +16,8 @@ from plain_mitsuba import plain_scene, render, show, z_score
 
 import rangesim
 from rangesim import AmcwToF, transport
+from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError
-from rangesim.light_transport.backend import select_variant
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.photons import trace_photons

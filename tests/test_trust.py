@@ -21,7 +21,7 @@ import pytest
 from small_result import ROOT, small_result
 
 from pcgraph.output import MANIFEST, STAGING
-from rangesim.capture_files import SIDECAR
+from rangesim.capture.capture_files import SIDECAR
 
 PLANE = str(ROOT / "scenes" / "plane.xml")
 TINY = ("--sensor", "ideal-tof", "--width", "32", "--height", "24", "--spp", "1", "--photons", "0")

@@ -13,13 +13,13 @@ from rangesim.capture import Capture
 from rangesim.causes.edges import depth_edges, error_off_edge
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
 from rangesim.causes.light_paths import clean_frames, points_in_projector, single_path_frames
-from rangesim.comparison import neighbours
 from rangesim.decoding import decode
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
+from rangesim.evaluation.comparison import neighbours
 from rangesim.response import DIRECT, KINDS, MULTIPATH
 from rangesim.sensor import Decoder
 from rangesim.signals import GroundTruth
-from rangesim.status import Status
 
 if TYPE_CHECKING:
     from rangesim.signals import Signals

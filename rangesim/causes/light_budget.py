@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.detector import PhotoDetector
+from rangesim.electronics.detector import PhotoDetector
 from rangesim.rig import Rig
 from rangesim.sensor import Background, Decoder
 

@@ -10,8 +10,8 @@ import numpy as np
 from rangesim.capture import Capture
 from rangesim.causes.cause import Cause, CauseMap
 from rangesim.causes.evidence import Evidence
-from rangesim.comparison import OUTLIER_M
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.evaluation.comparison import OUTLIER_M
 from rangesim.response import CAUSTIC, DIRECT, GLINT, MULTIPATH, VIA_DELTA
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import rangesim
 from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
-from rangesim.doctor import doctor_command
+from rangesim.environment.doctor import doctor_command
 from rangesim.errors import RangesimError, RangesimWarning, sentence
 
 app = typer.Typer(

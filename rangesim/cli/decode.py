@@ -14,7 +14,7 @@ from rangesim.cli.progress import say_where
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
-    from rangesim.range_image import RangeImage
+    from rangesim.decoding.range_image import RangeImage
     from rangesim.sensors import Sensor, StructuredLight
 
 CODES = ("gray", "gray-phase")
@@ -83,7 +83,7 @@ def decode_command(
 
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
     """ValueError if an option was given that has no effect on this input."""
-    from rangesim.capture_files import SIDECAR
+    from rangesim.capture.capture_files import SIDECAR
 
     given = {name for name in context.params if _from_command_line(context, name)}
     if (capture / SIDECAR).is_file() and (surplus := _options(OF_BARE_IMAGES, given)):
@@ -107,7 +107,7 @@ def _options(names: tuple[str, ...], given: set[str]) -> str:
 def _load(folder: Path, sensor: Sensor | None, bits: int | None) -> Capture:
     """The capture of a directory with a sidecar, or of bare images."""
     import rangesim
-    from rangesim.capture_files import SIDECAR
+    from rangesim.capture.capture_files import SIDECAR
     from rangesim.errors import FileFormatError
 
     if not folder.is_dir():
@@ -138,7 +138,7 @@ def _full_scale(capture: Capture, bits: int) -> Capture:
 
 def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float) -> Capture:
     """The capture with the rig of a calibration file."""
-    from rangesim.calibration_files import load_calibration
+    from rangesim.rig.calibration_files import load_calibration
 
     size = capture.sensor.emitter.size
     return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
@@ -146,8 +146,8 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
 
 def _own_sensor(name: str) -> Sensor:
     """The sensor of FILE.py:NAME."""
-    from rangesim.config import shown
     from rangesim.sensors import is_file_name, sensor_of
+    from rangesim.settings.config import shown
 
     if not is_file_name(name):
         raise ValueError(f"expected --sensor as FILE.py:NAME, got {shown(name)}; a capture says itself what took it.")
@@ -155,8 +155,8 @@ def _own_sensor(name: str) -> Sensor:
 
 
 def _structured_light(code: str, projector: str, axes: str, period: float, steps: int) -> StructuredLight:
-    from rangesim.config import nearest, shown
     from rangesim.sensors import StructuredLight
+    from rangesim.settings.config import nearest, shown
 
     if code not in CODES:
         raise ValueError(f"expected a code out of {', '.join(CODES)}, got {code!r}{nearest(code, CODES)}.")
@@ -175,7 +175,7 @@ def _structured_light(code: str, projector: str, axes: str, period: float, steps
 
 def _summary(image: RangeImage, out: Path) -> str:
     """What came out, in a line."""
-    from rangesim.status import Status
+    from rangesim.decoding.status import Status
 
     share = 100 * float(image.valid.mean())
     if image.camera is None:

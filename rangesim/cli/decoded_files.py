@@ -11,12 +11,12 @@ import numpy as np
 import rangesim
 from pcgraph.output import DirectoryKind, new_directory
 from rangesim.capture import Capture
-from rangesim.config import to_dict
+from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
-from rangesim.range_image import RangeImage
+from rangesim.experiment.result_files import save_range_image
+from rangesim.files.schema import write_json
 from rangesim.report import figures, palette
-from rangesim.result_files import save_range_image
-from rangesim.schema import write_json
+from rangesim.settings.config import to_dict
 
 SIDECAR = "decoded.json"
 FORMAT = "rangesim-decoded"

@@ -19,8 +19,8 @@ def compare_command(
 
       rangesim compare out/tabletop out/matte
     """
+    from rangesim.experiment.result_files import read_rows, read_settings
     from rangesim.report.tables import markdown as in_markdown
-    from rangesim.result_files import read_rows, read_settings
 
     tables = []
     for folder in results:
@@ -48,8 +48,8 @@ def report_command(
       rangesim report out/tabletop
     """
     from pcgraph.output import replace_listed_file
+    from rangesim.experiment.result_files import RESULT, load_result, read_settings
     from rangesim.report import render_report
-    from rangesim.result_files import RESULT, load_result, read_settings
     from rangesim.sensors import sensor_of
 
     for name in sensor or ():
@@ -74,10 +74,10 @@ def verify_command(
       rangesim verify out/tabletop
     """
     from pcgraph.output import verify_directory
-    from rangesim.capture_files import CAPTURE
+    from rangesim.capture.capture_files import CAPTURE
     from rangesim.cli.decoded_files import DECODED
     from rangesim.errors import FileFormatError, visible
-    from rangesim.result_files import RESULT
+    from rangesim.experiment.result_files import RESULT
 
     kinds = (RESULT, CAPTURE, DECODED)
     kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rangesim.catalogue import scene_names
 from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
+from rangesim.files.catalogue import scene_names
 
 if TYPE_CHECKING:
-    from rangesim.cost import Cost
     from rangesim.experiment import Experiment
+    from rangesim.experiment.cost import Cost
 
 
 def run_command(
@@ -109,8 +109,8 @@ def run_command(
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
     from pcgraph.output import check_directory
-    from rangesim import pipeline
-    from rangesim.result_files import RESULT
+    from rangesim.experiment import pipeline
+    from rangesim.experiment.result_files import RESULT
 
     if estimate or out is None:
         cost = pipeline.estimate(experiment)
@@ -133,8 +133,8 @@ def _announce(cost: Cost) -> None:
 
 def _say_what_measured_nothing(out: Path) -> None:
     """A line on stderr if some instrument has not a single point: most often the scene is not in metres."""
-    from rangesim.result_files import MeasurementRecord, read_settings
-    from rangesim.schema import read_record
+    from rangesim.experiment.result_files import MeasurementRecord, read_settings
+    from rangesim.files.schema import read_record
 
     settings = read_settings(out)
     names = [entry.name for entry in settings.instruments]
@@ -153,7 +153,7 @@ def _experiment(
 ) -> Experiment:
     """The experiment of a file or of a scene, with what the command line sets itself."""
     from rangesim.experiment import Experiment, load_experiment
-    from rangesim.instrument import instrument
+    from rangesim.experiment.instrument import instrument
 
     if config is None and scene is None:
         raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")

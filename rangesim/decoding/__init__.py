@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from rangesim.capture import Capture
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
 from rangesim.sensor import Decoder
 
 __all__ = ["decode"]

@@ -8,10 +8,10 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from rangesim.bounds import Bounds, check_fields
 from rangesim.capture import Capture, bright_level
 from rangesim.decoding.bands import bands
-from rangesim.status import Status
+from rangesim.decoding.status import Status
+from rangesim.settings.bounds import Bounds, check_fields
 
 Threshold = Annotated[float, Bounds("0 or positive", 0, 1e6)]
 

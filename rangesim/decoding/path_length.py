@@ -7,10 +7,10 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.decoding.bands import bands
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
 from rangesim.rig import Rig
 from rangesim.sensor import Decoder
-from rangesim.status import Status
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:

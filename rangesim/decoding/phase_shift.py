@@ -8,12 +8,12 @@ from typing import Annotated
 
 import numpy as np
 
-from rangesim.bounds import Bounds, check_fields
 from rangesim.capture import Capture
 from rangesim.decoding.bands import bands
 from rangesim.decoding.gray import GrayCode, Threshold
+from rangesim.decoding.status import Status
 from rangesim.sensor import Background, FrameContent, least_signal_for
-from rangesim.status import Status
+from rangesim.settings.bounds import Bounds, check_fields
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Annotated
 
 import numpy as np
 
-from rangesim.bounds import Bounds, check_fields
 from rangesim.capture import Capture
 from rangesim.decoding.bands import bands
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
 from rangesim.rig import Intrinsics, Rig
 from rangesim.sensor import Decoder
-from rangesim.status import Status
+from rangesim.settings.bounds import Bounds, check_fields
 
 ITERATIONS = 20
 """Most rounds to find the undecoded projector coordinate, which matters through the lens distortion only."""

@@ -16,8 +16,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.medium import Medium, is_boundary, medium_numbers
+from rangesim.light_transport.medium import Medium
 from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.scene.media import is_boundary, medium_numbers
 
 ENDLESS = 1e30
 """Metres to where a ray that meets no surface ends."""

@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.distortion import distort, undistort
 from rangesim.light_transport.medium import Media, Medium
 from rangesim.rig import Intrinsics, Rig
+from rangesim.rig.distortion import distort, undistort
 
 NO_RAY_PX = 1e-2
 """Where the inverse of a lens model reprojects worse than this in single precision, there is none."""

@@ -14,12 +14,12 @@ from rangesim.light_transport.device import Device, connect
 from rangesim.light_transport.indirect import Guides
 from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.loop import Budget, Lanes, Settings, View, mono
-from rangesim.light_transport.medium import is_boundary
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES, is_matte, transmits
+from rangesim.scene.media import is_boundary
 from rangesim.signals import GroundTruth
 
 

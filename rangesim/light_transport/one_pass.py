@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from rangesim.adaptive_sampling import AdaptiveSampling
+from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.absorption import absorbers_of
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
 from rangesim.light_transport.cutouts import cutouts_of
@@ -27,8 +27,8 @@ from rangesim.light_transport.truncation import estimate_truncation, warn_of_tru
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
-from rangesim.seeds import check_seed
 from rangesim.sensor import Sensor
+from rangesim.settings.seeds import check_seed
 from rangesim.signals import EnergySplit, Signals
 
 Indirect = Literal["filtered", "raw"]

@@ -26,10 +26,11 @@ from scipy.ndimage import binary_dilation
 from rangesim.light_transport.absorption import Absorbers
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.launches import Launches
-from rangesim.light_transport.medium import Media, is_boundary
+from rangesim.light_transport.medium import Media
 from rangesim.light_transport.photon_flight import fly
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.scene.media import is_boundary
 
 DEFENSIVE_SHARE = 0.05
 """Of the photons, for the pixels where the pre-pass found no delta surface."""

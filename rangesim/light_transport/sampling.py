@@ -18,7 +18,7 @@ class Seed(NamedTuple):
 
     @classmethod
     def of(cls, seed: int) -> Seed:
-        """The halves of a checked seed (`rangesim.seeds.check_seed`)."""
+        """The halves of a checked seed (`rangesim.settings.seeds.check_seed`)."""
         return cls(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, seed >> 32))
 
 

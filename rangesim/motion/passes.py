@@ -11,8 +11,8 @@ import numpy as np
 from rangesim.motion.timing import Instant, Timing, Window
 from rangesim.motion.track import Motion, Placement
 from rangesim.rig import Rig
-from rangesim.seeds import derived_seed
 from rangesim.sensor import Sensor
+from rangesim.settings.seeds import derived_seed
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion as plain data, as in experiment files; `rangesim.config.to_dict` writes it."""
+"""Motion as plain data, as in experiment files; `rangesim.settings.config.to_dict` writes it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from rangesim.config import check_keys, from_dict, shown
 from rangesim.motion.track import Motion, Track
+from rangesim.settings.config import check_keys, from_dict, shown
 
 
 def motion_from_dict(data: Any, place: str = "motion") -> Motion:

@@ -11,9 +11,9 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangesim.bounds import Bounds, Coordinate, check_fields
-from rangesim.config import nearest, shown, to_dict
 from rangesim.rig import Array, Rig, pose
+from rangesim.settings.bounds import Bounds, Coordinate, check_fields
+from rangesim.settings.config import nearest, shown, to_dict
 
 Rate = Annotated[float, Bounds("a rate per second", -1e6, 1e6)]
 

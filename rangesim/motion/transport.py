@@ -12,8 +12,8 @@ from rangesim.motion.passes import plan
 from rangesim.motion.timing import Timing
 from rangesim.motion.track import Motion
 from rangesim.rig import Rig
-from rangesim.seeds import check_seed
 from rangesim.sensor import Sensor
+from rangesim.settings.seeds import check_seed
 from rangesim.signals import Signals
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def transport_moving(
     ValueError
         No such shape, one that cannot be moved, or what `transport` refuses.
     """
-    from rangesim.adaptive_sampling import AdaptiveSampling
+    from rangesim.experiment.adaptive_sampling import AdaptiveSampling
     from rangesim.light_transport.one_pass import transport
     from rangesim.scene.moving import MovingScene
 

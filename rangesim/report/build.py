@@ -12,10 +12,10 @@ from markupsafe import Markup
 
 from pcgraph.plain_files import write_file
 from rangesim.errors import FileFormatError
+from rangesim.experiment.result_files import Measurement, Result
 from rangesim.report import cloud, figures, palette, tables
 from rangesim.report.policy import StyleRules, content_policy, visible_text
 from rangesim.report.verdict import verdict
-from rangesim.result_files import Measurement, Result
 
 SCRIPTS = ("viewer.js", "report.js")
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.image_files import PNG_STRATEGY
+from rangesim.experiment.result_files import Measurement
+from rangesim.files.image_files import PNG_STRATEGY
 from rangesim.report import palette
-from rangesim.result_files import Measurement
 from rangesim.signals import EnergySplit, GroundTruth
 
 GAMMA = 2.2

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesim.causes.cause import TITLES, Cause
-from rangesim.result_files import Measurement
-from rangesim.status import Status
+from rangesim.decoding.status import Status
+from rangesim.experiment.result_files import Measurement
 
 NOTHING = len(Cause)
 """Class beyond `Cause`: the scene has no surface there."""

@@ -10,11 +10,11 @@ from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.errors import visible
+from rangesim.evaluation.reading_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
-from rangesim.reading_noise import SMALL, noise_ratio
+from rangesim.experiment.result_files import Measurement
 from rangesim.report import palette
 from rangesim.report.figures import Share
-from rangesim.result_files import Measurement
 
 Rows = list[dict[str, Any]]
 

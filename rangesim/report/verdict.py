@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rangesim.experiment.result_files import Measurement
 from rangesim.report.tables import (
     Rows,
     is_reference,
@@ -17,7 +18,6 @@ from rangesim.report.tables import (
     seconds,
     titles,
 )
-from rangesim.result_files import Measurement
 
 MAIN_CAUSE = 0.1
 """Share of the failures from which a cause is named."""

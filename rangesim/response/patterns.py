@@ -10,10 +10,10 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from rangesim import limits
-from rangesim.bounds import Bounds, check_fields
-from rangesim.config import shown
 from rangesim.response.base import DenseResponse, LightPath, Math
 from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
+from rangesim.settings.bounds import Bounds, check_fields
+from rangesim.settings.config import shown
 
 Axis = Annotated[int, Bounds("0 (columns) or 1 (rows)", 0, 1)]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes: Mitsuba geometry with instances, material classes and a camera."""
 
-import rangesim.light_transport  # noqa: F401  (chooses the LLVM before Dr.Jit is imported)
+import rangesim.environment.backend  # noqa: F401  (chooses the LLVM before Dr.Jit is imported)
 from rangesim.scene.load import load_scene
 from rangesim.scene.scene import Instance, Scene
 

@@ -15,15 +15,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.bounds import Bounds, check_number
-from rangesim.catalogue import CATALOGUE, scene_file
+from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError
-from rangesim.light_transport.backend import select_variant
-from rangesim.light_transport.medium import is_boundary, why_not_traced
+from rangesim.files.catalogue import CATALOGUE, scene_file
+from rangesim.files.text_files import check_xml
 from rangesim.rig import Intrinsics, translation
 from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
+from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
 from rangesim.scene.nodes import ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
@@ -46,7 +46,7 @@ from rangesim.scene.sensor_band import (
     warn_of_colours,
     warn_of_lamps_behind_glass,
 )
-from rangesim.text_files import check_xml
+from rangesim.settings.bounds import Bounds, check_number
 
 Source = str | Path | Mapping[str, Any]
 
@@ -64,9 +64,9 @@ def load_scene(
     Parameters
     ----------
     source : path of a Mitsuba 3 XML file or of a mesh (PLY, OBJ, GLB, STL), the name of a scene that comes with the
-        package (`rangesim.catalogue.scene_names`; a file of that name goes first), or a Mitsuba scene dictionary. XML
-        and dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler are
-        ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
+        package (`rangesim.files.catalogue.scene_names`; a file of that name goes first), or a Mitsuba scene dictionary.
+        XML and dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler
+        are ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
         A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
         `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md);
         files beside the scene come first. BSDFs of type `retroreflector` are known (`rangesim.scene.retroreflector`).

@@ -12,10 +12,10 @@ import numpy as np
 
 from pcgraph.plain_files import check_file
 from rangesim import limits
-from rangesim.bounds import FARTHEST_M
-from rangesim.config import brief, nearest
 from rangesim.errors import FileFormatError
 from rangesim.scene.origin import Rounding, rounding_of, warn_of_coarse_mesh
+from rangesim.settings.bounds import FARTHEST_M
+from rangesim.settings.config import brief, nearest
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 Y_UP_SUFFIXES = (".glb", ".gltf")

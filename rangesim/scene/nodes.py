@@ -8,9 +8,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from rangesim.config import nearest, shown
 from rangesim.errors import FileFormatError
 from rangesim.scene.materials import MATERIAL_CLASSES
+from rangesim.settings.config import nearest, shown
 
 CLASS_KEY = "material_class"
 COMPOSITES = ("instance", "shapegroup", "merge")

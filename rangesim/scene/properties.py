@@ -17,11 +17,11 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim import limits
-from rangesim.bounds import FARTHEST_M, Bounds
-from rangesim.config import shown
 from rangesim.errors import FileFormatError
-from rangesim.image_files import check_pixels
-from rangesim.text_files import is_nested_deeper
+from rangesim.files.image_files import check_pixels
+from rangesim.files.text_files import is_nested_deeper
+from rangesim.settings.bounds import FARTHEST_M, Bounds
+from rangesim.settings.config import shown
 
 ANY = Bounds("finite", -1e30, 1e30)
 PLACE = Bounds("a coordinate in metres", -FARTHEST_M, FARTHEST_M)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.bounds import Bounds, check_number, whole
 from rangesim.rig import Intrinsics, Rig, look_at, pose, translation
+from rangesim.settings.bounds import Bounds, check_number, whole
 
 BASELINE = Bounds("a positive baseline in metres", 1e-9, 1e6)
 PROJECTOR_PIXELS = (1280, 800)

@@ -14,9 +14,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from rangesim.config import shown
 from rangesim.errors import FileFormatError, warn
-from rangesim.image_files import is_coloured
+from rangesim.files.image_files import is_coloured
+from rangesim.settings.config import shown
 
 REFLECTANCE_KEY = "sensor_reflectance"
 COLOUR_OF = {

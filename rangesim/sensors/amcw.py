@@ -10,17 +10,17 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim import limits
-from rangesim.bounds import HERTZ, Bounds, Hertz, check_fields, check_number
 from rangesim.capture import Capture
 from rangesim.decoding.bands import bands
 from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_weak, phase_sigma, tap_phase
 from rangesim.decoding.phase_unwrapping import unwrap
-from rangesim.detector import Detector
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
+from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, Phasor, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
-from rangesim.status import Status
+from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_number
 
 MAX_RANGE_M = 100.0
 """Ranges beyond are not searched by phase unwrapping, even if the frequencies were unambiguous farther out."""

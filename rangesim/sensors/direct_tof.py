@@ -10,17 +10,17 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from rangesim import limits
-from rangesim.bounds import Bounds, check_fields, whole
 from rangesim.capture import Capture, bright_level
 from rangesim.decoding.gray import Threshold
 from rangesim.decoding.histogram import coates, find_peak, window_reach
 from rangesim.decoding.path_length import range_image_from_path_length
-from rangesim.detector import Gate
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
+from rangesim.electronics.detector import Gate
+from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, LengthBins, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
-from rangesim.spad import SpadDetector
-from rangesim.status import Status
+from rangesim.settings.bounds import Bounds, check_fields, whole
 
 OVERSAMPLING = (1, 2, 4)
 """Bins of the transport pass per bin of a sensor with a pulse: so many that its sigma is at least one of them."""
@@ -82,7 +82,7 @@ class DirectToF(Sensor):
 
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         from pcgraph.parallel import SMALLEST_ROWS, in_blocks
-        from rangesim.histogram_filter import gaussian_filter
+        from rangesim.decoding.histogram_filter import gaussian_filter
 
         variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
         beyond: Literal["wrap", "constant"] = "wrap" if self.is_cyclic else "constant"

@@ -11,10 +11,10 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.decoding.path_length import range_image_from_path_length
-from rangesim.range_image import RangeImage
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
 from rangesim.response import FirstReturn, Response
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
-from rangesim.status import Status
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from types import ModuleType
 from typing import Any
 from zlib import crc32
 
-from rangesim.config import brief, from_dict, named_subclasses, nearest, shown
 from rangesim.errors import FileFormatError
 from rangesim.sensor import Sensor
+from rangesim.settings.config import brief, from_dict, named_subclasses, nearest, shown
 
 _SEPARATOR = ".py:"
 

@@ -11,15 +11,15 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from rangesim import limits
-from rangesim.bounds import Bounds, check_fields, whole
 from rangesim.capture import Capture
 from rangesim.decoding.gray import GrayCode, GrayThresholds, decode_gray, direct_contrast
 from rangesim.decoding.phase_shift import PhaseThresholds, refine_by_phase
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
 from rangesim.decoding.triangulate import TriangulationLimits, range_image_from_coordinates
-from rangesim.range_image import RangeImage
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for
-from rangesim.status import Status
+from rangesim.settings.bounds import Bounds, check_fields, whole
 
 AXES = ("columns", "rows")
 WHITE, BLACK = -2, -1

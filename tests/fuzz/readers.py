@@ -136,7 +136,7 @@ def _scene(path: Path, _: Arguments) -> Any:
 
 
 def _image(path: Path, _: Arguments) -> Any:
-    from rangesim.image_files import read_grey
+    from rangesim.files.image_files import read_grey
 
     return read_grey(path)
 
@@ -172,7 +172,7 @@ def _calibration(path: Path, _: Arguments) -> Any:
 
 
 def _result(path: Path, _: Arguments) -> Any:
-    from rangesim.result_files import load_result
+    from rangesim.experiment.result_files import load_result
 
     return load_result(path)
 

@@ -56,8 +56,8 @@ def directory(folder: Path, under: str) -> dict[str, bytes]:
 def result_files() -> dict[str, bytes]:
     """Files of a small result, under `result/`: structured light and an ideal ranger before a plane."""
     from rangesim.experiment import Experiment
-    from rangesim.instrument import Instrument
-    from rangesim.pipeline import run
+    from rangesim.experiment.instrument import Instrument
+    from rangesim.experiment.pipeline import run
     from rangesim.sensors import AmcwToF, IdealToF, StructuredLight
 
     instruments = (
@@ -131,8 +131,8 @@ def rig_files() -> Seeds:
     """Calibrations as JSON."""
     from synthetic import stereo_rig
 
-    from rangesim.calibration_files import save_calibration
     from rangesim.rig import Intrinsics
+    from rangesim.rig.calibration_files import save_calibration
 
     seeds = {}
     projector = Intrinsics.from_fov(32, 24, 60)
@@ -175,10 +175,10 @@ def edge_models() -> Seeds:
 
 
 def image_files(suffix: str) -> Seeds:
-    """Images of all kinds that `rangesim.image_files` reads under this suffix, 24 x 16 pixels."""
+    """Images of all kinds that `rangesim.files.image_files` reads under this suffix, 24 x 16 pixels."""
     from PIL import Image
 
-    from rangesim.image_files import write_grey
+    from rangesim.files.image_files import write_grey
 
     rng = np.random.default_rng(1)
     eight = rng.integers(0, 255, (16, 24), dtype=np.uint8)
@@ -255,7 +255,7 @@ def cloud_files(suffix: str) -> Seeds:
     from fuzz.cloud_files import CORPUS
     from pcgraph.io.ply import encode_ply
     from rangesim.point_cloud import PointCloud
-    from rangesim.point_cloud_files import save_point_cloud
+    from rangesim.point_cloud.point_cloud_files import save_point_cloud
 
     name = f"cloud.{suffix}"
     seeds = {key: of_file(name, content) for key, content in CORPUS.items() if key.startswith(suffix)}

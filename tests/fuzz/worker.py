@@ -307,7 +307,7 @@ def main() -> None:
     requests, answers = os.fdopen(os.dup(0), "r"), os.fdopen(os.dup(1), "w")
     with open(os.devnull) as nothing:
         os.dup2(nothing.fileno(), 0)
-    from rangesim.llvm import ensure_llvm
+    from rangesim.environment.llvm import ensure_llvm
 
     ensure_llvm()
     store = Path(sys.argv[2])

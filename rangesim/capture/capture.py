@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames as a camera delivers them, with what is needed to decode them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rangesim.electronics.detector import PhotoDetector
+from rangesim.rig import Rig
+from rangesim.sensor import Sensor
+
+if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
+
+DTYPES = ("uint8", "uint16", "uint32", "float32")
+
+
+BRIGHT_PERCENTILE = 99.0
+"""Percentile of the lit pixels that counts as bright: highlights of mirrors and gloss lie beyond."""
+
+
+def bright_level(values: np.ndarray) -> float:
+    """Level of bright pixels: the 99th percentile of the positive values; 0 if there are none."""
+    positive = values[values > 0]
+    return float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A stack of frames of one sensor.
+
+    Parameters
+    ----------
+    frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free
+        capture.
+    sensor : Sensor, the measuring principle the frames were taken with.
+    rig : Rig, or None for an uncalibrated capture.
+    detector : PhotoDetector, or None if unknown (a real capture) or noise-free.
+    exposure_s : float, seconds per frame; NaN if unknown.
+    ambient : Ambient, the ambient light it was taken in, or None if not stated.
+    """
+
+    frames: np.ndarray
+    sensor: Sensor
+    rig: Rig | None = None
+    detector: PhotoDetector | None = None
+    exposure_s: float = float("nan")
+    ambient: Ambient | None = None
+
+    def __post_init__(self) -> None:
+        if self.frames.ndim != 3 or len(self.frames) != self.sensor.n_frames or self.frames.size == 0:
+            raise ValueError(
+                f"expected {self.sensor.n_frames} frames of equal size for {self.sensor.type_name}, "
+                f"got an array of shape {self.frames.shape}."
+            )
+        if self.frames.dtype.name not in DTYPES:
+            raise ValueError(f"expected frames of type {', '.join(DTYPES)}, got {self.frames.dtype.name}.")
+        if self.rig is not None and self.frames.shape[1:] != (self.rig.camera.height, self.rig.camera.width):
+            raise ValueError(
+                f"expected frames of {self.rig.camera.width} x {self.rig.camera.height} pixels as the rig's camera, "
+                f"got {self.frames.shape[2]} x {self.frames.shape[1]}."
+            )
+
+    @property
+    def is_digital(self) -> bool:
+        """Whether the frames are digital numbers, not radiance."""
+        return bool(np.issubdtype(self.frames.dtype, np.integer))
+
+    @property
+    def black_level(self) -> float:
+        """Digital number without light; 0 if unknown or noise-free."""
+        return self.detector.black_level_dn if self.detector else 0.0
+
+    @property
+    def full_scale(self) -> float:
+        """Largest signal above black that a frame can hold; of a noise-free capture, that of its bright pixels."""
+        if not self.is_digital:
+            return bright_level(self.frames.max(axis=0)) or 1.0
+        return self._max_dn - self.black_level
+
+    @property
+    def _max_dn(self) -> int:
+        return self.detector.max_dn if self.detector else int(np.iinfo(self.frames.dtype).max)
+
+    def saturated(self, frames: np.ndarray) -> np.ndarray:
+        """(h, w) bool, where any of `frames` (k, h, w) of this capture is at the largest digital number."""
+        if not self.is_digital:
+            return np.zeros(frames.shape[1:], dtype=bool)
+        return np.asarray(frames.max(axis=0) >= self._max_dn)
+
+    def noise(self, frame: np.ndarray) -> np.ndarray | None:
+        """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown."""
+        return self.detector.noise_dn(frame) if self.detector else None
+
+    def save(self, directory: str | Path) -> None:
+        """Write the capture as a directory of images and a sidecar; see `rangesim.capture.capture_files`."""
+        from rangesim.capture.capture_files import save_capture
+
+        save_capture(self, directory)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals to a capture, as a camera would deliver it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rangesim.capture import Capture, bright_level
+from rangesim.electronics.detector import PhotoDetector
+from rangesim.rig import Rig
+from rangesim.sensor import Sensor
+from rangesim.settings.bounds import SECONDS, check_number
+from rangesim.settings.seeds import check_seed
+
+if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
+    from rangesim.signals import Signals
+
+TARGET_SHARE = 0.7
+"""Share of the saturation capacity where automatic exposure puts the bright pixels (`bright_level`)."""
+
+
+def expose(
+    signals: Signals,
+    sensor: Sensor,
+    detector: PhotoDetector | None = None,
+    exposure_s: float | None = None,
+    seed: int = 0,
+    ambient: Ambient | None = None,
+) -> Capture:
+    """Capture of `sensor`: its frames with the noise and limits of `detector`.
+
+    Parameters
+    ----------
+    signals : Signals of a transport pass that this sensor was part of.
+    sensor : Sensor.
+    detector : Detector (EMVA 1288) or, for direct time of flight, SpadDetector. None: a noise-free capture,
+        float32 radiance in W/m2/sr, unfiltered ambient light included. The frames of an ideal sensor
+        (`Sensor.is_ideal`) are always noise-free.
+    exposure_s : float, seconds per frame; None: chosen by `auto_exposure_s`.
+    seed : int, 0 to 2^64 - 1, of the noise. Every frame, of a SpadDetector every image row, has its own stream; the
+        same seed gives the same bytes on any number of threads.
+    ambient : Ambient, what kind of light the scene's own emitters give, and how strong: the detector's
+        band (`band_width_m`) then decides what counts of it. None: unknown, and the detector's
+        `ambient_transmission` does. Other light needs no new pass.
+
+    Raises
+    ------
+    ValueError
+        The pass lacks the sensor's signals, the exposure is not positive, the seed is out of its range, detector and
+        sensor do not go together, or ambient light is stated for a scene that has none.
+    """
+    if detector is not None and not isinstance(detector, PhotoDetector):
+        raise ValueError(f"expected a Detector, a SpadDetector or None, got {detector!r}.")
+    seed = check_seed(seed)
+    if exposure_s is not None:
+        check_number("exposure_s", exposure_s, SECONDS)
+    if ambient is not None:
+        ambient.check_emitters(bool(signals.energy.ambient.any()))
+    if detector is None or sensor.is_ideal:
+        return noise_free_capture(signals, sensor, ambient)
+    radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor.gate, ambient)), signals.rig)
+    if exposure_s is None:
+        exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
+    frames = detector.read_out(radiance, sensor.gate, signals.rig, exposure_s, seed)
+    return Capture(frames, sensor, signals.rig, detector, exposure_s, ambient)
+
+
+def noise_free_capture(
+    signals: Signals, sensor: Sensor, ambient: Ambient | None = None, sampling_errors: float = 0.0
+) -> Capture:
+    """Capture of radiance, without a detector; so many times the sampling error of the signals is added to them."""
+    unfiltered = 1.0 if ambient is None else ambient.scale
+    frames = signals.frames(sensor, unfiltered, sampling_errors)
+    return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
+
+
+def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
+    """Frames (k, h, w) as the camera's vignetting leaves them."""
+    return frames * rig.camera_illumination if rig.camera_vignetting else frames
+
+
+def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:
+    """Exposure in seconds, one for all frames, that puts the bright pixels at 70 % of saturation.
+
+    Of the pixels that receive light, 99 % are at or below that level in their brightest frame: the highlights
+    of mirrors and gloss may saturate. Limited by the detector's shortest and longest exposure.
+
+    Parameters
+    ----------
+    radiance : (k, h, w) float, W/m2/sr, mean of the frames.
+    """
+    level = bright_level(radiance.max(axis=0)) * detector.electrons_per_radiance(rig)
+    if level == 0:
+        return detector.max_exposure_s
+    wanted = TARGET_SHARE * detector.capacity_e / level
+    return float(np.clip(wanted, detector.min_exposure_s, detector.max_exposure_s))

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a decoder returns: one measurement, or the reason for none, per pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rangesim.decoding.status import Status
+from rangesim.rig import Intrinsics
+
+if TYPE_CHECKING:
+    from rangesim.point_cloud import PointCloud
+    from rangesim.sensor import Decoder
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """Depth and range per camera pixel.
+
+    Parameters
+    ----------
+    z : (h, w) float32, metres, along the optical axis of the camera; NaN where `status` is not OK.
+    range_m : (h, w) float32, metres, Euclidean distance from the camera centre; NaN likewise.
+    confidence : (h, w) float32 in 0..1, strength of the useful signal as a share of the largest the capture can hold
+        (of a noise-free capture: does hold). Structured light: white - black; AMCW: twice the modulation amplitude;
+        direct ToF: counts in the peak, of the highest peak; ideal: radiance.
+    status : (h, w) uint8, values of `Status`.
+    intensity : (h, w) float32, mean signal in the capture's units, for colouring points.
+    camera : Intrinsics, or None for an uncalibrated capture (then z and range_m are all NaN).
+    T_world_camera : (4, 4) float64.
+    projector_column, projector_row : (h, w) float32, decoded projector pixel coordinates (pixel centres at
+        integer + 0.5), NaN where not decoded; None for sensors without a code along that axis.
+    sampling_sigma_m : (h, w) float32, metres, of a simulated reading: standard deviation of z by the sampling of light
+        paths, estimated from one pair of draws for each pixel, so take medians over many; NaN where there is no
+        reading, infinite where sampling decides whether there is one. None: not known, see
+        `rangesim.evaluation.reading_noise`.
+    decoder : Decoder it comes from; None: not known.
+    """
+
+    z: np.ndarray
+    range_m: np.ndarray
+    confidence: np.ndarray
+    status: np.ndarray
+    intensity: np.ndarray
+    camera: Intrinsics | None = None
+    T_world_camera: np.ndarray | None = None
+    projector_column: np.ndarray | None = None
+    projector_row: np.ndarray | None = None
+    sampling_sigma_m: np.ndarray | None = None
+    decoder: Decoder | None = None
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(h, w) bool, where `status` is OK."""
+        return np.asarray(self.status == Status.OK)
+
+    def to_point_cloud(self, frame: str = "camera") -> PointCloud:
+        """Organised point cloud of this image, with normals; see `rangesim.point_cloud`."""
+        from rangesim.point_cloud import from_range_image
+
+        return from_range_image(self, frame)

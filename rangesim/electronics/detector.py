@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Light to digital numbers: what every detector has in common, and integrating image sensors after EMVA 1288.
+
+A pixel of a camera with entrance pupil radius a and focal length f collects from radiance L the irradiance
+E = L pi (a/f)^2, so E A t lambda / (h c) photons on its area A in the exposure t. With f = fx sqrt(A) the
+pixel pitch drops out: photons = L pi a^2 / (fx fy) t lambda / (h c), radiance times etendue. The fall-off
+towards the corners is the rig's (`camera_vignetting`), and comes before the detector.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
+
+import numpy as np
+
+from rangesim.rig import Rig
+from rangesim.settings.bounds import Bounds, Fraction, Metres, PositiveFraction, Seconds, Wavelength, check_fields
+
+if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
+
+PLANCK_TIMES_C = 6.626_070_15e-34 * 299_792_458.0
+"""h c in joule metres, exact."""
+
+
+Bits = Annotated[int, Bounds("a number of bits", 1, 16)]
+BandWidth = Annotated[float, Bounds("0 or positive", 1e-12, 2e-2, or_zero=True)]
+"""Metres."""
+
+
+class Gate(NamedTuple):
+    """When a sensor counts photons: those of one bin after another, again and again with each pulse of its laser.
+
+    period_s : from pulse to pulse. open_s : how much of it the bins cover. bins : as many as frames.
+    """
+
+    period_s: float
+    open_s: float
+    bins: int
+
+
+class PhotoDetector(ABC):
+    """What turns the radiance of a sensor's frames into digital numbers. Subclasses are frozen dataclasses.
+
+    Where a method takes a `gate`, it is `Sensor.gate`: when photons are counted; None for a sensor whose frames
+    integrate all light of an exposure.
+    """
+
+    type_name: ClassVar[str]
+    wavelength_m: float
+    quantum_efficiency: float
+    bits: int
+    ambient_transmission: float
+    band_width_m: float
+    min_exposure_s: float
+    max_exposure_s: float
+
+    @property
+    @abstractmethod
+    def capacity_e(self) -> float:
+        """Electrons (counts) at which a pixel saturates."""
+
+    @abstractmethod
+    def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
+        """(..., h, w) expected electrons (counts) of frames of `radiance` in W/m2/sr, dark ones included."""
+
+    @abstractmethod
+    def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
+        """(k, h, w) digital numbers with noise, of frames (k, h, w) of mean radiance, W/m2/sr.
+
+        Raises
+        ------
+        ValueError
+            The detector integrates and the sensor counts, or the other way round.
+        """
+
+    @property
+    def black_level_dn(self) -> float:
+        """Digital number without light."""
+        return 0.0
+
+    def own_noise_e2(self, dark_e: float) -> float:
+        """Variance, electrons squared, of what the detector itself adds to a frame with so many dark electrons."""
+        return dark_e
+
+    def noise_dn(self, dn: np.ndarray) -> np.ndarray | None:
+        """Standard deviation of a pixel whose mean is `dn`, digital numbers; None where that says too little."""
+        return None
+
+    def ambient_share(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
+        """Factor on the scene's ambient light for the part that counts: what passes the filter.
+
+        ambient : what kind of light it is, and how strong: the filter's band decides. None: unknown, so
+            `ambient_transmission` does.
+        """
+        return self.ambient_transmission if ambient is None else ambient.in_band(self.wavelength_m, self.band_width_m)
+
+    @property
+    def max_dn(self) -> int:
+        """Largest digital number; a pixel that reads it is saturated."""
+        return int(2**self.bits - 1)
+
+    @property
+    def dtype(self) -> type[np.unsignedinteger]:
+        """Smallest unsigned integer that holds a digital number."""
+        return np.uint8 if self.bits <= 8 else np.uint16
+
+    def electrons_per_radiance(self, rig: Rig) -> float:
+        """Electrons per second of exposure for a radiance of 1 W/m2/sr."""
+        camera = rig.camera
+        etendue = np.pi * rig.camera_aperture_radius_m**2 / (camera.fx * camera.fy)
+        return float(etendue * self.quantum_efficiency * self.wavelength_m / PLANCK_TIMES_C)
+
+    def _check(self) -> None:
+        check_fields(self)
+        if self.band_width_m >= 2 * self.wavelength_m:
+            raise ValueError(f"expected a band_width_m whose filter ends above 0 m, got {self.band_width_m}.")
+        if self.min_exposure_s > self.max_exposure_s:
+            raise ValueError(
+                f"expected min_exposure_s <= max_exposure_s, got {self.min_exposure_s} > {self.max_exposure_s}."
+            )
+
+
+class LinearPixel(NamedTuple):
+    """What an exposure makes of radiance, in a `Detector`.
+
+    electrons : per W/m2/sr. dark_e, max_mean_e, read_noise_e : electrons; beyond max_mean_e the pixel is saturated,
+    whatever its noise. gain_dn_e : digital numbers per electron. offset_dn, max_dn : digital numbers.
+    """
+
+    electrons: float
+    dark_e: float
+    max_mean_e: float
+    read_noise_e: float
+    gain_dn_e: float
+    offset_dn: float
+    max_dn: int
+
+
+def streams(seed: int, n: int) -> list[np.random.Generator]:
+    """`n` independent random generators; the same seed gives the same ones."""
+    return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(n)]
+
+
+@dataclass(frozen=True)
+class Detector(PhotoDetector):
+    """Linear image sensor after EMVA Standard 1288, release 4.0 Linear (symbols of the standard in brackets).
+
+    Parameters
+    ----------
+    wavelength_m : float, metres, of the projector's light [lambda].
+    quantum_efficiency : float in (0, 1], fill factor and lens transmission included [eta].
+    full_well_e : float, electrons, saturation capacity [mu_e.sat]; it maps to the largest digital number
+        (the well itself is a little deeper, so that a saturated pixel reads that number in spite of its
+        noise).
+    read_noise_e : float, electrons rms, temporal dark noise [sigma_d].
+    dark_current_e_s : float, electrons per second [mu_I].
+    bits : int in 1..16, ADC resolution.
+    offset_dn : float, digital numbers, black level [mu_y.dark without dark current].
+    ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through, where the kind
+        of light is not stated (`expose` without `ambient`); the default is that of sunlight in the default band.
+    band_width_m : float, metres, full width of the band-pass filter around wavelength_m, where the kind of light is
+        stated. In the band it passes ambient light as it does the projector's, whose losses are part of the
+        quantum efficiency; outside it passes nothing. 0: no ambient light at all.
+    pixel_pitch_m : float, metres; pixels are square [sqrt A]. Informative: it cancels, see the module.
+    min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
+    """
+
+    wavelength_m: Wavelength = 850e-9
+    quantum_efficiency: PositiveFraction = 0.4
+    full_well_e: Annotated[float, Bounds("positive and finite", 1, 1e9)] = 12_000.0
+    read_noise_e: Annotated[float, Bounds("0 or positive", 0, 1e9)] = 5.0
+    dark_current_e_s: Annotated[float, Bounds("0 or positive", 0, 1e12)] = 20.0
+    bits: Bits = 12
+    offset_dn: Annotated[float, Bounds("0 or positive", 0, 65535)] = 16.0
+    ambient_transmission: Fraction = 0.05
+    band_width_m: BandWidth = 50e-9
+    pixel_pitch_m: Metres = 5e-6
+    min_exposure_s: Seconds = 10e-6
+    max_exposure_s: Seconds = 0.1
+
+    type_name: ClassVar[str] = "emva1288"
+
+    def __post_init__(self) -> None:
+        self._check()
+        if self.offset_dn >= self.max_dn:
+            raise ValueError(f"expected 0 <= offset_dn < {self.max_dn}, got {self.offset_dn}.")
+
+    @classmethod
+    def time_of_flight(cls) -> Detector:
+        """A lock-in pixel as in indirect time-of-flight cameras: large, deep, noisier, behind a narrow filter."""
+        return cls(full_well_e=100_000.0, read_noise_e=20.0, dark_current_e_s=1000.0, pixel_pitch_m=10e-6,
+                   ambient_transmission=0.03, band_width_m=30e-9, max_exposure_s=0.02)  # fmt: skip
+
+    @classmethod
+    def ideal(cls) -> Detector:
+        """Shot noise and 16-bit quantisation alone: every photon counts, nothing is dark, the well is deep."""
+        return cls(quantum_efficiency=1.0, full_well_e=1e6, read_noise_e=0.0, dark_current_e_s=0.0, bits=16,
+                   offset_dn=0.0, ambient_transmission=0.0, band_width_m=0.0)  # fmt: skip
+
+    @property
+    def gain_dn_e(self) -> float:
+        """Digital numbers per electron, overall system gain [K]."""
+        return (self.max_dn - self.offset_dn) / self.full_well_e
+
+    @property
+    def capacity_e(self) -> float:
+        return self.full_well_e
+
+    @property
+    def black_level_dn(self) -> float:
+        return self.offset_dn
+
+    def own_noise_e2(self, dark_e: float) -> float:
+        return dark_e + self.read_noise_e**2 + 1 / (12 * self.gain_dn_e**2)
+
+    def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
+        pixel = self._pixel(rig, exposure_s)
+        return np.asarray(pixel.electrons * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
+
+    def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
+        if gate is not None:
+            raise ValueError("expected a SpadDetector for a sensor that counts photons, got an integrating Detector.")
+        from pcgraph.parallel import in_blocks
+        from rangesim.electronics.shot_noise import read_frame
+
+        pixel, rngs = self._pixel(rig, exposure_s), streams(seed, len(radiance))
+        result = np.empty(radiance.shape, dtype=self.dtype)
+
+        def read(start: int, stop: int) -> None:
+            for k in range(start, stop):
+                read_frame(rngs[k], np.ascontiguousarray(radiance[k], dtype=np.float32), pixel, result[k])
+
+        in_blocks(read, len(radiance), smallest=1)
+        return result
+
+    def _pixel(self, rig: Rig, exposure_s: float) -> LinearPixel:
+        return LinearPixel(
+            electrons=self.electrons_per_radiance(rig) * exposure_s,
+            dark_e=float(self.dark_current_e_s * exposure_s),
+            max_mean_e=10.0 * self.full_well_e + 1000,
+            read_noise_e=float(self.read_noise_e),
+            gain_dn_e=float(self.gain_dn_e),
+            offset_dn=float(self.offset_dn),
+            max_dn=self.max_dn,
+        )
+
+    def noise_dn(self, dn: np.ndarray) -> np.ndarray:
+        """Standard deviation of a pixel whose mean is `dn`, digital numbers: K^2 sigma_d^2 + 1/12 + K (mu - offset)."""
+        k = self.gain_dn_e
+        shot = k * np.maximum(np.asarray(dn, dtype=np.float32) - self.offset_dn, 0)
+        return np.asarray(np.sqrt(np.float32(k**2 * self.read_noise_e**2 + 1 / 12) + shot), dtype=np.float32)

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photon counters for direct time of flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
+
+import numpy as np
+
+from rangesim.electronics.detector import BandWidth, Bits, Gate, PhotoDetector, streams
+from rangesim.rig import Rig
+from rangesim.settings.bounds import Bounds, Fraction, PositiveFraction, Seconds, Wavelength
+
+if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
+
+
+MAX_MEAN = 1e9
+"""Photons of a bin, on average: more are drawn as this many, which saturates every counter."""
+
+
+class CountingPixel(NamedTuple):
+    """What an exposure makes of radiance, in one bin of a `SpadDetector`.
+
+    photons : per W/m2/sr. dark, max_mean : counts. max_dn : digital numbers.
+    """
+
+    photons: float
+    dark: float
+    max_mean: float
+    max_dn: int
+
+
+@dataclass(frozen=True)
+class SpadDetector(PhotoDetector):
+    """Single-photon counter with a histogram memory per pixel.
+
+    An exposure holds as many pulses of the laser's mean power as there are periods in it (`Gate.period_s`).
+    Ambient light and dark counts spread evenly over the bins; before start_s nothing is counted.
+
+    Parameters
+    ----------
+    wavelength_m : float, metres.
+    quantum_efficiency : float in (0, 1], photon detection efficiency, fill factor included.
+    dark_counts_hz : float, counts per second per pixel.
+    bits : int in 1..16, depth of the counter of a bin.
+    pile_up : bool; True: only the first photon of each histogram is counted (Coates 1968), be it of an earlier
+        pulse. False: every photon.
+    ambient_transmission, band_width_m : the band-pass filter against ambient light, as of `Detector`.
+    min_exposure_s, max_exposure_s : float, seconds, limits of the automatic exposure.
+    """
+
+    wavelength_m: Wavelength = 905e-9
+    quantum_efficiency: PositiveFraction = 0.15
+    dark_counts_hz: Annotated[float, Bounds("0 or positive", 0, 1e12)] = 500.0
+    bits: Bits = 12
+    pile_up: bool = True
+    ambient_transmission: Fraction = 0.02
+    band_width_m: BandWidth = 30e-9
+    min_exposure_s: Seconds = 10e-6
+    max_exposure_s: Seconds = 0.1
+
+    type_name: ClassVar[str] = "spad"
+
+    def __post_init__(self) -> None:
+        self._check()
+
+    @property
+    def capacity_e(self) -> float:
+        return float(self.max_dn)
+
+    def pulses(self, gate: Gate | None, exposure_s: float) -> int:
+        """Number of laser pulses in an exposure."""
+        return max(1, round(exposure_s / _counting(gate).period_s))
+
+    def ambient_share(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
+        """Factor on the scene's ambient light: what passes the filter while the histogram is open."""
+        gate = _counting(gate)
+        return super().ambient_share(gate, ambient) * gate.open_s / gate.period_s
+
+    def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
+        pixel = self._pixel(_counting(gate), rig, exposure_s)
+        return np.asarray(pixel.photons * np.asarray(radiance, dtype=np.float64) + pixel.dark)
+
+    def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
+        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from rangesim.electronics.shot_noise import count_first_photons, count_photons
+
+        gate, height = _counting(gate), radiance.shape[1]
+        pixel, pulses = self._pixel(gate, rig, exposure_s), self.pulses(gate, exposure_s)
+        result, rngs = np.empty(radiance.shape, dtype=self.dtype), streams(seed, height)
+
+        def read(start: int, stop: int) -> None:
+            for row in range(start, stop):
+                means = np.ascontiguousarray(radiance[:, row], dtype=np.float32)
+                if self.pile_up:
+                    count_first_photons(rngs[row], means, pixel, pulses, result[:, row])
+                else:
+                    count_photons(rngs[row], means, pixel, result[:, row])
+
+        in_blocks(read, height, smallest=SMALLEST_ROWS)
+        return result
+
+    def _pixel(self, gate: Gate, rig: Rig, exposure_s: float) -> CountingPixel:
+        pulses = self.pulses(gate, exposure_s)
+        return CountingPixel(
+            photons=self.electrons_per_radiance(rig) * pulses * gate.period_s,
+            dark=float(self.dark_counts_hz * pulses * gate.open_s / gate.bins),
+            max_mean=MAX_MEAN,
+            max_dn=self.max_dn,
+        )
+
+
+def _counting(gate: Gate | None) -> Gate:
+    """The gate; ValueError if there is none."""
+    if gate is None:
+        raise ValueError("expected a sensor that counts photons, such as DirectToF, for a SpadDetector.")
+    return gate

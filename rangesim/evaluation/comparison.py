@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A range image against ground truth, by material class."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from rangesim.decoding.range_image import RangeImage
+from rangesim.signals import GroundTruth
+
+OUTLIER_M = 0.010
+EDGE_RADIUS = 2
+"""Pixels from a depth edge within which a pixel can be a flying pixel."""
+EDGE_SHARE = 0.02
+"""A depth edge is where neighbours' true depths differ by more than this share of the nearer, and `outlier_m`."""
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Errors of one material class. NaN where there is nothing to count.
+
+    Parameters
+    ----------
+    material : str, class of the first surface behind the pixel, or "all".
+    pixels : int, with a true depth.
+    lit : int, of those, seen by the projector (the others lie in its shadow or beside its image).
+    completeness : share of the lit pixels with a measurement.
+    coverage : share of all pixels with a measurement.
+    bias_m : mean of z - true z, metres, over all measured pixels; lit or not.
+    median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of |z - true z|, metres.
+    outlier_rate : share of the measured pixels with |z - true z| > `outlier_m`.
+    edge_pixels : int, measured pixels within 2 pixels of a depth edge.
+    flying_rate : share of them that fly: their z is farther than `outlier_m` from every true depth in the 5 x
+        5 window, so they lie on neither side of the edge.
+    """
+
+    material: str
+    pixels: int
+    lit: int
+    completeness: float
+    coverage: float
+    bias_m: float
+    median_abs_m: float
+    rmse_m: float
+    p95_abs_m: float
+    outlier_rate: float
+    edge_pixels: int
+    flying_rate: float
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Statistics per material class, "all" last, and the error map.
+
+    table : tuple of ErrorStatistics.
+    error_m : (h, w) float32, metres, z - true z; NaN where there is no measurement or no truth.
+    flying : (h, w) bool, flying pixels.
+    outlier_m : float, metres.
+    """
+
+    table: tuple[ErrorStatistics, ...]
+    error_m: np.ndarray
+    flying: np.ndarray
+    outlier_m: float
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One dict per class, for JSON: None where a value is not defined."""
+        return [
+            {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(row).items()}
+            for row in self.table
+        ]
+
+    def row(self, material: str) -> ErrorStatistics:
+        """Statistics of one class; ValueError if there is none of this name."""
+        for row in self.table:
+            if row.material == material:
+                return row
+        names = ", ".join(row.material for row in self.table)
+        raise ValueError(f"expected a material class out of {names}, got {material!r}.")
+
+    def to_markdown(self) -> str:
+        """Table in Markdown; lengths in millimetres, shares in percent."""
+        heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
+        lines = ["| " + " | ".join(h.replace("_", " ") for h in heads) + " |", "|" + " --- |" * len(heads)]
+        for row in self.table:
+            lines.append("| " + " | ".join(_cell(k, v) for k, v in asdict(row).items()) + " |")
+        return "\n".join(lines) + "\n"
+
+
+def compare(image: RangeImage, truth: GroundTruth, outlier_m: float = OUTLIER_M) -> Comparison:
+    """Errors of a range image, per material class and over all.
+
+    Raises
+    ------
+    ValueError
+        Image and truth differ in size, or `outlier_m` is not positive.
+
+    References
+    ----------
+    Flying pixels: Sabov, Krüger: "Identification and correction of flying pixels in range camera data", SCCG
+    (2008); there detected from the image alone, here against the true depths.
+    """
+    if image.z.shape != truth.z.shape:
+        raise ValueError(f"expected ground truth of shape {image.z.shape} as the image, got {truth.z.shape}.")
+    if not outlier_m > 0:
+        raise ValueError(f"expected a positive outlier_m in metres, got {outlier_m}.")
+    error = np.where(image.valid, image.z.astype(np.float64) - truth.z, np.nan)
+    edge, flying = _flying(image.z, truth.z, outlier_m)
+    table = [
+        _statistics(name, mask, error, truth.projector_visible, edge, flying, outlier_m)
+        for name, mask in truth.classes().items()
+    ]
+    return Comparison(tuple(table), error.astype(np.float32), flying, outlier_m)
+
+
+def _statistics(
+    name: str,
+    mask: np.ndarray,
+    error: np.ndarray,
+    visible: np.ndarray,
+    edge: np.ndarray,
+    flying: np.ndarray,
+    outlier_m: float,
+) -> ErrorStatistics:
+    measured = mask & np.isfinite(error)
+    lit, at_edge = mask & visible, measured & edge
+    e = error[measured]
+    absolute = np.abs(e)
+    median, p95 = np.percentile(absolute, [50, 95]) if e.size else (np.nan, np.nan)
+    return ErrorStatistics(
+        material=name,
+        pixels=int(mask.sum()),
+        lit=int(lit.sum()),
+        completeness=_share(measured & visible, lit),
+        coverage=_share(measured, mask),
+        bias_m=float(e.mean()) if e.size else math.nan,
+        median_abs_m=float(median),
+        rmse_m=float(np.sqrt(np.mean(e**2))) if e.size else math.nan,
+        p95_abs_m=float(p95),
+        outlier_rate=float(np.mean(absolute > outlier_m)) if e.size else math.nan,
+        edge_pixels=int(at_edge.sum()),
+        flying_rate=_share(at_edge & flying, at_edge),
+    )
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float:
+    total = int(whole.sum())
+    return float(part.sum() / total) if total else math.nan
+
+
+def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w) bool each: near a depth edge, and flying."""
+    far = np.where(np.isfinite(true_z), true_z, np.inf)
+    nearest = np.full(z.shape, np.inf)
+    measured = np.where(np.isfinite(z), z, np.nan)
+    for shifted in neighbours(far, EDGE_RADIUS):
+        np.fmin(nearest, np.abs(measured - shifted), out=nearest)
+    step = _has_step(far, outlier_m)
+    edge = np.any(list(neighbours(step, EDGE_RADIUS)), axis=0) & np.isfinite(true_z)
+    return edge, edge & np.isfinite(measured) & (nearest > outlier_m)
+
+
+def _has_step(depth: np.ndarray, outlier_m: float) -> np.ndarray:
+    """(h, w) bool, pixels with a 4-neighbour across a depth edge; nothing (infinity) counts as far away."""
+    result = np.zeros(depth.shape, dtype=bool)
+    for a, b in (
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        ((slice(1, None),), (slice(None, -1),)),
+    ):
+        one, two = np.minimum(depth[a], depth[b]), np.maximum(depth[a], depth[b])
+        jump = (two > one * (1 + EDGE_SHARE)) & (two > one + outlier_m)
+        result[a] |= jump
+        result[b] |= jump
+    return result
+
+
+def neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:
+    """The array shifted to every offset of the window, edges repeated."""
+    padded = np.pad(values, radius, mode="edge")
+    h, w = values.shape
+    size = 2 * radius + 1
+    return [padded[y : y + h, x : x + w] for y in range(size) for x in range(size)]
+
+
+def _cell(name: str, value: Any) -> str:
+    if isinstance(value, float) and math.isnan(value):
+        return "-"
+    if name.endswith("_m"):
+        return f"{1000 * value:.2f}"
+    if isinstance(value, float):
+        return f"{100 * value:.1f} %"
+    return str(value)

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an experiment will cost: light paths, memory and time, before the work starts.
+
+Memory is counted: arrays of the light transport, of the signals, of the frames as they are exposed, of the report.
+Time is light paths over a rate. The rate is one constant per core, good within a factor of three on opaque scenes and
+tables with some glass; where that makes a run long, two small passes of the scene itself are timed instead, after one
+that compiles (glass on glass takes longer, mostly to compile).
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rangesim import limits
+from rangesim.errors import TruncationWarning
+from rangesim.experiment import Experiment
+from rangesim.experiment.instrument import Instrument
+
+if TYPE_CHECKING:
+    from rangesim.rig import Rig
+    from rangesim.scene import Scene
+
+LONG_S = 30.0
+"""A run that takes longer is announced."""
+LARGE_BYTES = 1e9
+"""A run that takes more is announced."""
+USUAL_SPP = 24
+"""Of light paths per pixel, if their number is not given: 16 to 64, by the surface."""
+PATHS_PER_CORE_S = 1.1e6
+"""Camera paths per second and core: tabletop and matte scenes, 5 segments, LLVM."""
+PATHS_PER_GPU_S = 1e8
+PHOTON_S = 3e-6
+PASS_S, START_S = 1.0, 4.0
+"""Seconds to compile a pass, and to import, load the scene and write the report."""
+FRAME_S, PIXEL_S = 100e-9, 6e-6
+"""Seconds per pixel of each frame (noise, files), and per pixel of each instrument (decoding, segments, report)."""
+BASE_BYTES = 4e8
+"""Of the process with its libraries and a scene."""
+TRANSPORT_BYTES = 2 << 30
+"""Tiles of the light transport stay below, see `transport`."""
+LANE_BYTES = 512
+"""Per pixel of a tile, besides 4 for each channel."""
+TRUTH_BYTES, RESULT_BYTES = 64, 200
+"""Per pixel of a pass, and of each instrument in the report."""
+PHOTON_BYTES = 200
+TRIAL_S = 60.0
+"""A run that takes longer by the constants is worth a trial."""
+TRIAL_WIDTH, TRIAL_SPP = 96, (4, 64)
+"""Camera pixels across a trial pass, and the samples of the two that are timed."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """An estimate.
+
+    light_paths : camera paths of all passes. segments : at most so many in each. photons : of all passes.
+    passes : of the light transport. memory_bytes : at the peak. seconds : on this machine.
+    """
+
+    light_paths: int
+    segments: int
+    photons: int
+    passes: int
+    memory_bytes: int
+    seconds: float
+
+    @property
+    def is_large(self) -> bool:
+        """Whether a user should know before the work starts."""
+        return self.seconds > LONG_S or self.memory_bytes > LARGE_BYTES
+
+    def __str__(self) -> str:
+        photons = f" and {_count(self.photons)} photons" if self.photons else ""
+        return (
+            f"about {_count(self.light_paths)} light paths of up to {self.segments} segments{photons} in "
+            f"{self.passes} pass{'es' if self.passes > 1 else ''}, {self.memory_bytes / 1e9:.1f} GB, "
+            f"{_duration(self.seconds)}"
+        )
+
+    def check_memory(self) -> None:
+        """Raise ValueError if the machine has not the memory; where that cannot be known, nothing is refused."""
+        chosen = limits.current().memory
+        most = available_memory_bytes() if chosen == limits.Limits().memory else chosen
+        if most is not None and self.memory_bytes > most:
+            raise ValueError(
+                f"expected a run within the {most / 1e9:.1f} GB of memory that are available, this one takes "
+                f"{self}; take fewer pixels, frames or bins, or raise the limit with {limits.VARIABLE}=memory=N."
+            )
+
+
+def estimate_cost(
+    experiment: Experiment, scene: Scene, passes: Sequence[tuple[Rig, list[Instrument]]], trial: bool = True
+) -> Cost:
+    """Cost of an experiment.
+
+    Parameters
+    ----------
+    passes : as `rangesim.experiment.pipeline.group_by_rig` returns.
+    trial : whether small passes may be timed where the run is long.
+    """
+    from rangesim.light_transport.caustics import PHOTONS
+    from rangesim.light_transport.photons import has_delta
+
+    photons = PHOTONS if experiment.photons is None else experiment.photons
+    photons = photons if has_delta(scene.mitsuba) else 0
+    pixels, count = 0, 0
+    for rig, instruments in passes:
+        size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # read back for the report
+        limits.check("bytes", size, "bytes in the results of one pass")
+        traced, n = _traced_pixels(experiment, rig, instruments)
+        pixels, count = pixels + traced, count + n
+    paths, all_photons = pixels * (experiment.spp or USUAL_SPP), photons * count
+    rest_s = START_S + sum(_rest_s(rig, instruments) for rig, instruments in passes)
+    seconds = rest_s + count * PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
+    cost = Cost(paths, experiment.max_depth, all_photons, count, _memory_bytes(passes, photons), seconds)
+    if trial and seconds > TRIAL_S:
+        compile_s, fixed_s, path_s = _timed_trial(experiment, scene, passes[0])
+        traced_s = (len(passes) - 1) * compile_s + count * fixed_s + paths * path_s
+        cost = replace(cost, seconds=rest_s + traced_s)
+    return cost
+
+
+def available_memory_bytes() -> int | None:
+    """Memory that this process may still take: of the machine, and of its control group; None where unknown."""
+    found = [_meminfo(), *_cgroup()]
+    known = [n for n in found if n is not None]
+    return min(known) if known else None
+
+
+def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instrument]) -> tuple[int, int]:
+    """Pixels that are rendered for a rig, over all light-transport passes, and the number of these."""
+    if experiment.motion is None:
+        return rig.camera.width * rig.camera.height, 1
+    from rangesim.motion.passes import plan
+
+    planned = [p for one in instruments for p in plan(rig, {one.sensor: one.timing}, experiment.motion)]
+    windows = [p.window for p in planned]
+    return sum((w.bottom - w.top) * (w.right - w.left) for w in windows), len(planned)
+
+
+def _rest_s(rig: Rig, instruments: Sequence[Instrument]) -> float:
+    pixels = rig.camera.width * rig.camera.height
+    return sum(pixels * (PIXEL_S + FRAME_S * one.sensor.n_frames) for one in instruments)
+
+
+def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> int:
+    """The largest of what is held at once: while light is traced, while frames are exposed, and in the report."""
+    at_once, report = 0.0, 0.0
+    for rig, instruments in passes:
+        pixels = rig.camera.width * rig.camera.height
+        responses = dict.fromkeys(r for one in instruments for r in one.sensor.responses())
+        channels = sum(r.channels for r in responses)
+        tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light apart
+        of_one = max(sum(r.channels for r in one.sensor.responses()) for one in instruments)
+        frames = max(one.sensor.n_frames for one in instruments)
+        exposed = pixels * 14 * frames  # three times float32, and the digital numbers
+        judged = pixels * 2 * 4 * of_one + exposed  # means and their error
+        tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES) + photons * PHOTON_BYTES
+        exposing = pixels * (2 * 4 * channels + 4 * of_one + TRUTH_BYTES) + exposed  # signals and their error
+        at_once = max(at_once, tracing, exposing)
+        report += pixels * sum(2 * one.sensor.n_frames + RESULT_BYTES for one in instruments)
+    return int(BASE_BYTES + max(at_once, report))
+
+
+def _timed_trial(
+    experiment: Experiment, scene: Scene, one_pass: tuple[Rig, Sequence[Instrument]]
+) -> tuple[float, float, float]:
+    """Seconds to compile a pass, of a pass whatever its size, and per light path, of small passes of the scene."""
+    import rangesim
+
+    rig, instruments = one_pass
+    camera = rig.camera.resized(TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width)))
+    settings = {"max_depth": experiment.max_depth, "glint": experiment.glint, "photons": experiment.photons}
+    if settings["photons"] is None:
+        del settings["photons"]
+    sensors, took = [one.sensor for one in instruments], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TruncationWarning)  # the run itself will tell
+        for spp in (TRIAL_SPP[0], *TRIAL_SPP):  # the first compiles
+            start = time.monotonic()
+            rangesim.transport(scene, replace(rig, camera=camera), sensors, spp=spp, **settings)  # type: ignore[arg-type]
+            took.append(time.monotonic() - start)
+    paths = camera.width * camera.height * (TRIAL_SPP[1] - TRIAL_SPP[0])
+    path_s = max((took[2] - took[1]) / paths, 0.1 / _paths_per_s())
+    return max(took[0] - took[1], 0.0), took[1], path_s
+
+
+def _paths_per_s() -> float:
+    import mitsuba as mi
+
+    return PATHS_PER_GPU_S if (mi.variant() or "").startswith("cuda") else PATHS_PER_CORE_S * _cores()
+
+
+def _cores() -> int:
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux alone
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def _meminfo() -> int | None:
+    """Bytes that Linux can give without swapping."""
+    path = Path("/proc/meminfo")
+    if not path.is_file():
+        return None
+    for line in path.read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return None
+
+
+def _cgroup() -> list[int | None]:
+    """Bytes left of the limits of the control groups that this process is in (version 2, and version 1)."""
+    root = Path("/sys/fs/cgroup")
+    groups = [root, root / "memory"]
+    membership = Path("/proc/self/cgroup")
+    if membership.is_file():
+        for line in membership.read_text(encoding="utf-8").splitlines():
+            _, controllers, name = line.split(":", 2)
+            base = root if not controllers else root / "memory"
+            if not controllers or "memory" in controllers.split(","):
+                groups += [base / Path(*parts) for parts in _prefixes(name)]
+    return [_left(g, *names) for g in dict.fromkeys(groups) for names in _NAMES]
+
+
+_NAMES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
+
+
+def _prefixes(name: str) -> list[tuple[str, ...]]:
+    parts = tuple(part for part in name.split("/") if part not in ("", ".", ".."))
+    return [parts[: n + 1] for n in range(len(parts))]
+
+
+def _left(group: Path, limit: str, usage: str) -> int | None:
+    if not (group / limit).is_file() or not (group / usage).is_file():
+        return None
+    most = (group / limit).read_text(encoding="ascii").strip()
+    if not most.isdigit():  # "max"
+        return None
+    return max(0, int(most) - int((group / usage).read_text(encoding="ascii")))
+
+
+def _count(n: int) -> str:
+    for scale, word in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if n >= scale:
+            return f"{n / scale:.3g} {word}"
+    return str(n)
+
+
+def _duration(seconds: float) -> str:
+    for scale, word in ((86400.0, "d"), (3600.0, "h"), (100.0, "min")):
+        if seconds >= scale:
+            return f"{seconds / (60.0 if word == 'min' else scale):.2g} {word}"
+    return f"{max(seconds, 1):.0f} s"

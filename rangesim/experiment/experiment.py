@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What to measure and with what: a scene, the settings of the light transport, and the instruments to compare."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from rangesim import limits
+from rangesim.electronics.ambient import Ambient
+from rangesim.errors import FileFormatError
+from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
+from rangesim.files.catalogue import scene_names
+from rangesim.files.text_files import read_toml
+from rangesim.motion import Motion
+from rangesim.motion.settings import motion_from_dict
+from rangesim.settings.bounds import Metres, check_fields, whole
+from rangesim.settings.config import check_keys, from_dict, shown, to_dict
+from rangesim.settings.seeds import check_seed
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A scene, seen by one or more instruments.
+
+    Parameters
+    ----------
+    scene : path of a Mitsuba 3 XML scene or of a mesh (PLY, OBJ, GLB ...), or the name of a scene that comes with the
+        package, such as tabletop.
+    material : material class of a bare mesh (None: matte); refused for a scene, which names its own.
+    unit_m : metres per unit of a bare mesh, 0.001 for millimetres (None: 1); refused for a scene.
+    width, height : pixels of the camera; None: as in the scene. The field of view is kept.
+    spp : light paths per pixel; None: 8, and up to `max_spp` where these leave noise that is not small against that
+        of the detectors, see `rangesim.experiment.adaptive_sampling`.
+    max_spp : light paths per pixel, at most, where `spp` is None.
+    max_depth : longest path, in segments between surfaces that scatter it, up to the light; 2 is direct light alone.
+        Glass and mirrors do not count.
+    photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
+    glint : whether the camera sees the projector's lens in mirrors.
+    seed : of transport and noise, 0 to 2^64 - 1; the same seed gives the same bytes.
+    ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
+    instruments : those whose emitters stand in the same place share one light-transport pass, if nothing moves.
+    motion : what moves; None: nothing.
+    """
+
+    scene: str
+    material: str | None = None
+    unit_m: Metres | None = None
+    width: Annotated[int, whole(1, "pixels")] | None = None
+    height: Annotated[int, whole(1, "pixels")] | None = None
+    spp: Annotated[int, whole(1, "spp")] | None = None
+    max_spp: Annotated[int, whole(1, "spp")] = 64
+    max_depth: Annotated[int, whole(1, "depth")] = 5
+    photons: Annotated[int, whole(0, "photons")] | None = None
+    glint: bool = True
+    seed: int = 0
+    ambient: Ambient | None = None
+    instruments: tuple[Instrument, ...] = tuple(instrument(name) for name in DEFAULT_SENSORS)
+    motion: Motion | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not self.scene or "\0" in self.scene:
+            raise ValueError(f"expected scene to be the path of a scene or a mesh, got {shown(self.scene)}.")
+        limits.check("pixels", (self.width or 1) * (self.height or 1), f"pixels, not {self.width} x {self.height}")
+        limits.check("instruments", len(self.instruments), "instruments")
+        object.__setattr__(self, "seed", check_seed(self.seed))
+        for one in self.instruments if self.motion else ():
+            period_s = one.timing.frame_period_s
+            if one.exposure_s is not None and 0 < period_s < one.exposure_s:
+                raise ValueError(
+                    f"expected exposure_s of {one.name} within its frame_period_s of {period_s:g} s, "
+                    f"got {one.exposure_s:g} s."
+                )
+        names = [i.name for i in self.instruments]
+        if not names:
+            raise ValueError("expected at least one instrument, got none.")
+        if twice := [n for n in names if names.count(n) > 1]:
+            raise ValueError(f"expected instruments of different names, got {twice[0]!r} twice.")
+
+
+def load_experiment(path: str | Path) -> Experiment:
+    """The experiment of a TOML file; a relative scene path counts from the file's directory.
+
+    A scene that comes with the package is meant where its name is given and no file of that name is there.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or no valid TOML, or holds an unknown key or a bad value; the message names the place.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileFormatError(f"{path} does not exist; expected an experiment (.toml).")
+    try:
+        experiment = experiment_from_dict(read_toml(path), path.parent)
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    beside = path.parent / experiment.scene
+    comes_along = experiment.scene in scene_names() and not beside.is_file()
+    return experiment if comes_along else replace(experiment, scene=str(beside))
+
+
+def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> Experiment:
+    """The experiment of plain data; each table under `instrument` is one instrument. ValueError as `from_dict`.
+
+    files_in : as for `rangesim.experiment.instrument.instrument_from_dict`.
+    """
+    check_keys(data, ["instrument" if f.name == "instruments" else f.name for f in fields(Experiment)], "experiment")
+    rest = {key: value for key, value in data.items() if key not in ("instrument", "motion")}
+    experiment = from_dict(Experiment, rest)
+    if data.get("motion") is not None:
+        experiment = replace(experiment, motion=motion_from_dict(data["motion"]))
+    tables = data.get("instrument")
+    if tables is None:
+        return experiment
+    if not isinstance(tables, list):
+        raise ValueError("expected instruments as tables headed [[instrument]], with two brackets.")
+    return replace(
+        experiment,
+        instruments=tuple(instrument_from_dict(t, f"instrument[{i}]", files_in) for i, t in enumerate(tables)),
+    )
+
+
+def experiment_to_dict(experiment: Experiment) -> dict[str, Any]:
+    """Plain data that `experiment_from_dict` reads back equal."""
+    data = to_dict(experiment)
+    data["instrument"] = data.pop("instruments")
+    return dict(data)

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole experiment: scene -> transport -> capture -> range image -> points -> comparison, segments, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import rangesim
+from pcgraph.output import new_directory
+from rangesim.capture import Capture
+from rangesim.capture.capture_files import write_capture
+from rangesim.causes import explain
+from rangesim.evaluation.reading_noise import reading_noise, warn_of_sampling
+from rangesim.experiment import Experiment
+from rangesim.experiment.adaptive_sampling import AdaptiveSampling
+from rangesim.experiment.cost import Cost, estimate_cost
+from rangesim.experiment.instrument import Instrument
+from rangesim.experiment.provenance import provenance
+from rangesim.experiment.result_files import (
+    RESULT,
+    SETTINGS,
+    MeasurementRecord,
+    load_result,
+    save_causes,
+    save_range_image,
+    save_rows,
+)
+from rangesim.files.array_files import write_arrays
+from rangesim.files.schema import write_record
+from rangesim.motion import transport_moving
+from rangesim.motion.moving_signals import MovingSignals
+from rangesim.settings.seeds import derived_seed
+
+if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
+    from rangesim.electronics.detector import PhotoDetector
+    from rangesim.motion import Timing
+    from rangesim.point_cloud import PointCloud
+    from rangesim.rig import Rig
+    from rangesim.scene import Scene
+    from rangesim.signals import Signals
+
+Progress = Callable[[str, float], None]
+"""Called with the name of the stage and the share of the whole job done, 0..1."""
+_TRANSPORT_SHARE = 0.7
+FEWEST_POINTS = 3
+"""Fewer points are no cloud worth grouping."""
+
+
+def run(
+    experiment: Experiment,
+    out: str | Path,
+    progress: Progress | None = None,
+    scene: Scene | None = None,
+    announce: Callable[[Cost], None] | None = None,
+) -> None:
+    """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
+
+    The files appear when all is done; a failure leaves nothing behind. An older result of that name is replaced; files
+    that somebody else put there stay. See `pcgraph.output`.
+
+    Parameters
+    ----------
+    scene : a scene that is loaded already, for example from a dictionary; `experiment.scene` then only names it.
+    announce : called with the estimated cost before the work starts.
+
+    Raises
+    ------
+    ValueError, FileFormatError, EnvironmentProblem
+        A setting out of range, more memory than there is, a scene that cannot be loaded, no suitable LLVM, or an `out`
+        that cannot take a result (see `pcgraph.output.check_directory`).
+    """
+    import mitsuba as mi
+
+    from pcgraph.warmup import compile_kernels
+    from rangesim.report import write_report
+
+    say = progress or _unwatched
+    with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
+        times: dict[str, float] = {}
+        say("Loading the scene", 0.0)
+        with timed(times, "load"):
+            scene = scene or rangesim.load_scene(
+                experiment.scene, material=experiment.material, unit_m=experiment.unit_m
+            )
+        if experiment.ambient is not None:
+            experiment.ambient.check_emitters(scene.has_ambient)
+        passes = group_by_rig(experiment, scene)
+        cost = estimate_cost(experiment, scene, passes, trial=announce is not None)
+        cost.check_memory()
+        if announce is not None:
+            announce(cost)
+        with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
+            compile_kernels()
+        for number, (rig, instruments) in enumerate(passes, 1):
+            signals = _trace(experiment, scene, rig, instruments, say, number, len(passes), times)
+            signals.save(str(folder / f"pass_{number}.npz"))
+            for one in instruments:
+                say(f"Measuring with {one.name}", _share(number, len(passes), 1.0))
+                measure(one, signals, folder / one.name, noise_seed(experiment, one), experiment.ambient)
+        write_record(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
+        say("Writing the report", 0.97)
+        result = load_result(folder)
+        tables = {m.name: m.rows for m in result.measurements}
+        _write_comparison(folder, list(tables.items()))
+        write_report(result, folder / "report.html")
+    warn_of_sampling(tables)
+
+
+def estimate(experiment: Experiment) -> Cost:
+    """Cost of `run`, in light paths, memory and time; the scene is loaded, and rendered small if it may take long.
+
+    Raises
+    ------
+    ValueError, FileFormatError, EnvironmentProblem
+        As `run`, but for the memory.
+    """
+    scene = rangesim.load_scene(experiment.scene, material=experiment.material, unit_m=experiment.unit_m)
+    return estimate_cost(experiment, scene, group_by_rig(experiment, scene))
+
+
+def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient: Ambient | None = None) -> None:
+    """Expose, decode, compare, explain and segment for one instrument; write all to the new directory `folder`."""
+    from pcgraph.parallel import side_by_side
+
+    folder.mkdir()
+    times: dict[str, float] = {}
+    moves = isinstance(signals, MovingSignals)
+    with timed(times, "exposure"):
+        detector = _in_time(one) if moves else one.detector
+        capture = rangesim.expose(signals, one.sensor, detector, one.exposure_s, seed, ambient)
+    with timed(times, "decode"):
+        image = rangesim.decode(capture, one.decoder)
+    noise = None
+    if signals.knows_sampling_error:
+        with timed(times, "noise"):
+            noise = reading_noise(image, capture, signals)
+        image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
+    comparison = rangesim.compare(image, signals.truth)
+    with timed(times, "causes"):
+        causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
+    rows = [row | failures for row, failures in zip(comparison.rows(), causes.shares(signals.truth), strict=True)]
+    if noise is not None:
+        rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]
+    with timed(times, "points"):
+        cloud = image.to_point_cloud()
+    enough = bool(cloud.valid.sum() >= FEWEST_POINTS)
+
+    def write_readings() -> None:
+        save_range_image(image, folder / "range.npz")
+        save_causes(causes, folder / "causes.npz")
+        save_rows(comparison.outlier_m, rows, folder)
+        if enough:
+            cloud.save(folder / "cloud.ply")
+
+    (folder / "capture").mkdir()
+    side_by_side(partial(write_capture, capture, folder / "capture"), write_readings)
+    if enough:
+        with timed(times, "segmentation"):
+            segment(cloud, folder / "segmentation.npz")
+    facts = acquisition(capture, one.timing, moves, int(cloud.valid.sum()), times)
+    write_record(folder / "measurement.json", facts)
+
+
+def _in_time(one: Instrument) -> PhotoDetector | None:
+    """The instrument's detector, whose automatic exposure ends before the next one begins."""
+    period_s = one.timing.frame_period_s
+    if one.detector is None or not period_s:
+        return one.detector
+    longest_s = max(one.detector.min_exposure_s, min(one.detector.max_exposure_s, period_s))
+    return replace(one.detector, max_exposure_s=longest_s)  # type: ignore[type-var]
+
+
+def segment(cloud: PointCloud, path: Path) -> None:
+    """Write supervoxels, objects and the tree of an organised cloud in the camera frame to a .npz file."""
+    import pcgraph
+
+    result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))
+    tree = result.tree
+    arrays = {"supervoxels": result.supervoxels, "labels": result.labels}
+    write_arrays(path, {**arrays, "parents": tree.parents, "altitudes": tree.altitudes})
+
+
+def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
+    """Instruments that share camera, emitter and power, and so one transport pass; in order of first appearance.
+
+    Where something moves, each is on its own: it has its own time, and so its own truth.
+    """
+    if experiment.motion is not None:
+        return [(one.rig(scene, experiment.width, experiment.height), [one]) for one in experiment.instruments]
+    groups: dict[Rig, list[Instrument]] = {}
+    for one in experiment.instruments:
+        rig = one.rig(scene, experiment.width, experiment.height)
+        groups.setdefault(rig, []).append(one)
+    return list(groups.items())
+
+
+def noise_seed(experiment: Experiment, one: Instrument) -> int:
+    """Seed of an instrument's noise: its own for each position in the experiment."""
+    return derived_seed(experiment.seed, experiment.instruments.index(one))
+
+
+def acquisition(
+    capture: Capture, timing: Timing, moves: bool, points: int, times_s: dict[str, float]
+) -> MeasurementRecord:
+    """Frames and time of a capture; exposure None for a noise-free one, which takes no time.
+
+    Exposures follow each other at once, or, where something moves, as the timing says.
+    """
+    exposure = capture.exposure_s if np.isfinite(capture.exposure_s) else None
+    camera = capture.frames.shape[1:]
+    shots = len(timing.exposure_times_s(capture.sensor))
+    taken = None
+    if exposure is not None:
+        pause = max(exposure, timing.frame_period_s) if moves else exposure
+        lines = camera[0] if timing.lines == "rows" else camera[1]
+        taken = (shots - 1) * pause + exposure + (lines - 1) * (timing.line_period_s if moves else 0.0)
+    return MeasurementRecord(
+        sensor=capture.sensor.type_name,
+        frames=len(capture.frames),
+        exposure_s=exposure,
+        acquisition_s=taken,
+        pixels=int(capture.frames[0].size),
+        points=points,
+        times_s=times_s,
+    )
+
+
+def _unwatched(stage: str, share: float) -> None:
+    """Tell nobody how far the work is."""
+
+
+@contextmanager
+def timed(times: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the seconds that the block takes to `times[stage]`."""
+    start = time.monotonic()
+    yield
+    times[stage] = times.get(stage, 0.0) + time.monotonic() - start
+
+
+def _trace(
+    experiment: Experiment,
+    scene: Scene,
+    rig: Rig,
+    instruments: list[Instrument],
+    say: Progress,
+    number: int,
+    passes: int,
+    times: dict[str, float],
+) -> Signals:
+    stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
+    say(stage, _share(number, passes, 0.0))
+    settings: dict[str, Any] = {
+        "spp": _spp(experiment, instruments),
+        "max_depth": experiment.max_depth,
+        "glint": experiment.glint,
+        "seed": experiment.seed,
+        "progress": None if say is _unwatched else lambda share: say(stage, _share(number, passes, share)),
+    }
+    if experiment.photons is not None:
+        settings["photons"] = experiment.photons
+    with timed(times, f"transport_{number}"):
+        if experiment.motion is None:
+            return rangesim.transport(scene, rig, [i.sensor for i in instruments], **settings)
+        (one,) = instruments
+        return transport_moving(scene, rig, {one.sensor: one.timing}, experiment.motion, **settings)[one.sensor]
+
+
+def _spp(experiment: Experiment, instruments: list[Instrument]) -> int | str | AdaptiveSampling:
+    if experiment.spp is not None:
+        return experiment.spp
+    if experiment.motion is not None:
+        return "auto"
+    return AdaptiveSampling(tuple(instruments), experiment.max_spp, ambient=experiment.ambient)
+
+
+def _share(number: int, passes: int, of_pass: float) -> float:
+    return 0.05 + 0.9 * (number - 1 + _TRANSPORT_SHARE * of_pass) / passes
+
+
+def _write_comparison(folder: Path, tables: list[tuple[str, list[dict[str, Any]]]]) -> None:
+    from rangesim.report.tables import markdown
+
+    (folder / "comparison.md").write_text(markdown(tables), encoding="utf-8")

@@ -1,0 +1,381 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results of an experiment as a directory, and back.
+
+DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.output`
+    experiment.json      resolved settings, versions, and which instruments share which pass
+    pass_1.npz           energy split and ground truth of each transport pass
+    comparison.md        statistics of all instruments
+    report.html
+    NAME/capture/        of each instrument: frames and sidecar
+         range.npz       range image
+         causes.npz      cause of every failed pixel
+         cloud.ply       points, metres, camera frame
+         comparison.json, measurement.json, segmentation.npz
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from pcgraph.output import DirectoryKind, recover
+from rangesim.capture import Capture
+from rangesim.capture.capture_files import load_capture
+from rangesim.causes import Cause, CauseMap
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
+from rangesim.errors import FileFormatError
+from rangesim.experiment import Experiment, experiment_from_dict
+from rangesim.files.array_files import write_arrays
+from rangesim.files.schema import (
+    ArraySpec,
+    Count,
+    Fraction,
+    Metres,
+    Name,
+    Positive,
+    Record,
+    Seconds,
+    read_checked_arrays,
+    read_record,
+    write_record,
+)
+from rangesim.rig import Rig
+from rangesim.settings.config import from_dict, shown
+from rangesim.signals import ALL, EnergySplit, GroundTruth, Truncation
+
+SETTINGS = "experiment.json"
+FORMAT = "rangesim-result"
+RESULT = DirectoryKind(FORMAT, SETTINGS, FileFormatError)
+"""Directories that hold the results of an experiment."""
+
+
+# ---- What the files hold -------------------------------------------------------------------------------------------
+
+
+class ShapeRecord(Record, frozen=True, kw_only=True):
+    """A shape of the scene."""
+
+    name: str
+    material: Name
+
+
+class SceneRecord(Record, frozen=True, kw_only=True):
+    """The scene that was measured. sha256 : of its file; None if it came from elsewhere."""
+
+    name: str
+    sha256: str | None
+    working_distance_m: Positive
+    shapes: list[ShapeRecord]
+
+
+class InstrumentRecord(Record, frozen=True, kw_only=True, rename={"light_pass": "pass"}):
+    """An instrument, the pass it took part in (from 1), and its rig."""
+
+    name: Name
+    light_pass: Count
+    rig: dict[str, Any]
+
+
+class ResultRecord(Record, frozen=True, kw_only=True):
+    """`experiment.json`."""
+
+    format: Literal["rangesim-result"] = "rangesim-result"
+    format_version: Literal[1] = 1
+    experiment: dict[str, Any]
+    scene: SceneRecord
+    passes: Count
+    instruments: list[InstrumentRecord]
+    versions: dict[str, str]
+    variant: str
+    times_s: dict[str, Seconds]
+
+
+class MeasurementRecord(Record, frozen=True, kw_only=True):
+    """`measurement.json`: frames, exposure and time per stage; exposure None for a noise-free capture."""
+
+    format: Literal["rangesim-measurement"] = "rangesim-measurement"
+    format_version: Literal[1] = 1
+    sensor: Name
+    frames: Count
+    exposure_s: Positive | None
+    acquisition_s: Seconds | None
+    pixels: Count
+    points: Count
+    times_s: dict[str, Seconds]
+
+
+class RowRecord(Record, frozen=True, kw_only=True):
+    """Statistics of one material class; see `rangesim.evaluation.comparison.ErrorStatistics`,
+    `rangesim.causes.CauseMap` and `rangesim.evaluation.reading_noise.ReadingNoise`."""
+
+    material: Name
+    pixels: Count
+    lit: Count
+    completeness: Fraction | None
+    coverage: Fraction | None
+    bias_m: Metres | None
+    median_abs_m: Metres | None
+    rmse_m: Metres | None
+    p95_abs_m: Metres | None
+    outlier_rate: Fraction | None
+    edge_pixels: Count
+    flying_rate: Fraction | None
+    failed: Fraction | None
+    causes: dict[str, Fraction]
+    detector_sigma_m: Metres | None = None
+    sampling_sigma_m: Metres | None = None
+
+
+class ComparisonRecord(Record, frozen=True, kw_only=True):
+    """`comparison.json`: a row per material class, "all" last."""
+
+    format: Literal["rangesim-comparison"] = "rangesim-comparison"
+    format_version: Literal[1] = 1
+    outlier_m: Positive
+    rows: list[RowRecord]
+
+
+_FARTHEST_M = 1e9
+_RADIANCE = ArraySpec("float32", low=0)
+_DEPTH = ArraySpec("float32", low=-_FARTHEST_M, high=_FARTHEST_M, nan=True)
+_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_FARTHEST_M, nan=True)
+_PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
+    "truth_z": _TRUE_DEPTH,
+    "truth_range_m": _TRUE_DEPTH,
+    "truth_normal": ArraySpec("float32", ("h", "w", 3), low=-1.01, high=1.01, nan=True),
+    "truth_instance": ArraySpec("int32", low=-1),
+    "truth_material": ArraySpec("int32", low=-1),
+    "truth_projector_uv": ArraySpec("float32", ("h", "w", 2), nan=True, inf=True),
+    "truth_projector_visible": ArraySpec("bool"),
+    "truth_instance_names": ArraySpec("str", ("instances",)),
+    "truth_material_names": ArraySpec("str", ("materials",)),
+    "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
+    "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
+}
+_RANGE = {
+    "z": _DEPTH,
+    "range_m": _DEPTH,
+    "confidence": ArraySpec("float32", low=0, high=1.001, nan=True),
+    "status": ArraySpec("uint8", high=max(Status)),
+    "intensity": ArraySpec("float32", nan=True),
+    "T_world_camera": ArraySpec("float64", (4, 4), required=False),
+    "projector_column": ArraySpec("float32", nan=True, required=False),
+    "projector_row": ArraySpec("float32", nan=True, required=False),
+    "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
+}
+_CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
+_SEGMENTATION = {
+    "supervoxels": ArraySpec("int32", low=-1),
+    "labels": ArraySpec("int32", low=-1),
+    "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
+    "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """Supervoxels of a point cloud and the tree that merges them.
+
+    supervoxels, labels : (h, w) int32, supervoxel and object per pixel, -1 without a point.
+    parents : (k,) int32, parent of each tree node, the supervoxels first; a root is its own parent.
+    altitudes : (k,) float64, not decreasing towards the root.
+    """
+
+    supervoxels: np.ndarray
+    labels: np.ndarray
+    parents: np.ndarray
+    altitudes: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What one instrument measured.
+
+    capture : Capture. image : RangeImage. truth : GroundTruth of its pass.
+    causes : CauseMap, why pixels failed.
+    rows : statistics per material class, "all" last; see `rangesim.evaluation.comparison.ErrorStatistics` and
+        `rangesim.causes.CauseMap.shares`.
+    segmentation : Segmentation, or None if there were no points to group.
+    facts : MeasurementRecord, frames, exposure and time per stage.
+    light_pass : int from 1, the transport pass the instrument took part in.
+    """
+
+    name: str
+    capture: Capture
+    image: RangeImage
+    truth: GroundTruth
+    causes: CauseMap
+    rows: list[dict[str, Any]]
+    segmentation: Segmentation | None
+    facts: MeasurementRecord
+    light_pass: int
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """An experiment and its outcome. energy : one EnergySplit per pass. info : scene, versions, times."""
+
+    experiment: Experiment
+    measurements: tuple[Measurement, ...]
+    energy: tuple[EnergySplit, ...]
+    info: ResultRecord
+
+
+# ---- Writing -------------------------------------------------------------------------------------------------------
+
+
+def save_range_image(image: RangeImage, path: Path) -> None:
+    """Write the arrays of a range image to a compressed .npz file; its camera is in the capture's sidecar."""
+    arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
+    write_arrays(path, arrays)
+
+
+def save_causes(causes: CauseMap, path: Path) -> None:
+    """Write a cause map to a compressed .npz file: `cause`, values of `rangesim.causes.Cause`, and `tolerance_m`."""
+    write_arrays(path, {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
+
+
+def save_rows(outlier_m: float, rows: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Write statistics per material class as `comparison.json`."""
+    write_record(folder / "comparison.json", ComparisonRecord(outlier_m=outlier_m, rows=[RowRecord(**r) for r in rows]))
+
+
+# ---- Reading -------------------------------------------------------------------------------------------------------
+
+
+def load_result(directory: str | Path) -> Result:
+    """The result that `rangesim.experiment.pipeline.run` wrote.
+
+    Raises
+    ------
+    FileFormatError
+        The directory is no result, or a part of it is missing or broken; the message names the file.
+    """
+    folder = Path(directory)
+    info = read_settings(folder)
+    try:
+        experiment = experiment_from_dict(info.experiment)
+    except ValueError as error:
+        raise FileFormatError(f"{folder / SETTINGS}: {error}") from error
+    names = [i.name for i in experiment.instruments]
+    if [entry.name for entry in info.instruments] != names:
+        raise FileFormatError(f"{folder / SETTINGS}: expected the instruments {shown(names)} as in its experiment.")
+    if {entry.light_pass for entry in info.instruments} != set(range(1, info.passes + 1)):
+        raise FileFormatError(f"{folder / SETTINGS}: expected each of {info.passes} passes to serve an instrument.")
+    if missing := [f"transport_{n}" for n in range(1, info.passes + 1) if f"transport_{n}" not in info.times_s]:
+        raise FileFormatError(f"{folder / SETTINGS}: expected the time {missing[0]} in times_s.")
+    sizes = _image_size(info, folder / SETTINGS)
+    passes = [_load_pass(folder / f"pass_{n}.npz", sizes) for n in range(1, info.passes + 1)]
+    measurements = tuple(
+        _load_measurement(folder / entry.name, passes[entry.light_pass - 1][1], entry.light_pass, sizes)
+        for entry in info.instruments
+    )
+    return Result(experiment, measurements, tuple(energy for energy, _ in passes), info)
+
+
+def read_settings(folder: Path) -> ResultRecord:
+    """Contents of `experiment.json`; FileFormatError if there is none of ours."""
+    recover(folder, FileFormatError)
+    if not (folder / SETTINGS).is_file():
+        raise FileFormatError(f"{folder} is no {FORMAT} directory: it has no {SETTINGS}.")
+    return read_record(folder / SETTINGS, ResultRecord)
+
+
+def read_rows(folder: Path) -> list[dict[str, Any]]:
+    """Statistics per material class of one instrument, from its `comparison.json`; FileFormatError if it is broken."""
+    path = folder / "comparison.json"
+    record = read_record(path, ComparisonRecord)
+    materials = [row.material for row in record.rows]
+    if materials.count(ALL) != 1 or len(set(materials)) < len(materials):
+        raise FileFormatError(f"{path}: expected one row per material, and one {ALL!r}, got {shown(materials)}.")
+    valid = {c.name.lower() for c in Cause if c}
+    for row in record.rows:
+        if unknown := set(row.causes) - valid:
+            raise FileFormatError(f"{path}: unknown cause {shown(min(unknown))} of {shown(row.material)}.")
+        if abs(sum(row.causes.values()) - (row.failed or 0)) > 1e-6:
+            raise FileFormatError(f"{path}: expected the causes of {shown(row.material)} to add up to what failed.")
+    return [msgspec.to_builtins(row) for row in record.rows]
+
+
+def _image_size(info: ResultRecord, path: Path) -> dict[str, int]:
+    """Height and width of the camera that all instruments share."""
+    try:
+        cameras = [from_dict(Rig, entry.rig, f"rig of {entry.name}").camera for entry in info.instruments]
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1:
+        raise FileFormatError(f"{path}: expected instruments whose cameras have one size, got {shown(sorted(sizes))}.")
+    ((h, w),) = sizes
+    return {"h": h, "w": w}
+
+
+def _load_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
+    data = read_checked_arrays(path, _PASS, dict(sizes))  # passes may see other instances
+    for ids in ("instance", "material"):
+        if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
+            raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
+    energy = EnergySplit(**{f.name: data[f"energy_{f.name}"] for f in fields(EnergySplit)})
+    truth: dict[str, Any] = {f.name: data[f"truth_{f.name}"] for f in fields(GroundTruth)}
+    for name in ("instance_names", "material_names"):
+        truth[name] = tuple(map(str, truth[name]))
+    return energy, GroundTruth(**truth)
+
+
+def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
+    capture = load_capture(folder / "capture")
+    if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
+        raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
+    arrays: dict[str, Any] = read_checked_arrays(folder / "range.npz", _RANGE, sizes)
+    if not np.array_equal(np.isfinite(arrays["z"]), arrays["status"] == Status.OK):
+        raise FileFormatError(f"{folder / 'range.npz'}: expected z to be finite where status is {Status.OK.value}.")
+    arrays["T_world_camera"] = capture.rig.T_world_camera
+    data = read_checked_arrays(folder / "causes.npz", _CAUSES, sizes)
+    facts = read_record(folder / "measurement.json", MeasurementRecord)
+    if (facts.sensor, facts.frames, facts.pixels) != (
+        capture.sensor.type_name, len(capture.frames), capture.frames[0].size
+    ):  # fmt: skip
+        raise FileFormatError(f"{folder / 'measurement.json'}: expected sensor, frames and pixels of the capture.")
+    return Measurement(
+        name=folder.name,
+        capture=capture,
+        image=RangeImage(**arrays, camera=capture.rig.camera),
+        truth=truth,
+        causes=CauseMap(data["cause"], float(data["tolerance_m"])),
+        rows=read_rows(folder),
+        segmentation=_load_segmentation(folder / "segmentation.npz", sizes),
+        facts=facts,
+        light_pass=light_pass,
+    )
+
+
+def _load_segmentation(path: Path, sizes: dict[str, int]) -> Segmentation | None:
+    if not path.is_file():
+        return None
+    data = read_checked_arrays(path, _SEGMENTATION, dict(sizes))
+    parents, altitudes = data["parents"], data["altitudes"]
+    nodes, leaves = len(parents), (len(parents) + 1) // 2
+    children = np.bincount(parents[: nodes - 1], minlength=nodes) if nodes and parents.max() < nodes else np.zeros(1)
+    is_tree = (
+        nodes % 2 == 1
+        and len(children) == nodes
+        and bool((parents[:-1] > np.arange(nodes - 1)).all())
+        and parents[-1] == nodes - 1
+        and not children[:leaves].any()
+        and bool((children[leaves:] == 2).all())
+        and bool((altitudes[parents] >= altitudes).all())
+    )
+    if not is_tree:
+        raise FileFormatError(f"{path}: expected parents and altitudes of a binary tree, its leaves first.")
+    for name in ("supervoxels", "labels"):
+        if data[name].max(initial=-1) >= leaves:
+            raise FileFormatError(f"{path}: array {name}: expected indices below the number of leaves, {leaves}.")
+    if not np.bincount(data["supervoxels"][data["supervoxels"] >= 0], minlength=leaves).all():
+        raise FileFormatError(f"{path}: array supervoxels: expected a pixel in each of {leaves} leaves.")
+    return Segmentation(**data)

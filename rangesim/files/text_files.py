@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""JSON, TOML and XML files, read within the limits: their size, and how deep they nest.
+
+Parsers of all three recurse, and Mitsuba's crashes the process where the stack ends. So depth is counted first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+from pcgraph.plain_files import check_file
+from rangesim import limits
+from rangesim.errors import FileFormatError
+from rangesim.settings.config import brief
+
+_LONG_KEY = r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){%d}"""
+_PARAMETER = re.compile(r"\$(\w+)")
+
+
+def read_text(path: str | Path) -> str:
+    """Contents of a UTF-8 file; FileFormatError if it is missing, too large or no text."""
+    path = Path(path)
+    check_file(path, FileFormatError)
+    try:
+        limits.check("text", path.stat().st_size, f"bytes in {path}", FileFormatError)
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is no text file.") from error
+    except OSError as error:
+        raise FileFormatError(f"cannot read {path}: {error.strerror or error}.") from error
+
+
+def read_json(path: str | Path) -> Any:
+    """Contents of a JSON file; FileFormatError if it is missing, too large, nested too deep or no JSON."""
+    text = read_text(path)
+    try:
+        data = json.loads(text)
+    except RecursionError:
+        raise _too_deep(path) from None
+    except ValueError as error:  # also of a number of more digits than Python converts
+        raise FileFormatError(f"{path} is no valid JSON: {brief(error)}.") from error
+    if is_nested_deeper(data, limits.current().nesting):
+        raise _too_deep(path)
+    return data
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Contents of a TOML file; FileFormatError if it is missing, too large, nested too deep or no TOML."""
+    text = read_text(path)
+    deepest = limits.current().nesting
+    if re.search(_LONG_KEY % deepest, text):  # a.b.c ... takes quadratic time
+        raise _too_deep(path)
+    try:
+        data = tomllib.loads(text)
+    except RecursionError:
+        raise _too_deep(path) from None
+    except ValueError as error:
+        raise FileFormatError(f"{path} is no valid TOML: {brief(error)}.") from error
+    if is_nested_deeper(data, deepest):
+        raise _too_deep(path)
+    return data
+
+
+def is_nested_deeper(data: Any, levels: int) -> bool:
+    """Whether plain data holds mappings or lists more than `levels` deep; also if it holds itself."""
+    layer = [data] if _is_container(data) else []
+    for _ in range(levels):
+        inner = (v for values in layer for v in (values.values() if isinstance(values, Mapping) else values))
+        layer = list({id(v): v for v in inner if _is_container(v)}.values())  # a thing that is used often counts once
+        if not layer:
+            return False
+    return bool(layer)
+
+
+def _is_container(value: Any) -> bool:
+    return isinstance(value, (Mapping, list, tuple))
+
+
+def check_xml(path: str | Path, resolve: Callable[[str], Path] | None = None) -> None:
+    """Raise FileFormatError if an XML file is missing, too large, nested too deep, no XML, or declares entities.
+
+    resolve : finds the file that an `<include filename="..."/>` names; each is checked in its place. None: includes
+        mean nothing.
+    """
+    _Xml(resolve).read(Path(path), 0, ())
+
+
+class _Xml:
+    """Depth and size of an XML file with what it includes."""
+
+    def __init__(self, resolve: Callable[[str], Path] | None) -> None:
+        self.resolve = resolve
+        self.size = 0
+        self.defaults: dict[str, str] = {}
+
+    def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
+        """Check a file that stands `depth` levels deep inside the files `within`."""
+        if path in within:
+            raise FileFormatError(f"{path} includes itself.")
+        check_file(path, FileFormatError)
+        try:
+            self.size += path.stat().st_size
+            limits.check("text", self.size, f"bytes in {path} and what it includes", FileFormatError)
+            data = path.read_bytes()
+        except OSError as error:
+            raise FileFormatError(f"cannot read {path}: {error.strerror or error}.") from error
+        deepest = limits.current().nesting
+        level = depth
+
+        def start(name: str, attributes: dict[str, str]) -> None:
+            nonlocal level
+            level += 1
+            if level > deepest:
+                raise _too_deep(path)
+            if name == "default" and "name" in attributes:
+                self.defaults.setdefault(attributes["name"], attributes.get("value", ""))
+            if name == "include" and self.resolve is not None:
+                place = _PARAMETER.sub(lambda m: self.defaults.get(m[1], m[0]), attributes.get("filename", ""))
+                found = self.resolve(place)
+                if os.path.isfile(found):  # also of names that cannot be; if not, whoever includes it says so
+                    self.read(found.resolve(), level, (*within, path))
+
+        def end(_: str) -> None:
+            nonlocal level
+            level -= 1
+
+        def entity(name: str, *_: Any) -> None:
+            raise FileFormatError(f"expected no entities in {path}, got {name[:40]!r}.")
+
+        parser = expat.ParserCreate()
+        parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = start, end, entity
+        try:
+            parser.Parse(data, True)
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: of an unknown encoding
+            raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
+
+
+def _too_deep(path: str | Path) -> FileFormatError:
+    most = limits.current().nesting
+    return FileFormatError(
+        f"expected at most {most} levels in {path}, got more; if this is meant, raise the limit with "
+        f"{limits.VARIABLE}=nesting=N or rangesim.limits.raised(nesting=N)."
+    )

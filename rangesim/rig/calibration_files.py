@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigs from calibration files: procam-calibration's OpenCV XML, and our own JSON.
+
+OpenCV has pixel centres at integer coordinates, we have them at integer + 0.5: principal points move by 0.5.
+OpenCV's stereo calibration maps the first device's coordinates to the second's, X_projector = R X_camera + T,
+here in millimetres; our `T_camera_projector` is the inverse, in metres.
+"""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pcgraph.plain_files import write_file
+from rangesim.errors import FileFormatError
+from rangesim.files.text_files import check_xml, read_json
+from rangesim.rig import Intrinsics, Rig
+from rangesim.settings.bounds import Bounds, check_number, whole
+from rangesim.settings.config import from_dict, shown, to_dict
+
+LARGEST = 1e9
+"""Of a number in a calibration file: pixels, millimetres, coefficients."""
+_SHAPES = {
+    "img_shape": 2,
+    "cam_int": 9,
+    "cam_dist": 5,
+    "proj_int": 9,
+    "proj_dist": 5,
+    "roration": 9,  # spelt so in the files
+    "translation": 3,
+}
+
+
+def load_calibration(
+    path: str | Path,
+    projector_size: tuple[int, int] | None = None,
+    code_step: int = 1,
+    unit_m: float = 1e-3,
+) -> Rig:
+    """Rig of a calibration file.
+
+    Parameters
+    ----------
+    path : `.xml`, OpenCV FileStorage as kamino410/procam-calibration writes it; or `.json`, as
+        `save_calibration`.
+    projector_size : (width, height) of the coded area in cells of `code_step` pixels; XML files do not hold
+        it, so it is required for them.
+    code_step : int, projector pixels per cell of the Gray code at calibration (procam-calibration's
+        graycode_step). The rig's projector then has the cells for pixels.
+    unit_m : float, metres per unit of length of an XML file (there, of its chessboard's square); millimetres.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing, broken, or does not hold a calibration.
+    ValueError
+        `code_step` or `unit_m` is not positive, or `projector_size` is missing for an XML file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileFormatError(f"{path} does not exist; expected a calibration file (.xml or .json).")
+    if path.suffix.lower() != ".xml":
+        return _load_json(path)
+    check_number("code_step", code_step, whole(1, "projector"))
+    check_number("unit_m", unit_m, Bounds("metres per unit", 1e-9, 1e6))
+    if projector_size is None:
+        raise ValueError(f"expected projector_size (width, height) in pixels: {path} does not hold it.")
+    if not isinstance(projector_size, Sequence) or len(projector_size) != 2:
+        raise ValueError(f"expected projector_size (width, height) in pixels, got {shown(projector_size)}.")
+    for name, size in zip(("projector width", "projector height"), projector_size, strict=True):
+        check_number(name, size, whole(1, "projector"))
+    values = _read_opencv(path)
+    try:
+        return _rig(values, projector_size, code_step, unit_m)
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def save_calibration(rig: Rig, path: str | Path) -> None:
+    """Write a rig as JSON; `load_calibration` reads it back equal."""
+    write_file(Path(path), (json.dumps(to_dict(rig), indent=1) + "\n").encode(), FileFormatError, make_parents=True)
+
+
+def _load_json(path: Path) -> Rig:
+    try:
+        return from_dict(Rig, read_json(path), "rig")
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def _read_opencv(path: Path) -> dict[str, np.ndarray]:
+    check_xml(path)
+    root = ET.parse(path).getroot()
+    values = {}
+    for name, size in _SHAPES.items():
+        text = root.findtext(f"{name}/data")
+        if text is None:
+            raise FileFormatError(f"{path}: expected a matrix {name!r} as procam-calibration writes it, found none.")
+        try:
+            values[name] = np.array(text.split(), dtype=np.float64)
+        except ValueError as error:
+            raise FileFormatError(f"{path}: matrix {name!r} does not hold numbers.") from error
+        if not (np.abs(values[name]) < LARGEST).all():
+            raise FileFormatError(
+                f"{path}: expected numbers below {LARGEST:g} in {name!r}, got {shown(values[name].tolist())}."
+            )
+        if values[name].size != size:
+            raise FileFormatError(f"{path}: expected {size} numbers in {name!r}, got {values[name].size}.")
+    return values
+
+
+def _rig(values: dict[str, np.ndarray], projector_size: tuple[int, int], code_step: int, unit_m: float) -> Rig:
+    if (values["img_shape"] % 1 != 0).any():
+        raise ValueError(f"expected img_shape to hold whole numbers, got {values['img_shape'].tolist()}.")
+    height, width = (int(n) for n in values["img_shape"])
+    projector_from_camera = np.eye(4)
+    projector_from_camera[:3, :3] = _nearest_rotation(values["roration"].reshape(3, 3))
+    projector_from_camera[:3, 3] = values["translation"] * unit_m
+    in_cells = values["proj_int"] / np.array([code_step] * 6 + [1] * 3)
+    return Rig(
+        camera=_intrinsics(width, height, values["cam_int"], values["cam_dist"]),
+        projector=_intrinsics(*projector_size, in_cells, values["proj_dist"]),
+        T_camera_projector=np.linalg.inv(projector_from_camera),
+    )
+
+
+def _intrinsics(width: int, height: int, matrix: np.ndarray, distortion: np.ndarray) -> Intrinsics:
+    fx, _, cx, _, fy, cy = (float(v) for v in matrix[:6])
+    return Intrinsics(width, height, fx, fy, cx + 0.5, cy + 0.5, tuple(float(v) for v in distortion))
+
+
+def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    u, scales, vt = np.linalg.svd(matrix)
+    if not np.allclose(scales, 1, atol=0.01):
+        raise ValueError(f"expected 'roration' to hold a rotation matrix, got {matrix.tolist()}.")
+    return np.asarray(u @ vt)

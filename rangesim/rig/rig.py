@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the camera and the emitter are, and how their pixels map to rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rangesim import limits
+from rangesim.rig.distortion import distort, fold_radius2, undistort
+from rangesim.settings.bounds import FARTHEST_M, Bounds, Exponent, Metres, Watts, check_fields, check_number, whole
+from rangesim.settings.config import shown, to_dict
+
+Array = NDArray[np.float64]
+
+RESIDUAL_PX = 1e-3
+"""Where the inverse of a lens model reprojects worse than this, there is none."""
+
+
+FocalLength = Annotated[float, Bounds("positive and finite", 1e-3, 1e9)]
+"""Pixels."""
+PrincipalPoint = Annotated[float, Bounds("a pixel coordinate", -1e9, 1e9)]
+Coefficient = Annotated[float, Bounds("a coefficient", -1e6, 1e6)]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole with Brown-Conrady distortion, OpenCV's model and frame: x right, y down, z forward.
+
+    Parameters
+    ----------
+    width, height : int, pixels
+    fx, fy, cx, cy : float, pixels; pixel centres lie at integer + 0.5: the middle of an image is (width/2, height/2).
+    distortion : tuple of 0 to 5 floats, OpenCV's order k1, k2, p1, p2, k3.
+    """
+
+    width: Annotated[int, whole(1)]
+    height: Annotated[int, whole(1)]
+    fx: FocalLength
+    fy: FocalLength
+    cx: PrincipalPoint
+    cy: PrincipalPoint
+    distortion: tuple[Coefficient, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        limits.check("pixels", self.width * self.height, f"pixels, not {shown(self.width)} x {shown(self.height)}")
+        if len(self.distortion) > 5:
+            raise ValueError(f"expected at most 5 distortion coefficients, got {shown(self.distortion)}.")
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, fov_x_deg: float) -> Intrinsics:
+        """Square pixels, principal point in the centre, horizontal field of view in degrees."""
+        check_number("fov_x_deg", fov_x_deg, Bounds("degrees between 0 and 180", 1e-6, 180 - 1e-6))
+        for name, value in (("width", width), ("height", height)):
+            check_number(name, value, whole(1))
+        f = 0.5 * width / np.tan(np.radians(fov_x_deg) / 2)
+        return cls(width, height, float(f), float(f), width / 2, height / 2)
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The same lens with another pixel count; the horizontal field of view and the shape of pixels are kept."""
+        for name, value in (("width", width), ("height", height)):
+            check_number(name, value, whole(1, "pixels"))
+        scale = width / self.width
+        cx, cy = (self.cx - self.width / 2) * scale + width / 2, (self.cy - self.height / 2) * scale + height / 2
+        return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy, self.distortion)
+
+    def pixel_centres(self, rows: slice = slice(None)) -> Array:
+        """(height, width, 2) pixel coordinates (x, y) of the pixel centres, of all rows or some."""
+        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height)[rows] + 0.5)
+        return np.stack([x, y], axis=-1)
+
+    def normalise(self, pixels: ArrayLike) -> Array:
+        """(..., 2) undistorted image-plane coordinates x/z, y/z of pixel coordinates (..., 2).
+
+        NaN where the distortion has no inverse: beyond the radius at which its polynomial turns round.
+        """
+        pixels = np.asarray(pixels, dtype=np.float64)
+        target_x, target_y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        if not any(self.distortion):
+            return np.stack([target_x, target_y], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y = undistort(self.coefficients, target_x, target_y)
+            image = distort(self.coefficients, x, y)
+            off = np.hypot((image.x - target_x) * self.fx, (image.y - target_y) * self.fy)
+            inverse = (off <= RESIDUAL_PX) & (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
+        return np.where(inverse[..., None], np.stack([x, y], axis=-1), np.nan)
+
+    def project(self, points: ArrayLike) -> Array:
+        """(..., 2) pixel coordinates of points (..., 3) in this device's frame; NaN behind it and beyond the
+        radius at which the distortion turns round."""
+        points = np.asarray(points, dtype=np.float64)
+        z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+        xy = points[..., :2] / z
+        if any(self.distortion):
+            x, y = xy[..., 0], xy[..., 1]
+            image = distort(self.coefficients, x, y)
+            appears = (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
+            xy = np.where(appears[..., None], np.stack([image.x, image.y], axis=-1), np.nan)
+        return xy * [self.fx, self.fy] + [self.cx, self.cy]
+
+    def directions(self, pixels: ArrayLike) -> Array:
+        """(..., 3) ray directions with z = 1 (not unit length) through pixel coordinates (..., 2); NaN where
+        `normalise` is."""
+        xy = self.normalise(pixels)
+        result = np.ones((*xy.shape[:-1], 3))
+        result[..., :2] = xy
+        return result
+
+    @property
+    def coefficients(self) -> tuple[float, float, float, float, float]:
+        """k1, k2, p1, p2, k3, the missing ones 0."""
+        return (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]  # type: ignore[return-value]
+
+    @property
+    def fold_radius2(self) -> float:
+        """See `rangesim.rig.distortion.fold_radius2`."""
+        return fold_radius2(self.coefficients)
+
+
+def pose(matrix: ArrayLike, name: str) -> Array:
+    """A read-only (4, 4) float64 copy of a rigid transform; ValueError if it is not one."""
+    try:
+        result: Array = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"expected {name} to be a (4, 4) matrix, got {shown(matrix)}.") from None
+    if result.shape != (4, 4) or not np.isfinite(result).all():
+        raise ValueError(f"expected {name} to be a finite (4, 4) matrix, got shape {result.shape}.")
+    if np.abs(result).max() > FARTHEST_M:
+        raise ValueError(f"expected {name} to move by at most {FARTHEST_M:g} m, got {np.abs(result).max():g}.")
+    rotation = result[:3, :3]
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    if not rigid or not np.allclose(result[3], [0, 0, 0, 1]):
+        raise ValueError(f"expected {name} to be rigid (a rotation and metres of translation), got {result.tolist()}.")
+    result.setflags(write=False)
+    return result
+
+
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """(4, 4) T_world_device of a device at `origin` that looks at `target`, metres, OpenCV frame."""
+    o, t, u = (np.asarray(a, dtype=np.float64) for a in (origin, target, up))
+    for name, value in (("origin", o), ("target", t), ("up", u)):
+        if value.shape != (3,) or not (np.abs(value) <= FARTHEST_M).all():
+            raise ValueError(f"expected {name} to be three finite coordinates, got {shown(value.tolist())}.")
+    z = t - o
+    x = np.cross(z, u)
+    if np.linalg.norm(z) == 0 or np.linalg.norm(x) == 0:
+        raise ValueError(f"expected target {t.tolist()} apart from origin {o.tolist()} and not along up {u.tolist()}.")
+    z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
+    result = np.eye(4)
+    result[:3] = np.stack([x, np.cross(z, x), z, o], axis=1)
+    return result
+
+
+def translation(x: float, y: float, z: float) -> Array:
+    """(4, 4) pure translation in metres."""
+    result = np.eye(4)
+    result[:3, 3] = x, y, z
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A camera and the emitter (projector or modulated lamp) fixed to it.
+
+    Parameters
+    ----------
+    camera : Intrinsics
+    projector : Intrinsics; of a ToF lamp, its field of illumination (the pixel count only names coordinates).
+    T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
+    T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres.
+    camera_aperture_radius_m, projector_aperture_radius_m : float, metres, radius of the entrance (exit) pupil.
+    projector_power_w : float, mean radiant power that leaves the projector when it shows white.
+    camera_focus_m, projector_focus_m : float, metres, depth z of the plane in focus of a thin lens with the aperture
+        above; None: sharp everywhere. See docs/optics.md for what a projector out of focus does to its patterns.
+    camera_vignetting, projector_vignetting : float >= 0, exponent n of the relative illumination cos^n of the angle to
+        the optical axis: 4 is the natural law, 0 an even image. It takes from `projector_power_w` what it darkens.
+    """
+
+    camera: Intrinsics
+    projector: Intrinsics
+    T_world_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
+    T_camera_projector: np.ndarray = field(default_factory=lambda: np.eye(4))
+    camera_aperture_radius_m: Metres = 0.75e-3
+    projector_aperture_radius_m: Metres = 2e-3
+    projector_power_w: Watts = 1.0
+    camera_focus_m: Metres | None = None
+    projector_focus_m: Metres | None = None
+    camera_vignetting: Exponent = 0.0
+    projector_vignetting: Exponent = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
+        object.__setattr__(self, "T_camera_projector", pose(self.T_camera_projector, "T_camera_projector"))
+        check_fields(self)
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, Rig) and to_dict(self) == to_dict(other)
+
+    def __hash__(self) -> int:
+        return hash((self.camera, self.projector, self.T_world_camera.tobytes(), self.T_camera_projector.tobytes()))
+
+    @property
+    def T_world_projector(self) -> Array:
+        """(4, 4) float64, maps projector coordinates to world coordinates, metres."""
+        return np.asarray(self.T_world_camera @ self.T_camera_projector)
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance between camera centre and projector centre, metres."""
+        return float(np.linalg.norm(self.T_camera_projector[:3, 3]))
+
+    @property
+    def projector_irradiance(self) -> float:
+        """Irradiance in W/m2 that white casts on a fronto-parallel plane at z = 1 m."""
+        p = self.projector
+        return self.projector_power_w * p.fx * p.fy / (p.width * p.height)
+
+    @property
+    def camera_illumination(self) -> NDArray[np.float32]:
+        """(h, w) float32 in 0..1, share of the light that vignetting leaves a pixel: cos^n of its ray to the axis."""
+        rays = self.camera.directions(self.camera.pixel_centres())
+        share = np.linalg.norm(rays, axis=-1) ** -self.camera_vignetting
+        return np.nan_to_num(share, nan=0.0).astype(np.float32)  # no ray, no light
