@@ -97,6 +97,36 @@ def of_scene(name: str) -> Iterator[tuple[str, Any]]:
             yield from ((f"{name}/{key}/{kind}/{k}", v) for k, v in of_readings(signals, one, noise))
 
 
+def of_media() -> Iterator[tuple[str, Any]]:
+    """A ball that scatters light inside, absorbing glass before it, a coat with holes, and lamps."""
+    grey = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.5}}
+    milk = {"type": "homogeneous", "sigma_t": 60.0, "albedo": 0.95, "phase": {"type": "hg", "g": 0.4}}
+    ink = {"type": "homogeneous", "sigma_t": 8.0, "albedo": 0.0}
+    shapes: dict[str, Any] = {
+        "wall": {"type": "rectangle", "to_world": at(0, 0, 1.4).scale(1.5).rotate([0, 1, 0], 180), "bsdf": grey},
+        "milk": {"type": "sphere", "center": [-0.12, 0, 1], "radius": 0.1, "bsdf": {"type": "null"}, "interior": milk},
+        "ink": {"type": "sphere", "center": [0.12, 0, 0.9], "radius": 0.1, "bsdf": {"type": "dielectric"}},
+        "mesh": {"type": "rectangle", "to_world": at(0, 0.2, 0.8).scale(0.1).rotate([0, 1, 0], 180)},
+        "lamp": {"type": "sphere", "center": [0.5, -0.5, 0.3], "radius": 0.05, "emitter": {"type": "area"}},
+    }
+    shapes["ink"]["interior"] = ink
+    shapes["mesh"]["bsdf"] = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "plastic"}}
+    camera = {"type": "perspective", "fov": 40, "to_world": at(0, 0, 0), "film": {"type": "hdrfilm"}}
+    scene = rangesim.load_scene({"type": "scene", "camera": camera, **shapes})
+    for key in ("gray-phase", "direct"):
+        one = Instrument(key, SENSORS[key], power_w=0.02)
+        rig = one.rig(scene, WIDTH, HEIGHT)
+        signals = rangesim.transport(scene, rig, [one.sensor], spp=SPP, photons=PHOTONS, seed=SEED)
+        yield from ((f"media/{key}/{k}", v) for k, v in of_signals(signals, one.sensor))
+
+
+def at(x: float, y: float, z: float) -> Any:
+    """Transform of something at this place that looks along z."""
+    import mitsuba as mi
+
+    return mi.ScalarTransform4f().translate([x, y, z])
+
+
 def of_motion() -> Iterator[tuple[str, Any]]:
     """An object that moves while each of three sensors takes its frames."""
     scene = rangesim.load_scene(str(SCENES / "plane.xml"))
@@ -123,7 +153,7 @@ def main() -> None:
     found: dict[str, str] = {}
     for name in NAMES:
         found |= {k: digest(v) for k, v in of_scene(name)}
-    found |= {k: digest(v) for k, v in of_motion()}
+    found |= {k: digest(v) for k, v in (*of_media(), *of_motion())}
     if options.out:
         options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     before = json.loads(options.against.read_text(encoding="utf-8")) if options.against else found

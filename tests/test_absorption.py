@@ -24,8 +24,8 @@ from rangesim import Intrinsics, Rig, Scene, load_scene, transport
 from rangesim.errors import FileFormatError
 from rangesim.light_transport import surfaces
 from rangesim.light_transport.absorption import absorbers_of
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import Photons, trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import FirstReturn
 from rangesim.scene.moving import MovingScene
 
@@ -131,8 +131,7 @@ POWER_W = 2.0
 
 
 def photons_of(scene: Scene, rig: Rig) -> Photons:
-    projector, absorbers = Device.projector(rig), absorbers_of(scene.mitsuba)
-    return trace_photons(scene.mitsuba, projector, POWER_W, 200_000, 4, 1, 2 << 30, absorbers=absorbers)
+    return trace_photons(TracedScene.of(scene.mitsuba, rig), POWER_W, 200_000, 4, 1, 2 << 30)
 
 
 def test_photons_into_an_absorbing_slab_land_are_absorbed_or_escape() -> None:

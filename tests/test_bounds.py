@@ -259,9 +259,12 @@ def test_numbers_are_no_bools(name: str) -> None:
         Experiment("a.xml", **{name: True})  # type: ignore[arg-type]
 
 
-MODULES = ("ambient", "detector", "experiment", "instrument", "motion.timing", "motion.track", "response.lengths",
-           "response.patterns", "rig", "sensors.structured_light", "sensors.amcw", "sensors.direct_tof",
-           "sensors.ideal_tof", "decoding.gray", "decoding.phase_shift", "decoding.triangulate", "spad")  # fmt: skip
+MODULES = (
+    *("electronics.ambient", "electronics.detector", "electronics.spad", "experiment.experiment"),
+    *("experiment.instrument", "motion.timing", "motion.track", "response.lengths", "response.patterns", "rig.rig"),
+    *("sensors.structured_light", "sensors.amcw", "sensors.direct_tof", "sensors.ideal_tof"),
+    *("decoding.gray", "decoding.phase_shift", "decoding.triangulate"),
+)
 RESULTS = {GrayCode, Phase, Triangulation}
 
 

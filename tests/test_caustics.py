@@ -28,9 +28,9 @@ import rangesim
 from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight, transport
 from rangesim.environment.backend import select_variant
 from rangesim.light_transport import photon_maps
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.photon_maps import ALPHA, GatheringRadius, Level, radii_of_maps
 from rangesim.light_transport.photons import PhotonBalance, Photons, shift_of, stratified_choice, trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Fringes, Images, LengthBins, LightPath
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -436,7 +436,7 @@ def test_radii_follow_the_law_of_progressive_photon_mapping() -> None:
 @pytest.mark.parametrize(("photons", "radius_m"), [(50_000, 1e-3), (400_000, 1e-3), (400_000, 3e-3)])
 def test_flux_depends_on_neither_radius_nor_number_of_photons(photons: int, radius_m: float) -> None:
     scene, rig = ball_over_a_plane()
-    landed = trace_photons(scene.mitsuba, Device.projector(rig), 1.0, 400_000, 16, 3, 2 << 30)
+    landed = trace_photons(TracedScene.of(scene.mitsuba, rig), 1.0, 400_000, 16, 3, 2 << 30)
     seen = np.abs(landed.position[:, :2]).max(axis=1) < 0.05 * np.tan(np.radians(55)) - 0.01
     rays = rig.camera.normalise(rig.camera.pixel_centres()) * 0.05
     expected = landed.flux[seen].sum(dtype=float) / 16
@@ -545,10 +545,10 @@ def test_all_64_bits_of_a_seed_shift_the_photons_evenly() -> None:
 def test_photons_of_many_seeds_light_every_pixel_that_sees_glass() -> None:
     """One in eight pixels is lit by a seed; were it the same ones each time, seeds would average nothing out."""
     scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
-    projector = Device.projector(rig_of(CAMERA, Intrinsics.from_fov(32, 24, 12)))
+    traced = TracedScene.of(scene.mitsuba, rig_of(CAMERA, Intrinsics.from_fov(32, 24, 12)))
     lit = []
     for seed in range(64):
-        landed = trace_photons(scene.mitsuba, projector, 1.0, 96, 2, seed, 1 << 30)
+        landed = trace_photons(traced, 1.0, 96, 2, seed, 1 << 30)
         lit.append(np.bincount(landed.v.astype(int) * 32 + landed.u.astype(int), minlength=32 * 24) > 0)
     assert max(map(np.sum, lit)) <= 96
     assert np.any(lit, axis=0).mean() > 0.99
@@ -585,7 +585,7 @@ def test_chunks_of_photons_and_tiles_change_no_byte() -> None:
     scene = rangesim.load_scene(SCENES / "tabletop.xml")
     rig = scene.rig(width=64, height=48)
     large, small = (
-        trace_photons(scene.mitsuba, Device.projector(rig), 1.0, 100_001, 7, 5, memory) for memory in (2 << 30, 999_937)
+        trace_photons(TracedScene.of(scene.mitsuba, rig), 1.0, 100_001, 7, 5, memory) for memory in (2 << 30, 999_937)
     )
     for name in ("position", "direction", "flux", "u", "v", "length_m", "map"):
         np.testing.assert_array_equal(getattr(large, name), getattr(small, name))

@@ -22,8 +22,8 @@ from delta_scenes import (
 )
 
 from rangesim import Intrinsics, Rig, Scene, look_at, transport
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.photons import Photons, trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import FirstReturn
 
 POWER_W = 2.0
@@ -32,8 +32,7 @@ CAMERA = Intrinsics.from_fov(64, 48, 40)
 
 
 def photons_of(scene: Scene, rig: Rig, photons: int = 200_000, maps: int = 4, seed: int = 1) -> Photons:
-    projector = Device.projector(rig)
-    return trace_photons(scene.mitsuba, projector, rig.projector_power_w, photons, maps, seed, 2 << 30)
+    return trace_photons(TracedScene.of(scene.mitsuba, rig), rig.projector_power_w, photons, maps, seed, 2 << 30)
 
 
 def mean_over_the_field(function: Any) -> float:

@@ -17,9 +17,9 @@ import pytest
 import rangesim
 from rangesim import AmcwToF, DirectToF, Rig, Scene, Signals, StructuredLight, transport
 from rangesim.light_transport import launches, photons
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.loop import _dealt
 from rangesim.light_transport.photons import trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import FirstReturn
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -176,12 +176,12 @@ def test_launches_of_any_size_give_the_same_bytes(
 
 
 def test_the_balance_of_photons_does_not_depend_on_launches(tabletop: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    projector = Device.projector(tabletop.rig(width=64, height=48))
+    traced = TracedScene.of(tabletop.mitsuba, tabletop.rig(width=64, height=48))
     monkeypatch.setattr(photons, "SUMMED_TOGETHER", 4096)
     found = []
     for units in (1 << 30, 10_000):
         monkeypatch.setattr(launches, "FIRST_UNITS", units)
-        found.append(trace_photons(tabletop.mitsuba, projector, 1.0, 50_001, 3, 5, 1 << 30))
+        found.append(trace_photons(traced, 1.0, 50_001, 3, 5, 1 << 30))
     assert astuple(found[0].balance) == astuple(found[1].balance)
     for name in ("position", "flux", "map"):
         np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))

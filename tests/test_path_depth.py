@@ -14,9 +14,9 @@ from scipy.spatial import ConvexHull
 from rangesim import Intrinsics, Rig, Scene, load_scene, transport
 from rangesim.environment.backend import select_variant
 from rangesim.errors import TruncationWarning
-from rangesim.light_transport import delta_chain, loop, photon_flight
-from rangesim.light_transport.device import Device
+from rangesim.light_transport import loop, photon_flight, specular_chain
 from rangesim.light_transport.photons import PhotonBalance, trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 
 CAMERA = Intrinsics.from_fov(64, 48, 12)
 PROJECTOR = Intrinsics.from_fov(160, 120, 26)
@@ -127,7 +127,7 @@ def gem(folder: Path, bsdf: dict[str, Any]) -> dict[str, Any]:
 
 def balance(scene: Scene) -> PhotonBalance:
     rig = rig_of(CAMERA, PROJECTOR, projector_power_w=2.0)
-    return trace_photons(scene.mitsuba, Device.projector(rig), 2.0, 100_000, 1, 1, 2 << 30).balance
+    return trace_photons(TracedScene.of(scene.mitsuba, rig), 2.0, 100_000, 1, 1, 2 << 30).balance
 
 
 def test_what_enters_a_diamond_comes_out(tmp_path: Path) -> None:
@@ -154,8 +154,8 @@ def test_roulette_between_mirrors_takes_no_light_and_gives_none(monkeypatch: pyt
     rig = rig_of(CAMERA, Intrinsics.from_fov(64, 16, 70))
     stored = {}
     for after in (2, 1000):
-        monkeypatch.setattr(delta_chain, "ROULETTE_AFTER", after)
-        stored[after] = trace_photons(scene.mitsuba, Device.projector(rig), 2.0, 200_000, 1, 1, 2 << 30)
+        monkeypatch.setattr(specular_chain, "ROULETTE_AFTER", after)
+        stored[after] = trace_photons(TracedScene.of(scene.mitsuba, rig), 2.0, 200_000, 1, 1, 2 << 30)
     few, all_of_them = stored[2], stored[1000]
     assert len(few.flux) < 0.7 * len(all_of_them.flux)
     assert few.balance.stored == pytest.approx(all_of_them.balance.stored, rel=0.01)

@@ -19,9 +19,9 @@ import rangesim
 from rangesim import AmcwToF, Detector, DirectToF, Scene, SpadDetector, expose, transport
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.experiment.pipeline import noise_seed
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.photons import trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
 
 SEEDS = tuple(
@@ -61,7 +61,7 @@ def path_loop(scene: Scene, seed: int) -> list[np.ndarray]:
 
 
 def photons(scene: Scene, seed: int) -> list[np.ndarray]:
-    return [trace_photons(scene.mitsuba, Device.projector(scene.rig()), 1.0, 500, 2, seed, 1 << 30).position]
+    return [trace_photons(TracedScene.of(scene.mitsuba, scene.rig()), 1.0, 500, 2, seed, 1 << 30).position]
 
 
 def caustics(scene: Scene, seed: int) -> list[np.ndarray]:
@@ -71,7 +71,7 @@ def caustics(scene: Scene, seed: int) -> list[np.ndarray]:
 
 def glint(scene: Scene, seed: int) -> list[np.ndarray]:
     rig = replace(scene.rig(width=48, height=36), projector_aperture_radius_m=0.02)
-    found = trace_glint(scene.mitsuba, rig, [], seed)
+    found = trace_glint(TracedScene.of(scene.mitsuba, rig), rig, [], seed)
     assert found.radiance.any()
     return [found.radiance]
 

@@ -18,9 +18,8 @@ import rangesim
 from rangesim import AmcwToF, transport
 from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError
-from rangesim.light_transport.device import Device
-from rangesim.light_transport.medium import media_of
 from rangesim.light_transport.photons import trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import SPEED_OF_LIGHT, Fringes, Images, Phasor
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -310,8 +309,8 @@ def test_photons_that_cross_a_medium_are_weakened_by_it() -> None:
     stored = []
     for sigma_t in (1e-6, 50.0):
         scene = scene_of(slab(depth_m=0.02), medium(sigma_t, 0.0), wall=wall, pane=pane)
-        projector = Device.projector(scene.rig(baseline_m=0.01))
-        landed = trace_photons(scene.mitsuba, projector, 1.0, 50_000, 1, 7, 1 << 30, media_of(scene.mitsuba))
+        traced = TracedScene.of(scene.mitsuba, scene.rig(baseline_m=0.01))
+        landed = trace_photons(traced, 1.0, 50_000, 1, 7, 1 << 30)
         balance = landed.balance
         rest = balance.direct + balance.stored + balance.absorbed + balance.escaped + balance.truncated
         assert balance.emitted == pytest.approx(rest, rel=1e-4)

@@ -4,18 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from rangesim.light_transport.absorption import Absorbers
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.indirect import REACH_PX
-from rangesim.light_transport.medium import Media
 from rangesim.light_transport.photon_maps import MOST_MAPS, GatheringRadius, PhotonMaps
 from rangesim.light_transport.photons import has_delta, trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.rig import Rig
-from rangesim.scene import Scene
 
 PHOTONS = 500_000
 PHOTONS_PER_DISC = 400
@@ -28,38 +24,23 @@ SMALLEST_RADIUS_M = 1e-6
 
 
 def caustic_maps(
-    scene: Scene,
+    traced: TracedScene,
     rig: Rig,
     photons: int,
     radius_m: float | None,
     spp: int,
     seed: int,
     memory_bytes: int,
-    media: Media | None,
-    absorbers: Absorbers | None,
-    surfaces: Any,
     report: Callable[[], None] = lambda: None,
 ) -> PhotonMaps | None:
     """Maps for a pass of `spp` samples; None if there are no photons, nothing to send them through, or none landed.
 
     `report` is called after each kernel launch.
     """
-    if not photons or not has_delta(scene.mitsuba):
+    if not photons or not has_delta(traced.scene):
         return None
-    maps, projector = min(spp, MOST_MAPS), Device.projector(rig)
-    landed = trace_photons(
-        scene.mitsuba,
-        projector,
-        rig.projector_power_w,
-        photons,
-        maps,
-        seed,
-        memory_bytes,
-        media,
-        absorbers,
-        surfaces,
-        report,
-    )
+    maps = min(spp, MOST_MAPS)
+    landed = trace_photons(traced, rig.projector_power_w, photons, maps, seed, memory_bytes, report)
     radius = gathering_radius(rig, landed.per_pixel, radius_m)
     wide = REACH_PX / rig.camera.fx
     return PhotonMaps(landed, maps, radius, rig.projector_irradiance, wide) if len(landed.flux) else None

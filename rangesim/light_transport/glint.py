@@ -20,16 +20,15 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rangesim.light_transport.absorption import Absorbers
-from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.exact_point import spawn_close
 from rangesim.light_transport.launches import Launches, fewest_lanes
 from rangesim.light_transport.loop import mono
-from rangesim.light_transport.medium import Media, bounded
+from rangesim.light_transport.medium import bounded
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Continued, Seed, of_part, random_stream, stratified
+from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, spawn_specular_ray, survival
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
 
@@ -75,24 +74,16 @@ class Glint:
 
 
 def trace_glint(
-    scene: Any,
+    traced: TracedScene,
     rig: Rig,
     responses: Sequence[Response],
     seed: int,
-    media: Media | None = None,
-    absorbers: Absorbers | None = None,
-    surfaces: Any = None,
     report: Callable[[], None] = lambda: None,
 ) -> Glint:
-    """What the camera of the rig sees of the projector's lens.
-
-    `surfaces`, see `surfaces_of`; `report` is called after each kernel launch.
-    """
-    camera, projector = Device.camera(rig), Device.projector(rig)
-    h, w = rig.camera.height, rig.camera.width
-    view = View(surfaces or scene, camera, media, absorbers, Seed.of(seed))
-    worth_probing = _worth_probing(scene, camera, projector, h, w)
-    pixel, radius_m = _near_the_lens(view, rig, projector, worth_probing, report)
+    """What the camera of the rig sees of the projector's lens; `report` is called after each kernel launch."""
+    view = View(traced, Seed.of(seed))
+    worth_probing = _worth_probing(traced, rig.camera.height, rig.camera.width)
+    pixel, radius_m = _near_the_lens(view, rig, worth_probing, report)
     if len(pixel) == 0:
         nothing, none = np.zeros(0, np.float32), {r: np.zeros((r.channels, 0), np.float32) for r in responses}
         return Glint(pixel, nothing, none, nothing, none)
@@ -142,7 +133,7 @@ def _sums(
     """Sums over the paths of each pixel from number `first` on; each part has random numbers of its own."""
     nearest, total = (np.zeros(len(pixel), np.float32) for _ in range(2))
     radiance = rig.projector_irradiance / (np.pi * radius_m**2)
-    accumulators, launches, projector = Accumulators(responses, len(pixel)), Launches(), Device.projector(rig)
+    accumulators, launches, projector = Accumulators(responses, len(pixel)), Launches(), view.traced.projector
     for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=fewest_lanes()):
         some, n = slice(begin, end), end - begin
         lens = Lens(rig, projector, radius_m[some], radiance[some])
@@ -150,10 +141,7 @@ def _sums(
         state = PathState(
             chain=lanes.start(),
             throughput=dr.ones(mi.Float, n),
-            length=dr.zeros(mi.Float, n),
-            ior=dr.ones(mi.Float, n),
-            previous=dr.zeros(mi.Point3f, n),
-            sigma_a=None if view.absorbers is None else dr.zeros(mi.Float, n),
+            beam=Beam.start(view.traced._replace(media=None), n),  # boundaries of media end its paths
             channels=accumulators.zeros(n),
             total=dr.zeros(mi.Float, n),
             nearest=dr.full(mi.Float, dr.inf, n),
@@ -169,10 +157,7 @@ def _sums(
 class View(NamedTuple):
     """What the camera looks into, and the seed of its random numbers."""
 
-    surfaces: Any
-    camera: Device
-    media: Media | None
-    absorbers: Any
+    traced: TracedScene
     seed: Seed
 
 
@@ -206,14 +191,14 @@ class Lanes:
     def __init__(
         self, view: View, pixel: np.ndarray, paths: int, first_place: int = 0, first: int = 0, part: int = 0
     ) -> None:
-        self.surfaces, self.camera, self.media, self.absorbers, seed = view
+        self.traced, seed = view
         self.pixel, self.paths = mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, paths)
         self.place = dr.arange(mi.UInt32, len(pixel)) + dr.opaque(mi.UInt32, first_place)
         rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())
         self.first = dr.opaque(mi.UInt32, first)
         self.random = Continued(of_part(rng, dr.opaque(mi.UInt32, part)))
-        width = mi.UInt32(self.camera.size.x)
+        width = mi.UInt32(self.traced.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
 
     def start(self) -> Chain:
@@ -239,10 +224,7 @@ class PathState:
 
     chain: Chain
     throughput: Any
-    length: Any
-    ior: Any
-    previous: Any
-    sigma_a: Any
+    beam: Beam
     channels: list[list[Any]]
     total: Any
     nearest: Any
@@ -270,11 +252,11 @@ class Lens:
         return across, t, (slope > 0) & (t > 0) & (t < si.t)
 
 
-def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int) -> np.ndarray:
+def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
     """Flat indices of the pixels around whose centre there is a delta surface, or the lens in plain view."""
-    meets, exists = meets_delta(scene, camera)
+    meets, exists = meets_delta(traced.scene, traced.camera)
     mask = meets.reshape(h, w)
-    uv, z = camera.project(mi.Point3f(projector.centre))
+    uv, z = traced.camera.project(mi.Point3f(traced.projector.centre))
     u, v = float(uv.x[0]), float(uv.y[0])
     if float(z[0]) > 0 and 0 <= u < w and 0 <= v < h:
         mask[int(v), int(u)] = True
@@ -282,12 +264,12 @@ def _worth_probing(scene: Any, camera: Device, projector: Device, h: int, w: int
 
 
 def _near_the_lens(
-    view: View, rig: Rig, projector: Device, pixel: np.ndarray, report: Callable[[], None]
+    view: View, rig: Rig, pixel: np.ndarray, report: Callable[[], None]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Those of the pixels whose probes come near the lens, as measured by how far they spread; and for each of them
     the radius in metres of the disc to hit."""
     aperture = np.full(len(pixel), rig.projector_aperture_radius_m)
-    lens = Lens(rig, projector, aperture[:1], aperture[:1])
+    lens = Lens(rig, view.traced.projector, aperture[:1], aperture[:1])
     nearest, spread = np.empty(len(pixel), np.float32), np.empty(len(pixel), np.float32)
     launches = Launches()
     for begin, end in launches.ranges(len(pixel), SEGMENTS * PROBES, at_least=fewest_lanes()):
@@ -308,7 +290,7 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
 
     Where light splits into reflection and refraction, probes take both alike, however faint one is.
     """
-    surfaces, camera, media = lanes.surfaces, lanes.camera, lanes.media
+    traced = lanes.traced
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
     nearest, spread, before = state.nearest, state.spread, state.before  # where the last one crossed
@@ -317,20 +299,20 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
     left = most + dr.zeros(mi.UInt32, dr.width(k))  # turns
     while (k < lanes.paths) & (left > 0):
         rng = lanes.random.at(random)
-        primary = camera.centre_ray(lanes.corner + stratified(lanes.shift, k))
+        primary = traced.camera.centre_ray(lanes.corner + stratified(lanes.shift, k))
         ray = mi.Ray3f(
             dr.select(chain == 0, primary.origin, origin), dr.select(chain == 0, primary.direction, direction)
         )
-        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
+        si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
         across, _, crosses = lens.offset(ray, si)
         nearest = dr.select(crosses, dr.minimum(nearest, dr.norm(across)), nearest)
         # The least step, because probes that went another way are far off and say nothing
         spread = dr.select(crosses, dr.minimum(spread, dr.norm(across - before)), spread)
         before = dr.select(crosses, across, before)
-        hit = si.is_valid() & ~bounded(media, si)
+        hit = si.is_valid() & ~bounded(traced.media, si)
         way = dr.select(rng.next_float32() < 0.5, mi.Float(0), mi.Float(0.9999))
         bs, weight = si.bsdf(ray).sample(context, si, way, mi.Point2f(0.5), hit)
-        ray = spawn_close(si, si.p, si.to_world(bs.wo))
+        ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
         chain += 1
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (mono(weight) <= 0) | (chain >= MAX_CHAIN)
         chain = dr.select(ends, 0, chain)
@@ -346,11 +328,16 @@ def _paths_to_the_lens(
 ) -> tuple[PathState, Any]:
     """The state after at most so many turns of the loop, and the turns taken: dense channels and radiance of the delta
     paths from each pixel to the lens; bins go to the accumulators."""
-    surfaces, camera, media, absorbers = lanes.surfaces, lanes.camera, lanes.media, lanes.absorbers
+    traced, camera = lanes.traced, lanes.traced.camera
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
-    throughput, length, ior, previous = state.throughput, state.length, state.ior, state.previous
-    sigma_a, channels, total, nearest = state.sigma_a, state.channels, state.total, state.nearest
+    throughput, beam, channels, total, nearest = (
+        state.throughput,
+        state.beam,
+        state.channels,
+        state.total,
+        state.nearest,
+    )
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
     left = most + dr.zeros(mi.UInt32, dr.width(k))  # turns
@@ -363,12 +350,12 @@ def _paths_to_the_lens(
         )
         primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, lanes.first + k), on_lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, direction))
-        previous, length = dr.select(starts, primary.origin, previous), dr.select(starts, primary.lead, length)
-        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
+        beam = beam.begun(starts, primary.origin, primary.lead)
+        si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
 
         # ---- Does this segment meet the lens? --------------------------------------------------------
         across, way, crosses = lens.offset(ray, si)
-        uv, z = lens.projector.project(previous)
+        uv, z = lens.projector.project(beam.previous)
         size = lens.projector.size
         nearest = dr.select(crosses, dr.minimum(nearest, dr.norm(across)), nearest)
         meets = crosses & (dr.norm(across) < lens.radius) & (z > 0)
@@ -379,33 +366,31 @@ def _paths_to_the_lens(
             throughput * lens.radiance * lens.projector.relative_illumination(-ray.d) / dr.square(dr.square(cosine))
         )
         radiance = dr.select(meets, radiance * lens.projector.pixel_density(-ray.d), 0)
-        u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, dr.fma(ior, way, length)))
+        u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, dr.fma(beam.ior, way, beam.length)))
         path = LightPath(u, v, path_length, dr.full(mi.Bool, False, dr.width(k)), mi.UInt32(GLINT))
         channels = accumulators.add(channels, path, radiance, lanes.place, meets)
         total += radiance
 
         # ---- On through delta interactions, or the next path -----------------------------------------
-        hit = si.is_valid() & ~meets & ~bounded(media, si)
-        length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
-        if dr.hint(absorbers is not None, mode="scalar"):
-            throughput *= absorbers.transmittance(sigma_a, dr.select(hit, dr.norm(si.p - previous), 0))
+        hit = si.is_valid() & ~meets & ~bounded(traced.media, si)
+        beam.length = beam.length_to(si.p, hit)
+        if dr.hint(traced.absorbers is not None, mode="scalar"):
+            throughput *= beam.unabsorbed(traced, si.p, hit)
         bs, weight = si.bsdf(ray).sample(
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), hit
         )
         throughput *= mono(weight)
-        ior = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
-        previous = mi.Point3f(si.p)
-        ray = spawn_close(si, si.p, si.to_world(bs.wo))
+        beam = beam.refracted(bs, hit).begun(True, si.p, beam.length)
+        ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
         chain += 1
-        chance = survival(chain, throughput * dr.square(ior))
+        chance = survival(chain, throughput * dr.square(beam.ior))
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
         ends |= rng.next_float32() >= chance
         throughput /= chance
-        if dr.hint(absorbers is not None, mode="scalar"):
-            sigma_a = dr.select(ends, 0, absorbers.beyond(si, ray.d, sigma_a, hit))
+        beam = beam.beyond(traced, si, ray.d, hit, mi.Bool(False)).ended(traced, ends)
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)
-        throughput, ior = dr.select(ends, 1, throughput), dr.select(ends, 1, ior)
+        throughput = dr.select(ends, 1, throughput)
         random, origin, direction = rng.state, ray.o, ray.d
         left -= 1
     at = Chain(random, k, chain, origin, direction)
-    return PathState(at, throughput, length, ior, previous, sigma_a, channels, total, nearest), most - left
+    return PathState(at, throughput, beam, channels, total, nearest), most - left

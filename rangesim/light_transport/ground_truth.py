@@ -10,12 +10,13 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.cutouts import first_surface
-from rangesim.light_transport.device import Device, connect
+from rangesim.light_transport.device import connect
 from rangesim.light_transport.indirect import Guides
 from rangesim.light_transport.launches import Launches
 from rangesim.light_transport.loop import Budget, Lanes, Settings, View, mono
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.rig import Rig
 from rangesim.scene import Scene
 from rangesim.scene.materials import MATERIAL_CLASSES, is_matte, transmits
@@ -23,17 +24,16 @@ from rangesim.scene.media import is_boundary
 from rangesim.signals import GroundTruth
 
 
-def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> tuple[GroundTruth, Guides]:
+def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTruth, Guides]:
     """First surface along the ray through each pixel centre; see `rangesim.signals.GroundTruth`."""
     h, w = rig.camera.height, rig.camera.width
-    camera, projector = Device.camera(rig), Device.projector(rig)
     launches, shapes = Launches(), scene.mitsuba.shapes()
     index_of = mi.Int32(table_of(scene.mitsuba, np.arange(len(shapes), dtype=np.int32)))
     transmits_of = mi.Bool(table_of(scene.mitsuba, [is_boundary(s) or transmits(s.bsdf()) for s in shapes]))
     matte = np.array([is_matte(s) for s in shapes])
     parts = []
     for begin, end in launches.ranges(h * w):
-        part = _truth(scene, surfaces, camera, projector, index_of, transmits_of, begin, end)
+        part = _truth(traced, scene.has_cutouts, index_of, transmits_of, begin, end)
         launches.evaluate(part, end - begin)
         parts.append([np.asarray(x.numpy()) for x in part])
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -64,7 +64,7 @@ def ground_truth(scene: Scene, rig: Rig, surfaces: Any) -> tuple[GroundTruth, Gu
 def mean_reflectance(view: View, settings: Settings, rig: Rig, has_cutouts: bool, samples: int) -> np.ndarray:
     """(h, w) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
     launches, parts = Launches(), []
-    surfaces, camera, shape = view.surfaces, view.camera, (rig.camera.height, rig.camera.width)
+    surfaces, camera, shape = view.traced.surfaces, view.traced.camera, (rig.camera.height, rig.camera.width)
     count = np.full(shape[0] * shape[1], samples, np.uint32)
     budget = Budget(np.arange(len(count)), count, count, rig.projector_irradiance)
     for begin, end in launches.ranges(len(count), samples):
@@ -82,24 +82,16 @@ def mean_reflectance(view: View, settings: Settings, rig: Rig, has_cutouts: bool
     return np.concatenate(parts).reshape(shape)
 
 
-def _truth(
-    scene: Scene,
-    surfaces: Any,
-    camera: Device,
-    projector: Device,
-    index_of: Any,
-    transmits_of: Any,
-    begin: int,
-    end: int,
-) -> list[Any]:
+def _truth(traced: TracedScene, has_cutouts: bool, index_of: Any, transmits_of: Any, begin: int, end: int) -> list[Any]:
     """Of a range of pixels: hit, index of the shape, z, range, visibility, u, v, and three of each of the normal,
     the place from the camera, and the shading normal, and the diffuse reflectance."""
+    camera = traced.camera
     ray = camera.centre_rays(begin, end)
-    si = first_surface(surfaces, mi.Ray3f(ray.origin, ray.direction), scene.has_cutouts)
+    si = first_surface(traced.surfaces, mi.Ray3f(ray.origin, ray.direction), has_cutouts)
     hit = si.is_valid() if ray.exists is None else si.is_valid() & ray.exists
     to_camera = camera.centre - mi.Vector3f(si.p)
     normal = dr.select(dr.dot(si.n, to_camera) < 0, -si.n, si.n)
-    link = connect(scene.mitsuba, projector, si, hit)
+    link = connect(traced.scene, traced.projector, si, hit)
     uv = link.uv
     shape = number_of(si.shape)
     through = dr.gather(mi.Bool, transmits_of, shape, hit)

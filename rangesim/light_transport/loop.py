@@ -8,7 +8,7 @@ whatever the number of threads. The loop is run in launches of bounded time, eac
 turns further: what a lane has done is its `State`, so that neither the lanes of a launch nor its turns change a byte.
 
 A path has two limits. `max_depth` counts the surfaces that scatter it; delta interactions (glass, mirrors, coats,
-holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.delta_chain`).
+holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.specular_chain`).
 
 Inside a translucent object a turn of the loop is a scattering event instead of a surface; a stay inside counts as one
 surface towards the depth, however often it scatters (`rangesim.light_transport.medium`). Inside glass that absorbs,
@@ -30,16 +30,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.absorption import ENDLESS, Absorbers
-from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
-from rangesim.light_transport.device import Device, connect
-from rangesim.light_transport.exact_point import on_its_line, spawn_close
+from rangesim.light_transport.device import connect
 from rangesim.light_transport.launches import Launches, Report, fewest_lanes
-from rangesim.light_transport.medium import FAINT, MAX_EVENTS, Media, Medium
+from rangesim.light_transport.medium import FAINT, MAX_EVENTS
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
+from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.truncation import Tally
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
 from rangesim.scene import Scene
@@ -165,35 +164,24 @@ class State:
     origin: Any
     direction: Any
     throughput: Any
-    length: Any
-    ior: Any
+    beam: Beam
     first: Any
     via: Any
-    previous: Any
     previous_pdf: Any
     previous_delta: Any
     was_bent: Any
-    inside: Any
     events: Any
     stays: Any
-    sigma_a: Any
 
 
 class View(NamedTuple):
-    """What the loop is run in: scene, devices, photons; the same for all lanes.
+    """What the loop is run in: the scene with its devices, and photons; the same for all lanes.
 
-    surfaces : what rays are intersected with, see `surfaces_of`.
-    maps : PhotonMaps, or None. media, cutouts, absorbers : Media, Cutouts and Absorbers, or None where there are none.
+    maps : PhotonMaps, or None.
     """
 
-    scene: Any
-    surfaces: Any
-    camera: Device
-    projector: Device
+    traced: TracedScene
     maps: PhotonMaps | None = None
-    media: Any = None
-    cutouts: Any = None
-    absorbers: Any = None
 
 
 def trace(
@@ -258,11 +246,11 @@ class Lanes:
             dr.opaque(mi.UInt32, n) for n in (budget.first, budget.stride, budget.part)
         )
         self.irradiance = dr.opaque(mi.Float, budget.irradiance)
-        width = mi.UInt32(view.camera.size.x)
+        width = mi.UInt32(view.traced.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
         rng = random_stream(settings.seed, self.pixel)
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the samples in the pixel
-        on_lens = view.camera.has_lens
+        on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(of_part(rng, self.part))
         self.choice = Continued(of_part(random_stream(settings.seed, self.pixel, Stream.SECOND), self.part))
@@ -274,7 +262,7 @@ class Lanes:
 
 def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes) -> State:
     """The state of lanes that have done nothing yet."""
-    lanes, gathers, in_media = dr.width(at.pixel), view.maps is not None, view.media is not None
+    lanes, gathers, in_media = dr.width(at.pixel), view.maps is not None, view.traced.media is not None
     shines = [True, True, True, gathers, settings.ambient, gathers]
     return State(
         # ---- Of the lane: its random numbers, its sums -----------------------------------------------
@@ -294,18 +282,14 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
         origin=dr.zeros(mi.Point3f, lanes),  # of the ray
         direction=dr.zeros(mi.Vector3f, lanes),
         throughput=dr.ones(mi.Float, lanes),  # radiance at the camera per radiance along the ray
-        length=dr.zeros(mi.Float, lanes),  # optical length from the camera to `previous`, metres
-        ior=dr.ones(mi.Float, lanes),  # refractive index along the ray
+        beam=Beam.start(view.traced, lanes),  # from the last vertex on; its length counts from the camera
         first=dr.full(mi.Bool, True, lanes),  # no non-delta surface so far
         via=dr.full(mi.Bool, False, lanes),  # some delta surface so far
-        previous=dr.zeros(mi.Point3f, lanes),  # the last vertex
         previous_pdf=dr.zeros(mi.Float, lanes),  # of the BSDF sample that made the ray; for MIS with ambient light
         previous_delta=dr.full(mi.Bool, True, lanes),
         was_bent=dr.full(mi.Bool, False, lanes),  # the ray left a delta surface
-        inside=view.media.none(lanes) if in_media else None,  # what the ray runs through
         events=dr.zeros(mi.UInt32, lanes) if in_media else None,  # scatterings in media and crossed boundaries so far
         stays=dr.full(mi.Bool, False, lanes) if in_media else None,  # scattered since it entered the medium
-        sigma_a=dr.zeros(mi.Float, lanes) if view.absorbers is not None else None,  # along the ray, 1/m
     )
 
 
@@ -314,16 +298,17 @@ def walk(
     view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
     """The state of the lanes after at most so many turns of the loop, and the turns that each one took."""
-    scene, surfaces, camera, projector, maps, media, cutouts, absorbers = view
+    traced, maps = view
+    scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     # ---- The state, by name ------------------------------------------------------------------------
     random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
-    origin, towards, previous = state.origin, state.direction, state.previous
+    origin, towards = state.origin, state.direction
     direct, multipath, via_delta, caustic, ambient, faint = state.radiance
     at_first, further, before_last, at_last, indirect, cut = state.tally
-    depth, chain, throughput, length, ior = state.depth, state.chain, state.throughput, state.length, state.ior
+    depth, chain, throughput, beam = state.depth, state.chain, state.throughput, state.beam
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
-    inside, events, stays, sigma_a = state.inside, state.events, state.stays, state.sigma_a
+    events, stays = state.events, state.stays
     lanes = dr.width(sample)
     left = most + dr.zeros(mi.UInt32, lanes)  # turns
     active = (sample < at.samples) & (left > 0)
@@ -342,8 +327,7 @@ def walk(
         jitter, lens = in_pairs(at.shift, at.lens_shift, number, at.total)
         primary = camera.sample_ray(at.corner + jitter, lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
-        length = dr.select(starts, primary.lead, length)
-        previous = dr.select(starts, primary.origin, previous)
+        beam = beam.begun(starts, primary.origin, primary.lead)
         if dr.hint(camera.distortion is not None, mode="scalar"):
             throughput = dr.select(starts & ~primary.exists, 0, throughput)  # no ray, no light
 
@@ -351,13 +335,9 @@ def walk(
         si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
-        si.p = dr.select(was_bent, on_its_line(si, previous, ray.d), met)
+        si.p = dr.select(was_bent, corrected_point(si, beam.previous, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
-            flight = inside.free_flight(rng.next_float32())
-            scatters = hit & (flight < dr.norm(si.p - previous))
-            crosses = hit & ~scatters & media.bounded_by(si, hit)
-            si.p = dr.select(scatters, dr.fma(ray.d, flight, previous), si.p)
-            si.n = dr.select(scatters, 0, si.n)  # so that rays start at the event itself
+            scatters, crosses = media.event(beam.inside, beam.previous, ray.d, si, hit, rng.next_float32())
         at_surface = hit & ~scatters
         # It counts if it scatters the path; whether it does is known when the next direction is
         if dr.hint(media is not None, mode="scalar"):
@@ -366,11 +346,9 @@ def walk(
         else:
             arrives = mi.Bool(True)
             depth += 1
-        # Not si.t: spawned rays start a little off the surface
-        length = dr.select(hit, dr.fma(ior, dr.norm(si.p - previous), length), length)
+        beam.length = beam.length_to(si.p, hit)
         if dr.hint(absorbers is not None, mode="scalar"):
-            distance = dr.select(hit, dr.norm(si.p - previous), ENDLESS)
-            throughput *= absorbers.transmittance(sigma_a, distance, inside)
+            throughput *= beam.unabsorbed(traced, si.p, hit)
         bsdf = si.bsdf(ray)
         may_connect = hit & (depth < settings.max_depth) & (scatters | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
 
@@ -383,7 +361,7 @@ def walk(
         at_last += dr.select(depth + 1 == settings.max_depth, arriving, 0)
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
-        link = connect(scene, projector, si, may_connect, media, inside)
+        link = connect(scene, projector, si, may_connect, media, beam.inside)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
@@ -395,13 +373,14 @@ def walk(
         value, bs_weight = mono(value), mono(bs_weight)
         wo = si.to_world(bs.wo)
         if dr.hint(media is not None, mode="scalar"):
-            value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(ray.d, link.direction)), value)
-            bs_weight = dr.select(scatters, inside.albedo, bs_weight)
+            medium = beam.inside
+            value = dr.select(scatters, medium.albedo * medium.phase(dr.dot(ray.d, link.direction)), value)
+            bs_weight = dr.select(scatters, medium.albedo, bs_weight)
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
-            wo = dr.select(scatters, inside.scattered(ray.d, xi), wo)
+            wo = dr.select(scatters, medium.scattered(ray.d, xi), wo)
         radiance = dr.select(link.lit, throughput * value * link.geometry * at.irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
-        u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, length + link.distance))
+        u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, beam.length + link.distance))
         kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
         light = LightPath(u, v, path_length, first, kind, link.blur_px)
         channels = accumulators.add(channels, light, radiance, at.place, link.lit, kind == MULTIPATH)
@@ -412,7 +391,7 @@ def walk(
 
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
-            vertex = Vertex(si, bsdf, throughput, length, first & ~link.lit)
+            vertex = Vertex(si, bsdf, throughput, beam.length, first & ~link.lit)
             chosen = at.choice.at(choice)
             xi = [chosen.next_float32() for _ in range(3)]
             choice = chosen.state
@@ -428,29 +407,26 @@ def walk(
         if dr.hint(settings.ambient, mode="scalar"):
             alone = previous_delta | (not settings.lamps)  # no other strategy finds this light
             before = dr.zeros(mi.Interaction3f, lanes)
-            before.p = previous
+            before.p = beam.previous
             ambient += throughput * emission(scene, si, before, previous_pdf, alone, active & ~scatters)
             if dr.hint(settings.lamps, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
                 if dr.hint(media is None, mode="scalar"):
-                    lamp = sampled_emission(scene, bsdf, si, absorbers, sigma_a, xi, may_connect)
+                    lamp = sampled_emission(traced, bsdf, si, beam, xi, may_connect)
                     ambient += throughput * lamp
                 else:
-                    lamp = emission_through(
-                        media, scene, bsdf, si, ray.d, inside, scatters, absorbers, sigma_a, xi, may_connect
-                    )
+                    lamp = emission_through(traced, bsdf, si, ray.d, beam, scatters, xi, may_connect)
                     ambient += throughput * lamp
 
         # ---- Next direction --------------------------------------------------------------------------
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        is_transmitted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
         throughput *= bs_weight
-        ior = dr.select(is_transmitted, ior * bs.eta, ior)
+        beam = beam.refracted(bs, at_surface)
         was_bent = is_delta & ~crosses
         if dr.hint(settings.delta, mode="scalar"):
             depth -= dr.select(was_bent, mi.UInt32(1), mi.UInt32(0))
             chain = dr.select(crosses, chain, dr.select(was_bent, chain + 1, 0))
-        share = throughput * dr.square(ior)  # of the light, that this path stands for
+        share = throughput * dr.square(beam.ior)  # of the light, that this path stands for
         chance = dr.select(depth > settings.rr_depth, dr.minimum(share, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
             chance = dr.minimum(chance, survival(chain, share))
@@ -463,17 +439,15 @@ def walk(
             passes = cutouts.passed(si, bs, at_surface)
         first &= ~scatters & (passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         via |= is_delta & ~passes
-        previous = mi.Point3f(si.p)
+        beam = beam.begun(True, si.p, beam.length)
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
-        ray.o = dr.select(was_bent, spawn_close(si, met, wo).o, ray.o)
+        ray.o = dr.select(was_bent, spawn_specular_ray(si, met, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
-            inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
             stays = scatters | (stays & ~crosses)
-        if dr.hint(absorbers is not None, mode="scalar"):
-            sigma_a = absorbers.beyond(si, wo, sigma_a, at_surface)
+        beam = beam.beyond(traced, si, wo, at_surface, crosses)
 
         # ---- Or next sample --------------------------------------------------------------------------
         # The last surface can only be seen to emit, so it is needed for ambient light alone
@@ -483,7 +457,7 @@ def walk(
             goes_on |= (scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS)
         goes_on &= hit & survives & (throughput > 0)
         if dr.hint(settings.delta, mode="scalar"):
-            cut += dr.select(goes_on & (chain >= MAX_CHAIN), throughput * dr.square(ior), 0)
+            cut += dr.select(goes_on & (chain >= MAX_CHAIN), throughput * dr.square(beam.ior), 0)
             goes_on &= chain < MAX_CHAIN
         ends = ~goes_on
         sample = dr.select(ends, sample + 1, sample)
@@ -491,18 +465,14 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             chain = dr.select(ends, 0, chain)
         throughput = dr.select(ends, 1, throughput)
-        length = dr.select(ends, 0, length)
-        ior = dr.select(ends, 1, ior)
+        beam = beam.ended(traced, ends)
         first |= ends
         via &= ~ends
         previous_delta |= ends
         was_bent &= ~ends
         if dr.hint(media is not None, mode="scalar"):
-            inside = inside.replaced(ends, media.none(lanes))
             events = dr.select(ends, 0, events)
             stays &= ~ends
-        if dr.hint(absorbers is not None, mode="scalar"):
-            sigma_a = dr.select(ends, 0, sigma_a)
         random, origin, towards = rng.state, ray.o, ray.d
         left -= 1
         active = (sample < at.samples) & (left > 0)
@@ -520,18 +490,14 @@ def walk(
         origin=origin,
         direction=towards,
         throughput=throughput,
-        length=length,
-        ior=ior,
+        beam=beam,
         first=first,
         via=via,
-        previous=previous,
         previous_pdf=previous_pdf,
         previous_delta=previous_delta,
         was_bent=was_bent,
-        inside=inside,
         events=events,
         stays=stays,
-        sigma_a=sigma_a,
     ), most - left
 
 
@@ -599,44 +565,34 @@ def emission(scene: Any, si: Any, previous: Any, pdf: Any, alone: Any, active: A
     return dr.select(active, weight * mono(emitter.eval(si, active)), 0)
 
 
-def sampled_emission(
-    scene: Any, bsdf: Any, si: Any, absorbers: Absorbers | None, sigma_a: Any, xi: Any, active: Any
-) -> Any:
+def sampled_emission(traced: TracedScene, bsdf: Any, si: Any, beam: Beam, xi: Any, active: Any) -> Any:
     """Reflected radiance of one sampled direction to a scene emitter, weighted against BSDF sampling.
 
-    `sigma_a`: absorption coefficient along the ray that met `si`; None without absorbers.
+    `beam` : that which met `si`.
     """
-    ds, radiance = scene.sample_emitter_direction(si, xi, True, active)
+    ds, radiance = traced.scene.sample_emitter_direction(si, xi, True, active)
     active &= ds.pdf != 0
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
+    absorbers = traced.absorbers
     if absorbers is not None:
-        weight *= absorbers.transmittance(absorbers.beyond(si, ds.d, sigma_a, active), ds.dist)
+        weight *= absorbers.transmittance(absorbers.beyond(si, ds.d, beam.sigma_a, active), ds.dist)
     return dr.select(active, weight * mono(value) * mono(radiance), 0)
 
 
 def emission_through(
-    media: Media,
-    scene: Any,
-    bsdf: Any,
-    si: Any,
-    direction: Any,
-    inside: Medium,
-    scatters: Any,
-    absorbers: Absorbers | None,
-    sigma_a: Any,
-    xi: Any,
-    active: Any,
+    traced: TracedScene, bsdf: Any, si: Any, direction: Any, beam: Beam, scatters: Any, xi: Any, active: Any
 ) -> Any:
     """Like `sampled_emission`, through media as well, and also at scattering events.
 
     Lamps of finite size are left to random walks there and beyond boundaries, so that none is counted twice.
     """
+    scene, media, absorbers, inside = traced.scene, traced.media, traced.absorbers, beam.inside
     ds, radiance = scene.sample_emitter_direction(si, xi, False, active)
     active &= ds.pdf != 0
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)
     value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
-    around = None if absorbers is None else absorbers.beyond(si, ds.d, sigma_a, active & ~scatters)
+    around = None if absorbers is None else absorbers.beyond(si, ds.d, beam.sigma_a, active & ~scatters)
     share, crossed = media.transmittance(scene, si, ds.p, inside, active, around)
     weight = dr.select(scatters | crossed, 0, power_heuristic(ds.pdf, pdf))
     weight = dr.select(ds.delta, 1, weight)

@@ -95,6 +95,18 @@ class Media:
         shape = number_of(si.shape)
         return Medium(*(dr.gather(mi.Float, column, shape, enters) for column in self.table))
 
+    def event(self, inside: Medium, previous: Any, direction: Any, si: Any, hit: Any, xi: Any) -> tuple[Any, Any]:
+        """Whether light scatters on its way from `previous` to the surface `si`, or crosses a boundary there.
+
+        Where it scatters, position and normal of `si` become those of the event: rays then start there itself.
+        """
+        flight = inside.free_flight(xi)
+        scatters = hit & (flight < dr.norm(si.p - previous))
+        crosses = hit & ~scatters & self.bounded_by(si, hit)
+        si.p = dr.select(scatters, dr.fma(direction, flight, previous), si.p)
+        si.n = dr.select(scatters, 0, si.n)
+        return scatters, crosses
+
     @dr.syntax
     def transmittance(
         self, scene: Any, si: Any, target: Any, inside: Medium, active: Any, around: Any = None

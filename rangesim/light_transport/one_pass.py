@@ -11,18 +11,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from rangesim.experiment.adaptive_sampling import AdaptiveSampling
-from rangesim.light_transport.absorption import absorbers_of
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
-from rangesim.light_transport.cutouts import cutouts_of
-from rangesim.light_transport.device import Device
 from rangesim.light_transport.estimate import FEWEST_FOR_HALVES, Estimate
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect import LightFilter
 from rangesim.light_transport.launches import Launches, Progress, raised_as_it_is, report_part
 from rangesim.light_transport.loop import Radiance, Settings, View
-from rangesim.light_transport.medium import media_of
-from rangesim.light_transport.surfaces import surfaces_of
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.truncation import estimate_truncation, warn_of_truncation
 from rangesim.response import Response
 from rangesim.rig import Rig
@@ -71,7 +67,7 @@ def transport(
         and 64 elsewhere.
     max_depth : int >= 1, segments of a path between surfaces that scatter it, up to the light: 2 is direct light alone,
         as in Mitsuba. Delta interactions (glass, mirrors, thin panes, coats, holes) do not count; they have a limit of
-        their own, `rangesim.light_transport.delta_chain.MAX_CHAIN` in a row.
+        their own, `rangesim.light_transport.specular_chain.MAX_CHAIN` in a row.
     rr_depth : int >= 1, surfaces that scatter after which Russian roulette may end a path.
     photons : int >= 0, caustic photons: the projector's light through glass and off mirrors, see
         `rangesim.light_transport.photons`; 0: none, and such light is missing. No cost without such surfaces.
@@ -118,9 +114,9 @@ def transport(
         raise ValueError(f"expected indirect to be one of {', '.join(get_args(Indirect))}, got {indirect!r}.")
     keeps_apart = indirect == "filtered"
     report, launches = Progress(progress), Launches(is_watched=progress is not None)
-    media, surfaces, absorbers = media_of(scene.mitsuba), surfaces_of(scene.mitsuba), absorbers_of(scene.mitsuba)
     here = scene.in_renderer(rig)
-    truth, guides = ground_truth(scene, here, surfaces)
+    traced = TracedScene.of(scene.mitsuba, here)
+    truth, guides = ground_truth(scene, traced, rig)
     if adaptive:
         samples = np.full(h * w, adaptive.first_spp)
     elif spp == "auto":
@@ -129,15 +125,14 @@ def transport(
         samples = np.full(h * w, spp)
     fewest = int(samples.min())
     settings = Settings.of(scene, seed, max_depth, rr_depth)
-    inside = (media, absorbers, surfaces, partial(report, 0.0))
-    maps = caustic_maps(scene, here, photons, caustic_radius_m, fewest, seed, memory_bytes, *inside)
-    camera, projector, cutouts = Device.camera(here), Device.projector(here), cutouts_of(scene.mitsuba)
-    view = View(scene.mitsuba, surfaces, camera, projector, maps, media, cutouts, absorbers)
+    at_work = partial(report, 0.0)
+    maps = caustic_maps(traced, here, photons, caustic_radius_m, fewest, seed, memory_bytes, at_work)
+    view = View(traced, maps)
     if keeps_apart and scene.has_matte_textures:
         seen = mean_reflectance(view, settings, rig, scene.has_cutouts, min(fewest, TEXTURE_SAMPLES))
         guides = guides._replace(reflectance=seen)
     shared = LightFilter(guides) if keeps_apart else None
-    glints = trace_glint(scene.mitsuba, here, responses, seed, *inside) if glint else None
+    glints = trace_glint(traced, here, responses, seed, at_work) if glint else None
     has_halves = sampling_error and fewest >= FEWEST_FOR_HALVES
     estimate = Estimate(view, settings, rig, responses, keeps_apart, has_halves, memory_bytes, launches)
 

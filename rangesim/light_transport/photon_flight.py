@@ -9,12 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.absorption import ENDLESS, Absorbers
-from rangesim.light_transport.delta_chain import MAX_CHAIN, survival
-from rangesim.light_transport.device import Device
-from rangesim.light_transport.exact_point import on_its_line, spawn_close
-from rangesim.light_transport.medium import Media
 from rangesim.light_transport.sampling import Continued, Seed, random_stream
+from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
+from rangesim.light_transport.traced_scene import TracedScene
 
 LANDING_SHARE = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
@@ -34,51 +31,31 @@ class Landing(NamedTuple):
 
 
 def fly(
-    surfaces: Any,
-    projector: Device,
-    pixel: np.ndarray,
-    flux: np.ndarray,
-    number: np.ndarray,
-    seed: int,
-    media: Media | None = None,
-    absorbers: Absorbers | None = None,
+    traced: TracedScene, pixel: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
 ) -> tuple[Landing, tuple[Any, ...]]:
     """Landings of photons sent through projector pixels, and the fates of each that `PhotonBalance` sums up."""
-    pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(projector.size.x)
+    pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(traced.projector.size.x)
     photon = mi.UInt32(number.astype(np.uint32))
     rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
     power, most = mi.Float(flux.astype(np.float32)), dr.opaque(mi.UInt32, MAX_CHAIN)
-    return _chain(surfaces, projector, uv, power, rng, most, media, absorbers)
+    return _chain(traced, uv, power, rng, most)
 
 
 @dr.syntax
-def _chain(
-    surfaces: Any,
-    projector: Device,
-    uv: Any,
-    power: Any,
-    rng: Any,
-    max_chain: Any,
-    media: Any = None,
-    absorbers: Any = None,
-) -> tuple[Landing, tuple[Any, ...]]:
+def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -> tuple[Landing, tuple[Any, ...]]:
     """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
-    lanes = dr.width(power)
+    lanes, projector, media, absorbers = dr.width(power), traced.projector, traced.media, traced.absorbers
     lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(projector.has_lens, mode="scalar") else None
     primary = projector.sample_ray(uv, lens)
     flux = power * projector.relative_illumination(primary.direction)
     if dr.hint(primary.exists is not None, mode="scalar"):
         flux = dr.select(primary.exists, flux, 0)
     emitted = mi.Float(flux)
-    length = primary.lead + dr.zeros(mi.Float, lanes)  # optical, from the projector to `previous`
-    ior = dr.ones(mi.Float, lanes)  # refractive index along the ray
+    beam = Beam.start(traced, lanes).begun(True, primary.origin, primary.lead)
     chain = dr.zeros(mi.UInt32, lanes)  # delta interactions so far
-    inside: Any = None if media is None else media.none(lanes)  # what the ray runs through
-    sigma_a: Any = None if absorbers is None else dr.zeros(mi.Float, lanes)  # along the ray, 1/m
     left = max_chain + dr.zeros(mi.UInt32, lanes)  # surfaces and boundaries of media that may still be met
-    previous = mi.Point3f(primary.origin)
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
     cosine = dr.ones(mi.Float, lanes)
     direct, stored, absorbed, escaped, truncated = (dr.zeros(mi.Float, lanes) for _ in range(5))
@@ -93,22 +70,22 @@ def _chain(
         rng, ray = numbers.at(random), mi.Ray3f(origin, towards)
         crosses = mi.Bool(False)  # the boundary of a medium
         # ---- Next surface ----------------------------------------------------------------------------
-        si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
-        point = dr.select(chain > 0, on_its_line(si, previous, ray.d), si.p)
+        point = dr.select(chain > 0, corrected_point(si, beam.previous, ray.d), si.p)
         if dr.hint(absorbers is not None, mode="scalar"):
-            distance = dr.select(hit, dr.norm(point - previous), ENDLESS)
-            lost = dr.select(active, flux * (1 - absorbers.transmittance(sigma_a, distance, inside)), 0)
+            lost = dr.select(active, flux * (1 - beam.unabsorbed(traced, point, hit)), 0)
             flux -= lost
             absorbed += lost
         escaped += dr.select(active & ~hit, flux, 0)
         if dr.hint(media is not None, mode="scalar"):
             crosses = hit & media.bounded_by(si, hit)
-            lost = dr.select(hit, flux * (1 - dr.exp(-inside.sigma_t * dr.norm(point - previous))), 0)
+            through = dr.exp(-beam.inside.sigma_t * dr.norm(point - beam.previous))
+            lost = dr.select(hit, flux * (1 - through), 0)
             flux -= lost
             direct += dr.select(chain == 0, lost, 0)
             absorbed += dr.select(chain == 0, 0, lost)
-        length = dr.select(hit, dr.fma(ior, dr.norm(point - previous), length), length)
+        beam.length = beam.length_to(point, hit)
         bsdf = si.bsdf(ray)
         scatters = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
@@ -135,18 +112,14 @@ def _chain(
         remains = dr.select(goes_on, remains / chance, 0)  # on average nothing is absorbed by this
         absorbed += dr.select(hit & ~(~mirrors & (chain == 0)), flux - remains - dr.select(lands, landing_flux, 0), 0)
         flux = dr.select(active, remains, flux)
-        ior = dr.select(goes_on & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission), ior * bs.eta, ior)
         chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))
-        previous = dr.select(goes_on, point, previous)
-        ray = spawn_close(si, si.p, si.to_world(bs.wo))
-        if dr.hint(media is not None, mode="scalar"):
-            inside = inside.replaced(crosses, media.beyond(si, ray.d, crosses))
-        if dr.hint(absorbers is not None, mode="scalar"):
-            sigma_a = absorbers.beyond(si, ray.d, sigma_a, goes_on)
+        beam = beam.refracted(bs, goes_on).begun(goes_on, point, beam.length)
+        ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
+        beam = beam.beyond(traced, si, ray.d, goes_on, crosses)
         left -= dr.select(goes_on | crosses, mi.UInt32(1), mi.UInt32(0))
         truncated += dr.select(goes_on & (left == 0), flux, 0)
         active = goes_on & (left > 0)
         random, origin, towards = rng.state, ray.o, ray.d
 
-    landing = Landing(position, direction, stored, uv.x, uv.y, length, cosine)
+    landing = Landing(position, direction, stored, uv.x, uv.y, beam.length, cosine)
     return landing, (emitted, direct, stored, absorbed, escaped, truncated)

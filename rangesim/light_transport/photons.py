@@ -23,13 +23,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rangesim.light_transport.absorption import Absorbers
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.launches import Launches
-from rangesim.light_transport.medium import Media
 from rangesim.light_transport.photon_flight import fly
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.media import is_boundary
 
 DEFENSIVE_SHARE = 0.05
@@ -120,23 +119,19 @@ def meets_delta(scene: Any, device: Device) -> tuple[np.ndarray, np.ndarray]:
 
 
 def trace_photons(
-    scene: Any,
-    projector: Device,
+    traced: TracedScene,
     power_w: float,
     photons: int,
     maps: int,
     seed: int,
     memory_bytes: int,
-    media: Media | None = None,
-    absorbers: Absorbers | None = None,
-    surfaces: Any = None,
     report: Callable[[], None] = lambda: None,
 ) -> Photons:
     """`photons` photons of a projector of that power, dealt out evenly to `maps` independent maps.
 
-    `surfaces`, see `surfaces_of`; `report` is called after each kernel launch.
+    `report` is called after each kernel launch.
     """
-    pixels, share = _worthwhile_pixels(scene, projector)
+    pixels, share = _worthwhile_pixels(traced.scene, traced.projector)
     per_map = -(-photons // maps)
     cumulative, shift = np.cumsum(share), shift_of(seed)
     total = per_map * maps
@@ -148,7 +143,7 @@ def trace_photons(
         number = np.arange(begin, end)
         chosen = stratified_choice(cumulative, number, per_map, shift)
         flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
-        landing, fate = fly(surfaces or scene, projector, pixels[chosen], flux, number, seed, media, absorbers)
+        landing, fate = fly(traced, pixels[chosen], flux, number, seed)
         launches.evaluate([list(landing), list(fate)], SURFACES_PER_PHOTON * (end - begin))
         kept = np.flatnonzero(landing.flux)
         landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rangesim.errors import TruncationWarning
-from rangesim.light_transport.delta_chain import MAX_CHAIN
+from rangesim.light_transport.specular_chain import MAX_CHAIN
 from rangesim.signals import EnergySplit, Truncation
 
 DIRECT_ALONE = 2
