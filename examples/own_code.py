@@ -117,7 +117,6 @@ class TemporalUnwrapping(Decoder):
             confidence=2 * phases[-1].modulation / capture.full_scale,
             intensity=phases[-1].mean - np.float32(capture.black_level),
             limits=self.triangulation,
-            decoder=self,
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

@@ -142,7 +142,7 @@ class GateRatio(Decoder):
         status = np.where(is_enough, Status.OK, Status.LOW_SIGNAL)
         status[capture.saturated(capture.frames)] = Status.SATURATED
         return range_image_from_path_length(
-            capture, length_m, status=status, confidence=both / capture.full_scale, intensity=both, decoder=self
+            capture, length_m, status=status, confidence=both / capture.full_scale, intensity=both
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

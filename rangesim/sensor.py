@@ -11,12 +11,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from rangesim.electronics.detector import Detector, Gate, PhotoDetector
 from rangesim.response import Response
+from rangesim.settings.config import Named
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
@@ -38,13 +39,14 @@ class Emitter(NamedTuple):
     baseline_m: float | None = None
 
 
-class Sensor(ABC):
+class Sensor(Named, ABC):
     """A measuring principle: which responses to light paths it reads, and which frames it makes of them.
 
     A sensor holds no geometry (that is the `Rig`), no electronics (`PhotoDetector`) and no thresholds (`Decoder`), but
     it names the ones it comes with. Subclasses are frozen dataclasses.
     """
 
+    known: ClassVar[dict[str, type[Any]]] = {}
     type_name: ClassVar[str]
     """Name in configuration files and sidecars."""
 
@@ -58,11 +60,13 @@ class Sensor(ABC):
 
     @abstractmethod
     def responses(self) -> tuple[Response, ...]:
-        """The basis of linear functionals that the transport pass has to accumulate."""
+        """The basis of linear functionals that the transport pass has to accumulate; equal ones each time."""
 
     @abstractmethod
     def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         """(k, h, w) float32 mean radiance of the frames, W/m2/sr, from what the transport pass accumulated.
+
+        Images are always whole, so that a frame may depend on neighbouring pixels.
 
         Parameters
         ----------
@@ -111,7 +115,10 @@ class Sensor(ABC):
 
     @classmethod
     def presets(cls) -> dict[str, Sensor]:
-        """Sensors of this kind by their names on the command line; `type_name` with default settings alone."""
+        """Sensors of this kind by their names on the command line; by default `type_name` with default settings.
+
+        Not inherited: a subclass of a sensor has its own, or the default.
+        """
         return {cls.type_name: cls()}
 
     def check(self, width: int, height: int) -> None:
@@ -141,7 +148,7 @@ class Sensor(ABC):
     @property
     def details(self) -> str:
         """Its settings in a few words."""
-        return f"{self.n_frames} frames"
+        return f"{self.n_frames} frame{'s' * (self.n_frames != 1)}"
 
     def representative_frames(self, frames: np.ndarray) -> list[int]:
         """Indices of up to three of the captured frames (k, h, w) that show how it works."""
@@ -182,12 +189,13 @@ class FrameContent(NamedTuple):
     dark: float = 1.0
 
 
-class Decoder(ABC):
+class Decoder(Named, ABC):
     """Makes range images of captures. Subclasses are frozen dataclasses; their fields are thresholds.
 
     A decoder may look at as many pixels around each as it likes.
     """
 
+    known: ClassVar[dict[str, type[Any]]] = {}
     type_name: ClassVar[str]
     """Name in configuration files."""
 

@@ -157,7 +157,12 @@ class Signals:
             scale, error = np.float32(sampling_errors), self.sampling
             channels = [c + scale * error.channels[r] for c, r in zip(channels, sensor.responses(), strict=True)]
             projector = projector + scale * error.projector
-        return sensor.frames(channels, projector, ambient_transmission * self.energy.ambient)
+        frames = sensor.frames(channels, projector, ambient_transmission * self.energy.ambient)
+        expected = (sensor.n_frames, *projector.shape)
+        if not isinstance(frames, np.ndarray) or frames.shape != expected or frames.dtype != np.float32:
+            got = f"{frames.shape} and {frames.dtype}" if isinstance(frames, np.ndarray) else type(frames).__name__
+            raise ValueError(f"expected frames of {sensor.type_name} of shape {expected} and type float32, got {got}.")
+        return frames
 
     def save(self, path: str | Path) -> None:
         """Write energy split, ground truth and truncation to a compressed .npz file (for later comparison).

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import dataclass, field, replace
@@ -19,8 +20,10 @@ from rangesim import (
     Capture,
     Decoder,
     Detector,
+    DirectToF,
     RangeImage,
     Sensor,
+    SpadDetector,
     Status,
     StructuredLight,
     decode,
@@ -33,10 +36,11 @@ from rangesim.errors import FileFormatError
 from rangesim.experiment import experiment_from_dict, load_experiment
 from rangesim.experiment.instrument import Instrument
 from rangesim.sensor import Background
-from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, sensor_from_dict, sensor_of
+from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, presets, sensor_from_dict, sensor_of
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 GATED = f"{EXAMPLES / 'own_sensor.py'}:GatedCamera"
+TWIN = "from rangesim.sensors import AmcwDecoder, AmcwToF"
 FRINGES = f"{EXAMPLES / 'own_code.py'}:MultiFrequency"
 
 
@@ -182,7 +186,7 @@ class Smoothed(Decoder):
         z = median_filter(image.z, 3)
         status = np.where(np.isfinite(z), image.status, Status.LOW_SIGNAL).astype(np.uint8)
         z = np.where(status == Status.OK, z, np.nan)
-        return replace(image, z=z, range_m=image.range_m * z / image.z, status=status, decoder=self)
+        return replace(image, z=z, range_m=image.range_m * z / image.z, status=status)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         return self.inner.least_signal(sensor, background)
@@ -208,33 +212,103 @@ def test_a_decoder_that_looks_at_neighbours_sees_whole_images() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "name", "message"),
+    ("text", "message"),
     [
-        (None, "Thing", "does not exist; expected a Python file with a sensor"),
-        ("1 / 0", "Thing", "fails: ZeroDivisionError"),
-        ("import no_such_module", "Thing", "fails: ModuleNotFoundError"),
-        ("class Thing: pass", "Thing", "expected Thing to be a sensor or a class of sensors, got <class"),
-        ("", "Thing", "expected Thing to be a sensor or a class of sensors, got None"),
-        ("from rangesim import Sensor\nclass Thing(Sensor): pass", "Thing", "cannot be made without arguments"),
+        (None, "does not exist; expected a Python file with a sensor"),
+        ("1 / 0", "fails: ZeroDivisionError"),
+        ("import no_such_module", "fails: ModuleNotFoundError"),
+        ("import sys\nsys.exit(0)", "fails: SystemExit: 0"),
+        ("class Thing: pass", "expected Thing to be a sensor or a class of sensors, got <class"),
+        ("", "expected Thing to be a sensor or a class of sensors, got None"),
+        ("from rangesim import Sensor\nclass Thing(Sensor): pass", "Thing: TypeError: Can't instantiate abstract"),
+        (f"{TWIN}\nclass Thing(AmcwToF): pass", "fails: TypeError: expected Thing to have a type_name of its own"),
+        (f"{TWIN}\nclass Thing(AmcwToF): type_name = 'direct-tof'", "of its own; 'direct-tof' is taken"),
+        (f"{TWIN}\nclass Thing(AmcwDecoder): type_name = 'direct-tof'", "of its own; 'direct-tof' is taken"),
+        (f"{TWIN}\nclass Thing(AmcwToF):\n type_name = 'a'\n def __init__(self): raise OSError('x')", "OSError: x"),
+        (f"{TWIN}\nclass Thing(AmcwToF):\n type_name = 'b'\n def frame_names(self): return ['a/b']", "frame_names"),
     ],
 )
-def test_a_file_without_a_sensor_is_refused_in_one_sentence(
-    text: str | None, name: str, message: str, tmp_path: Path
-) -> None:
+def test_a_file_without_a_sensor_is_refused_in_one_sentence(text: str | None, message: str, tmp_path: Path) -> None:
     if text is not None:
         (tmp_path / "mine.py").write_text(text)
     with pytest.raises(FileFormatError, match=message) as error:
-        sensor_of(f"mine.py:{name}", tmp_path)
+        sensor_of("mine.py:Thing", tmp_path)
     assert "\n" not in str(error.value)
+    assert sensor_of("direct-tof") == DirectToF()
 
 
-def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "twin.py").write_text(
-        "from rangesim.sensors import AmcwToF\nclass Twin(AmcwToF):\n    type_name = 'direct-tof'\n"
+def test_a_subclass_leaves_the_presets_of_its_parent_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        f"{TWIN}\nfrom dataclasses import dataclass\n@dataclass(frozen=True)\nclass Low(AmcwToF):\n"
+        "    contrast: float = 0.3\n    type_name = 'low-contrast'\nLOWEST = Low(contrast=0.1)\n"
     )
-    with pytest.raises(FileFormatError, match="'direct-tof' of Twin is taken"):
-        sensor_of("twin.py:Twin", tmp_path)
-    assert type(sensor_from_dict({"type": "direct-tof"}, "sensor")).__name__ == "DirectToF"
+    assert sensor_of("mine.py:Low", tmp_path).contrast == 0.3  # type: ignore[attr-defined]
+    assert sensor_of("amcw") == AmcwToF()
+    assert presets()["low-contrast"] == sensor_of("mine.py:Low", tmp_path)
+    # Settings of an instance are kept where a table changes others
+    lowest = sensor_from_dict({"type": "mine.py:LOWEST", "waveform": "square"}, "sensor", tmp_path)
+    assert (lowest.contrast, lowest.waveform) == (0.1, "square")  # type: ignore[attr-defined]
+
+
+def test_a_file_that_failed_is_loaded_again_once_it_is_mended(tmp_path: Path) -> None:
+    """As in a notebook; and one that was edited, too."""
+    path = tmp_path / "again.py"
+    text = f"{TWIN}\nclass Again(AmcwToF): type_name = 'again'\n"
+    for time_s, (body, fails) in enumerate(
+        [(text + "1 / 0", True), (text, False), (text + "X = Again((3e7,))", False)]
+    ):
+        path.write_text(body)
+        os.utime(path, (time_s, time_s))
+        if fails:
+            with pytest.raises(FileFormatError, match="ZeroDivisionError"):
+                sensor_of("again.py:Again", tmp_path)
+        else:
+            assert sensor_of("again.py:Again", tmp_path).type_name == "again"
+    assert sensor_of("again.py:X", tmp_path).modulation_hz == (3e7,)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"z": np.zeros((3, 3), np.float32)}, "return z of shape"),
+        ({"z": np.zeros((120, 160))}, "and type float32"),
+        ({"status": np.ones((120, 160), np.uint8)}, "to return z where status is OK"),
+    ],
+)
+def test_what_a_decoder_returns_is_checked(changes: dict[str, np.ndarray], message: str) -> None:
+    @dataclass(frozen=True)
+    class Wrong(Smoothed):
+        type_name: ClassVar[str] = "wrong"
+
+        def decode(self, capture: Capture) -> RangeImage:
+            return replace(self.inner.decode(capture), **changes)
+
+    capture = expose(plane_signals(stereo_rig(baseline_m=0.03), AmcwToF()), AmcwToF())
+    with pytest.raises(ValueError, match=f"expected Wrong .*{message}"):
+        decode(capture, Wrong())
+
+
+def test_a_range_image_is_of_the_decoder_that_was_asked() -> None:
+    """Also where that one leaves the work to another."""
+    capture = expose(plane_signals(stereo_rig(baseline_m=0.03), AmcwToF()), AmcwToF())
+    assert decode(capture, Smoothed()).decoder == Smoothed()
+    assert decode(capture, Smoothed().inner).decoder == AmcwDecoder()
+
+
+def test_frames_and_detectors_that_do_not_fit_are_refused() -> None:
+    class Odd(AmcwToF):
+        type_name = "odd"
+
+        def frames(self, *given: np.ndarray) -> np.ndarray:  # type: ignore[override]
+            return super().frames(*given).astype(np.float64)  # type: ignore[arg-type]
+
+    signals = plane_signals(stereo_rig(), AmcwToF())
+    with pytest.raises(ValueError, match=r"expected frames of odd of shape .* and type float32, got .* float64"):
+        expose(signals, Odd())
+    with pytest.raises(ValueError, match="expected a SpadDetector"):
+        Instrument("a", DirectToF(), Detector())
+    with pytest.raises(ValueError, match="expected a sensor that counts photons"):
+        Instrument("a", AmcwToF(), SpadDetector())
 
 
 def test_what_is_read_back_runs_no_file(tmp_path: Path) -> None:
@@ -250,7 +324,8 @@ def test_what_is_read_back_runs_no_file(tmp_path: Path) -> None:
 
 
 def test_an_experiment_names_files_from_its_own_folder(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text((EXAMPLES / "own_sensor.py").read_text().replace("gated-camera", "my-gates"))
+    text = (EXAMPLES / "own_sensor.py").read_text()
+    (tmp_path / "mine.py").write_text(text.replace("gated-camera", "my-gates").replace("gate-ratio", "my-ratio"))
     (tmp_path / "mine.toml").write_text('scene = "plane"\n[[instrument]]\nsensor = "mine.py:GatedCamera"\n')
     (one,) = load_experiment(tmp_path / "mine.toml").instruments
     assert one.name == "my-gates"

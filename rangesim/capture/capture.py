@@ -93,7 +93,7 @@ class Capture:
         return np.asarray(frames.max(axis=0) >= self._max_dn)
 
     def noise(self, frame: np.ndarray) -> np.ndarray | None:
-        """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown."""
+        """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown, or counts."""
         return self.detector.noise_dn(frame) if self.detector else None
 
     def save(self, directory: str | Path) -> None:

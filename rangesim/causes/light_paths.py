@@ -31,17 +31,17 @@ def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarr
     """
     where = np.isfinite(truth.z)
     path = _straight_path(rig, truth, where)
-    values = max(sum(r.channels for r in sensor.responses()), sensor.n_frames)
-    result = np.zeros((sensor.n_frames, where.size), dtype=np.float32)
-    pixels = np.flatnonzero(where)
-    step = max(1, _CHUNK_VALUES // values)
-    for begin in range(0, len(pixels), step):
-        part = slice(begin, begin + step)
-        some = LightPath(path.u[None, part], path.v[None, part], path.path_length_m[None, part], True)
-        white = np.ones(some.u.shape, dtype=np.float32)
-        frames = sensor.frames([_weights(r, some) for r in sensor.responses()], white, np.zeros_like(white))
-        result[:, pixels[part]] = frames[:, 0]
-    return result.reshape(-1, *where.shape)
+    channels = []
+    for response in sensor.responses():
+        image = np.zeros((response.channels, *where.shape), dtype=np.float32)
+        values, pixels = image.reshape(response.channels, -1), np.flatnonzero(where)
+        step = max(1, _CHUNK_VALUES // response.channels)
+        for begin in range(0, len(pixels), step):
+            part = slice(begin, begin + step)
+            some = LightPath(path.u[None, part], path.v[None, part], path.path_length_m[None, part], True)
+            values[:, pixels[part]] = _weights(response, some)[:, 0]
+        channels.append(image)
+    return sensor.frames(channels, where.astype(np.float32), np.zeros(where.shape, dtype=np.float32))
 
 
 def points_in_projector(rig: Rig, z: np.ndarray, where: np.ndarray) -> np.ndarray:

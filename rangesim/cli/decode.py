@@ -74,6 +74,8 @@ def decode_command(
     if taken_with is None and projector is not None:
         taken_with = _structured_light(code, projector, axes, period, steps)
     loaded = _load(capture, taken_with, bits)
+    if taken_with is not None and type(loaded.sensor) is not type(taken_with):
+        raise ValueError(f"expected --sensor to name the sensor of {capture}, {loaded.sensor.type_name}.")
     if calibration:
         loaded = _calibrated(loaded, calibration, code_step, unit)
     image = rangesim.decode(loaded)

@@ -15,6 +15,7 @@ from rangesim.files.catalogue import scene_names
 if TYPE_CHECKING:
     from rangesim.experiment import Experiment
     from rangesim.experiment.cost import Cost
+    from rangesim.experiment.instrument import Instrument
 
 
 def run_command(
@@ -148,17 +149,29 @@ def _say_what_measured_nothing(out: Path) -> None:
         )
 
 
+def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
+    """An instrument for each sensor; those of files are called by their NAME there where their types are the same."""
+    from rangesim.experiment.instrument import instrument
+    from rangesim.sensors import is_file_name
+
+    found = [instrument(name) for name in sensors]
+    names = [one.name for one in found]
+    return tuple(
+        replace(one, name=name.rpartition(":")[2]) if is_file_name(name) and names.count(one.name) > 1 else one
+        for name, one in zip(sensors, found, strict=True)
+    )
+
+
 def _experiment(
     scene: Path | None, config: Path | None, settings: dict[str, Any], sensors: list[str] | None
 ) -> Experiment:
     """The experiment of a file or of a scene, with what the command line sets itself."""
     from rangesim.experiment import Experiment, load_experiment
-    from rangesim.experiment.instrument import instrument
 
     if config is None and scene is None:
         raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")
     if sensors:
-        settings["instruments"] = tuple(instrument(name) for name in sensors)
+        settings["instruments"] = _instruments(sensors)
     if config is None:
         return Experiment(scene=str(scene), **settings)
     if scene is not None:

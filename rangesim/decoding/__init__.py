@@ -3,9 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
 from rangesim.sensor import Decoder
+from rangesim.settings.config import shown
 
 __all__ = ["decode"]
 
@@ -20,8 +26,28 @@ def decode(capture: Capture, decoder: Decoder | None = None) -> RangeImage:
     Raises
     ------
     ValueError
-        Not a capture, or one of a sensor that the decoder does not know.
+        Not a capture, one of a sensor that the decoder does not know, or the decoder returned no range image of it.
     """
     if not isinstance(capture, Capture):
         raise ValueError(f"expected a Capture, as expose, load_capture or import_capture return, got {capture!r}.")
-    return (decoder or capture.sensor.default_decoder).decode(capture)
+    decoder = decoder or capture.sensor.default_decoder
+    image = decoder.decode(capture)
+    _check(image, capture, decoder)
+    return replace(image, decoder=decoder)
+
+
+def _check(image: RangeImage, capture: Capture, decoder: Decoder) -> None:
+    """Raise ValueError if a decoder returned anything but a range image of the capture."""
+    name, shape = type(decoder).__name__, capture.frames.shape[1:]
+    if not isinstance(image, RangeImage):
+        raise ValueError(f"expected {name} to return a RangeImage, got {shown(image)}.")
+    for key, dtype in (("z", "float32"), ("range_m", "float32"), ("confidence", "float32"), ("status", "uint8")):
+        values = getattr(image, key)
+        if values.shape != shape or values.dtype.name != dtype:
+            raise ValueError(
+                f"expected {name} to return {key} of shape {shape} and type {dtype}, "
+                f"got {values.shape} and {values.dtype}."
+            )
+    ok = image.status == Status.OK
+    if bool((np.isfinite(image.z) & ~ok).any()) or (image.camera is not None and not np.isfinite(image.z[ok]).all()):
+        raise ValueError(f"expected {name} to return z where status is OK, and NaN everywhere else.")

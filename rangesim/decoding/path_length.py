@@ -10,7 +10,6 @@ from rangesim.decoding.bands import bands
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.rig import Rig
-from rangesim.sensor import Decoder
 
 
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
@@ -40,7 +39,6 @@ def range_image_from_path_length(
     status: np.ndarray,
     confidence: np.ndarray,
     intensity: np.ndarray,
-    decoder: Decoder,
 ) -> RangeImage:
     """Range image of decoded path lengths; lengths that lead to no point in front of the camera are
     OUT_OF_RANGE.
@@ -72,5 +70,4 @@ def range_image_from_path_length(
         intensity=np.asarray(intensity, dtype=np.float32),
         camera=rig.camera if rig else None,
         T_world_camera=rig.T_world_camera if rig else None,
-        decoder=decoder,
     )

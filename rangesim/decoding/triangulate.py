@@ -13,7 +13,6 @@ from rangesim.decoding.bands import bands
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.rig import Intrinsics, Rig
-from rangesim.sensor import Decoder
 from rangesim.settings.bounds import Bounds, check_fields
 
 ITERATIONS = 20
@@ -111,7 +110,6 @@ def range_image_from_coordinates(
     confidence: np.ndarray,
     intensity: np.ndarray,
     limits: TriangulationLimits,
-    decoder: Decoder,
 ) -> RangeImage:
     """Range image of decoded projector coordinates; see `RangeImage` for the arrays.
 
@@ -152,7 +150,6 @@ def range_image_from_coordinates(
         T_world_camera=capture.rig.T_world_camera if capture.rig else None,
         projector_column=column,
         projector_row=row,
-        decoder=decoder,
     )
 
 

@@ -76,6 +76,10 @@ class PhotoDetector(ABC):
             The detector integrates and the sensor counts, or the other way round.
         """
 
+    @abstractmethod
+    def check(self, gate: Gate | None) -> None:
+        """Raise ValueError if the detector integrates and the sensor counts photons, or the other way round."""
+
     @property
     def black_level_dn(self) -> float:
         """Digital number without light."""
@@ -86,7 +90,8 @@ class PhotoDetector(ABC):
         return dark_e
 
     def noise_dn(self, dn: np.ndarray) -> np.ndarray | None:
-        """Standard deviation of a pixel whose mean is `dn`, digital numbers; None where that says too little."""
+        """Standard deviation of a pixel whose mean is `dn`, digital numbers; None where that says too little, as of
+        photon counts, whose decoders know their own statistics."""
         return None
 
     def ambient_share(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
@@ -209,6 +214,10 @@ class Detector(PhotoDetector):
     def capacity_e(self) -> float:
         return self.full_well_e
 
+    def check(self, gate: Gate | None) -> None:
+        if gate is not None:
+            raise ValueError("expected a SpadDetector for a sensor that counts photons, got an integrating Detector.")
+
     @property
     def black_level_dn(self) -> float:
         return self.offset_dn
@@ -221,8 +230,7 @@ class Detector(PhotoDetector):
         return np.asarray(pixel.electrons * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
 
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
-        if gate is not None:
-            raise ValueError("expected a SpadDetector for a sensor that counts photons, got an integrating Detector.")
+        self.check(gate)
         from pcgraph.parallel import in_blocks
         from rangesim.electronics.shot_noise import read_frame
 

@@ -66,6 +66,9 @@ class SpadDetector(PhotoDetector):
     def __post_init__(self) -> None:
         self._check()
 
+    def check(self, gate: Gate | None) -> None:
+        _counting(gate)
+
     @property
     def capacity_e(self) -> float:
         return float(self.max_dn)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.sensors import Decoder, Sensor, presets, sensor_from_dict, sensor_of
+from rangesim.sensors import Decoder, Sensor, check_sensor, presets, sensor_from_dict, sensor_of
 from rangesim.settings.bounds import Exponent, Metres, Seconds, Watts, check_fields
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 
@@ -75,7 +75,10 @@ class Instrument:
             raise ValueError(
                 f"expected a name of letters, digits, - and _, at most {LONGEST_NAME}, got {shown(self.name)}."
             )
+        check_sensor(self.sensor)
         detector = self.detector or self.sensor.default_detector
+        if detector is not None and not self.sensor.is_ideal:
+            detector.check(self.sensor.gate)
         object.__setattr__(self, "detector", detector if self.noise else None)
 
     def rig(self, scene: Scene, width: int | None = None, height: int | None = None) -> Rig:

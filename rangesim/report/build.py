@@ -93,7 +93,7 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
 
 def _frames(m: Measurement) -> dict[str, Any]:
     f = m.facts
-    taken = f"{f.frames} frames"
+    taken = f"{f.frames} frame{'s' * (f.frames != 1)}"
     if f.exposure_s is not None:
         taken += f", {tables.seconds(f.exposure_s)} each" if f.frames != 1 else f", {tables.seconds(f.exposure_s)}"
     else:

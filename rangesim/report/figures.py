@@ -111,7 +111,7 @@ def cause_map(measurement: Measurement) -> tuple[str, list[Share]]:
 def captured_frames(capture: Capture) -> list[Picture]:
     """A few representative frames, all with the same white."""
     names = capture.sensor.frame_names()
-    chosen = capture.sensor.representative_frames(capture.frames)
+    chosen = [i for i in capture.sensor.representative_frames(capture.frames) if 0 <= i < len(names)]
     white = max(float(np.percentile(capture.frames[i], 99.5)) for i in chosen)
     black = capture.black_level
     return [Picture(grey(capture.frames[i], white, black), names[i].replace("_", " "), names[i]) for i in chosen]

@@ -5,7 +5,7 @@ from rangesim.sensor import Decoder, Emitter, Sensor
 from rangesim.sensors.amcw import AmcwDecoder, AmcwToF
 from rangesim.sensors.direct_tof import DirectToF, DirectToFDecoder
 from rangesim.sensors.ideal_tof import IdealToF, IdealToFDecoder
-from rangesim.sensors.registry import is_file_name, presets, sensor_from_dict, sensor_of
+from rangesim.sensors.registry import check_sensor, is_file_name, presets, sensor_from_dict, sensor_of
 from rangesim.sensors.structured_light import StructuredLight, StructuredLightDecoder
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Sensor",
     "StructuredLight",
     "StructuredLightDecoder",
+    "check_sensor",
     "is_file_name",
     "presets",
     "sensor_from_dict",

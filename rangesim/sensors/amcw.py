@@ -183,7 +183,6 @@ class AmcwDecoder(Decoder):
             status=status,
             confidence=2 * amplitude / capture.full_scale,
             intensity=mean - capture.black_level,
-            decoder=self,
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

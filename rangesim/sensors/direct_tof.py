@@ -198,7 +198,7 @@ class DirectToFDecoder(Decoder):
         status = np.where(is_strong, Status.OK, Status.LOW_SIGNAL)
         status[capture.saturated(capture.frames)] = Status.SATURATED
         return range_image_from_path_length(
-            capture, length, status=status, confidence=peak / (bright or 1.0), intensity=intensity, decoder=self
+            capture, length, status=status, confidence=peak / (bright or 1.0), intensity=intensity
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

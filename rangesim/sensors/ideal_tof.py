@@ -78,9 +78,7 @@ class IdealToFDecoder(Decoder):
         length = weighted / np.where(dark, 1.0, radiance)
         status = np.where(dark, Status.LOW_SIGNAL, Status.OK)
         confidence = radiance / (bright_level(radiance) or 1.0)
-        return range_image_from_path_length(
-            capture, length, status=status, confidence=confidence, intensity=radiance, decoder=self
-        )
+        return range_image_from_path_length(capture, length, status=status, confidence=confidence, intensity=radiance)
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         return background.floor(0.0)

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping
-from functools import cache
+from dataclasses import is_dataclass
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -13,22 +14,36 @@ from typing import Any
 from zlib import crc32
 
 from rangesim.errors import FileFormatError
-from rangesim.sensor import Sensor
-from rangesim.settings.config import brief, from_dict, named_subclasses, nearest, shown
+from rangesim.sensor import Decoder, Sensor
+from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict
 
 _SEPARATOR = ".py:"
+_FRAME_NAME = re.compile(r"[\w.+-]+")
 
 
 def presets() -> dict[str, Sensor]:
     """Sensors by the names that stand for them on the command line, of all classes that are loaded."""
-    return {name: sensor for kind in _kinds() for name, sensor in kind.presets().items()}
+    found: dict[str, Sensor] = {}
+    for kind in Sensor.known.values():
+        for name, sensor in _presets_of(kind).items():
+            found.setdefault(name, sensor)
+    return found
+
+
+def _presets_of(kind: type[Sensor]) -> dict[str, Sensor]:
+    if "presets" in vars(kind):
+        return kind.presets()
+    try:
+        return {kind.type_name: kind()}
+    except Exception:  # noqa: BLE001  (somebody's class, which has no default settings; naming it says why)
+        return {}
 
 
 def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
     """The sensor of a preset's name, or of FILE.py:NAME, a sensor or class of sensors in a Python file.
 
     Loading a file runs it, so only name files that you trust. Its classes are known from then on, in captures and
-    results too.
+    results too. A file that has changed is loaded again.
 
     Parameters
     ----------
@@ -56,6 +71,8 @@ def sensor_of(name: str, files_in: Path | None = Path()) -> Sensor:
 def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sensor:
     """The sensor of plain data: a name as for `sensor_of`, or a table whose `type` is a `type_name` or FILE.py:NAME.
 
+    A table changes settings of the class, or of the sensor where NAME is one.
+
     Parameters
     ----------
     files_in : as for `sensor_of`; the default loads no file, for what is read back from captures and results.
@@ -71,11 +88,12 @@ def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sen
         if isinstance(data, Mapping):
             given = data.get("type")
             if files_in is not None and isinstance(given, str) and is_file_name(given):
-                data = {**data, "type": sensor_of(given, files_in).type_name}
-            elif isinstance(given, str) and given not in (types := [k.type_name for k in _kinds()]):
+                data = {**to_dict(sensor_of(given, files_in)), **data, "type": sensor_of(given, files_in).type_name}
+            elif isinstance(given, str) and given not in Sensor.known:
                 raise ValueError(
-                    f"expected 'type' to be one of {', '.join(types)}, got {shown(given)}{nearest(given, types)}; "
-                    "a sensor of your own is known once its file is named, as in --sensor FILE.py:NAME."
+                    f"expected 'type' to be one of {', '.join(Sensor.known)}, got {shown(given)}"
+                    f"{nearest(given, Sensor.known)}; a sensor of your own is known once its file is named, as in "
+                    "--sensor FILE.py:NAME."
                 )
     except (FileFormatError, ValueError) as error:
         raise ValueError(f"{place}: {error}") from error
@@ -87,41 +105,61 @@ def is_file_name(name: str) -> bool:
     return _SEPARATOR in name
 
 
-def _kinds() -> list[type[Sensor]]:
-    """All classes of sensors that are loaded."""
-    return list(named_subclasses(Sensor))  # type: ignore[type-abstract]
+def check_sensor(sensor: Sensor) -> None:
+    """Raise ValueError if a sensor of a user's own is not made as sensors have to be."""
+    kind = type(sensor)
+    if not getattr(kind, "type_name", ""):
+        raise ValueError(f"expected {kind.__name__} to have a type_name.")
+    for thing in (sensor, sensor.default_decoder):
+        if not (is_dataclass(thing) and type(thing).__dataclass_params__.frozen):
+            raise ValueError(f"expected {type(thing).__name__} to be a frozen dataclass.")
+    if not isinstance(sensor.default_decoder, Decoder):
+        raise ValueError(f"expected the default_decoder of {kind.__name__} to be a Decoder.")
+    names = sensor.frame_names()
+    if wrong := [name for name in names if not _FRAME_NAME.fullmatch(name)]:
+        raise ValueError(f"expected frame_names of letters, digits, _ . + and -, as for files, got {shown(wrong[0])}.")
+    if sensor.gate is not None and sensor.gate.bins != len(names):
+        raise ValueError(f"expected the gate of {kind.__name__} to have {len(names)} bins, got {sensor.gate.bins}.")
 
 
 def _sensor_in(path: Path, attribute: str) -> Sensor:
     found = getattr(_module(path), attribute, None)
-    if isinstance(found, Sensor):
-        return found
-    if not (isinstance(found, type) and issubclass(found, Sensor)):
-        raise FileFormatError(f"{path}: expected {attribute} to be a sensor or a class of sensors, got {shown(found)}.")
     try:
-        return found()
-    except TypeError as error:  # abstract, or arguments without default
-        raise FileFormatError(f"{path}: {attribute} cannot be made without arguments: {brief(error)}.") from error
+        if isinstance(found, type) and issubclass(found, Sensor):
+            found = found()
+        if isinstance(found, Sensor):
+            check_sensor(found)
+            return found
+    except Exception as error:  # whatever a file of somebody's raises
+        raise FileFormatError(f"{path}: {attribute}: {type(error).__name__}: {brief(error)}") from error
+    raise FileFormatError(f"{path}: expected {attribute} to be a sensor or a class of sensors, got {shown(found)}.")
 
 
-@cache
+_MODULES: dict[Path, tuple[int, ModuleType]] = {}
+"""Files that ran, and when they were last changed then."""
+
+
 def _module(path: Path) -> ModuleType:
-    """The module of a file, which runs once."""
+    """The module of a file, which runs once, and again when it has changed."""
     if not path.is_file():
         raise FileFormatError(f"{path} does not exist; expected a Python file with a sensor.")
+    changed = path.stat().st_mtime_ns
+    if path in _MODULES and _MODULES[path][0] == changed:
+        return _MODULES[path][1]
     name = f"_rangesim_file_{path.stem}_{crc32(bytes(path)):x}"
     spec = spec_from_file_location(name, path)
     assert spec is not None, path  # a .py file has one
     assert spec.loader is not None, path
     module = module_from_spec(spec)
-    before = {kind.type_name for kind in _kinds()}
+    before = [(family, dict(family.known)) for family in (Sensor, Decoder)]
     sys.modules[name] = module  # dataclasses look their own module up
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
-        raise FileFormatError(f"{path} fails: {type(error).__name__}: {brief(error)}.") from error
-    for kind in _kinds():
-        if kind.__module__ == name and kind.type_name in before:
-            raise FileFormatError(f"{path}: the type_name {kind.type_name!r} of {kind.__name__} is taken.")
+        for family, known in before:
+            family.known.clear()
+            family.known.update(known)
+        raise FileFormatError(f"{path} fails: {type(error).__name__}: {brief(error)}") from error
+    _MODULES[path] = changed, module
     return module

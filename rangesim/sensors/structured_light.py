@@ -222,7 +222,6 @@ class StructuredLightDecoder(Decoder):
             confidence=contrast.values / np.float32(capture.full_scale),
             intensity=capture.frames[WHITE].astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
-            decoder=self,
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

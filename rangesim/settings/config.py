@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import reprlib
+import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -113,12 +114,14 @@ def _required(field: dataclasses.Field[Any]) -> bool:
 
 def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     """`cls` itself, or the subclass that the key `type` names; removes that key from `values`."""
-    choices: dict[str, type[T]] = {}
-    for kind in named_subclasses(cls):
-        choices.setdefault(kind.type_name, kind)  # type: ignore[attr-defined]
+    choices: dict[str, type[T]] = getattr(cls, "known", None) or {
+        kind.type_name: kind  # type: ignore[attr-defined]
+        for kind in cls.__subclasses__()
+        if hasattr(kind, "type_name")
+    }
     own = getattr(cls, "type_name", None)
     if own:
-        choices[own] = cls
+        choices = {own: cls}
     if not choices:
         return cls
     tag = values.pop("type", own)
@@ -129,12 +132,33 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     return choices[tag]
 
 
-def named_subclasses(cls: type[T]) -> typing.Iterator[type[T]]:
-    """Subclasses that have a `type_name`, at any depth, the nearest first, then in the order of their definition."""
-    level = cls.__subclasses__()
-    while level:
-        yield from (kind for kind in level if hasattr(kind, "type_name"))
-        level = [deeper for kind in level for deeper in kind.__subclasses__()]
+class Named:
+    """A family of classes, each of which has a `type_name` of its own, by which files name it.
+
+    A class takes the place of an older one that the same lines defined, as where a notebook runs a cell again.
+    """
+
+    type_name: typing.ClassVar[str]
+    known: typing.ClassVar[dict[str, type[Any]]]
+    """Classes of the family by `type_name`, in the order of their definition; the base of a family has its own."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "known" in vars(cls) or not hasattr(cls, "type_name"):
+            return
+        name = cls.type_name
+        if "type_name" not in vars(cls):
+            raise TypeError(f"expected {cls.__name__} to have a type_name of its own, other than {name!r}.")
+        older = cls.known.get(name)
+        if older is not None and (older.__qualname__, _source(older)) != (cls.__qualname__, _source(cls)):
+            raise TypeError(f"expected {cls.__name__} to have a type_name of its own; {name!r} is taken.")
+        cls.known[name] = cls
+
+
+def _source(kind: type[Any]) -> str:
+    """File of a class, or its module where there is none."""
+    module = sys.modules.get(kind.__module__)
+    return getattr(module, "__file__", None) or kind.__module__
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
