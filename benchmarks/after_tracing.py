@@ -22,7 +22,7 @@ from typing import TypeVar
 import numpy as np
 
 from rangesim import Intrinsics, Rig, Sensor, Signals, decode, expose
-from rangesim.response import LengthBins, LightPath, NumpyMath, Response
+from rangesim.response import LightPath, NumpyMath, Response, TransientHistogram
 from rangesim.rig import translation
 from rangesim.sensors import presets
 from rangesim.signals import EnergySplit, GroundTruth
@@ -93,7 +93,7 @@ def plane(width: int, height: int, name: str) -> Signals:
 
 def channels(response: Response, path: LightPath, radiance: np.ndarray) -> np.ndarray:
     """(c, h, w) float32 of one light path per pixel."""
-    if not isinstance(response, LengthBins):
+    if not isinstance(response, TransientHistogram):
         return np.stack([radiance * w for w in response.weights(path, NumpyMath())]).astype(np.float32)  # type: ignore[attr-defined]
     result = np.zeros((response.channels + 1, *radiance.shape), dtype=np.float32)  # the last takes what is in no bin
     for index, weight in response.shares(path, NumpyMath()):

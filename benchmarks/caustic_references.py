@@ -64,10 +64,10 @@ def seen(name: str, case: Case) -> dict[str, np.ndarray]:
 def ptracer(case: Case, scale: float) -> Reference:
     """Mitsuba's particle tracer, in two independent halves."""
     import mitsuba as mi
-    from finite_aperture import MOST_SURFACES
+    from finite_aperture import MAX_SURFACES
 
     plain = plain_scene(case.scene, case.rig, {"type": "hdrfilm", "pixel_format": "luminance"})
-    integrator = mi.load_dict({"type": "ptracer", "max_depth": MOST_SURFACES, "rr_depth": MOST_SURFACES})
+    integrator = mi.load_dict({"type": "ptracer", "max_depth": MAX_SURFACES, "rr_depth": MAX_SURFACES})
     light, frames = stripes()
     halves = np.empty((2, len(frames), case.rig.camera.height, case.rig.camera.width))
     for i, frame in enumerate(frames):

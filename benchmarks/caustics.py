@@ -46,10 +46,10 @@ def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.
     """Photons that landed, and (repeats, 2) seconds to trace them and to build their maps."""
     from rangesim.light_transport.caustics import PHOTONS, gathering_radius
     from rangesim.light_transport.device import Device
-    from rangesim.light_transport.photon_maps import MOST_MAPS, PhotonMaps
+    from rangesim.light_transport.photon_maps import MAX_MAPS, PhotonMaps
     from rangesim.light_transport.photons import trace_photons
 
-    maps = min(spp, MOST_MAPS)
+    maps = min(spp, MAX_MAPS)
     trace = partial(trace_photons, scene.mitsuba, Device.projector(rig), rig.projector_power_w, PHOTONS, maps)
     seconds = []
     for seed in range(repeats + 1):

@@ -5,8 +5,8 @@ Real: two scenes of the ClearGrasp data set (Sajjan et al. 2020; RealSense D435)
 measured as they are and again sprayed opaque. Simulated: `scenes/glassware.xml` with the same intrinsics at the same
 distance, with and without photons beyond glass. Figures on the objects, and on the background:
 
-    lost       share of the pixels (whose true depth is known) without a measurement
-    > 10 mm    share of the others that are off by more than 10 mm
+    lost       fraction of the pixels (whose true depth is known) without a measurement
+    > 10 mm    fraction of the others that are off by more than 10 mm
     median     signed error in z, millimetres; positive is too far
     quartiles  25 % and 75 % of the signed error, millimetres
 

@@ -25,7 +25,7 @@ from rangesim import Rig
 GUIDED_SHARE, STRAIGHT_SHARE = 0.45, 0.1
 STRAIGHT_HALF_ANGLE_RAD = 0.04
 LANES = 1 << 18
-MOST_SURFACES = 130
+MAX_SURFACES = 130
 """Of a path: a pane guides light along for dozens of reflections."""
 
 
@@ -113,7 +113,7 @@ def _trace(scene: Any, lamp: Lamp, guided: Cone, straight: Cone, corner: Any, sp
     right, down, forward, eye = axes(lamp.rig.T_world_camera)
     focal, principal = dr.opaque(mi.Float, camera.fx), mi.Point2f(camera.cx, camera.cy)
     _, _, axis, centre = axes(lamp.rig.T_world_projector)
-    radius2, most = dr.opaque(mi.Float, lamp.radius_m**2), dr.opaque(mi.UInt32, MOST_SURFACES)
+    radius2, most = dr.opaque(mi.Float, lamp.radius_m**2), dr.opaque(mi.UInt32, MAX_SURFACES)
     lanes = dr.width(corner)
     rng = mi.PCG32(lanes, dr.opaque(mi.UInt64, seed + 1))
     sums = [dr.zeros(mi.Float, lanes) for _ in range(2 + len(lamp.patterns))]

@@ -43,8 +43,8 @@ class Case(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What n pixels of a region show: radiance of white (n,), of fringes (n,) complex; median |z error| in mm, share of
-    pixels decoded."""
+    """What n pixels of a region show: radiance of white (n,), of fringes (n,) complex; median |z error| in mm, fraction
+    of pixels decoded."""
 
     white: np.ndarray
     fringes: np.ndarray

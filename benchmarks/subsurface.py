@@ -53,7 +53,7 @@ def bias_mm(signals: rangesim.Signals, sensor: rangesim.Sensor) -> float:
 
 
 def row(name: str, folder: Path) -> dict[str, float | str]:
-    """Figures of one medium: share of single scattering, contrast and shift of stripes, range error."""
+    """Figures of one medium: fraction of single scattering, contrast and shift of stripes, range error."""
     scene = block(name, folder)
     rig = scene.rig(baseline_m=0.1)
     pixel_m = DISTANCE_M / rig.projector.fx

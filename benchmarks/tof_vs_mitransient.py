@@ -7,8 +7,8 @@ depth, in this process, after warm-up, in turns. The last line printed is JSON:
     time_ratio      one pass over mitransient's render (medians)
     max_abs_z       largest |z| over the bins; z = mean difference over the image, over its standard error
     bins            number of bins that hold light
-    sum_error       largest difference between the sum of a pixel's bins and its steady image, over the brightest pixel
-    steady_z        z of the steady images
+    sum_error       largest difference between the sum of a pixel's bins and its white image, over the brightest pixel
+    steady_z        z of the white images
 
 Usage: python benchmarks/tof_vs_mitransient.py [SCENE] [--width 256] [--height 256] [--spp 64] [--max-depth 5]
 """
@@ -25,7 +25,7 @@ import numpy as np
 from plain_mitsuba import plain_scene, timed, z_score
 
 from rangesim import load_scene, transport
-from rangesim.response import LengthBins
+from rangesim.response import TransientHistogram
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 
@@ -42,7 +42,7 @@ def main() -> None:
     import mitsuba as mi
 
     rig = scene.rig(width=args.width, height=args.height)
-    bins = LengthBins(start_m=0.0, width_m=0.04, channels=300)
+    bins = TransientHistogram(start_m=0.0, width_m=0.04, channels=300)
     film = {
         "type": "transient_hdr_film",
         "start_opl": bins.start_m,
@@ -53,8 +53,8 @@ def main() -> None:
     integrator = mi.load_dict({"type": "transient_path", "max_depth": args.max_depth, "rr_depth": 5})
 
     def theirs(seed: int) -> tuple[np.ndarray, np.ndarray]:
-        steady, transient = mi.render(plain, integrator=integrator, spp=args.spp, seed=seed)
-        return np.array(steady).squeeze(), np.moveaxis(np.array(transient).squeeze(), -1, 0)
+        white, transient = mi.render(plain, integrator=integrator, spp=args.spp, seed=seed)
+        return np.array(white).squeeze(), np.moveaxis(np.array(transient).squeeze(), -1, 0)
 
     def ours(seed: int) -> Any:
         alike = {"indirect": "raw", "sampling_error": False}  # neither is part of what mitransient does
@@ -64,7 +64,7 @@ def main() -> None:
     ours_s, theirs_s = [], []
     for run in range(1, args.runs + 1):
         signals, a = timed(partial(ours, run))
-        (steady, histogram), b = timed(partial(theirs, run))
+        (white, histogram), b = timed(partial(theirs, run))
         ours_s.append(a), theirs_s.append(b)
         print(f"run {run}: one pass {a:.2f} s, mitransient {b:.2f} s")
 
@@ -79,7 +79,7 @@ def main() -> None:
         "max_abs_z": round(max(map(abs, scores.values())), 2),
         "bins": len(scores),
         "sum_error": float(np.abs(mine.sum(axis=0) - projector).max() / projector.max()),
-        "steady_z": round(z_score(projector, steady), 2),
+        "steady_z": round(z_score(projector, white), 2),
     }
     print(json.dumps(result))
 

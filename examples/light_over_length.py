@@ -20,7 +20,7 @@ SCENES = Path(__file__).resolve().parent.parent / "scenes"
 PIXELS = {"corner": (10, 15), "tabletop": (15, 20)}
 """(row, column) in an image of 40 x 30 pixels."""
 FAINTEST = 1e-4
-"""Lower end of the scale, as a share of the brightest bin."""
+"""Lower end of the scale, as a fraction of the brightest bin."""
 COLORS = ("#1b2330", "#963246", "#e97c01", "#d44197", "#c9b000")
 """Of the kinds of light, as in the cause map of the report."""
 

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from rangesim import AmcwToF, DirectToF, StructuredLight, decode, expose, load_scene
-from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
+from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "matte.xml"
 BALL = "large_ball"
@@ -38,7 +38,7 @@ def main() -> None:
     pictures = []
     for speed in SPEEDS_M_S:
         print(f"ball at {speed} m/s")
-        motion = Motion({BALL: SteadyTrack((speed, 0.0, 0.0))})
+        motion = Motion({BALL: ConstantTwist((speed, 0.0, 0.0))})
         for name, (sensor, timing) in CAMERAS.items():
             # All see the ball at its place in the scene file in the middle of their acquisition
             centred = replace(timing, start_s=-timing.reference_s(sensor, rig.camera))

@@ -50,9 +50,9 @@ class MultiFrequency(Sensor):
     def responses(self) -> tuple[Fringes, ...]:
         return tuple(Fringes(0, period) for period in self.periods_px)
 
-    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         shifts = 2 * np.pi * np.arange(self.steps) / self.steps
-        shown = [0.5 * (steady + np.cos(s) * cosine + np.sin(s) * sine) for cosine, sine in channels for s in shifts]
+        shown = [0.5 * (white + np.cos(s) * cosine + np.sin(s) * sine) for cosine, sine in channels for s in shifts]
         return (np.stack(shown) + ambient).astype(np.float32)
 
     def frame_names(self) -> list[str]:
@@ -101,9 +101,9 @@ class TemporalUnwrapping(Decoder):
         if not isinstance(sensor, MultiFrequency):
             raise ValueError(f"expected a multi-frequency capture, got {sensor.type_name}.")
         phases = [phase_of(frames) for frames in np.split(capture.frames, sensor.periods)]
-        column = phases[0].turns * sensor.periods_px[0]
+        column = phases[0].normalised * sensor.periods_px[0]
         for phase, period_px in zip(phases[1:], sensor.periods_px[1:], strict=True):
-            column = (np.rint(column / period_px - phase.turns) + phase.turns) * period_px
+            column = (np.rint(column / period_px - phase.normalised) + phase.normalised) * period_px
         status = np.full(column.shape, Status.OK, dtype=np.uint8)
         status[(column < 0) | (column > sensor.width)] = Status.CODE_ERROR
         for phase in phases:

@@ -71,7 +71,7 @@ class GatedCamera(Sensor):
     def responses(self) -> tuple[Gates]:
         return (Gates(tuple(SPEED_OF_LIGHT * self.delays_s), SPEED_OF_LIGHT * self.width_s),)
 
-    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         lit = np.concatenate([channels[0], np.zeros_like(channels[0][:1])])
         return (lit + self.duty * ambient).astype(np.float32)
 

@@ -46,11 +46,11 @@ class RangesimWarning(UserWarning):
 
 
 class TruncationWarning(RangesimWarning):
-    """Light paths were ended so early that a noticeable part of the projector's light, `share`, is missing."""
+    """Light paths were ended so early that a noticeable part of the projector's light, `fraction`, is missing."""
 
-    def __init__(self, message: str, share: float) -> None:
+    def __init__(self, message: str, fraction: float) -> None:
         super().__init__(message)
-        self.share = share
+        self.fraction = fraction
 
 
 class SamplingWarning(RangesimWarning):

@@ -63,7 +63,7 @@ class Sensor(Named, ABC):
         """The basis of linear functionals that the transport pass has to accumulate; equal ones each time."""
 
     @abstractmethod
-    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         """(k, h, w) float32 mean radiance of the frames, W/m2/sr, from what the transport pass accumulated.
 
         Images are always whole, so that a frame may depend on neighbouring pixels.
@@ -71,7 +71,7 @@ class Sensor(Named, ABC):
         Parameters
         ----------
         channels : one (c, h, w) float32 per response, in the order of `responses()`, W/m2/sr.
-        steady : (h, w) float32, radiance under constant light of the projector at full power, without ambient.
+        white : (h, w) float32, radiance under constant light of the projector at full power, without ambient.
         ambient : (h, w) float32, radiance of all other light that passes the camera's filter.
         """
 

@@ -24,7 +24,7 @@ class EnergySplit:
 
     direct : projector -> surface -> camera.
     multipath : two or more non-delta surfaces.
-    via_delta : the camera sees the lit surface off a mirror or through glass, and nothing else between.
+    specular : the camera sees the lit surface off a mirror or through glass, and nothing else between.
     caustic : the projector lights the surface off a mirror or through glass.
     glint : the camera sees the projector's lens off a mirror, through glass or directly.
     ambient : every light but the projector, before any filter.
@@ -32,7 +32,7 @@ class EnergySplit:
 
     direct: np.ndarray
     multipath: np.ndarray
-    via_delta: np.ndarray
+    specular: np.ndarray
     caustic: np.ndarray
     glint: np.ndarray
     ambient: np.ndarray
@@ -40,7 +40,7 @@ class EnergySplit:
     @property
     def projector(self) -> np.ndarray:
         """(h, w) float32, all light of the projector at full power, without ambient."""
-        return self.direct + self.multipath + self.via_delta + self.caustic + self.glint
+        return self.direct + self.multipath + self.specular + self.caustic + self.glint
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ class GroundTruth:
 
 @dataclass(frozen=True)
 class Truncation:
-    """Estimate of the projector's light that a pass left out, by what ended it; shares of all its light in the image,
-    glint excepted and what is left out included. See `rangesim.light_transport.truncation`.
+    """Estimate of the projector's light that a pass left out, by what ended it; fractions of all its light in the
+    image, glint excepted and what is left out included. See `rangesim.light_transport.truncation`.
 
     depth : of paths with more scattering surfaces than `max_depth` allows; NaN where that is 2 or less, which asks for
         direct light alone. chains : of camera paths with too many delta interactions in a row. photons : of photons
@@ -88,7 +88,7 @@ class Truncation:
 
     @property
     def total(self) -> float:
-        """All that is known to be left out, a share of the projector's light."""
+        """All that is known to be left out, a fraction of the projector's light."""
         return float(np.nansum([self.depth, self.chains, self.photons]))
 
 

@@ -16,7 +16,7 @@ import rangesim
 from rangesim import AmcwToF, Capture, Detector, RangeImage, Rig, Scene, Signals, StructuredLight, transport
 from rangesim.causes import Cause
 from rangesim.environment.backend import select_variant
-from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
+from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SIZE = {"width": 80, "height": 60}
@@ -144,7 +144,7 @@ def motion() -> Case:
     timing = Timing(frame_period_s=1 / 60)
     timing = replace(timing, start_s=-timing.reference_s(sensor, rig.camera))
     options = {"spp": 64, "max_depth": 2}
-    moves = Motion({"board": SteadyTrack((0.0, 0.0, -0.3))})
+    moves = Motion({"board": ConstantTwist((0.0, 0.0, -0.3))})
     signals = transport_moving(scene, rig, {sensor: timing}, moves, **options)[sensor]
     at_rest = transport(scene, rig, [sensor], **options)
     healed = right(measure(at_rest, sensor, Detector())[1], at_rest)
@@ -192,7 +192,7 @@ def mirror_by_energy(signals: Signals) -> list[tuple[Any, Cause]]:
     where it is direct. Off it: shadow without direct light, or edges."""
     e = signals.energy
     mirror = is_instance(signals, "mirror")
-    off_mirror = e.via_delta + e.caustic + e.multipath
+    off_mirror = e.specular + e.caustic + e.multipath
     little = 0.01 * np.median(e.direct[e.direct > 0])
     return [
         (mirror & (e.direct > little) & (e.direct > off_mirror), Cause.DEPTH_EDGE),
@@ -292,13 +292,13 @@ def ambient() -> Case:
     return timed_case(signals, sensor, detector, exposure_s, [(healed, Cause.AMBIENT)])
 
 
-def wrapped() -> Case:
+def range_ambiguity() -> Case:
     """A wall beyond the unambiguous range of one frequency; healed by a lower one."""
     scene = room(wall=board(0, 0, 3.0, 4), post=board(0.3, 0, 1.5, 0.2))
     sensor, slow, detector = AmcwToF((80e6,)), AmcwToF((20e6,)), Detector.time_of_flight()
     signals = transport(scene, scene.rig(0.001, **SIZE), [sensor, slow], spp=64, max_depth=2)
     healed = right(measure(signals, slow, None)[1], signals)
-    return case(signals, sensor, detector, lambda c, i: [(healed, Cause.WRAPPED), (True, Cause.DEPTH_EDGE)])
+    return case(signals, sensor, detector, lambda c, i: [(healed, Cause.RANGE_AMBIGUITY), (True, Cause.DEPTH_EDGE)])
 
 
 def resolution() -> Case:

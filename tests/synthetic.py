@@ -73,9 +73,9 @@ def plane_signals(rig: Rig, *sensors: Sensor, distance_m: float = 1.0, **changes
 
 def _channels(response: Response, path: LightPath, radiance: np.ndarray) -> np.ndarray:
     if isinstance(response, SparseResponse):
-        shares = response.shares(path, NumpyMath())
+        weights = response.bin_weights(path, NumpyMath())
         bins = range(response.channels)
-        return np.stack([sum(np.where(i == b, radiance * w, 0) for i, w in shares) for b in bins]).astype(np.float32)
+        return np.stack([sum(np.where(i == b, radiance * w, 0) for i, w in weights) for b in bins]).astype(np.float32)
     assert isinstance(response, DenseResponse)
     return np.stack([radiance * w for w in response.weights(path, NumpyMath())]).astype(np.float32)
 

@@ -115,7 +115,7 @@ def test_what_the_projector_lights_is_seen_through_a_slab_weakened_and_as_far_aw
         rig = rig_of(CAMERA, Intrinsics.from_fov(160, 120, 120), (0.0, 0.0, 0.5))
         signals = transport(scene, rig, [FirstReturn()], spp=64, photons=0, max_depth=2)
         weight, moment = signals.channels[FirstReturn()]
-        images.append((signals.energy.via_delta, moment / weight))
+        images.append((signals.energy.specular, moment / weight))
     (clear, length), (dim, same_length) = images
     # The light lands where it lands, whatever is absorbed; a pass to and fro inside is R^2 of it
     t = tangents(CAMERA)
@@ -137,8 +137,8 @@ def photons_of(scene: Scene, rig: Rig) -> Photons:
 def test_photons_into_an_absorbing_slab_land_are_absorbed_or_escape() -> None:
     scene = scene_of(pane=filled(slab()), wall=wall(1.0, matte()))
     balance = photons_of(scene, rig_of(CAMERA, PROJECTOR)).balance
-    fates = balance.direct + balance.stored + balance.absorbed + balance.escaped + balance.truncated
-    assert fates == pytest.approx(balance.emitted, rel=1e-6)
+    parts = balance.direct + balance.stored + balance.absorbed + balance.escaped + balance.truncated
+    assert parts == pytest.approx(balance.emitted, rel=1e-6)
     rays = PROJECTOR.normalise(PROJECTOR.pixel_centres())
     passed, reflected = (x.mean() for x in of_slab(np.linalg.norm(rays, axis=-1)))
     assert balance.stored == pytest.approx(POWER_W * passed, rel=2e-3)
@@ -305,7 +305,7 @@ def test_glass_that_absorbs_nothing_is_the_same_to_the_byte() -> None:
         scene = scene_of(ball=body, wall=wall(2.0, matte()), sky=SKY)
         assert absorbers_of(scene.mitsuba) is None
         images.append(transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=4, seed=5, photons=10_000).energy)
-    for name in ("direct", "multipath", "via_delta", "caustic", "glint", "ambient"):
+    for name in ("direct", "multipath", "specular", "caustic", "glint", "ambient"):
         assert getattr(images[0], name).tobytes() == getattr(images[1], name).tobytes()
 
 
@@ -325,7 +325,7 @@ def test_a_body_that_moves_takes_its_medium_along() -> None:
     images = [
         transport(s, rig_of(CAMERA, PROJECTOR), [], spp=16, photons=50_000, glint=False).energy for s in (moved, there)
     ]
-    for name, tolerance in (("ambient", 2e-3), ("caustic", 0.03), ("via_delta", 0.03)):
+    for name, tolerance in (("ambient", 2e-3), ("caustic", 0.03), ("specular", 0.03)):
         a, b = (getattr(energy, name) for energy in images)
         assert a.sum() == pytest.approx(b.sum(), rel=tolerance)
 
@@ -335,7 +335,7 @@ def test_the_same_seed_gives_the_same_bytes_in_tiles_and_for_joint_shapes(monkey
         parts = {f"ball_{i}": filled(ball(0.05, x=0.12 * i - 0.3), 5.0 * i) for i in range(6)}
         scene = scene_of(**parts, wall=wall(2.0, matte()), sky=SKY)
         energy = transport(scene, rig_of(CAMERA, PROJECTOR), [], spp=4, photons=0, memory_bytes=memory_bytes).energy
-        return energy.ambient.tobytes() + energy.via_delta.tobytes() + energy.glint.tobytes()
+        return energy.ambient.tobytes() + energy.specular.tobytes() + energy.glint.tobytes()
 
     images = [seen(1 << 30), seen(1 << 19)]
     monkeypatch.setattr(surfaces, "MANY", 2)

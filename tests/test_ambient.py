@@ -33,8 +33,8 @@ def test_shares_of_a_black_body_are_integrals_of_planck_s_law(temperature_k: flo
     for low, high in [(825, 875), (925, 955), (380, 780), (1500, 3000)]:
         wavelength = np.linspace(low, high, 20_001) * 1e-9
         expected = np.trapezoid(planck(wavelength, temperature_k), wavelength) / whole
-        assert Tungsten(temperature_k).share(low, high) == pytest.approx(expected, rel=1e-6)
-    assert Tungsten(temperature_k).share(1, 1e5) == pytest.approx(1, abs=1e-4)
+        assert Tungsten(temperature_k).fraction(low, high) == pytest.approx(expected, rel=1e-6)
+    assert Tungsten(temperature_k).fraction(1, 1e5) == pytest.approx(1, abs=1e-4)
 
 
 def test_the_eye_s_sensitivity() -> None:
@@ -59,9 +59,9 @@ def test_the_sun_s_table_is_that_of_the_standard() -> None:
     at = dict(zip(EDGES_NM, SPECTRAL_W_M2_NM, strict=False))
     assert at[935.0] < 0.5 * at[980.0] < at[860.0]
     assert at[760.0] < 0.5 * at[750.0]
-    assert Sun().share(925, 955) < 0.45 * Sun().share(835, 865)
+    assert Sun().fraction(925, 955) < 0.45 * Sun().fraction(835, 865)
     with pytest.raises(ValueError, match="300 to 1100 nm for sunlight, got 1525"):
-        Sun().share(1525, 1575)
+        Sun().fraction(1525, 1575)
 
 
 def test_the_sun_s_table_agrees_with_pvlib_s_copy() -> None:
@@ -100,8 +100,8 @@ def test_strength_in_lux_and_in_watts_say_the_same() -> None:
 
 def test_the_default_transmission_is_sunlight_in_the_default_band() -> None:
     for detector in (Detector(), Detector.time_of_flight(), SpadDetector()):
-        share = Ambient("sun").in_band(detector.wavelength_m, detector.band_width_m)
-        assert share == pytest.approx(detector.ambient_transmission, rel=0.1)
+        fraction = Ambient("sun").in_band(detector.wavelength_m, detector.band_width_m)
+        assert fraction == pytest.approx(detector.ambient_transmission, rel=0.1)
     assert Ambient("sun").in_band(850e-9, Detector.ideal().band_width_m) == 0
 
 
@@ -115,12 +115,12 @@ def electrons(capture: Capture) -> np.ndarray:
 
 
 def test_sunlight_on_a_capture_is_what_the_law_says() -> None:
-    """In the black frame: electrons = ambient radiance times scale times share times etendue."""
+    """In the black frame: electrons = ambient radiance times scale times fraction times etendue."""
     detector = Detector(dark_current_e_s=0.0, full_well_e=40_000.0)
     signals = plane_signals(stereo_rig(), SENSOR, ambient=0.5 / np.pi)  # half of a scene's 1 W/m2 comes back
     sun = Ambient("sun", illuminance_lux=20_000.0)
     capture = expose(signals, SENSOR, detector, exposure_s=2e-5, ambient=sun)
-    expected = 0.5 / np.pi * 20_000 / Sun().efficacy_lm_w * Sun().share(825, 875)
+    expected = 0.5 / np.pi * 20_000 / Sun().efficacy_lm_w * Sun().fraction(825, 875)
     expected *= detector.electrons_per_radiance(signals.rig) * 2e-5
     assert electrons(capture)[-1].mean() == pytest.approx(expected, rel=0.01)
     np.testing.assert_allclose(

@@ -24,17 +24,17 @@ from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.experiment.instrument import Optics, instrument
-from rangesim.motion import Motion, PoseTrack, SteadyTrack, Timing
+from rangesim.motion import ConstantTwist, Motion, PoseTrack, Timing
 from rangesim.response import (
     FirstReturn,
     Fringes,
     GrayBits,
     Images,
-    LengthBins,
     LengthSplit,
     LightPath,
     NumpyMath,
     Phasor,
+    TransientHistogram,
 )
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import (
@@ -139,9 +139,9 @@ def use_instrument(one: Any) -> None:
 def use_timing(timing: Any) -> None:
     assert np.isfinite(timing.exposure_times_s(AmcwToF())).all()
     assert math.isfinite(timing.reference_s(AmcwToF(), CAMERA))
-    assert sum(i.share * i.window.of(np.ones((18, 24))).sum() for i in timing.instants(0.0, CAMERA)) == pytest.approx(
-        24 * 18
-    )
+    assert sum(
+        i.fraction * i.window.of(np.ones((18, 24))).sum() for i in timing.instants(0.0, CAMERA)
+    ) == pytest.approx(24 * 18)
 
 
 def use_track(track: Any) -> None:
@@ -193,15 +193,15 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (Experiment("a.xml"), use_experiment),
     (Timing(line_period_s=1e-5, exposure_s=1e-3), use_timing),
     (PoseTrack(np.array([0.0, 1.0]), np.stack([np.eye(4), translation(1, 0, 0)])), use_track),
-    (SteadyTrack(), use_track),
-    (Motion({"ball": SteadyTrack()}), lambda m: m.at(1.0)),
+    (ConstantTwist(), use_track),
+    (Motion({"ball": ConstantTwist()}), lambda m: m.at(1.0)),
     (GrayBits(0, 4, 1), use_response),
     (Fringes(0, 16.0), use_response),
     (Images(np.ones((2, 6, 8), np.float32)), use_response),
     (Phasor(20e6), use_response),
     (Phasor(20e6, True), use_response),
     (FirstReturn(), use_response),
-    (LengthBins(0.0, 0.03, 16), use_response),
+    (TransientHistogram(0.0, 0.03, 16), use_response),
     (LengthSplit(0.0, 0.03, 16), use_response),
 ]  # fmt: skip
 

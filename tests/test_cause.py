@@ -35,11 +35,11 @@ from rangesim.response import (
     DIRECT,
     KINDS,
     MULTIPATH,
-    VIA_DELTA,
-    LengthBins,
+    SPECULAR,
     LengthSplit,
     LightPath,
     NumpyMath,
+    TransientHistogram,
 )
 from rangesim.signals import GroundTruth
 
@@ -65,9 +65,9 @@ def test_a_scene_made_for_it_produces_each_cause(cause: Cause) -> None:
     failed = case.failed
     assert (found.failed == failed).all()
     agree = (found.cause == case.decided)[failed]
-    share, of_it = float(agree.mean()), int((found.cause == cause).sum())
-    print(f"{cause.name.lower()}: {failed.sum()} failed, {of_it} of them by it, agreement {100 * share:.2f} %")  # noqa: T201
-    assert share >= AGREEMENT
+    fraction, of_it = float(agree.mean()), int((found.cause == cause).sum())
+    print(f"{cause.name.lower()}: {failed.sum()} failed, {of_it} of them by it, agreement {100 * fraction:.2f} %")  # noqa: T201
+    assert fraction >= AGREEMENT
     assert of_it >= 20
     assert (case.decided[failed] == cause).sum() >= 20
 
@@ -192,7 +192,7 @@ def test_what_lies_beyond_the_range_is_wrapped_and_not_low_signal() -> None:
     signals = plane_signals(stereo_rig(baseline_m=0.0), sensor)
     capture = expose(signals, sensor)
     found = explain(decode(capture), capture, signals)
-    assert (found.cause[signals.truth.projector_visible] == Cause.WRAPPED).all()
+    assert (found.cause[signals.truth.projector_visible] == Cause.RANGE_AMBIGUITY).all()
 
 
 def test_glint_is_named_where_it_is_most_of_the_light() -> None:
@@ -261,7 +261,7 @@ def test_shares_are_of_the_pixels_of_a_material() -> None:
         projector_visible=np.ones((2, 4), bool),
         material_names=("matte", "mirror"),
     )
-    matte, mirror, everything = CauseMap(cause, 0.01).shares(truth)
+    matte, mirror, everything = CauseMap(cause, 0.01).fractions(truth)
     assert matte == {"material": "matte", "failed": 4 / 6, "causes": {"multipath": 3 / 6, "shadowed": 1 / 6}}
     assert mirror == {"material": "mirror", "failed": 1.0, "causes": {"specular_away": 1.0}}
     assert everything["failed"] == 5 / 7
@@ -292,13 +292,13 @@ def test_the_docs_define_every_cause() -> None:
 
 def test_the_split_over_path_length_adds_up_to_bins_and_to_the_energy_split() -> None:
     scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
-    bins, split = LengthBins(0.0, 0.5, 80), LengthSplit(0.0, 0.5, 80)
+    bins, split = TransientHistogram(0.0, 0.5, 80), LengthSplit(0.0, 0.5, 80)
     signals = rangesim.transport(scene, scene.rig(0.03, width=64, height=48), [bins, split], spp=4)
     parts = signals.channels[split].reshape(len(KINDS), 80, 48, 64)
     np.testing.assert_allclose(parts.sum(axis=0), signals.channels[bins], rtol=1e-5, atol=1e-6)
     for kind, part in zip(KINDS, parts, strict=True):
         np.testing.assert_allclose(part.sum(axis=0), getattr(signals.energy, kind), rtol=1e-4, atol=1e-6)
-    assert all(parts[k].any() for k in (DIRECT, MULTIPATH, VIA_DELTA, CAUSTIC))
+    assert all(parts[k].any() for k in (DIRECT, MULTIPATH, SPECULAR, CAUSTIC))
 
 
 def test_paths_out_of_the_bins_count_nowhere() -> None:
@@ -319,4 +319,4 @@ def test_where_nothing_fails_nothing_is_explained(sensor: Sensor) -> None:
     capture = rangesim.expose(signals, sensor)
     found = explain(rangesim.decode(capture), capture, signals, tolerance_m=0.2)
     assert not found.failed.any()
-    assert found.shares(signals.truth)[-1] == {"material": "all", "failed": 0.0, "causes": {}}
+    assert found.fractions(signals.truth)[-1] == {"material": "all", "failed": 0.0, "causes": {}}

@@ -29,9 +29,9 @@ from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight,
 from rangesim.environment.backend import select_variant
 from rangesim.light_transport import photon_maps
 from rangesim.light_transport.photon_maps import ALPHA, GatheringRadius, Level, radii_of_maps
-from rangesim.light_transport.photons import PhotonBalance, Photons, shift_of, stratified_choice, trace_photons
+from rangesim.light_transport.photons import EnergyBudget, Photons, shift_of, stratified_choice, trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
-from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Fringes, Images, LengthBins, LightPath
+from rangesim.response import SPEED_OF_LIGHT, DenseResponse, Fringes, Images, LightPath, TransientHistogram
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 CAMERA = Intrinsics.from_fov(64, 48, 20)
@@ -94,7 +94,7 @@ def test_the_length_of_sight_through_a_slab_is_that_of_snell_s_law() -> None:
     across, light = path.across(t), path.transmittance(t)
     optical = path.length(t) + np.hypot(across, PLANE - lamp_at)
     check_lengths(signals, limit_m, (light * optical).sum(axis=(2, 3)) / light.sum(axis=(2, 3)))
-    assert signals.energy.via_delta.min() > 0
+    assert signals.energy.specular.min() > 0
     assert not signals.energy.direct.any()
 
 
@@ -104,7 +104,7 @@ def test_light_and_sight_through_a_slab_and_what_time_of_flight_makes_of_it() ->
     Both may bounce in the slab, R^2 of them twice.
     """
     limit_m, frequency_hz, d = 2.15, 100e6, FAR - NEAR
-    ideal, amcw, bins = IdealToF(), AmcwToF((frequency_hz,), waveform="sine"), LengthBins(2.0, 0.03, 40)
+    ideal, amcw, bins = IdealToF(), AmcwToF((frequency_hz,), waveform="sine"), TransientHistogram(2.0, 0.03, 40)
     scene = scene_of(slab=slab(NEAR, FAR), wall=wall(PLANE, matte()))
     signals = transport(
         scene,
@@ -199,7 +199,7 @@ def test_light_off_polished_plastic_is_fresnel_s_share_of_the_image_source() -> 
 
 
 def test_light_through_a_pane_and_off_plastic_lands_and_goes_on() -> None:
-    """On the plastic a photon that came through glass both lands and goes on; shares of either must add up."""
+    """On the plastic a photon that came through glass both lands and goes on; fractions of either must add up."""
     pane = wall(0.1, {**GLASS, "type": "thindielectric"}, 0.19)
     scene, rig = beside_a_mirror(PLASTIC, pane=pane)
     check_image_source(
@@ -344,7 +344,7 @@ def test_a_gather_is_the_sum_over_all_photons_of_its_map(
     import mitsuba as mi
 
     select_variant()
-    monkeypatch.setattr(photon_maps, "MOST_LOOKED_AT", most_looked_at)
+    monkeypatch.setattr(photon_maps, "MAX_LOOKED_AT", most_looked_at)
     rng = np.random.default_rng(1)
 
     def on_the_plane(n: int) -> np.ndarray:
@@ -353,7 +353,7 @@ def test_a_gather_is_the_sum_over_all_photons_of_its_map(
 
     position, of_map, nothing = on_the_plane(photons), np.arange(photons) % maps, np.zeros(photons, np.float32)
     flux = rng.uniform(0.5, 1.5, photons).astype(np.float32)
-    none = PhotonBalance(0, 0, 0, 0, 0, 0)
+    none = EnergyBudget(0, 0, 0, 0, 0, 0)
     landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map, none, per_pixel=1.0)
     there = np.array([0.0, 0.0, 3.0])
     radius = GatheringRadius(0.0, (0.0, 0.0), there, there, fixed_m=radius_m)
@@ -385,7 +385,7 @@ def test_a_gather_whose_radius_grows_with_distance_is_the_sum_over_all_photons(
     import mitsuba as mi
 
     select_variant()
-    monkeypatch.setattr(photon_maps, "MOST_LOOKED_AT", 10_000)
+    monkeypatch.setattr(photon_maps, "MAX_LOOKED_AT", 10_000)
     rng, n, maps = np.random.default_rng(2), 40_000, 4
 
     def on_the_plane(k: int) -> np.ndarray:
@@ -393,7 +393,7 @@ def test_a_gather_whose_radius_grows_with_distance_is_the_sum_over_all_photons(
 
     position, of_map, nothing = on_the_plane(n), np.arange(n) % maps, np.zeros(n, np.float32)
     flux = rng.uniform(0.5, 1.5, n).astype(np.float32)
-    none = PhotonBalance(0, 0, 0, 0, 0, 0)
+    none = EnergyBudget(0, 0, 0, 0, 0, 0)
     landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map, none, per_pixel=1.0)
     radius = GatheringRadius(0.05, (0.02, 0.07), np.array([-1.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.05]))
     built = photon_maps.PhotonMaps(landed, maps, radius, irradiance=1e-9)
@@ -514,14 +514,15 @@ def test_more_photons_make_less_noise() -> None:
 
 
 def test_every_seed_sends_photons_through_other_pixels_with_the_chance_of_each() -> None:
-    """Systematic sampling: a photon of a map in every stratum, so a pixel's chance per map is its share, at most 1."""
+    """Systematic sampling: a photon of a map in every stratum, so a pixel's chance per map is its fraction, at most
+    1."""
     select_variant()
-    share = np.random.default_rng(1).choice([1.0, 0.02], 400)
+    fraction = np.random.default_rng(1).choice([1.0, 0.02], 400)
     per_map, maps, seeds = 60, 3, range(2000)
-    number, cumulative = np.arange(per_map * maps), np.cumsum(share)
+    number, cumulative = np.arange(per_map * maps), np.cumsum(fraction)
     shifts = np.array([shift_of(seed) for seed in seeds])
     chosen = np.stack([stratified_choice(cumulative, number, per_map, shift) for shift in shifts])
-    expected = per_map * share / share.sum()
+    expected = per_map * fraction / fraction.sum()
     per_seed = [np.bincount(one, minlength=400) for one in chosen.reshape(-1, per_map)]
     found = np.mean(per_seed, axis=0)
     tolerance = 5 * np.sqrt(expected * (1 - expected) / len(seeds))  # as if maps were no help
@@ -565,7 +566,7 @@ def test_caustics_leave_all_other_light_as_it_was() -> None:
     scene = rangesim.load_scene(SCENES / "tabletop.xml")
     rig = scene.rig(width=64, height=48)
     on, off = (transport(scene, rig, all_sensors(), spp=8, photons=n, glint=False) for n in (50_000, 0))
-    for name in ("direct", "multipath", "via_delta", "ambient", "glint"):
+    for name in ("direct", "multipath", "specular", "ambient", "glint"):
         np.testing.assert_array_equal(getattr(on.energy, name), getattr(off.energy, name))
     assert on.energy.caustic.any()
     assert not off.energy.caustic.any()
@@ -619,7 +620,7 @@ def test_every_response_sees_the_caustics() -> None:
     scene = rangesim.load_scene(SCENES / "tabletop.xml")
     rig = scene.rig(width=64, height=48)
     light = StructuredLight(axes=("columns",), code="gray")
-    images, bins = Images(np.ones((1, 800, 1280), np.float32)), LengthBins(0.0, 0.5, 60)
+    images, bins = Images(np.ones((1, 800, 1280), np.float32)), TransientHistogram(0.0, 0.5, 60)
     signals = transport(scene, rig, [light, images, bins], spp=8)
     white = signals.energy.projector
     assert (signals.energy.caustic > 0.5 * white).any()

@@ -15,7 +15,7 @@ from rangesim.cli import main
 from rangesim.experiment import Experiment, cost, pipeline
 from rangesim.experiment.cost import Cost, available_memory_bytes, estimate_cost
 from rangesim.experiment.instrument import instrument
-from rangesim.motion import Motion, SteadyTrack, Timing
+from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.sensors import DirectToF
 
 MATTE = str(ROOT / "scenes" / "matte.xml")
@@ -35,7 +35,7 @@ def test_light_paths_are_pixels_times_samples_times_passes() -> None:
 
 
 def test_each_frame_of_a_scene_that_moves_is_a_pass() -> None:
-    moves = Motion({"floor": SteadyTrack(velocity_m_s=(0.1, 0.0, 0.0))})
+    moves = Motion({"floor": ConstantTwist(velocity_m_s=(0.1, 0.0, 0.0))})
     one = replace(instrument("gray"), timing=Timing(frame_period_s=0.01))
     found = of(Experiment(MATTE, width=64, height=48, spp=4, instruments=(one,), motion=moves))
     assert found.passes == one.sensor.n_frames + 1  # and the middle of the acquisition

@@ -23,7 +23,7 @@ from rangesim.decoding.phase_shift import tap_phase
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
-from rangesim.response import SPEED_OF_LIGHT, LengthBins, LightPath, NumpyMath
+from rangesim.response import SPEED_OF_LIGHT, LightPath, NumpyMath, TransientHistogram
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder, IdealToF
 from rangesim.signals import Signals
@@ -90,10 +90,10 @@ def test_phases_that_agree_on_nothing_are_wrapped() -> None:
     other = [[100 + 40 * np.cos(1.0 - k * np.pi / 2) for _ in turns] for k in range(4)]
     frames = np.array([*taps, *other], dtype=np.float32)[:, None, :]
     status = decode(Capture(frames, sensor)).status
-    assert set(np.unique(status)) <= {Status.OK, Status.WRAPPED}
+    assert set(np.unique(status)) <= {Status.OK, Status.UNWRAPPING_FAILED}
     three = AmcwToF((20e6, 80e6, 100e6))
     frames = np.concatenate([frames[4:], np.roll(frames[:4], 7, axis=2), frames[:4]])
-    assert (decode(Capture(frames, three)).status == Status.WRAPPED).mean() > 0.3
+    assert (decode(Capture(frames, three)).status == Status.UNWRAPPING_FAILED).mean() > 0.3
 
 
 def test_square_waves_wiggle_unless_corrected() -> None:
@@ -191,7 +191,7 @@ def test_coates_undoes_pile_up() -> None:
     detector = SpadDetector(pile_up=True, bits=16, ambient_transmission=1.0, quantum_efficiency=0.6)
     exposure = 2e-4
     capture = expose(signals, sensor, detector, exposure_s=exposure)
-    radiance = signals.frames(sensor, detector.ambient_share(sensor.gate))
+    radiance = signals.frames(sensor, detector.ambient_fraction(sensor.gate))
     mean = detector.mean_electrons(radiance, sensor.gate, rig, exposure)
     pulses = detector.pulses(sensor.gate, exposure)
     assert capture.frames.sum(axis=0).max() <= pulses
@@ -272,7 +272,7 @@ def test_lengths_are_binned_modulo_the_period(
     length_m: float, bins: int, width_m: float, start_m: float, gap_m: float
 ) -> None:
     """Every length has a bin where the bins fill the period; exactly on an edge, that on either side."""
-    response = LengthBins(start_m, width_m, bins, bins * width_m + gap_m)
+    response = TransientHistogram(start_m, width_m, bins, bins * width_m + gap_m)
     path = LightPath(*(np.array([x]) for x in (0.0, 0.0, length_m)), np.array([True]))
     found = response.bin(path, NumpyMath())[0]
     places = [(length_m - start_m + d) % (bins * width_m + gap_m) for d in (-1e-6, 1e-6)]
@@ -305,9 +305,9 @@ def test_the_ghost_piles_up_before_what_it_comes_before() -> None:
 @given(st.floats(0, 400), st.integers(2, 300), st.floats(1e-3, 0.5), st.floats(0, 3))
 def test_shared_bins_keep_the_mean_length(length_m: float, bins: int, width_m: float, start_m: float) -> None:
     """Two bins side by side, of weights that add up to one; their centres' mean is the length modulo the period."""
-    response = LengthBins(start_m, width_m, bins, bins * width_m, is_shared=True)
+    response = TransientHistogram(start_m, width_m, bins, bins * width_m, is_shared=True)
     path = LightPath(*(np.array([x]) for x in (0.0, 0.0, length_m)), np.array([True]))
-    (lower, a), (upper, b) = [(int(i[0]), float(w[0])) for i, w in response.shares(path, NumpyMath())]
+    (lower, a), (upper, b) = [(int(i[0]), float(w[0])) for i, w in response.bin_weights(path, NumpyMath())]
     assert a + b == pytest.approx(1)
     assert min(a, b) >= 0
     assert upper == (lower + 1) % bins

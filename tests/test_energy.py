@@ -204,8 +204,8 @@ def test_thin_glass_keeps_both_faces(thickness_m: float) -> None:
     response = FirstReturn()
     scenes = (scene_of(wall=wall(1.0, matte(0.5))), scene_of(wall=wall(1.0, matte(0.5)), foil=foil(thickness_m)))
     plain, covered = (transport(s, rig_of(CAMERA, PROJECTOR), [response], spp=32, seed=1) for s in scenes)
-    share = covered.energy.caustic.sum() / plain.energy.direct.sum()
-    assert share == pytest.approx(0.85, abs=0.01)  # 0.923 for each way
+    fraction = covered.energy.caustic.sum() / plain.energy.direct.sum()
+    assert fraction == pytest.approx(0.85, abs=0.01)  # 0.923 for each way
     lit = (plain.channels[response][0] > 0) & (covered.channels[response][0] > 0)
     lengths = (c.channels[response][1][lit] / c.channels[response][0][lit] for c in (plain, covered))
     before, after = lengths

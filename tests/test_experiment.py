@@ -23,7 +23,7 @@ from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_
 from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, Optics, instrument
 from rangesim.experiment.pipeline import group_by_rig, noise_seed, run
 from rangesim.experiment.result_files import load_result
-from rangesim.motion import Motion, SteadyTrack, Timing
+from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.sensors import DirectToF, IdealToF
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
@@ -125,12 +125,12 @@ def test_the_result_holds_every_stage() -> None:
         assert m.image.z.shape == (90, 120) == m.truth.z.shape
         assert (np.isfinite(m.image.z) == (m.image.status == Status.OK)).all()
         assert m.segmentation is not None
-        assert (m.segmentation.supervoxels >= 0).sum() == m.facts.points == m.image.valid.sum()
-        assert {"exposure", "decode", "noise", "causes", "points", "segmentation"} == set(m.facts.times_s)
+        assert (m.segmentation.supervoxels >= 0).sum() == m.metadata.points == m.image.valid.sum()
+        assert {"exposure", "decode", "noise", "causes", "points", "segmentation"} == set(m.metadata.times_s)
         assert m.rows[-1]["material"] == "all"
-    acquired = {m.name: m.facts.acquisition_s for m in result.measurements}
+    acquired = {m.name: m.metadata.acquisition_s for m in result.measurements}
     assert acquired["ideal"] is None
-    lines, histogram = result.measurements[0].facts, result.measurements[2].facts
+    lines, histogram = result.measurements[0].metadata, result.measurements[2].metadata
     assert lines.acquisition_s == pytest.approx(lines.frames * lines.exposure_s)
     assert histogram.acquisition_s == histogram.exposure_s  # all bins fill in one exposure
     assert {"mitsuba", "drjit", "numpy", "python", "rangesim"} <= set(result.info.versions)
@@ -154,7 +154,7 @@ def test_a_sensor_that_sees_nothing_is_reported_as_such(tmp_path: Path) -> None:
     blind = Instrument("blind", SENSORS["lines"], exposure_s=1e-9)
     run(replace(small_experiment(), instruments=(blind,), spp=1), tmp_path / "dark")
     (measurement,) = load_result(tmp_path / "dark").measurements
-    assert measurement.facts.points == 0
+    assert measurement.metadata.points == 0
     assert measurement.segmentation is None
     assert "measured nothing" in (tmp_path / "dark" / "report.html").read_text(encoding="utf-8")
 
@@ -162,7 +162,7 @@ def test_a_sensor_that_sees_nothing_is_reported_as_such(tmp_path: Path) -> None:
 def test_progress_rises_to_the_end(tmp_path: Path) -> None:
     seen: list[float] = []
     one = replace(small_experiment(), instruments=(Instrument("ideal", IdealToF()),), spp=1)
-    run(one, tmp_path / "one", lambda stage, share: seen.append(share))
+    run(one, tmp_path / "one", lambda stage, fraction: seen.append(fraction))
     assert seen == sorted(seen)
     assert 0.9 < seen[-1] <= 1
 
@@ -177,7 +177,7 @@ def test_a_scene_from_a_dictionary_runs_too(tmp_path: Path) -> None:
     experiment = Experiment("cornell_box", width=64, height=64, spp=4, instruments=(instrument("ideal-tof"),))
     run(experiment, tmp_path / "box", scene=scene)
     (measurement,) = load_result(tmp_path / "box").measurements
-    assert measurement.facts.points > 0.9 * 64 * 64
+    assert measurement.metadata.points > 0.9 * 64 * 64
     assert measurement.rows[-1]["median_abs_m"] < 0.01
 
 
@@ -226,7 +226,7 @@ def test_the_experiment_of_the_docs_is_one() -> None:
 
 
 def test_exposures_end_before_the_next_frame_of_what_moves() -> None:
-    moves = Motion({"ball": SteadyTrack((0.1, 0.0, 0.0))})
+    moves = Motion({"ball": ConstantTwist((0.1, 0.0, 0.0))})
     one = instrument("gray", exposure_s=0.02, timing=Timing(frame_period_s=0.01))
     assert Experiment("x.xml", instruments=(one,)).instruments == (one,)  # at rest they follow each other
     with pytest.raises(ValueError, match=r"exposure_s of gray within its frame_period_s of 0\.01 s, got 0\.02 s"):

@@ -10,7 +10,7 @@ import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import BRIGHT_PERCENTILE
-from rangesim.capture.exposure import TARGET_SHARE, expose
+from rangesim.capture.exposure import TARGET_FRACTION, expose
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT
@@ -78,7 +78,7 @@ def test_auto_exposure_puts_the_bright_pixels_at_its_target() -> None:
     for ambient in (0.0, 5.0):
         capture = expose(plane_signals(rig, SENSOR, ambient=ambient), SENSOR, detector)
         brightest = (capture.frames.max(axis=0) - detector.offset_dn) / (detector.max_dn - detector.offset_dn)
-        assert abs(np.percentile(brightest, BRIGHT_PERCENTILE) - TARGET_SHARE) < 0.03
+        assert abs(np.percentile(brightest, BRIGHT_PERCENTILE) - TARGET_FRACTION) < 0.03
         assert not capture.saturated(capture.frames).any()
     limited = dataclasses.replace(detector, min_exposure_s=0.05)
     assert expose(plane_signals(rig, SENSOR), SENSOR, limited).exposure_s == 0.05

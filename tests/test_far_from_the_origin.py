@@ -27,7 +27,7 @@ from rangesim import (
 )
 from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError, RangesimWarning
-from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
+from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
 from rangesim.response import FirstReturn
 from rangesim.scene.origin import NEAR_M
 
@@ -153,7 +153,7 @@ def test_a_room_that_is_moved_reads_the_same(by: tuple[float, ...], tmp_path: Pa
 @pytest.mark.parametrize("by", [ROOM, UTM])
 def test_caustics_glint_and_what_is_seen_through_glass_are_the_same(by: tuple[float, ...], tmp_path: Path) -> None:
     here, there = (measured(load_scene(glass(at)), photons=50_000) for at in ((0.0, 0.0, 0.0), by))
-    for name in ("caustic", "via_delta", "glint", "multipath"):
+    for name in ("caustic", "specular", "glint", "multipath"):
         expected = getattr(here.energy, name)
         assert expected.any()
         np.testing.assert_allclose(getattr(there.energy, name), expected, atol=1e-4 * expected.mean(), rtol=1e-4)
@@ -232,10 +232,10 @@ def test_what_moves_moves_in_the_world(tmp_path: Path) -> None:
         centre = tuple(np.add(by, (0.0, 2.0, 0.0)))
         motion = Motion(
             {
-                "ball": SteadyTrack((0.5, 0.0, 0.0), (0.0, 0.0, 1.0), centre),
-                "mesh": SteadyTrack((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), centre),
+                "ball": ConstantTwist((0.5, 0.0, 0.0), (0.0, 0.0, 1.0), centre),
+                "mesh": ConstantTwist((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), centre),
             },
-            SteadyTrack((0.0, 0.2, 0.0), (0.0, 0.1, 0.0), by),
+            ConstantTwist((0.0, 0.2, 0.0), (0.0, 0.1, 0.0), by),
         )
         rig = scene.rig(width=64, height=48)
         signals = transport_moving(scene, rig, {sensor: Timing(0.1, single_tap=True)}, motion, spp=4)[sensor]

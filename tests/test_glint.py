@@ -174,7 +174,7 @@ def test_what_stands_before_the_lens_hides_it() -> None:
 def test_glint_comes_or_goes_and_nothing_else_changes() -> None:
     scene, rig = scene_of(mirror=wall(1.0, MIRROR, 0.2), wall=wall(2.0, matte())), mirror_rig()
     on, off = (transport(scene, rig, SENSORS, spp=4, glint=glint) for glint in (True, False))
-    for name in ("direct", "multipath", "via_delta", "caustic", "ambient"):
+    for name in ("direct", "multipath", "specular", "caustic", "ambient"):
         np.testing.assert_array_equal(getattr(on.energy, name), getattr(off.energy, name))
     dark = on.energy.glint == 0
     for response in SENSORS:

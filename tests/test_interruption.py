@@ -207,8 +207,8 @@ def test_progress_grows_to_one_and_is_told_at_most_ten_times_a_second(
     shares: list[float] = []
     times: list[float] = []
 
-    def progress(share: float) -> None:
-        shares.append(share)
+    def progress(fraction: float) -> None:
+        shares.append(fraction)
         times.append(time.monotonic())
 
     transport(tabletop, tabletop.rig(width=160, height=120), [], spp=128, progress=progress)
@@ -219,8 +219,8 @@ def test_progress_grows_to_one_and_is_told_at_most_ten_times_a_second(
 
 
 def test_what_progress_raises_ends_the_pass(tabletop: Scene) -> None:
-    def cancel(share: float) -> None:
-        raise StopIteration(share)
+    def cancel(fraction: float) -> None:
+        raise StopIteration(fraction)
 
     with pytest.raises(StopIteration, match=r"^0\.0$"):  # photons come first
         transport(tabletop, tabletop.rig(width=32, height=24), [], spp=1_000_000, progress=cancel)

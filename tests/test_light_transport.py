@@ -13,7 +13,7 @@ from delta_scenes import GLASS, MIRROR, matte, rig_of, scene_of, wall
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, StructuredLight, look_at, transport
 from rangesim.environment.backend import select_variant
-from rangesim.response import FirstReturn, Images, LengthBins
+from rangesim.response import FirstReturn, Images, TransientHistogram
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SIZE = {"width": 64, "height": 48}
@@ -55,7 +55,7 @@ def test_a_fronto_parallel_plane_has_the_radiance_of_lambert_s_law() -> None:
     expected = 0.5 / np.pi * rig.projector_irradiance
     np.testing.assert_allclose(signals.energy.direct, expected, rtol=2e-4)
     assert not signals.energy.multipath.any()
-    assert not signals.energy.via_delta.any()
+    assert not signals.energy.specular.any()
 
 
 def test_the_projector_s_power_is_what_reaches_a_plane() -> None:
@@ -113,7 +113,7 @@ def test_off_a_mirror_the_path_length_is_that_of_the_mirror_image() -> None:
     centre = (slice(23, 25), slice(31, 33))
     assert signals.truth.material_names[signals.truth.material[24, 32]] == "mirror"
     assert signals.energy.direct[centre].max() == 0
-    assert signals.energy.via_delta[centre].min() > 0
+    assert signals.energy.specular[centre].min() > 0
     # 1 m to the mirror, 2 m on to one of the walls at x = -2, 2 (alike), and back to the lamp at (0, 0.6, 0)
     expected = 1.0 + 2.0 + np.hypot(2.0, 0.4)
     np.testing.assert_allclose((moment[centre] / radiance[centre]).mean(), expected, atol=2e-3)
@@ -177,7 +177,7 @@ def test_patterns_agree_with_a_projector_that_shows_them() -> None:
 
 
 def test_bins_add_up_to_the_steady_image(corner: rangesim.Scene) -> None:
-    bins = LengthBins(0.0, 0.1, 200)
+    bins = TransientHistogram(0.0, 0.1, 200)
     signals = transport(corner, corner.rig(**SIZE), [bins], spp=32)
     np.testing.assert_allclose(signals.channels[bins].sum(axis=0), signals.energy.projector, rtol=1e-5)
 
@@ -273,7 +273,7 @@ def test_a_mirror_beside_the_view_is_multipath_not_via_delta() -> None:
     )
     energy = transport(scene, scene.rig(), [], spp=64).energy
     assert energy.multipath.mean() > 0
-    assert not energy.via_delta.any()
+    assert not energy.specular.any()
 
 
 def test_a_cut_out_hole_is_seen_through() -> None:
@@ -301,7 +301,7 @@ def test_a_cut_out_hole_is_seen_through() -> None:
     lit = signals.energy.direct > 0
     assert lit.mean() > 0.8
     np.testing.assert_allclose(image.z[lit], 2.0, atol=2e-3)
-    assert not signals.energy.via_delta.any()
+    assert not signals.energy.specular.any()
 
 
 NESTED: dict[str, tuple[dict[str, Any], str]] = {
@@ -335,7 +335,7 @@ def test_the_holes_of_a_mask_are_as_if_nothing_were_there_whatever_it_is_cut_fro
     np.testing.assert_array_equal(classes, np.where(holes, "matte", material))
     np.testing.assert_array_equal(truth.projector_visible[holes], free.truth.projector_visible[holes])
     assert free.energy.direct[holes].all()
-    assert not through.energy.via_delta[holes].any()
+    assert not through.energy.specular[holes].any()
     np.testing.assert_allclose(through.energy.direct[holes], free.energy.direct[holes], rtol=1e-5)
     np.testing.assert_allclose(through.channels[response][:, holes], free.channels[response][:, holes], rtol=1e-5)
 
@@ -370,7 +370,7 @@ def test_the_back_of_a_thin_sheet_is_not_lit() -> None:
 
 
 def test_bins_of_a_periodic_laser_are_those_of_a_single_shot_folded(corner: rangesim.Scene) -> None:
-    once, again = LengthBins(0.0, 0.1, 400), LengthBins(0.0, 0.1, 16, 1.6)
+    once, again = TransientHistogram(0.0, 0.1, 400), TransientHistogram(0.0, 0.1, 16, 1.6)
     signals = transport(corner, corner.rig(**SIZE), [once, again], spp=16)
     folded = signals.channels[once].reshape(25, 16, 48, 64).sum(axis=0)
     assert signals.channels[once][16:].any()
@@ -380,7 +380,7 @@ def test_bins_of_a_periodic_laser_are_those_of_a_single_shot_folded(corner: rang
 
 def test_shared_bins_keep_the_mean_length_of_light() -> None:
     scene = rangesim.load_scene(SCENES / "plane.xml")
-    bins, first = LengthBins(0.0, 0.2, 20, is_shared=True), FirstReturn()
+    bins, first = TransientHistogram(0.0, 0.2, 20, is_shared=True), FirstReturn()
     signals = transport(scene, scene.rig(**SIZE), [bins, first], spp=16, max_depth=2)
     radiance, moment = signals.channels[first]
     centres = (np.arange(20) + 0.5) * 0.2

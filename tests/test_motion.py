@@ -21,7 +21,7 @@ from rangesim.decoding.phase_shift import phase_of, tap_phase
 from rangesim.experiment import experiment_from_dict, experiment_to_dict
 from rangesim.experiment.pipeline import run
 from rangesim.experiment.result_files import load_result
-from rangesim.motion import Motion, MovingSignals, PoseTrack, SteadyTrack, Timing, transport_moving
+from rangesim.motion import ConstantTwist, Motion, MovingSignals, PoseTrack, Timing, transport_moving
 from rangesim.motion.passes import plan
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import translation
@@ -76,7 +76,7 @@ def all_bytes(signals: Signals) -> bytes:
 
 
 def test_a_pose_track_is_linear_in_translation_and_in_angle_and_constant_beyond_its_ends() -> None:
-    quarter = SteadyTrack((1.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2))
+    quarter = ConstantTwist((1.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2))
     track = PoseTrack(np.array([1.0, 2.0]), np.stack([np.eye(4), quarter.at(1.0)]))
     np.testing.assert_allclose(track.at(1.5), quarter.at(0.5), atol=1e-12)
     np.testing.assert_array_equal(track.at(-7.0), np.eye(4))
@@ -84,7 +84,7 @@ def test_a_pose_track_is_linear_in_translation_and_in_angle_and_constant_beyond_
 
 
 def test_a_steady_track_turns_about_its_centre_which_moves_on() -> None:
-    track = SteadyTrack((0.5, 0.0, 0.0), (0.0, 0.0, 2.0), (1.0, 2.0, 3.0))
+    track = ConstantTwist((0.5, 0.0, 0.0), (0.0, 0.0, 2.0), (1.0, 2.0, 3.0))
     np.testing.assert_allclose(track.at(0.3) @ [1, 2, 3, 1], [1.15, 2, 3, 1], atol=1e-12)
     np.testing.assert_allclose(track.at(0.1)[:2, 0], [np.cos(0.2), np.sin(0.2)], atol=1e-12)
 
@@ -122,10 +122,10 @@ def test_the_lines_of_a_scan_are_covered_once_each_at_its_time() -> None:
     instants = timing.instants(2.0, camera)
     assert [i.window.top for i in instants][1:] == [i.window.bottom for i in instants][:-1]
     assert (instants[0].window.top, instants[-1].window.bottom) == (0, 48)
-    for time_s, window, share in instants:
+    for time_s, window, fraction in instants:
         lines = np.arange(window.top, window.bottom)
         assert time_s == pytest.approx(np.mean(2.0 + 0.1 * lines))
-        assert share == 1
+        assert fraction == 1
     assert timing.reference_s(DirectToF(), camera) == pytest.approx(0.1 * 47 / 2)
 
 
@@ -133,8 +133,8 @@ def test_equal_places_share_a_pass_whatever_the_sensor(matte: Scene) -> None:
     rig = matte.rig(width=64, height=48)
     light, tof = StructuredLight(), AmcwToF((20e6, 50e6))
     timings: dict[Sensor, Timing] = {light: Timing(0.01), tof: Timing(0.01), DirectToF(): Timing(line_period_s=0.001)}
-    assert len(plan(rig, timings, Motion({"can": SteadyTrack()}))) == 1
-    ball = Motion({"large_ball": SteadyTrack((1.0, 0.0, 0.0))})
+    assert len(plan(rig, timings, Motion({"can": ConstantTwist()}))) == 1
+    ball = Motion({"large_ball": ConstantTwist((1.0, 0.0, 0.0))})
     bands = [p for p in plan(rig, timings, ball) if p.window.bottom - p.window.top < 48]
     times = {*Timing(0.01).exposure_times_s(light), *(t.reference_s(s, rig.camera) for s, t in timings.items())}
     assert len(bands) == 16
@@ -167,12 +167,12 @@ def test_without_motion_the_bytes_are_those_of_a_static_pass() -> None:
 def test_the_scene_is_as_it_was_afterwards_even_if_something_went_wrong(matte: Scene) -> None:
     rig = matte.rig(width=32, height=24)
     before = all_bytes(transport(matte, rig, [IdealToF()], spp=4))
-    everything = Motion({i.name: SteadyTrack((0.3, 0.2, 0.1), (0.5, 0.0, 1.0)) for i in matte.instances})
+    everything = Motion({i.name: ConstantTwist((0.3, 0.2, 0.1), (0.5, 0.0, 1.0)) for i in matte.instances})
     transport_moving(matte, rig, {AmcwToF((20e6,)): Timing(0.1, single_tap=True)}, everything, spp=4)
     assert all_bytes(transport(matte, rig, [IdealToF()], spp=4)) == before
 
-    def stop(share: float) -> None:
-        if share > 0.5:
+    def stop(fraction: float) -> None:
+        if fraction > 0.5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -182,7 +182,7 @@ def test_the_scene_is_as_it_was_afterwards_even_if_something_went_wrong(matte: S
 
 def test_a_static_scene_scanned_in_bands_is_the_same_within_its_noise(matte: Scene) -> None:
     rig, sensor = matte.rig(width=64, height=48), DirectToF(bins=64, bin_s=100e-12)
-    hardly = Motion({"wall": SteadyTrack((1e-12, 0.0, 0.0))})  # every band is a pass of its own
+    hardly = Motion({"wall": ConstantTwist((1e-12, 0.0, 0.0))})  # every band is a pass of its own
     for lines in ("rows", "columns"):
         timing = Timing(line_period_s=0.01, lines=lines, bands=5)  # type: ignore[arg-type]
         options: dict[str, Any] = {"spp": 16, "indirect": "raw"}  # a pixel at a border has fewer to share with
@@ -197,7 +197,7 @@ def test_moving_the_rig_is_moving_everything_else_the_other_way(matte: Scene) ->
     """Spheres, cubes (meshes), rectangles, a cylinder and a disk."""
     rig, sensor = matte.rig(width=64, height=48), AmcwToF((20e6,))
     centre, timing = (0.0, 0.1, 0.1), {sensor: Timing(0.02, single_tap=True)}
-    forth, back = (SteadyTrack(rotation_rad_s=(s * 0.3, 0.0, s * 1.0), centre_m=centre) for s in (1, -1))
+    forth, back = (ConstantTwist(rotation_rad_s=(s * 0.3, 0.0, s * 1.0), centre_m=centre) for s in (1, -1))
     (one,) = transport_moving(matte, rig, timing, Motion(rig=forth), spp=8).values()
     (other,) = transport_moving(matte, rig, timing, Motion({i.name: back for i in matte.instances}), spp=8).values()
     np.testing.assert_array_equal(one.truth.instance, other.truth.instance)
@@ -224,7 +224,7 @@ def test_the_normals_of_a_mesh_file_turn_with_it(tmp_path: Path) -> None:
     )
     scene = rangesim.load_scene(tmp_path / "ball.xml")
     rig, sensor = scene.rig(width=48, height=36), AmcwToF((20e6,))
-    half_turn = Motion({"ball": SteadyTrack(rotation_rad_s=(0.0, 0.0, np.pi))})  # in 1 s
+    half_turn = Motion({"ball": ConstantTwist(rotation_rad_s=(0.0, 0.0, np.pi))})  # in 1 s
     (moved,) = transport_moving(scene, rig, {sensor: Timing(start_s=1.0)}, half_turn, spp=4).values()
     static = transport(scene, rig, [sensor], spp=4).frames(sensor)
     difference = np.abs(moved.frames(sensor) - static)
@@ -238,7 +238,7 @@ def phase_error(phase: np.ndarray, drift: np.ndarray, loss: float, contrast: flo
     """Error of the phase of four frames at 0, 90, 180, 270 degrees, against the phase in the middle of the four.
 
     To first order in what changes from one frame to the next: the phase, by `drift` radians, and the light, by the
-    share -`loss`. With frames (1 + contrast cos(phi_j - theta_j)) B_j / 2, cosine = frame 0 - frame 2 and sine =
+    fraction -`loss`. With frames (1 + contrast cos(phi_j - theta_j)) B_j / 2, cosine = frame 0 - frame 2 and sine =
     frame 1 - frame 3 are taken half a frame before and after the middle, which gives three terms: the phases differ,
     the offset does not cancel, and sine is fainter than cosine.
     """
@@ -254,7 +254,7 @@ def wrapped(radians: np.ndarray) -> np.ndarray:
 def test_four_taps_one_after_another_of_a_plane_that_comes_closer(plane: Scene, modulation_hz: float) -> None:
     rig = straight_rig(plane, 0.0, Intrinsics.from_fov(1280, 800, 70))
     sensor, speed, period = AmcwToF((modulation_hz,)), -0.2, 0.01
-    motion = Motion({"wall": SteadyTrack((0.0, speed, 0.0))})
+    motion = Motion({"wall": ConstantTwist((0.0, speed, 0.0))})
 
     def frames(timing: Timing) -> tuple[Signals, np.ndarray]:
         (signals,) = transport_moving(plane, rig, {sensor: timing}, motion, spp=16, max_depth=2).values()
@@ -270,7 +270,7 @@ def test_four_taps_one_after_another_of_a_plane_that_comes_closer(plane: Scene, 
     phase = 2 * np.pi * turns_per_m * signals.truth.range_m
     cosine = signals.truth.z / signals.truth.range_m
     drift = 2 * np.pi * turns_per_m * speed * period / cosine
-    measured = wrapped(2 * np.pi * (tap_phase(one_by_one).turns - tap_phase(at_once).turns))
+    measured = wrapped(2 * np.pi * (tap_phase(one_by_one).normalised - tap_phase(at_once).normalised))
     expected = phase_error(phase, drift, 2 * speed * period / signals.truth.z, sensor.contrast)
     assert np.abs(expected).max() > 1e-3
     assert np.abs(measured - expected).max() < 1e-4
@@ -278,7 +278,7 @@ def test_four_taps_one_after_another_of_a_plane_that_comes_closer(plane: Scene, 
 
 def test_four_taps_at_once_have_no_error(plane: Scene) -> None:
     rig = straight_rig(plane, 0.0, Intrinsics.from_fov(1280, 800, 70))
-    sensor, motion = AmcwToF((50e6,)), Motion({"wall": SteadyTrack((0.0, -5.0, 0.0))})
+    sensor, motion = AmcwToF((50e6,)), Motion({"wall": ConstantTwist((0.0, -5.0, 0.0))})
     timing = Timing(start_s=0.05)
     (signals,) = transport_moving(plane, rig, {sensor: timing}, motion, spp=64, max_depth=2).values()
     image = rangesim.decode(rangesim.expose(signals, sensor))
@@ -293,7 +293,7 @@ def test_fringes_one_after_another_of_a_plane_that_recedes(plane: Scene) -> None
     projector = Intrinsics.from_fov(*size, 70)
     rig = straight_rig(plane, baseline, projector)
     sensor = StructuredLight(*size, period_px=32)
-    motion = Motion({"wall": SteadyTrack((0.0, speed, 0.0))})
+    motion = Motion({"wall": ConstantTwist((0.0, speed, 0.0))})
     steps = [i for i, name in enumerate(sensor.frame_names()) if "phase" in name]
 
     def fringes(timing: Timing) -> np.ndarray:
@@ -307,7 +307,7 @@ def test_fringes_one_after_another_of_a_plane_that_recedes(plane: Scene) -> None
     phase = 2 * np.pi / sensor.period_px * u
     drift = 2 * np.pi / sensor.period_px * projector.fx * baseline / z**2 * speed * period
     lit = (u > 1) & (u < size[0] - 1)
-    measured = wrapped(2 * np.pi * (phase_of(one_by_one).turns - phase_of(at_once).turns))[lit]
+    measured = wrapped(2 * np.pi * (phase_of(one_by_one).normalised - phase_of(at_once).normalised))[lit]
     expected = phase_error(phase, np.full_like(phase, drift), 2 * speed * period / z, 1.0)[lit]
     assert np.abs(expected).max() > 4e-3
     assert np.corrcoef(measured, expected)[0, 1] > 0.99
@@ -317,7 +317,7 @@ def test_fringes_one_after_another_of_a_plane_that_recedes(plane: Scene) -> None
 def edge(card: Scene, timing: Timing) -> np.ndarray:
     """(h,) column of the right edge of the card in each row of the range image."""
     rig, sensor = card.rig(width=64, height=48, baseline_m=0.001), IdealToF()
-    motion = Motion({"card": SteadyTrack((1.0, 0.0, 0.0))})
+    motion = Motion({"card": ConstantTwist((1.0, 0.0, 0.0))})
     (signals,) = transport_moving(card, rig, {sensor: timing}, motion, spp=16, max_depth=2).values()
     near = rangesim.decode(rangesim.expose(signals, sensor)).z < 1.0
     columns = np.arange(64) + 1.0
@@ -338,10 +338,10 @@ def test_a_scan_shears_what_moves_sideways_and_a_flash_does_not(card: Scene) -> 
 
 def test_a_stack_of_patterns_smears_and_a_burst_of_taps_smears_less(matte: Scene) -> None:
     rig = matte.rig(width=96, height=72)
-    motion = Motion({"large_ball": SteadyTrack((0.5, 0.0, 0.0))})
+    motion = Motion({"large_ball": ConstantTwist((0.5, 0.0, 0.0))})
 
     def failed(sensor: Sensor, timing: Timing) -> float:
-        """Share of the ball's pixels that are lost or off by more than 1 cm."""
+        """LegendEntry of the ball's pixels that are lost or off by more than 1 cm."""
         (signals,) = transport_moving(matte, rig, {sensor: timing}, motion, spp=8, max_depth=2).values()
         error = np.abs(rangesim.decode(rangesim.expose(signals, sensor)).z - signals.truth.z)
         return float(np.mean(~(error[signals.truth.instance == 2] < 0.01)))
@@ -355,7 +355,7 @@ def test_a_stack_of_patterns_smears_and_a_burst_of_taps_smears_less(matte: Scene
 
 def test_an_exposure_in_two_halves_is_their_mean(card: Scene) -> None:
     rig, sensor = card.rig(width=32, height=24), AmcwToF((20e6,))
-    motion = Motion({"card": SteadyTrack((2.0, 0.0, 0.0))})
+    motion = Motion({"card": ConstantTwist((2.0, 0.0, 0.0))})
 
     def frames(timing: Timing) -> np.ndarray:
         return transport_moving(card, rig, {sensor: timing}, motion, spp=4)[sensor].frames(sensor)
@@ -368,7 +368,7 @@ def test_an_exposure_in_two_halves_is_their_mean(card: Scene) -> None:
 
 def test_motion_is_told_of_what_moves_and_of_what_it_passes(card: Scene) -> None:
     rig, sensor = card.rig(width=64, height=48), AmcwToF((20e6,))
-    motion = Motion({"card": SteadyTrack((1.0, 0.0, 0.0))})
+    motion = Motion({"card": ConstantTwist((1.0, 0.0, 0.0))})
     (signals,) = transport_moving(card, rig, {sensor: Timing(0.04, single_tap=True)}, motion, spp=1).values()
     assert isinstance(signals, MovingSignals)
     assert signals.motion_m is not None
@@ -384,7 +384,7 @@ def test_motion_is_told_of_what_moves_and_of_what_it_passes(card: Scene) -> None
 def test_ambient_light_is_filtered_frame_by_frame() -> None:
     scene = rangesim.load_scene(SCENES / "cornell.xml")
     rig, sensor = scene.rig(width=32, height=24), AmcwToF((20e6,))
-    hardly = Motion({"tall_box": SteadyTrack((1e-9, 0.0, 0.0))})  # at its place, but in four passes
+    hardly = Motion({"tall_box": ConstantTwist((1e-9, 0.0, 0.0))})  # at its place, but in four passes
     timing = {sensor: Timing(0.01, single_tap=True)}
     (signals,) = transport_moving(scene, rig, timing, hardly, spp=16).values()
     static = transport(scene, rig, [sensor], spp=16)
@@ -402,10 +402,10 @@ def test_ambient_light_is_filtered_frame_by_frame() -> None:
 @pytest.mark.parametrize(
     ("timings", "motion", "message"),
     [
-        ({IdealToF(): Timing()}, Motion({"large_bal": SteadyTrack()}), "did you mean 'large_ball'"),
+        ({IdealToF(): Timing()}, Motion({"large_bal": ConstantTwist()}), "did you mean 'large_ball'"),
         ({}, Motion(), "expected sensors with their timings"),
         ({IdealToF(): 0.1}, Motion(), "expected a Timing for each sensor"),
-        ({IdealToF(): Timing()}, {"can": SteadyTrack()}, "expected a Motion"),
+        ({IdealToF(): Timing()}, {"can": ConstantTwist()}, "expected a Motion"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(matte: Scene, timings: Mapping, motion: Motion, message: str) -> None:
@@ -414,7 +414,7 @@ def test_what_cannot_be_meant_is_refused(matte: Scene, timings: Mapping, motion:
 
 
 def test_a_motion_without_a_track_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected a PoseTrack or a SteadyTrack for 'can'"):
+    with pytest.raises(ValueError, match="expected a PoseTrack or a ConstantTwist for 'can'"):
         Motion({"can": np.eye(4)})  # type: ignore[dict-item]
 
 
@@ -425,7 +425,7 @@ def test_a_scene_that_cannot_be_loaded_again_is_refused(matte: Scene) -> None:
             once,
             matte.rig(width=8, height=6),
             {IdealToF(): Timing(start_s=1.0)},
-            Motion({"can": SteadyTrack((1, 0, 0))}),
+            Motion({"can": ConstantTwist((1, 0, 0))}),
         )
 
 
@@ -448,7 +448,7 @@ sensor = "ideal-tof"
 timing.line_period_s = 0.002
 
 [motion.objects.large_ball]
-type = "steady"
+type = "constant-twist"
 velocity_m_s = [0.5, 0, 0]
 
 [motion.rig]
@@ -461,7 +461,7 @@ poses = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]
 def test_an_experiment_reads_back_equal_with_its_motion() -> None:
     experiment = experiment_from_dict(tomllib.loads(EXPERIMENT))
     assert experiment.motion is not None
-    assert experiment.motion.objects["large_ball"] == SteadyTrack((0.5, 0.0, 0.0))
+    assert experiment.motion.objects["large_ball"] == ConstantTwist((0.5, 0.0, 0.0))
     assert [i.timing for i in experiment.instruments] == [Timing(0.01), Timing(line_period_s=0.002)]
     assert experiment_from_dict(json.loads(json.dumps(experiment_to_dict(experiment)))) == experiment
 
@@ -471,7 +471,7 @@ def test_an_experiment_reads_back_equal_with_its_motion() -> None:
     [
         ({"object": {}}, "did you mean 'objects'"),
         ({"objects": {"can": {"velocity_m_s": [1, 0, 0]}}}, r"motion\.objects\.can: expected 'type' to be one of"),
-        ({"rig": {"type": "steady", "velocity": [1, 0, 0]}}, r"motion\.rig: unknown key 'velocity'"),
+        ({"rig": {"type": "constant-twist", "velocity": [1, 0, 0]}}, r"motion\.rig: unknown key 'velocity'"),
         ({"rig": {"type": "poses", "times_s": [0], "poses": [[[2, 0], [0, 1]]]}}, "as many poses"),
         ([1.0, 0.0], "expected a table"),
     ],

@@ -223,12 +223,12 @@ def test_paths_through_a_lens_meet_in_focus_and_are_equally_long_there() -> None
     rng = np.random.default_rng(0)
     pixel, lens = mi.Point2f(rng.uniform([0, 0], [320, 240], (999, 2)).T), mi.Point2f(rng.random((2, 999)))
     ray = device.sample_ray(pixel, lens)
-    origin, direction, lead = (np.array(x, dtype=float).T for x in (ray.origin, ray.direction, ray.lead))
+    origin, direction, path_offset = (np.array(x, dtype=float).T for x in (ray.origin, ray.direction, ray.path_offset))
     t = (0.8 - origin[:, 2]) / direction[:, 2]
     focus = origin + t[:, None] * direction
     chief = np.array(device.ray_direction(pixel), dtype=float).T
     np.testing.assert_allclose(focus, chief / chief[:, 2:] * 0.8, atol=1e-6)
-    np.testing.assert_allclose(lead + t, np.linalg.norm(focus, axis=-1), atol=1e-6)
+    np.testing.assert_allclose(path_offset + t, np.linalg.norm(focus, axis=-1), atol=1e-6)
     radius2 = np.sum(origin[:, :2] ** 2, axis=-1)
     assert radius2.max() <= 0.02**2 * (1 + 1e-5)
     assert radius2.mean() == pytest.approx(0.02**2 / 2, rel=0.05)  # uniform over the disc

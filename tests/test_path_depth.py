@@ -15,7 +15,7 @@ from rangesim import Intrinsics, Rig, Scene, load_scene, transport
 from rangesim.environment.backend import select_variant
 from rangesim.errors import TruncationWarning
 from rangesim.light_transport import loop, photon_flight, specular_chain
-from rangesim.light_transport.photons import PhotonBalance, trace_photons
+from rangesim.light_transport.photons import EnergyBudget, trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
 
 CAMERA = Intrinsics.from_fov(64, 48, 12)
@@ -125,7 +125,7 @@ def gem(folder: Path, bsdf: dict[str, Any]) -> dict[str, Any]:
     return {"type": "ply", "filename": str(folder / "gem.ply"), "face_normals": True, "bsdf": bsdf}
 
 
-def balance(scene: Scene) -> PhotonBalance:
+def balance(scene: Scene) -> EnergyBudget:
     rig = rig_of(CAMERA, PROJECTOR, projector_power_w=2.0)
     return trace_photons(TracedScene.of(scene.mitsuba, rig), 2.0, 100_000, 1, 1, 2 << 30).balance
 

@@ -144,21 +144,21 @@ def test_noise_falls_below_the_share_that_was_asked_for(matte: Scene) -> None:
     one = Instrument("amcw", AmcwToF())
     rig = one.rig(matte, **SMALL_IMAGE)
     ratios = []
-    for share in (0.5, 0.1):
-        adaptive = AdaptiveSampling((one,), max_spp=1024, share=share)
+    for fraction in (0.5, 0.1):
+        adaptive = AdaptiveSampling((one,), max_spp=1024, fraction=fraction)
         signals = transport(matte, rig, [one.sensor], spp=adaptive)
         capture = expose(signals, one.sensor, one.detector)
         noise = reading_noise(decode(capture), capture, signals)
         row = noise.by_material(signals.truth)[-1]
         ratios.append(row["sampling_sigma_m"] / row["detector_sigma_m"])
-        assert ratios[-1] < 1.25 * share  # few samples say it roughly
+        assert ratios[-1] < 1.25 * fraction  # few samples say it roughly
     assert ratios[1] < 0.5 * ratios[0]
 
 
 def test_rounds_have_the_same_bytes_whatever_the_memory_budget(matte: Scene) -> None:
     sensor = AmcwToF()
     rig = matte.rig(0.03, width=48, height=36)
-    adaptive = AdaptiveSampling((Instrument("one", sensor),), share=0.1)
+    adaptive = AdaptiveSampling((Instrument("one", sensor),), fraction=0.1)
     one, two = (transport(matte, rig, [sensor], spp=adaptive, memory_bytes=n) for n in (1 << 30, 1 << 20))
     assert [a.tobytes() for a in one.channels.values()] == [b.tobytes() for b in two.channels.values()]
     assert one.energy.multipath.tobytes() == two.energy.multipath.tobytes()
@@ -167,7 +167,7 @@ def test_rounds_have_the_same_bytes_whatever_the_memory_budget(matte: Scene) -> 
 @pytest.mark.parametrize("most", [1, 2, 3, 4, 15, 16, 17, 18, 19, 20, 63, 65, 66])
 def test_any_largest_number_of_samples_will_do_and_none_exceeds_it(most: int) -> None:
     scene, sensor = load_scene("glassware"), AmcwToF()
-    adaptive = AdaptiveSampling((Instrument("one", sensor),), most, share=1e-3)
+    adaptive = AdaptiveSampling((Instrument("one", sensor),), most, fraction=1e-3)
     signals = transport(scene, scene.rig(0.03, width=32, height=24), [sensor], spp=adaptive, photons=0, glint=False)
     assert signals.energy.projector.any()
     assert signals.knows_sampling_error == (most > 2)
@@ -176,7 +176,7 @@ def test_any_largest_number_of_samples_will_do_and_none_exceeds_it(most: int) ->
 def test_settings_of_adaptive_sampling_out_of_range_are_refused(matte: Scene) -> None:
     one = Instrument("one", AmcwToF())
     changes: list[dict[str, Any]] = [{"max_spp": n} for n in (0, -3, 2.5, "64", None)]
-    for change in [*changes, {"share": 0.0}, {"share": np.nan}, {"share": np.inf}]:
+    for change in [*changes, {"fraction": 0.0}, {"fraction": np.nan}, {"fraction": np.inf}]:
         with pytest.raises(ValueError, match=next(iter(change))):
             AdaptiveSampling((one,), **change)
     with pytest.raises(ValueError, match="for instrument 'one'"):
@@ -259,12 +259,12 @@ def test_nothing_is_said_where_sampling_is_small_or_pixels_are_few() -> None:
 
 
 def test_a_scan_of_something_that_moves_knows_its_sampling_error(matte: Scene) -> None:
-    from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
+    from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
 
     sensor, rig = AmcwToF(), matte.rig(0.03, width=48, height=36)
     options: dict[str, Any] = {"spp": 16, "indirect": "raw"}
     still = transport(matte, rig, [sensor], seed=1, **options)
-    hardly = Motion({"wall": SteadyTrack((1e-12, 0.0, 0.0))})
+    hardly = Motion({"wall": ConstantTwist((1e-12, 0.0, 0.0))})
     timing = Timing(frame_period_s=0.1, single_tap=True)
     moving = transport_moving(matte, rig, {sensor: timing}, hardly, seed=1, **options)[sensor]
     for errors in (1.0, -1.0):

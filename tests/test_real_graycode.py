@@ -103,13 +103,13 @@ def opencv_points(cv2: Any, rig: Rig, image: RangeImage, step: int) -> np.ndarra
 
 def test_wrong_code_step_shows_in_the_epipolar_error(real_data: Path, capture: Capture) -> None:
     path = real_data / "graycode_board" / "calibration_result.xml"
-    share = {}
+    fraction = {}
     for step in (1, CODE_STEP):
         rig = load_calibration(path, (1024, 768), code_step=step)
         small = Capture(capture.frames, SENSOR, rig)
-        share[step] = decode(small).valid.mean()
-    assert share[CODE_STEP] > 0.6
-    assert share[1] < 0.01
+        fraction[step] = decode(small).valid.mean()
+    assert fraction[CODE_STEP] > 0.6
+    assert fraction[1] < 0.01
 
 
 def plane_residual(points: np.ndarray) -> np.ndarray:

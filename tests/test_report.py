@@ -84,10 +84,10 @@ def test_seconds_have_units(value: float | None, text: str) -> None:
 
 def test_the_error_scale_is_odd_and_rises_to_its_limits() -> None:
     errors = np.array([-1, -palette.ERROR_LIMIT_M, -1e-3, 0, 1e-3, palette.ERROR_LIMIT_M, 1])
-    share = palette.error_share(errors)
-    np.testing.assert_allclose(share, 1 - share[::-1])
-    np.testing.assert_allclose(share[[0, 1, 3, 5, 6]], [0, 0, 0.5, 1, 1])
-    assert (np.diff(palette.error_share(np.linspace(-0.1, 0.1, 99))) > 0).all()
+    fraction = palette.error_fraction(errors)
+    np.testing.assert_allclose(fraction, 1 - fraction[::-1])
+    np.testing.assert_allclose(fraction[[0, 1, 3, 5, 6]], [0, 0, 0.5, 1, 1])
+    assert (np.diff(palette.error_fraction(np.linspace(-0.1, 0.1, 99))) > 0).all()
 
 
 def test_every_outcome_has_a_name_and_a_colour() -> None:
@@ -114,8 +114,8 @@ SIGHT = {
 @pytest.mark.parametrize("sight", SIGHT)
 def test_causes_are_told_apart_without_red_or_green_cones(sight: str) -> None:
     """CIE 1976 colour differences of all pairs of outcomes; 2.3 is just noticeable."""
-    share = palette.OUTCOME_COLORS / 255
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    fraction = palette.OUTCOME_COLORS / 255
+    linear = np.where(fraction <= 0.04045, fraction / 12.92, ((fraction + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ SIGHT[sight].T, 0, 1)
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     xyz = seen @ to_xyz.T / [0.9505, 1.0, 1.089]
@@ -179,8 +179,8 @@ def _measured(sensor: str, complete: float, median: float, outliers: float, acqu
     row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
     row |= {"failed": 0.05, "causes": {"multipath": 0.04, "low_signal": 0.01}}
     rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
-    facts = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
-    return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, facts=facts)
+    metadata = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
+    return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, metadata=metadata)
 
 
 @needs_browser

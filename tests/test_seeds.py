@@ -22,7 +22,7 @@ from rangesim.experiment.pipeline import noise_seed
 from rangesim.light_transport.glint import trace_glint
 from rangesim.light_transport.photons import trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
-from rangesim.motion import Motion, SteadyTrack, Timing, transport_moving
+from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
 
 SEEDS = tuple(
     dict.fromkeys(
@@ -78,7 +78,7 @@ def glint(scene: Scene, seed: int) -> list[np.ndarray]:
 
 def a_moving_scan(scene: Scene, seed: int) -> list[np.ndarray]:
     """Every band of a scan has a seed derived from the one given."""
-    sensor, motion = AmcwToF(), Motion({"ball": SteadyTrack((1.0, 0.0, 0.0))})
+    sensor, motion = AmcwToF(), Motion({"ball": ConstantTwist((1.0, 0.0, 0.0))})
     timing = Timing(line_period_s=1e-4, bands=2)
     rig = scene.rig(width=8, height=8)
     options: dict[str, Any] = {"spp": 2, "photons": 0, "glint": False}

@@ -67,8 +67,8 @@ def test_the_tails_are_poisson(mean: float) -> None:
     counts, law = np.empty(4 * DRAWS), stats.poisson(mean)
     draw_poisson(np.random.default_rng(3), mean, counts)
     low, high = law.ppf([1e-4, 1 - 1e-4])
-    for found, share in (((counts < low).sum(), law.cdf(low - 1)), ((counts > high).sum(), law.sf(high))):
-        assert abs(found - share * len(counts)) < 5 * np.sqrt(share * len(counts)) + 1
+    for found, fraction in (((counts < low).sum(), law.cdf(low - 1)), ((counts > high).sum(), law.sf(high))):
+        assert abs(found - fraction * len(counts)) < 5 * np.sqrt(fraction * len(counts)) + 1
 
 
 def test_the_expansion_of_the_quantile_is_within_its_bound() -> None:

@@ -137,7 +137,7 @@ def test_a_dense_medium_reflects_as_the_h_functions_say(albedo: float) -> None:
     irradiance, light, view, _ = geometry(rig, signals.truth)
     expected = irradiance * half_space(albedo, light, view)
     assert signals.energy.projector.mean() == pytest.approx(expected.mean(), rel=0.01)
-    assert not signals.energy.via_delta.any()
+    assert not signals.energy.specular.any()
     assert not signals.energy.caustic.any()
 
 

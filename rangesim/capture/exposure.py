@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
     from rangesim.signals import Signals
 
-TARGET_SHARE = 0.7
-"""Share of the saturation capacity where automatic exposure puts the bright pixels (`bright_level`)."""
+TARGET_FRACTION = 0.7
+"""Fraction of the saturation capacity where automatic exposure puts the bright pixels (`bright_level`)."""
 
 
 def expose(
@@ -61,7 +61,7 @@ def expose(
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or sensor.is_ideal:
         return noise_free_capture(signals, sensor, ambient)
-    radiance = _through_lens(signals.frames(sensor, detector.ambient_share(sensor.gate, ambient)), signals.rig)
+    radiance = _through_lens(signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient)), signals.rig)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor.gate, signals.rig, exposure_s, seed)
@@ -95,5 +95,5 @@ def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetecto
     level = bright_level(radiance.max(axis=0)) * detector.electrons_per_radiance(rig)
     if level == 0:
         return detector.max_exposure_s
-    wanted = TARGET_SHARE * detector.capacity_e / level
+    wanted = TARGET_FRACTION * detector.capacity_e / level
     return float(np.clip(wanted, detector.min_exposure_s, detector.max_exposure_s))

@@ -30,7 +30,7 @@ class Cause(IntEnum):
     GLINT = 9
     LOW_SIGNAL = 10
     AMBIENT = 11
-    WRAPPED = 12
+    RANGE_AMBIGUITY = 12
     RESOLUTION = 13
 
 
@@ -47,7 +47,7 @@ DEFINITIONS = {
     Cause.GLINT: "The detector saturated, or most of the light came straight from the lens of the projector.",
     Cause.LOW_SIGNAL: "Too little projector light for the detector's own noise.",
     Cause.AMBIENT: "Enough projector light, but ambient light fills the detector or swamps it with noise.",
-    Cause.WRAPPED: "The distance lies beyond the unambiguous range, or the wrong period was picked (time of flight).",
+    Cause.RANGE_AMBIGUITY: "The distance lies beyond the unambiguous range, or a wrong period was picked.",
     Cause.RESOLUTION: "Neither stray light nor noise: code, bins or baseline are too coarse for this depth.",
 }
 """What each cause means, in a sentence."""
@@ -65,7 +65,7 @@ TITLES = {
     Cause.GLINT: "glint or saturated",
     Cause.LOW_SIGNAL: "low signal",
     Cause.AMBIENT: "ambient-swamped",
-    Cause.WRAPPED: "wrapped",
+    Cause.RANGE_AMBIGUITY: "range ambiguity",
     Cause.RESOLUTION: "too coarse",
 }
 """Names for tables and legends."""
@@ -87,11 +87,11 @@ class CauseMap:
         """(h, w) bool: there is a surface, but no reading of it to the tolerance."""
         return np.asarray(self.cause != Cause.NONE)
 
-    def shares(self, truth: GroundTruth) -> list[dict[str, Any]]:
-        """Per material class of the first surface, "all" last: what failed, and why, as shares of its pixels.
+    def fractions(self, truth: GroundTruth) -> list[dict[str, Any]]:
+        """Per material class of the first surface, "all" last: what failed, and why, as fractions of its pixels.
 
-        Each is a dict of `material` (str), `failed` (share of the pixels of this class; None if it has none) and
-        `causes` (name of the cause -> share of the pixels of this class, largest first, none of them 0).
+        Each is a dict of `material` (str), `failed` (fraction of the pixels of this class; None if it has none) and
+        `causes` (name of the cause -> fraction of the pixels of this class, largest first, none of them 0).
         """
         return [_row(name, self.cause[mask]) for name, mask in truth.classes().items()]
 
@@ -99,5 +99,5 @@ class CauseMap:
 def _row(material: str, causes: np.ndarray) -> dict[str, Any]:
     counts = np.bincount(causes, minlength=len(Cause))
     found = sorted((c for c in Cause if c and counts[c]), key=lambda c: -counts[c])
-    shares = {c.name.lower(): float(counts[c] / causes.size) for c in found}
-    return {"material": material, "failed": float(np.mean(causes > 0)) if causes.size else None, "causes": shares}
+    fractions = {c.name.lower(): float(counts[c] / causes.size) for c in found}
+    return {"material": material, "failed": float(np.mean(causes > 0)) if causes.size else None, "causes": fractions}

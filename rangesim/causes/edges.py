@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 
-from rangesim.evaluation.comparison import EDGE_SHARE
+from rangesim.evaluation.comparison import EDGE_FRACTION
 
 NEAR = 2
 """Pixels around an edge pixel, in both directions, that show how its surface fares off the edge."""
@@ -27,7 +27,7 @@ def depth_edges(z: np.ndarray, tolerance_m: float) -> np.ndarray:
 
 def across(z: np.ndarray, tolerance_m: float) -> np.ndarray:
     """Depth beyond which a surface lies across a depth edge from one at z, as in `rangesim.evaluation.comparison`."""
-    return np.asarray(np.maximum(z * (1 + EDGE_SHARE), z + tolerance_m))
+    return np.asarray(np.maximum(z * (1 + EDGE_FRACTION), z + tolerance_m))
 
 
 def error_off_edge(

@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 FAINT = 0.1
-"""Less than this share of what white paper would return here is little light."""
+"""Less than this fraction of what white paper would return here is little light."""
 DISTURBING = 0.005
-"""Share of the projector's light, other than direct, from which it can shift a reading by the tolerance."""
-MOTION_SHARE = 0.1
-"""Share of the tolerance from which motion counts: triangulation magnifies it by distance over baseline, 5 or more."""
+"""Fraction of the projector's light, other than direct, from which it can shift a reading by the tolerance."""
+MOTION_FRACTION = 0.1
+"""Fraction of the tolerance from which motion counts: triangulation magnifies it by distance over baseline, 5 or
+more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +116,11 @@ class Evidence:
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """The surface moves by more than `MOTION_SHARE` of the tolerance during the acquisition."""
+        """The surface moves by more than `MOTION_FRACTION` of the tolerance during the acquisition."""
         motion_m = self.signals.motion_m
         if motion_m is None:
             return np.zeros(self.truth.z.shape, dtype=bool)
-        return np.nan_to_num(motion_m) > MOTION_SHARE * self.tolerance_m
+        return np.nan_to_num(motion_m) > MOTION_FRACTION * self.tolerance_m
 
     # ---- The light -----------------------------------------------------------------------------------
 
@@ -193,7 +194,7 @@ class Evidence:
         period_m = self.capture.sensor.shortest_period_m
         if period_m is None:
             return np.zeros(self.failed.shape, dtype=bool)
-        refused = np.isin(self.image.status, [Status.WRAPPED, Status.OUT_OF_RANGE])
+        refused = np.isin(self.image.status, [Status.UNWRAPPING_FAILED, Status.OUT_OF_RANGE])
         return np.asarray(refused | (np.abs(self.image.range_m - self.truth.range_m) > period_m / 2))
 
     # ---- Helpers -------------------------------------------------------------------------------------

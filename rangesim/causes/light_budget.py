@@ -70,7 +70,7 @@ def _in_electrons(
     gate = capture.sensor.gate
     dark, bright = (float(detector.mean_electrons(np.full(1, x), gate, rig, capture.exposure_s)[0]) for x in (0.0, 1.0))
     gain = bright - dark
-    behind_filter = detector.ambient_share(gate, capture.ambient) * ambient * gain
+    behind_filter = detector.ambient_fraction(gate, capture.ambient) * ambient * gain
     return Background(behind_filter, bright_level(signal * gain), dark, detector.own_noise_e2(dark)), gain
 
 

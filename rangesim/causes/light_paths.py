@@ -61,7 +61,7 @@ def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath
 def _weights(response: Response, path: LightPath) -> np.ndarray:
     if isinstance(response, SparseResponse):
         result = np.zeros((response.channels + 1, *path.u.shape), dtype=np.float32)
-        for index, weight in response.shares(path, NumpyMath()):
+        for index, weight in response.bin_weights(path, NumpyMath()):
             bins = np.minimum(np.asarray(index), response.channels).astype(np.intp)[None]
             np.put_along_axis(result, bins, np.take_along_axis(result, bins, axis=0) + weight, axis=0)
         return result[:-1]

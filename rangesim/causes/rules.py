@@ -12,7 +12,7 @@ from rangesim.causes.cause import Cause, CauseMap
 from rangesim.causes.evidence import Evidence
 from rangesim.decoding.range_image import RangeImage
 from rangesim.evaluation.comparison import OUTLIER_M
-from rangesim.response import CAUSTIC, DIRECT, GLINT, MULTIPATH, VIA_DELTA
+from rangesim.response import CAUSTIC, DIRECT, GLINT, MULTIPATH, SPECULAR
 
 if TYPE_CHECKING:
     from rangesim.signals import Signals
@@ -85,7 +85,7 @@ def rules(e: Evidence) -> list[Rule]:
         (e.is_a("mirror"), Cause.SPECULAR_AWAY),
         # ---- No straight way for the light
         (e.unlit & e.enough & e.mostly(CAUSTIC), Cause.CAUSTIC),
-        (e.unlit & e.enough & e.mostly(VIA_DELTA), Cause.MIRRORED_GHOST),
+        (e.unlit & e.enough & e.mostly(SPECULAR), Cause.MIRRORED_GHOST),
         (e.unlit, Cause.SHADOWED),
         # ---- Too little of it comes back
         (e.is_a("glossy") & e.faint & ~e.optical, Cause.SPECULAR_AWAY),
@@ -94,7 +94,7 @@ def rules(e: Evidence) -> list[Rule]:
         (too_dark & e.swamped, Cause.AMBIENT),
         (too_dark, Cause.LOW_SIGNAL),
         # ---- The distance itself
-        (e.beyond_range, Cause.WRAPPED),
+        (e.beyond_range, Cause.RANGE_AMBIGUITY),
         (e.optical & e.coarse, Cause.RESOLUTION),
         # ---- The pixel holds more than one distance
         (e.moving, Cause.MOTION),
@@ -102,11 +102,11 @@ def rules(e: Evidence) -> list[Rule]:
         (e.in_shadow, Cause.SHADOWED),
         (e.optical & ~disturbed & e.beside_shadow, Cause.SHADOWED),
         (disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC),
-        (disturbed & e.mostly(VIA_DELTA, OTHER), Cause.MIRRORED_GHOST),
+        (disturbed & e.mostly(SPECULAR, OTHER), Cause.MIRRORED_GHOST),
         (disturbed & e.mostly(MULTIPATH, OTHER), Cause.MULTIPATH),
         (disturbed, Cause.GLINT),
         # ---- The decoder, and noise
-        (e.wrong_period, Cause.WRAPPED),
+        (e.wrong_period, Cause.RANGE_AMBIGUITY),
         (e.optical, Cause.RESOLUTION),
         (e.swamped, Cause.AMBIENT),
         (np.ones_like(too_dark), Cause.LOW_SIGNAL),

@@ -17,7 +17,7 @@ from rangesim.errors import TruncationWarning
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
-    """A callable that takes the name of the stage and the share done, 0..1; None if nobody watches."""
+    """A callable that takes the name of the stage and the fraction done, 0..1; None if nobody watches."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -32,7 +32,7 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("Starting", total=1.0)
-        yield lambda stage, share: bar.update(task, description=stage, completed=share)
+        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
 
 
 def say_where(out: Path, target: Path) -> None:
@@ -58,4 +58,4 @@ def light_left_out_in_a_line() -> Iterator[None]:
         warnings.showwarning = keep  # type: ignore[assignment]
         yield
     if left_out:
-        typer.echo(f"rangesim: {max(left_out, key=lambda warning: warning.share)}", err=True)
+        typer.echo(f"rangesim: {max(left_out, key=lambda warning: warning.fraction)}", err=True)

@@ -13,7 +13,7 @@ def compare_command(
     results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
     markdown: Annotated[bool, typer.Option("--markdown", help="Markdown instead of a drawn table.")] = False,
 ) -> None:
-    """Print errors per surface material and sensor, and why pixels failed; lengths in mm, shares in %.
+    """Print errors per surface material and sensor, and why pixels failed; lengths in mm, fractions in %.
 
     Example:
 

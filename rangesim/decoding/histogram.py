@@ -38,8 +38,8 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     ----------
     Coates: "The correction for photon 'pile-up' in the measurement of radiative lifetimes", J. Phys. E 1 (1968).
     """
-    from rangesim.decoding.peaks import detected_share
+    from rangesim.decoding.peaks import detected_fraction
 
-    share = np.empty((len(counts), counts[0].size))
-    detected_share(counts.reshape(share.shape), pulses, share)
-    return np.asarray(-pulses * np.log1p(-share)).reshape(counts.shape)
+    fraction = np.empty((len(counts), counts[0].size))
+    detected_fraction(counts.reshape(fraction.shape), pulses, fraction)
+    return np.asarray(-pulses * np.log1p(-fraction)).reshape(counts.shape)

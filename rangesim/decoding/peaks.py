@@ -8,17 +8,17 @@ import math
 import numpy as np
 from numba import njit
 
-LARGEST_SHARE = 1 - 1e-6
+MAX_FRACTION = 1 - 1e-6
 """Of pulses in which a photon was detected: more leave no estimate."""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def detected_share(counts, pulses, share):  # type: ignore[no-untyped-def]
-    """Write, of histograms (k, n) of first photons, the share of the pulses that were left before each bin."""
+def detected_fraction(counts, pulses, fraction):  # type: ignore[no-untyped-def]
+    """Write, of histograms (k, n) of first photons, the fraction of the pulses that were left before each bin."""
     left = np.full(counts.shape[1], float(pulses))
     for b in range(len(counts)):
         for column in range(counts.shape[1]):
-            share[b, column] = min(counts[b, column] / max(left[column], 1.0), LARGEST_SHARE)
+            fraction[b, column] = min(counts[b, column] / max(left[column], 1.0), MAX_FRACTION)
             left[column] -= counts[b, column]
 
 

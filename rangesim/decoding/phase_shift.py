@@ -46,9 +46,13 @@ class PhaseThresholds:
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """turns : (h, w) float32 in [0, 1), phase over 2 pi. modulation, mean : (h, w) float32, the capture's units."""
+    """Phase of fringes or taps.
 
-    turns: np.ndarray
+    normalised : (h, w) float32 in [0, 1), the phase over 2 pi.
+    modulation, mean : (h, w) float32, in the units of the capture.
+    """
+
+    normalised: np.ndarray
     modulation: np.ndarray
     mean: np.ndarray
 
@@ -69,8 +73,10 @@ def phase_of(frames: np.ndarray) -> Phase:
         cosine += np.float32(np.cos(2 * np.pi * s / n)) * value
         sine += np.float32(np.sin(2 * np.pi * s / n)) * value
         total += value
-    turns = np.arctan2(sine, cosine) * np.float32(1 / (2 * np.pi))
-    return Phase(np.where(turns < 0, turns + 1, turns), np.hypot(cosine, sine) * np.float32(2 / n), total / n)
+    normalised = np.arctan2(sine, cosine) * np.float32(1 / (2 * np.pi))
+    return Phase(
+        np.where(normalised < 0, normalised + 1, normalised), np.hypot(cosine, sine) * np.float32(2 / n), total / n
+    )
 
 
 def phase_sigma(capture: Capture, phase: Phase, steps: int) -> np.ndarray | None:
@@ -98,10 +104,10 @@ def tap_phase(taps: np.ndarray, exact_square: bool = False) -> Phase:
     if exact_square:
         diagonal = np.maximum(np.abs(cosine) + np.abs(sine), np.finfo(np.float32).tiny)
         quarter = sine / diagonal
-        turns = 0.25 * np.where(cosine >= 0, quarter, 2 - quarter)
+        normalised = 0.25 * np.where(cosine >= 0, quarter, 2 - quarter)
     else:
-        turns = np.arctan2(sine, cosine) * np.float32(1 / (2 * np.pi))
-    return Phase(turns - np.floor(turns), 0.5 * np.hypot(cosine, sine), tap.mean(axis=0))
+        normalised = np.arctan2(sine, cosine) * np.float32(1 / (2 * np.pi))
+    return Phase(normalised - np.floor(normalised), 0.5 * np.hypot(cosine, sine), tap.mean(axis=0))
 
 
 def modulation_is_weak(capture: Capture, phase: Phase, steps: int, thresholds: PhaseThresholds) -> np.ndarray:
@@ -136,8 +142,8 @@ def refine_by_phase(
     coordinate, status = np.empty_like(gray.coordinate), gray.status.copy()
     for rows in bands(len(status)):
         phase, whole, refused = phase_of(frames[:, rows]), gray.coordinate[rows], status[rows]
-        periods = np.rint(whole / np.float32(period_px) - phase.turns)
-        coordinate[rows] = (periods + phase.turns) * np.float32(period_px)
+        periods = np.rint(whole / np.float32(period_px) - phase.normalised)
+        coordinate[rows] = (periods + phase.normalised) * np.float32(period_px)
         ok = refused == Status.OK
         contradiction = np.abs(coordinate[rows] - whole) > gray.cell_px / 2 + period_px / 8
         washed_out = 2 * phase.modulation < least_swing[rows]  # as those seen by interreflection alone

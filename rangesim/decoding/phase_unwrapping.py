@@ -19,17 +19,17 @@ from rangesim.response import SPEED_OF_LIGHT
 class Unwrapped:
     """Common path length of several phases.
 
-    length_m : (h, w) float64, metres. residual_turns : (h, w), largest misfit of any frequency's phase.
+    length_m : (h, w) float64, metres. residual : (h, w), largest misfit of any frequency's phase.
     ambiguity : (h, w) in 0..1, root of the best cost over the second best; 0 if there is no second.
     """
 
     length_m: np.ndarray
-    residual_turns: np.ndarray
+    residual: np.ndarray
     ambiguity: np.ndarray
 
 
 def unwrap(
-    turns: list[np.ndarray], modulation_hz: tuple[float, ...], weights: list[np.ndarray], longest_m: float
+    normalised: list[np.ndarray], modulation_hz: tuple[float, ...], weights: list[np.ndarray], longest_m: float
 ) -> Unwrapped:
     """Path length that agrees best with the phases of all frequencies.
 
@@ -39,7 +39,7 @@ def unwrap(
 
     Parameters
     ----------
-    turns : per frequency (h, w) in [0, 1). weights : per frequency (h, w), inverse variance of its length
+    normalised : per frequency (h, w) in [0, 1). weights : per frequency (h, w), inverse variance of its length
         (any scale).
     longest_m : float, metres, path length up to which candidates are searched.
     """
@@ -47,17 +47,17 @@ def unwrap(
     base = int(np.argmin(wavelengths))
     candidates = max(1, int(np.ceil(longest_m / wavelengths[base] - 1e-6)))
     total = np.sum(weights, axis=0)
-    best_cost, second_cost = np.full((2, *turns[0].shape), np.inf)
-    best = np.zeros(turns[0].shape)
+    best_cost, second_cost = np.full((2, *normalised[0].shape), np.inf)
+    best = np.zeros(normalised[0].shape)
     for n in range(candidates):
-        guess = (turns[base].astype(np.float64) + n) * wavelengths[base]
-        lengths = [w * (t + np.rint(guess / w - t)) for t, w in zip(turns, wavelengths, strict=True)]
+        guess = (normalised[base].astype(np.float64) + n) * wavelengths[base]
+        lengths = [w * (t + np.rint(guess / w - t)) for t, w in zip(normalised, wavelengths, strict=True)]
         mean = sum(x * k for x, k in zip(lengths, weights, strict=True)) / total
         cost = sum(k * (x - mean) ** 2 for x, k in zip(lengths, weights, strict=True))
         better = cost < best_cost
         second_cost = np.minimum(second_cost, np.maximum(cost, best_cost))
         best_cost = np.minimum(cost, best_cost)
         best = np.where(better, mean, best)
-    misfits = [best / w - t for t, w in zip(turns, wavelengths, strict=True)]
+    misfits = [best / w - t for t, w in zip(normalised, wavelengths, strict=True)]
     residual = np.max([np.abs(m - np.rint(m)) for m in misfits], axis=0)
     return Unwrapped(best, residual, np.sqrt(best_cost / np.maximum(second_cost, 1e-30)))

@@ -24,7 +24,7 @@ class RangeImage:
     ----------
     z : (h, w) float32, metres, along the optical axis of the camera; NaN where `status` is not OK.
     range_m : (h, w) float32, metres, Euclidean distance from the camera centre; NaN likewise.
-    confidence : (h, w) float32 in 0..1, strength of the useful signal as a share of the largest the capture can hold
+    confidence : (h, w) float32 in 0..1, strength of the useful signal as a fraction of the largest the capture can hold
         (of a noise-free capture: does hold). Structured light: white - black; AMCW: twice the modulation amplitude;
         direct ToF: counts in the peak, of the highest peak; ideal: radiance.
     status : (h, w) uint8, values of `Status`.

@@ -16,7 +16,7 @@ class Status(IntEnum):
     """At least one frame is at full well or at the largest digital number."""
     CODE_ERROR = 3
     """Codes contradict each other, leave the projector, or violate the epipolar geometry."""
-    WRAPPED = 4
+    UNWRAPPING_FAILED = 4
     """The phases of several frequencies agree on no common distance."""
     OUT_OF_RANGE = 5
     """A distance was decoded that the sensor cannot measure (behind it, or beyond its limits)."""

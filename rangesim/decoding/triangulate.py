@@ -46,7 +46,7 @@ class Triangulation:
 
     epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected
         coordinate; zero if only one axis was decoded.
-    relative_error : (n,) float64, error of z as a share of z that one projector pixel of error means, |dz/dx_p| / z.
+    relative_error : (n,) float64, error of z as a fraction of z that one projector pixel of error means, |dz/dx_p| / z.
     """
 
     z: np.ndarray

@@ -5,10 +5,10 @@ A transport pass keeps the light of the scene's own emitters apart (`Signals.ene
 the units of the scene file. `Ambient` says what that light is: an illuminant with a spectrum, and how strong. Light is
 linear, so both are factors on the finished pass:
 
-    ambient radiance that counts = energy.ambient * scale * share
+    ambient radiance that counts = energy.ambient * scale * fraction
 
 scale : broadband irradiance of the illuminant over the irradiance in the scene's units.
-share : of the illuminant's broadband irradiance, the part inside the filter's band.
+fraction : of the illuminant's broadband irradiance, the part inside the filter's band.
 
 Reflectances are those of the scene, so of the sensor's wavelength, as they should be: only light of that band counts.
 """
@@ -46,14 +46,14 @@ def photopic(wavelength_nm: Any) -> np.ndarray:
 
 
 class Illuminant(ABC):
-    """A spectrum, as the share of its irradiance below each wavelength."""
+    """A spectrum, as the fraction of its irradiance below each wavelength."""
 
     @abstractmethod
     def below(self, wavelength_nm: np.ndarray) -> np.ndarray:
-        """Share 0..1 of the broadband irradiance at wavelengths below those given, nm. ValueError where unknown."""
+        """Fraction 0..1 of the broadband irradiance at wavelengths below those given, nm. ValueError where unknown."""
 
-    def share(self, low_nm: float, high_nm: float) -> float:
-        """Share 0..1 of the broadband irradiance between two wavelengths, nm."""
+    def fraction(self, low_nm: float, high_nm: float) -> float:
+        """Fraction 0..1 of the broadband irradiance between two wavelengths, nm."""
         low, high = self.below(np.array([low_nm, high_nm]))
         return float(high - low)
 
@@ -177,4 +177,4 @@ class Ambient:
         """Factor on the scene's ambient light for a band-pass filter of that centre and full width, metres."""
         if width_m == 0:
             return 0.0
-        return self.scale * self.spectrum.share(1e9 * (centre_m - width_m / 2), 1e9 * (centre_m + width_m / 2))
+        return self.scale * self.spectrum.fraction(1e9 * (centre_m - width_m / 2), 1e9 * (centre_m + width_m / 2))

@@ -94,7 +94,7 @@ class PhotoDetector(ABC):
         photon counts, whose decoders know their own statistics."""
         return None
 
-    def ambient_share(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
+    def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
         """Factor on the scene's ambient light for the part that counts: what passes the filter.
 
         ambient : what kind of light it is, and how strong: the filter's band decides. None: unknown, so
@@ -164,8 +164,8 @@ class Detector(PhotoDetector):
     dark_current_e_s : float, electrons per second [mu_I].
     bits : int in 1..16, ADC resolution.
     offset_dn : float, digital numbers, black level [mu_y.dark without dark current].
-    ambient_transmission : float in 0..1, share of ambient light that the band-pass filter lets through, where the kind
-        of light is not stated (`expose` without `ambient`); the default is that of sunlight in the default band.
+    ambient_transmission : float in 0..1, fraction of ambient light that the band-pass filter lets through, where the
+        kind of light is not stated (`expose` without `ambient`); the default is that of sunlight in the default band.
     band_width_m : float, metres, full width of the band-pass filter around wavelength_m, where the kind of light is
         stated. In the band it passes ambient light as it does the projector's, whose losses are part of the
         quantum efficiency; outside it passes nothing. 0: no ambient light at all.

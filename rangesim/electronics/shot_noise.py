@@ -90,7 +90,8 @@ def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
     """How many of `photons`, each in one of `pulses` by chance, fall into a pulse that has one before them.
 
     By thinning: a photon is a candidate with probability 1 - exp(-rate), which exceeds photons / pulses, so that the
-    gaps between candidates are exponential; of these, the share is taken that makes it the pulses hit so far / pulses.
+    gaps between candidates are exponential; of these, the fraction is taken that makes it the pulses hit so far /
+    pulses.
     """
     shared, number = 0, 1  # the first photon, number 0, finds all pulses empty
     rate = 2 * photons / pulses if photons < 0.75 * pulses else math.inf

@@ -77,10 +77,10 @@ class SpadDetector(PhotoDetector):
         """Number of laser pulses in an exposure."""
         return max(1, round(exposure_s / _counting(gate).period_s))
 
-    def ambient_share(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
+    def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
         """Factor on the scene's ambient light: what passes the filter while the histogram is open."""
         gate = _counting(gate)
-        return super().ambient_share(gate, ambient) * gate.open_s / gate.period_s
+        return super().ambient_fraction(gate, ambient) * gate.open_s / gate.period_s
 
     def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
         pixel = self._pixel(_counting(gate), rig, exposure_s)

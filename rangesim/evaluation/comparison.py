@@ -15,8 +15,8 @@ from rangesim.signals import GroundTruth
 OUTLIER_M = 0.010
 EDGE_RADIUS = 2
 """Pixels from a depth edge within which a pixel can be a flying pixel."""
-EDGE_SHARE = 0.02
-"""A depth edge is where neighbours' true depths differ by more than this share of the nearer, and `outlier_m`."""
+EDGE_FRACTION = 0.02
+"""A depth edge is where neighbours' true depths differ by more than this fraction of the nearer, and `outlier_m`."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class ErrorStatistics:
     material : str, class of the first surface behind the pixel, or "all".
     pixels : int, with a true depth.
     lit : int, of those, seen by the projector (the others lie in its shadow or beside its image).
-    completeness : share of the lit pixels with a measurement.
-    coverage : share of all pixels with a measurement.
+    completeness : fraction of the lit pixels with a measurement.
+    coverage : fraction of all pixels with a measurement.
     bias_m : mean of z - true z, metres, over all measured pixels; lit or not.
     median_abs_m, rmse_m, p95_abs_m : median, root mean square and 95th percentile of |z - true z|, metres.
-    outlier_rate : share of the measured pixels with |z - true z| > `outlier_m`.
+    outlier_rate : fraction of the measured pixels with |z - true z| > `outlier_m`.
     edge_pixels : int, measured pixels within 2 pixels of a depth edge.
-    flying_rate : share of them that fly: their z is farther than `outlier_m` from every true depth in the 5 x
+    flying_rate : fraction of them that fly: their z is farther than `outlier_m` from every true depth in the 5 x
         5 window, so they lie on neither side of the edge.
     """
 
@@ -83,7 +83,7 @@ class Comparison:
         raise ValueError(f"expected a material class out of {names}, got {material!r}.")
 
     def to_markdown(self) -> str:
-        """Table in Markdown; lengths in millimetres, shares in percent."""
+        """Table in Markdown; lengths in millimetres, fractions in percent."""
         heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
         lines = ["| " + " | ".join(h.replace("_", " ") for h in heads) + " |", "|" + " --- |" * len(heads)]
         for row in self.table:
@@ -135,19 +135,19 @@ def _statistics(
         material=name,
         pixels=int(mask.sum()),
         lit=int(lit.sum()),
-        completeness=_share(measured & visible, lit),
-        coverage=_share(measured, mask),
+        completeness=_fraction(measured & visible, lit),
+        coverage=_fraction(measured, mask),
         bias_m=float(e.mean()) if e.size else math.nan,
         median_abs_m=float(median),
         rmse_m=float(np.sqrt(np.mean(e**2))) if e.size else math.nan,
         p95_abs_m=float(p95),
         outlier_rate=float(np.mean(absolute > outlier_m)) if e.size else math.nan,
         edge_pixels=int(at_edge.sum()),
-        flying_rate=_share(at_edge & flying, at_edge),
+        flying_rate=_fraction(at_edge & flying, at_edge),
     )
 
 
-def _share(part: np.ndarray, whole: np.ndarray) -> float:
+def _fraction(part: np.ndarray, whole: np.ndarray) -> float:
     total = int(whole.sum())
     return float(part.sum() / total) if total else math.nan
 
@@ -172,7 +172,7 @@ def _has_step(depth: np.ndarray, outlier_m: float) -> np.ndarray:
         ((slice(1, None),), (slice(None, -1),)),
     ):
         one, two = np.minimum(depth[a], depth[b]), np.maximum(depth[a], depth[b])
-        jump = (two > one * (1 + EDGE_SHARE)) & (two > one + outlier_m)
+        jump = (two > one * (1 + EDGE_FRACTION)) & (two > one + outlier_m)
         result[a] |= jump
         result[b] |= jump
     return result

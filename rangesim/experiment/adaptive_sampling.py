@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FIRST_SPP = 8
 """Samples that all pixels get."""
-SHARE = 1 / 3
+FRACTION = 1 / 3
 """Of the detector's noise, that of sampling at most: together they are then a twentieth above the detector's alone."""
 NEGLIGIBLE = 1e-5
 """Standard deviation, over the median depth of the scene, that is small enough in any case."""
@@ -44,13 +44,13 @@ class AdaptiveSampling:
     ----------
     instruments : whose detectors, exposures and decoders decide.
     max_spp : int >= 1, samples that no pixel exceeds.
-    share : positive, standard deviation of a reading by sampling, over that by the detector, that is small enough.
+    fraction : positive, standard deviation of a reading by sampling, over that by the detector, that is small enough.
     ambient : Ambient, as for `expose`.
     """
 
     instruments: tuple[Instrument, ...]
     max_spp: Annotated[int, whole(1, "spp")] = 64
-    share: Annotated[float, Bounds("positive and finite", 1e-6, 1e6)] = SHARE
+    fraction: Annotated[float, Bounds("positive and finite", 1e-6, 1e6)] = FRACTION
     ambient: Ambient | None = None
 
     def __post_init__(self) -> None:
@@ -78,7 +78,7 @@ class AdaptiveSampling:
             noise = reading_noise(decode(capture, one.decoder), capture, signals)
             enough = np.full(len(excess), negligible)
             if capture.is_digital:  # where nothing can be read, samples are of no use
-                enough = np.maximum(enough, self.share * group_sigma(noise.detector, group, where_unknown=np.inf))
+                enough = np.maximum(enough, self.fraction * group_sigma(noise.detector, group, where_unknown=np.inf))
             with np.errstate(divide="ignore", invalid="ignore"):
                 excess = np.fmax(excess, (group_sigma(noise.sampling, group) / enough) ** 2)
         wanted = 4 * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / 4)  # whole pairs in both halves

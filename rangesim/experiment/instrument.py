@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rangesim.rig import Rig
     from rangesim.scene import Scene
 
-LONGEST_NAME = 100
+MAX_NAME = 100
 """Characters; the name becomes that of a directory."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
@@ -71,9 +71,9 @@ class Instrument:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if not _NAME.fullmatch(self.name) or len(self.name) > LONGEST_NAME:
+        if not _NAME.fullmatch(self.name) or len(self.name) > MAX_NAME:
             raise ValueError(
-                f"expected a name of letters, digits, - and _, at most {LONGEST_NAME}, got {shown(self.name)}."
+                f"expected a name of letters, digits, - and _, at most {MAX_NAME}, got {shown(self.name)}."
             )
         check_sensor(self.sensor)
         detector = self.detector or self.sensor.default_detector

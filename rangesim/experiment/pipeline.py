@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 Progress = Callable[[str, float], None]
-"""Called with the name of the stage and the share of the whole job done, 0..1."""
-_TRANSPORT_SHARE = 0.7
-FEWEST_POINTS = 3
+"""Called with the name of the stage and the fraction of the whole job done, 0..1."""
+_TRANSPORT_FRACTION = 0.7
+MIN_POINTS = 3
 """Fewer points are no cloud worth grouping."""
 
 
@@ -83,10 +83,10 @@ def run(
     from pcgraph.warmup import compile_kernels
     from rangesim.report import write_report
 
-    say = progress or _unwatched
+    tell = progress or _unwatched
     with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
         times: dict[str, float] = {}
-        say("Loading the scene", 0.0)
+        tell("Loading the scene", 0.0)
         with timed(times, "load"):
             scene = scene or rangesim.load_scene(
                 experiment.scene, material=experiment.material, unit_m=experiment.unit_m
@@ -101,13 +101,14 @@ def run(
         with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
             compile_kernels()
         for number, (rig, instruments) in enumerate(passes, 1):
-            signals = _trace(experiment, scene, rig, instruments, say, number, len(passes), times)
+            signals = _trace(experiment, scene, rig, instruments, tell, number, len(passes), times)
             signals.save(str(folder / f"pass_{number}.npz"))
-            for one in instruments:
-                say(f"Measuring with {one.name}", _share(number, len(passes), 1.0))
-                measure(one, signals, folder / one.name, noise_seed(experiment, one), experiment.ambient)
+            for instrument in instruments:
+                tell(f"Measuring with {instrument.name}", _fraction(number, len(passes), 1.0))
+                seed = noise_seed(experiment, instrument)
+                measure(instrument, signals, folder / instrument.name, seed, experiment.ambient)
         write_record(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
-        say("Writing the report", 0.97)
+        tell("Writing the report", 0.97)
         result = load_result(folder)
         tables = {m.name: m.rows for m in result.measurements}
         _write_comparison(folder, list(tables.items()))
@@ -127,7 +128,7 @@ def estimate(experiment: Experiment) -> Cost:
     return estimate_cost(experiment, scene, group_by_rig(experiment, scene))
 
 
-def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient: Ambient | None = None) -> None:
+def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, ambient: Ambient | None = None) -> None:
     """Expose, decode, compare, explain and segment for one instrument; write all to the new directory `folder`."""
     from pcgraph.parallel import side_by_side
 
@@ -135,10 +136,10 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     times: dict[str, float] = {}
     moves = isinstance(signals, MovingSignals)
     with timed(times, "exposure"):
-        detector = _in_time(one) if moves else one.detector
-        capture = rangesim.expose(signals, one.sensor, detector, one.exposure_s, seed, ambient)
+        detector = _in_time(instrument) if moves else instrument.detector
+        capture = rangesim.expose(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
     with timed(times, "decode"):
-        image = rangesim.decode(capture, one.decoder)
+        image = rangesim.decode(capture, instrument.decoder)
     noise = None
     if signals.knows_sampling_error:
         with timed(times, "noise"):
@@ -147,12 +148,12 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     comparison = rangesim.compare(image, signals.truth)
     with timed(times, "causes"):
         causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
-    rows = [row | failures for row, failures in zip(comparison.rows(), causes.shares(signals.truth), strict=True)]
+    rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
     if noise is not None:
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]
     with timed(times, "points"):
         cloud = image.to_point_cloud()
-    enough = bool(cloud.valid.sum() >= FEWEST_POINTS)
+    enough = bool(cloud.valid.sum() >= MIN_POINTS)
 
     def write_readings() -> None:
         save_range_image(image, folder / "range.npz")
@@ -166,17 +167,17 @@ def measure(one: Instrument, signals: Signals, folder: Path, seed: int, ambient:
     if enough:
         with timed(times, "segmentation"):
             segment(cloud, folder / "segmentation.npz")
-    facts = acquisition(capture, one.timing, moves, int(cloud.valid.sum()), times)
-    write_record(folder / "measurement.json", facts)
+    metadata = acquisition(capture, instrument.timing, moves, int(cloud.valid.sum()), times)
+    write_record(folder / "measurement.json", metadata)
 
 
-def _in_time(one: Instrument) -> PhotoDetector | None:
+def _in_time(instrument: Instrument) -> PhotoDetector | None:
     """The instrument's detector, whose automatic exposure ends before the next one begins."""
-    period_s = one.timing.frame_period_s
-    if one.detector is None or not period_s:
-        return one.detector
-    longest_s = max(one.detector.min_exposure_s, min(one.detector.max_exposure_s, period_s))
-    return replace(one.detector, max_exposure_s=longest_s)  # type: ignore[type-var]
+    period_s = instrument.timing.frame_period_s
+    if instrument.detector is None or not period_s:
+        return instrument.detector
+    longest_s = max(instrument.detector.min_exposure_s, min(instrument.detector.max_exposure_s, period_s))
+    return replace(instrument.detector, max_exposure_s=longest_s)  # type: ignore[type-var]
 
 
 def segment(cloud: PointCloud, path: Path) -> None:
@@ -195,17 +196,17 @@ def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[I
     Where something moves, each is on its own: it has its own time, and so its own truth.
     """
     if experiment.motion is not None:
-        return [(one.rig(scene, experiment.width, experiment.height), [one]) for one in experiment.instruments]
+        return [(i.rig(scene, experiment.width, experiment.height), [i]) for i in experiment.instruments]
     groups: dict[Rig, list[Instrument]] = {}
-    for one in experiment.instruments:
-        rig = one.rig(scene, experiment.width, experiment.height)
-        groups.setdefault(rig, []).append(one)
+    for instrument in experiment.instruments:
+        rig = instrument.rig(scene, experiment.width, experiment.height)
+        groups.setdefault(rig, []).append(instrument)
     return list(groups.items())
 
 
-def noise_seed(experiment: Experiment, one: Instrument) -> int:
+def noise_seed(experiment: Experiment, instrument: Instrument) -> int:
     """Seed of an instrument's noise: its own for each position in the experiment."""
-    return derived_seed(experiment.seed, experiment.instruments.index(one))
+    return derived_seed(experiment.seed, experiment.instruments.index(instrument))
 
 
 def acquisition(
@@ -234,7 +235,7 @@ def acquisition(
     )
 
 
-def _unwatched(stage: str, share: float) -> None:
+def _unwatched(stage: str, fraction: float) -> None:
     """Tell nobody how far the work is."""
 
 
@@ -251,27 +252,28 @@ def _trace(
     scene: Scene,
     rig: Rig,
     instruments: list[Instrument],
-    say: Progress,
+    tell: Progress,
     number: int,
     passes: int,
     times: dict[str, float],
 ) -> Signals:
     stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
-    say(stage, _share(number, passes, 0.0))
+    tell(stage, _fraction(number, passes, 0.0))
     settings: dict[str, Any] = {
         "spp": _spp(experiment, instruments),
         "max_depth": experiment.max_depth,
         "glint": experiment.glint,
         "seed": experiment.seed,
-        "progress": None if say is _unwatched else lambda share: say(stage, _share(number, passes, share)),
+        "progress": None if tell is _unwatched else lambda fraction: tell(stage, _fraction(number, passes, fraction)),
     }
     if experiment.photons is not None:
         settings["photons"] = experiment.photons
     with timed(times, f"transport_{number}"):
         if experiment.motion is None:
             return rangesim.transport(scene, rig, [i.sensor for i in instruments], **settings)
-        (one,) = instruments
-        return transport_moving(scene, rig, {one.sensor: one.timing}, experiment.motion, **settings)[one.sensor]
+        (instrument,) = instruments
+        timings = {instrument.sensor: instrument.timing}
+        return transport_moving(scene, rig, timings, experiment.motion, **settings)[instrument.sensor]
 
 
 def _spp(experiment: Experiment, instruments: list[Instrument]) -> int | str | AdaptiveSampling:
@@ -282,8 +284,8 @@ def _spp(experiment: Experiment, instruments: list[Instrument]) -> int | str | A
     return AdaptiveSampling(tuple(instruments), experiment.max_spp, ambient=experiment.ambient)
 
 
-def _share(number: int, passes: int, of_pass: float) -> float:
-    return 0.05 + 0.9 * (number - 1 + _TRANSPORT_SHARE * of_pass) / passes
+def _fraction(number: int, passes: int, of_pass: float) -> float:
+    return 0.05 + 0.9 * (number - 1 + _TRANSPORT_FRACTION * of_pass) / passes
 
 
 def _write_comparison(folder: Path, tables: list[tuple[str, list[dict[str, Any]]]]) -> None:

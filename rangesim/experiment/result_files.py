@@ -141,10 +141,10 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
     rows: list[RowRecord]
 
 
-_FARTHEST_M = 1e9
+_MAX_COORDINATE_M = 1e9
 _RADIANCE = ArraySpec("float32", low=0)
-_DEPTH = ArraySpec("float32", low=-_FARTHEST_M, high=_FARTHEST_M, nan=True)
-_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_FARTHEST_M, nan=True)
+_DEPTH = ArraySpec("float32", low=-_MAX_COORDINATE_M, high=_MAX_COORDINATE_M, nan=True)
+_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_MAX_COORDINATE_M, nan=True)
 _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "truth_z": _TRUE_DEPTH,
     "truth_range_m": _TRUE_DEPTH,
@@ -200,9 +200,9 @@ class Measurement:
     capture : Capture. image : RangeImage. truth : GroundTruth of its pass.
     causes : CauseMap, why pixels failed.
     rows : statistics per material class, "all" last; see `rangesim.evaluation.comparison.ErrorStatistics` and
-        `rangesim.causes.CauseMap.shares`.
+        `rangesim.causes.CauseMap.contributions`.
     segmentation : Segmentation, or None if there were no points to group.
-    facts : MeasurementRecord, frames, exposure and time per stage.
+    metadata : MeasurementRecord, frames, exposure and time per stage.
     light_pass : int from 1, the transport pass the instrument took part in.
     """
 
@@ -213,7 +213,7 @@ class Measurement:
     causes: CauseMap
     rows: list[dict[str, Any]]
     segmentation: Segmentation | None
-    facts: MeasurementRecord
+    metadata: MeasurementRecord
     light_pass: int
 
 
@@ -337,8 +337,8 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         raise FileFormatError(f"{folder / 'range.npz'}: expected z to be finite where status is {Status.OK.value}.")
     arrays["T_world_camera"] = capture.rig.T_world_camera
     data = read_checked_arrays(folder / "causes.npz", _CAUSES, sizes)
-    facts = read_record(folder / "measurement.json", MeasurementRecord)
-    if (facts.sensor, facts.frames, facts.pixels) != (
+    metadata = read_record(folder / "measurement.json", MeasurementRecord)
+    if (metadata.sensor, metadata.frames, metadata.pixels) != (
         capture.sensor.type_name, len(capture.frames), capture.frames[0].size
     ):  # fmt: skip
         raise FileFormatError(f"{folder / 'measurement.json'}: expected sensor, frames and pixels of the capture.")
@@ -350,7 +350,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),
         rows=read_rows(folder),
         segmentation=_load_segmentation(folder / "segmentation.npz", sizes),
-        facts=facts,
+        metadata=metadata,
         light_pass=light_pass,
     )
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rangesim.light_transport.indirect import REACH_PX
-from rangesim.light_transport.photon_maps import MOST_MAPS, GatheringRadius, PhotonMaps
+from rangesim.light_transport.photon_maps import MAX_MAPS, GatheringRadius, PhotonMaps
 from rangesim.light_transport.photons import has_delta, trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.rig import Rig
@@ -20,7 +20,7 @@ RADIUS_IN_PROJECTOR_PIXELS = 3.0
 RADIUS_IN_CAMERA_PIXELS = (0.3, 3.0)
 """Bounds of the largest photon radius, where it is: finer than the stripes, about as fine as the image."""
 
-SMALLEST_RADIUS_M = 1e-6
+MIN_RADIUS_M = 1e-6
 
 
 def caustic_maps(
@@ -39,7 +39,7 @@ def caustic_maps(
     """
     if not photons or not has_delta(traced.scene):
         return None
-    maps = min(spp, MOST_MAPS)
+    maps = min(spp, MAX_MAPS)
     landed = trace_photons(traced, rig.projector_power_w, photons, maps, seed, memory_bytes, report)
     radius = gathering_radius(rig, landed.per_pixel, radius_m)
     wide = REACH_PX / rig.camera.fx
@@ -58,5 +58,5 @@ def check_photons(photons: int, radius_m: float | None) -> None:
     """Raise ValueError if there cannot be so many photons, or no such radius."""
     if not isinstance(photons, (int, np.integer)) or photons < 0:
         raise ValueError(f"expected photons to be a whole number of at least 0, got {photons!r}.")
-    if radius_m is not None and not SMALLEST_RADIUS_M <= radius_m < np.inf:
-        raise ValueError(f"expected a caustic_radius_m of at least {SMALLEST_RADIUS_M:g} m, got {radius_m!r}.")
+    if radius_m is not None and not MIN_RADIUS_M <= radius_m < np.inf:
+        raise ValueError(f"expected a caustic_radius_m of at least {MIN_RADIUS_M:g} m, got {radius_m!r}.")

@@ -52,7 +52,7 @@ def first_surface(surfaces: Any, ray: Any, has_cutouts: bool) -> Any:
 
 
 def _openness(si: Any) -> Any:
-    """Share of the light that passes the surface through holes.
+    """Fraction of the light that passes the surface through holes.
 
     It is that which passes unchanged at grazing incidence, where thin glass reflects everything.
     """

@@ -23,15 +23,15 @@ class PrimaryRay(NamedTuple):
     """A ray that leaves a device.
 
     origin, direction : world, metres and unit.
-    lead : Float, metres, what the path length from the device's centre has ahead of that from `origin`: all paths
-        through a lens to a point in focus are optically as long as the one through its centre.
+    path_offset : Float, metres, by which the path length from the device's centre exceeds that from `origin`: all
+        paths through a lens to a point in focus are optically as long as the one through its centre.
     exists : Bool, false where the distortion has no inverse and the lens sends no ray (the direction is then that of
         the axis); None: everywhere.
     """
 
     origin: Any
     direction: Any
-    lead: Any
+    path_offset: Any
     exists: Any = None
 
 
@@ -160,7 +160,7 @@ class Device:
     # ---- How bright, how sharp ---------------------------------------------------------------------------
 
     def relative_illumination(self, direction: Any) -> Any:
-        """Share of a pixel's light that vignetting leaves along a unit world direction away from the device.
+        """Fraction of a pixel's light that vignetting leaves along a unit world direction away from the device.
 
         The Python number 1 where there is no vignetting.
         """
@@ -233,7 +233,7 @@ def connect(
         shadow_ray = si.spawn_ray_to(mi.Point3f(projector.centre))
         lit = in_image & ~scene.ray_test(shadow_ray, coherent=False, active=in_image)
     else:
-        share, _ = media.transmittance(scene, si, mi.Point3f(projector.centre), inside, in_image)
-        lit, geometry = in_image & (share > 0), geometry * share
+        fraction, _ = media.transmittance(scene, si, mi.Point3f(projector.centre), inside, in_image)
+        lit, geometry = in_image & (fraction > 0), geometry * fraction
     blur = projector.blur_px(z)
     return Connection(uv, to_projector, distance, geometry, lit, None if blur is None else dr.select(lit, blur, 0))

@@ -19,7 +19,7 @@ from rangesim.signals import SamplingError
 
 BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
-FEWEST_FOR_HALVES = 3
+MIN_FOR_HALVES = 3
 """Samples of a pixel: two and one."""
 SMOOTH = [Radiance._fields.index("multipath"), Radiance._fields.index("faint")]
 """Light that neighbouring pixels may share."""
@@ -94,7 +94,7 @@ class Estimate:
     view, settings : View and Settings, what is sampled.
     rig, responses : whose image, and what is summed up.
     keeps_apart : whether smooth light is kept apart, to be shared by neighbours.
-    has_halves : whether samples are dealt into halves; every pixel then needs `FEWEST_FOR_HALVES` at once.
+    has_halves : whether samples are dealt into halves; every pixel then needs `MIN_FOR_HALVES` at once.
     memory_bytes : of the arrays of the renderer.
     """
 
@@ -120,7 +120,7 @@ class Estimate:
     def sample(self, pixels: np.ndarray, samples: np.ndarray, report: Report) -> None:
         """Take so many samples (n,) more of pixels (n,), given by ascending flat indices; all have had equally many.
 
-        `report` gets the share done.
+        `report` gets the fraction done.
         """
         first = int(sum(taken.ravel()[pixels[0]] for taken in self.samples))
         samples = samples.astype(np.uint32)
@@ -195,4 +195,4 @@ class Estimate:
 
 def projector_light(radiance: Radiance) -> np.ndarray:
     """All light of the projector, without glint, (h, w)."""
-    return np.asarray(radiance.direct + radiance.multipath + radiance.via_delta + radiance.caustic + radiance.faint)
+    return np.asarray(radiance.direct + radiance.multipath + radiance.specular + radiance.caustic + radiance.faint)

@@ -40,15 +40,15 @@ UNKNOWN_SPREAD = 8.0
 """Radii of the lens; stands for the spread where but one probe crossed its plane."""
 FINEST = 0.2
 """Times the spread, the radius of the smallest disc that a pixel's paths hit well: about a tenth of the pixel."""
-MOST_ENLARGED = 16.0
+MAX_ENLARGEMENT = 16.0
 """Times the radius of the lens, of the disc that stands for it."""
-MOST_PATHS = 1 << 22
+MAX_PATHS = 1 << 22
 """Of all pixels together."""
 PATHS_PER_PIXEL = (64, 4096)
 """Fewest and most."""
 SCREENING, CLOSE = 8, 8.0
-"""Share of the paths that look first, as its inverse; the others are sent where one of them came so close to the centre
-of the lens, in radii. A lens that one path in 4000 hits has eight of 512 come as close; it is missed by chance
+"""Fraction of the paths that look first, as its inverse; the others are sent where one of them came so close to the
+centre of the lens, in radii. A lens that one path in 4000 hits has eight of 512 come as close; it is missed by chance
 once in 3000 times."""
 SEGMENTS = 4
 """Of a path, about."""
@@ -87,7 +87,7 @@ def trace_glint(
     if len(pixel) == 0:
         nothing, none = np.zeros(0, np.float32), {r: np.zeros((r.channels, 0), np.float32) for r in responses}
         return Glint(pixel, nothing, none, nothing, none)
-    paths = int(np.clip(MOST_PATHS // len(pixel), *PATHS_PER_PIXEL)) // 2  # of each half
+    paths = int(np.clip(MAX_PATHS // len(pixel), *PATHS_PER_PIXEL)) // 2  # of each half
     few = paths // SCREENING
     halves = [_sums(view, rig, responses, pixel, radius_m, half * paths, few, half, report) for half in (0, 1)]
     close = np.flatnonzero(np.minimum(*(half.nearest for half in halves)) < CLOSE)
@@ -280,13 +280,13 @@ def _near_the_lens(
         nearest[some], spread[some] = state.nearest.numpy(), state.spread.numpy()
     spread = np.where(np.isfinite(spread), spread, np.float32(UNKNOWN_SPREAD * rig.projector_aperture_radius_m))
     near = nearest < aperture + NEAR * spread
-    return pixel[near], np.clip(FINEST * spread, aperture, MOST_ENLARGED * aperture)[near]
+    return pixel[near], np.clip(FINEST * spread, aperture, MAX_ENLARGEMENT * aperture)[near]
 
 
 @dr.syntax
 def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[ProbeState, Any]:
-    """The state after at most so many turns of the loop, and the turns taken: the least distance at which each pixel's
-    delta paths pass the lens's centre, and how far apart they cross its plane (infinite where fewer than two do).
+    """The state after at most so many iterations, and those taken: the least distance at which each pixel's delta paths
+    pass the lens's centre, and how far apart they cross its plane (infinite where fewer than two do).
 
     Where light splits into reflection and refraction, probes take both alike, however faint one is.
     """
@@ -296,7 +296,7 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
     nearest, spread, before = state.nearest, state.spread, state.before  # where the last one crossed
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
-    left = most + dr.zeros(mi.UInt32, dr.width(k))  # turns
+    left = most + dr.zeros(mi.UInt32, dr.width(k))  # iterations
     while (k < lanes.paths) & (left > 0):
         rng = lanes.random.at(random)
         primary = traced.camera.centre_ray(lanes.corner + stratified(lanes.shift, k))
@@ -326,8 +326,8 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
 def _paths_to_the_lens(
     lanes: Lanes, lens: Lens, accumulators: Accumulators, state: PathState, most: Any
 ) -> tuple[PathState, Any]:
-    """The state after at most so many turns of the loop, and the turns taken: dense channels and radiance of the delta
-    paths from each pixel to the lens; bins go to the accumulators."""
+    """The state after at most so many iterations, and those taken: dense channels and radiance of the delta paths
+    from each pixel to the lens; bins go to the accumulators."""
     traced, camera = lanes.traced, lanes.traced.camera
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
@@ -340,7 +340,7 @@ def _paths_to_the_lens(
     )
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Delta
-    left = most + dr.zeros(mi.UInt32, dr.width(k))  # turns
+    left = most + dr.zeros(mi.UInt32, dr.width(k))  # iterations
     while (k < lanes.paths) & (left > 0):
         rng = lanes.random.at(random)
         # ---- The next path starts at the camera ------------------------------------------------------
@@ -350,7 +350,7 @@ def _paths_to_the_lens(
         )
         primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, lanes.first + k), on_lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, direction))
-        beam = beam.begun(starts, primary.origin, primary.lead)
+        beam = beam.begun(starts, primary.origin, primary.path_offset)
         si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
 
         # ---- Does this segment meet the lens? --------------------------------------------------------

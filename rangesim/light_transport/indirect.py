@@ -38,7 +38,8 @@ JUMP = 0.02
 """Distance of a neighbour off the surface, over that from the camera, from which on a pixel sees an edge with something
 behind: it sees both, and does not lend its light to others."""
 RIDGE = 0.05
-"""Of the regression, as a share of the weight times the squared step: how soon a one-sided window is a plain mean."""
+"""Of the regression, as a fraction of the weight times the squared step: how soon a one-sided window is a plain
+mean."""
 
 CHANNELS_AT_ONCE, ROWS_AT_ONCE = 32, 16
 """Of the filter: what fits into the caches."""

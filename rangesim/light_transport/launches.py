@@ -28,21 +28,21 @@ UNWATCHED_LAUNCH_S = 20.0
 LONGEST = 1.5
 """After which a launch of a loop should end, its lanes finished or not."""
 FIRST_UNITS = 1 << 21
-"""Work of a first launch: as many turns of a loop, rays or photons."""
+"""Work of a first launch: as many iterations of a loop, rays or photons."""
 LONGER_WHERE_PREPARED_LONG = 2.0
 """Times as long, at most, where it takes long to make the kernel (thousands of shapes)."""
 LANES_TOGETHER = 16
-FEWEST_AT_WORK = 256
+MIN_AT_WORK = 256
 STEEPEST = 8.0
 """Growth of the work from one launch to the next, at most."""
-MOST_TURNS = 1 << 31
+MAX_ITERATIONS = 1 << 31
 """Of a launch, so that they can be counted."""
 REPORT_S = 0.1
 """Between two reports of progress, seconds, at least."""
 
 State = TypeVar("State")
 Report = Callable[[float], None]
-"""Called with the share done, 0..1, after each launch."""
+"""Called with the fraction done, 0..1, after each launch."""
 
 
 class Launches:
@@ -78,28 +78,28 @@ class Launches:
         pending: Callable[[], Any] = list,
         report: Callable[[State], None] = lambda state: None,
     ) -> tuple[State, int]:
-        """The state of the lanes when all of them are finished, and the turns of the loop that they took together.
+        """The state of the lanes when all of them are finished, and the iterations of the loop that they took together.
 
         Parameters
         ----------
-        loop : makes of a state and the most turns allowed (UInt32) the next state and the turns (lanes,) that were
-            taken: fewer than allowed by a lane that is finished.
+        loop : makes of a state and the most iterations allowed (UInt32) the next state and (lanes,) the iterations that
+            were taken: fewer than allowed by a lane that is finished.
         pending : the buffers that it scatters to.
         report : called with the state after each launch.
         """
         dr.make_opaque(state)  # like the state of later launches, so that they share a kernel
         total, at_work = 0, lanes
         while at_work:
-            most = min(max(1, int(self.units * LONGEST) // at_work), MOST_TURNS)
+            most = min(max(1, int(self.units * LONGEST) // at_work), MAX_ITERATIONS)
             start = time.perf_counter()
             state, taken = loop(state, dr.opaque(mi.UInt32, most))
             seconds = evaluate([state, taken, pending()])
-            turns = taken.numpy()
-            self.learn(int(turns.sum()), seconds, time.perf_counter() - start - seconds)
-            total += int(turns.sum())
+            iterations = taken.numpy()
+            self.learn(int(iterations.sum()), seconds, time.perf_counter() - start - seconds)
+            total += int(iterations.sum())
             # Neighbours are at work together, and a few lanes take as long as many
-            groups = np.logical_or.reduceat(turns == most, np.arange(0, lanes, LANES_TOGETHER))
-            at_work = max(FEWEST_AT_WORK, LANES_TOGETHER * int(groups.sum())) if groups.any() else 0
+            groups = np.logical_or.reduceat(iterations == most, np.arange(0, lanes, LANES_TOGETHER))
+            at_work = max(MIN_AT_WORK, LANES_TOGETHER * int(groups.sum())) if groups.any() else 0
             report(state)
         return state, total
 
@@ -146,9 +146,9 @@ def fewest_lanes() -> int:
     return 1 << 18 if mi.variant().startswith("cuda") else max(4096, 512 * dr.thread_count())
 
 
-def report_part(report: Report, before: float, part: float, share: float) -> None:
-    """Report the share done of a part of the work, which begins where `before` of it is done."""
-    report(before + part * share)
+def report_part(report: Report, before: float, part: float, fraction: float) -> None:
+    """Report the fraction done of a part of the work, which begins where `before` of it is done."""
+    report(before + part * fraction)
 
 
 class Progress:
@@ -158,8 +158,8 @@ class Progress:
         self.call = call
         self.last_s = -REPORT_S
 
-    def __call__(self, share: float) -> None:
+    def __call__(self, fraction: float) -> None:
         now = time.monotonic()
-        if self.call is not None and (share >= 1 or now - self.last_s >= REPORT_S):
+        if self.call is not None and (fraction >= 1 or now - self.last_s >= REPORT_S):
             self.last_s = now
-            self.call(share)
+            self.call(fraction)

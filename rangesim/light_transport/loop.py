@@ -2,16 +2,17 @@
 """The path loop: one pass of light paths serves every pattern, frequency and bin.
 
 One lane owns one pixel and traces its samples one after the other; where a path ends, the lane starts the
-next sample in the same turn of the loop. So no lane idles while its neighbours finish, every channel is a
+next sample in the same iteration of the loop. So no lane idles while its neighbours finish, every channel is a
 register instead of a film, and each sum is made by one thread in one order: same seed, same bytes,
 whatever the number of threads. The loop is run in launches of bounded time, each of which takes some lanes so many
-turns further: what a lane has done is its `State`, so that neither the lanes of a launch nor its turns change a byte.
+iterations further: what a lane has done is its `State`, so that neither the lanes of a launch nor its iterations change
+a byte.
 
 A path has two limits. `max_depth` counts the surfaces that scatter it; delta interactions (glass, mirrors, coats,
 holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.specular_chain`).
 
-Inside a translucent object a turn of the loop is a scattering event instead of a surface; a stay inside counts as one
-surface towards the depth, however often it scatters (`rangesim.light_transport.medium`). Inside glass that absorbs,
+Inside a translucent object an iteration of the loop is a scattering event instead of a surface; a stay inside counts as
+one surface towards the depth, however often it scatters (`rangesim.light_transport.medium`). Inside glass that absorbs,
 what a segment leaves of the throughput is exp(-sigma_a d) (`rangesim.light_transport.absorption`).
 
 The strategies that bring projector light to the camera partition all light paths: next-event estimation (here),
@@ -40,14 +41,14 @@ from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs,
 from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.truncation import Tally
-from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, VIA_DELTA, LightPath
+from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, SPECULAR, LightPath
 from rangesim.scene import Scene
 
 NEIGHBOURS = 256
 """Pixels in a row that share a launch. Launches take such runs from all over the image: so their times are alike."""
-TURNS_PER_SAMPLE = 2
+ITERATIONS_PER_SAMPLE = 2
 """As long as nothing is known."""
-MOST_BENT = 4.0
+MAX_BENT = 4.0
 """Cosine of a photon to the surface at a vertex, at most, over that where it landed."""
 
 
@@ -116,7 +117,7 @@ class Radiance(NamedTuple):
 
     direct: Any
     multipath: Any
-    via_delta: Any
+    specular: Any
     caustic: Any
     ambient: Any
     faint: Any
@@ -146,7 +147,7 @@ class Vertex(NamedTuple):
 
 @dataclass
 class State:
-    """What a lane carries from one turn of the loop to the next; see `start`.
+    """What a lane carries from one iteration of the loop to the next; see `start`.
 
     A dataclass, not frozen: Dr.Jit looks into no named tuple when it evaluates. What never changes is not in it (None
     instead), or Dr.Jit would trace the loop twice.
@@ -154,7 +155,7 @@ class State:
 
     random: Any
     choice: Any
-    turns: Any
+    rotation: Any
     channels: list[list[Any]]
     radiance: list[Any]
     tally: list[Any]
@@ -194,18 +195,18 @@ def trace(
 ) -> Traced:
     """Radiance by kind of path, and what tells how much is left out; channels go to the accumulators.
 
-    The pixels of the budget are those of the accumulators. `report` gets the share done.
+    The pixels of the budget are those of the accumulators. `report` gets the fraction done.
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
     traced = Traced(*(np.empty((len(kind._fields), pixels), np.float32) for kind in (Radiance, Tally)))
     samples = budget.samples
-    total, begin, finished, turns = int(samples.sum(dtype=np.int64)), 0, 0, 0
+    total, begin, finished, iterations = int(samples.sum(dtype=np.int64)), 0, 0, 0
 
     def tell(state: State) -> None:
         report((finished + float(state.sample.numpy().sum(dtype=np.int64))) / total)
 
     while begin < len(runs):
-        per_sample = turns / finished if finished else TURNS_PER_SAMPLE
+        per_sample = iterations / finished if finished else ITERATIONS_PER_SAMPLE
         most = max(fewest_lanes(), int(launches.units / (per_sample * total / pixels))) // NEIGHBOURS
         left = len(runs) - begin
         end = begin + -(-left // -(-left // most))  # launches of even size
@@ -218,7 +219,7 @@ def trace(
         for images, sums in zip(traced, (state.radiance, state.tally), strict=True):
             for image, values in zip(images, sums, strict=True):
                 image[places] = 0 if values is None else values.numpy()
-        begin, finished, turns = end, finished + int(samples[places].sum(dtype=np.int64)), turns + taken
+        begin, finished, iterations = end, finished + int(samples[places].sum(dtype=np.int64)), iterations + taken
     return traced
 
 
@@ -269,7 +270,7 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
         random=mi.UInt64(at.random.rng.state),
         choice=mi.UInt64(at.choice.rng.state) if gathers else None,  # of photons; they change no other light
         # Shared by neighbours; evenly spread from here on
-        turns=of_part(random_stream(settings.seed, at.pixel >> 4, Stream.THIRD), at.part).next_uint32()
+        rotation=of_part(random_stream(settings.seed, at.pixel >> 4, Stream.THIRD), at.part).next_uint32()
         if gathers
         else None,
         channels=accumulators.zeros(lanes),
@@ -297,25 +298,34 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
 def walk(
     view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
-    """The state of the lanes after at most so many turns of the loop, and the turns that each one took."""
+    """The state of the lanes after at most so many iterations of the loop, and those that each one took."""
     traced, maps = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
     # ---- The state, by name ------------------------------------------------------------------------
-    random, choice, turns, channels, sample = state.random, state.choice, state.turns, state.channels, state.sample
+    random, choice, rotation, channels, sample = (
+        state.random,
+        state.choice,
+        state.rotation,
+        state.channels,
+        state.sample,
+    )
     origin, towards = state.origin, state.direction
-    direct, multipath, via_delta, caustic, ambient, faint = state.radiance
+    direct, multipath, specular, caustic, ambient, faint = state.radiance
     at_first, further, before_last, at_last, indirect, cut = state.tally
     depth, chain, throughput, beam = state.depth, state.chain, state.throughput, state.beam
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
     events, stays = state.events, state.stays
     lanes = dr.width(sample)
-    left = most + dr.zeros(mi.UInt32, lanes)  # turns
+    left = most + dr.zeros(mi.UInt32, lanes)  # iterations
     active = (sample < at.samples) & (left > 0)
 
     while active:
         rng = at.random.at(random)
-        scatters, crosses = mi.Bool(False), mi.Bool(False)  # this turn: an event inside a medium, or its boundary
+        scatters, crosses = (
+            mi.Bool(False),
+            mi.Bool(False),
+        )  # in this iteration: an event inside a medium, or its boundary
 
         # ---- A new sample starts at the camera -------------------------------------------------------
         starts = depth == 0
@@ -327,7 +337,7 @@ def walk(
         jitter, lens = in_pairs(at.shift, at.lens_shift, number, at.total)
         primary = camera.sample_ray(at.corner + jitter, lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
-        beam = beam.begun(starts, primary.origin, primary.lead)
+        beam = beam.begun(starts, primary.origin, primary.path_offset)
         if dr.hint(camera.distortion is not None, mode="scalar"):
             throughput = dr.select(starts & ~primary.exists, 0, throughput)  # no ray, no light
 
@@ -381,11 +391,11 @@ def walk(
         radiance = dr.select(link.lit, throughput * value * link.geometry * at.irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
         u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, beam.length + link.distance))
-        kind = dr.select(first, dr.select(via, mi.UInt32(VIA_DELTA), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
+        kind = dr.select(first, dr.select(via, mi.UInt32(SPECULAR), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
         light = LightPath(u, v, path_length, first, kind, link.blur_px)
         channels = accumulators.add(channels, light, radiance, at.place, link.lit, kind == MULTIPATH)
         direct += dr.select(kind == DIRECT, radiance, 0)
-        via_delta += dr.select(kind == VIA_DELTA, radiance, 0)
+        specular += dr.select(kind == SPECULAR, radiance, 0)
         multipath += dr.select(kind == MULTIPATH, radiance, 0)
         indirect += dr.select(is_later, radiance, 0)
 
@@ -395,8 +405,8 @@ def walk(
             chosen = at.choice.at(choice)
             xi = [chosen.next_float32() for _ in range(3)]
             choice = chosen.state
-            turns += 2654435769  # 2^32 over the golden ratio
-            chance, gathers = mi.Float(turns >> 8) * 2**-24, may_connect & ~scatters
+            rotation += 2654435769  # 2^32 over the golden ratio
+            chance, gathers = mi.Float(rotation >> 8) * 2**-24, may_connect & ~scatters
             photon, brought, is_wide = gather(maps, vertex, number, xi, chance, gathers)
             channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
             caustic += dr.select(is_wide, 0, radiance)
@@ -426,10 +436,10 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             depth -= dr.select(was_bent, mi.UInt32(1), mi.UInt32(0))
             chain = dr.select(crosses, chain, dr.select(was_bent, chain + 1, 0))
-        share = throughput * dr.square(beam.ior)  # of the light, that this path stands for
-        chance = dr.select(depth > settings.rr_depth, dr.minimum(share, 0.95), 1)
+        fraction = throughput * dr.square(beam.ior)  # of the light, that this path stands for
+        chance = dr.select(depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
-            chance = dr.minimum(chance, survival(chain, share))
+            chance = dr.minimum(chance, survival(chain, fraction))
         if dr.hint(media is not None, mode="scalar"):
             chance = dr.select(scatters, dr.minimum(throughput / FAINT, 1), dr.select(crosses, 1, chance))
         survives = rng.next_float32() < chance
@@ -480,9 +490,9 @@ def walk(
     return State(
         random=random,
         choice=choice,
-        turns=turns,
+        rotation=rotation,
         channels=channels,
-        radiance=[direct, multipath, via_delta, caustic, ambient, faint],
+        radiance=[direct, multipath, specular, caustic, ambient, faint],
         tally=[at_first, further, before_last, at_last, indirect, cut],
         sample=sample,
         depth=depth,
@@ -517,11 +527,11 @@ def gather(
         if maps.near(level, p, reach, sample, active & (chance < kind.chance)):
             found = maps.gather(level, p, n, reach, sample, xi[0], xi[1], active)
             irradiance += found.irradiance / kind.chance
-            share = dr.select(irradiance > 0, found.irradiance / kind.chance / irradiance, 0)
-            taken = pick < share
+            fraction = dr.select(irradiance > 0, found.irradiance / kind.chance / irradiance, 0)
+            taken = pick < fraction
             photon = dr.select(taken, found.photon, photon)
             is_wide = dr.select(taken, maps.is_wide[level], is_wide)
-            pick = dr.select(taken, pick / share, (pick - share) / (1 - share))
+            pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))
     return photon, irradiance, is_wide
 
 
@@ -546,7 +556,7 @@ def caustics(
         # Photons count flux per area, so the geometric cosine is in them already; the BSDF counts that to the shading
         # normal (Veach 1997, 5.3). Where a photon landed beside an edge, its own facet is the one that counts
         seen, lit = dr.dot(vertex.si.to_world(wi), vertex.si.n), -dr.dot(flight.direction, vertex.si.n)
-        cosine = dr.maximum(flight.cosine, dr.abs(lit) / MOST_BENT)
+        cosine = dr.maximum(flight.cosine, dr.abs(lit) / MAX_BENT)
         on_one_side = seen * lit * wi.z * wo.z > 0  # for both normals, or for neither
         radiance = vertex.throughput * irradiance * mono(value) / cosine
         radiance = dr.select(found & on_one_side, radiance, 0)
@@ -593,10 +603,10 @@ def emission_through(
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)
     value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
     around = None if absorbers is None else absorbers.beyond(si, ds.d, beam.sigma_a, active & ~scatters)
-    share, crossed = media.transmittance(scene, si, ds.p, inside, active, around)
+    fraction, crossed = media.transmittance(scene, si, ds.p, inside, active, around)
     weight = dr.select(scatters | crossed, 0, power_heuristic(ds.pdf, pdf))
     weight = dr.select(ds.delta, 1, weight)
-    return dr.select(active, weight * share * value * mono(radiance), 0)
+    return dr.select(active, weight * fraction * value * mono(radiance), 0)
 
 
 def power_heuristic(a: Any, b: Any) -> Any:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Translucent objects: light that walks through a homogeneous participating medium behind an index-matched boundary.
 
-Inside, light travels exponentially distributed ways between scattering events (mean 1 / sigma_t), keeps the share
+Inside, light travels exponentially distributed ways between scattering events (mean 1 / sigma_t), keeps the fraction
 `albedo` of itself at each, and turns by an angle of the phase function of Henyey and Greenstein (1941); g = 0 is
 isotropic. The boundary neither reflects nor refracts, so the way to the projector is straight, and what is left of the
 light along it is exp(-sigma_t times the way inside) (Beer-Lambert). See docs/subsurface.md. Media that absorb alone
@@ -111,8 +111,9 @@ class Media:
     def transmittance(
         self, scene: Any, si: Any, target: Any, inside: Medium, active: Any, around: Any = None
     ) -> tuple[Any, Any]:
-        """Share of the light that reaches `target` straight from `si`, which lies in the medium `inside`; 0 behind any
-        other surface. And whether the way crosses a boundary. `around`: absorption coefficient outside the media."""
+        """Fraction of the light that reaches `target` straight from `si`, which lies in the medium `inside`; 0 behind
+        any other surface. And whether the way crosses a boundary. `around`: absorption coefficient outside the
+        media."""
         start = mi.Point3f(si.p)
         ray = mi.Ray3f(si.spawn_ray_to(target))
         sigma_t, thickness = mi.Float(inside.sigma_t), dr.zeros(mi.Float, dr.width(active))

@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
-from rangesim.light_transport.estimate import FEWEST_FOR_HALVES, Estimate
+from rangesim.light_transport.estimate import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect import LightFilter
@@ -30,7 +30,7 @@ from rangesim.signals import EnergySplit, Signals
 Indirect = Literal["filtered", "raw"]
 MATTE_SPP, OTHER_SPP = 16, 64
 """Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
-PATHS_SHARE = 0.95
+PATHS_FRACTION = 0.95
 """Of the progress, that the samples make."""
 TEXTURE_SAMPLES = 64
 """Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
@@ -83,7 +83,7 @@ def transport(
         budget, and each its own noise.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed
         come on top, some 200 bytes each.
-    progress : called with the share done, 0..1, after each kernel launch, at most ten times a second. What it raises
+    progress : called with the fraction done, 0..1, after each kernel launch, at most ten times a second. What it raises
         ends the pass.
 
     Raises
@@ -133,7 +133,7 @@ def transport(
         guides = guides._replace(reflectance=seen)
     shared = LightFilter(guides) if keeps_apart else None
     glints = trace_glint(traced, here, responses, seed, at_work) if glint else None
-    has_halves = sampling_error and fewest >= FEWEST_FOR_HALVES
+    has_halves = sampling_error and fewest >= MIN_FOR_HALVES
     estimate = Estimate(view, settings, rig, responses, keeps_apart, has_halves, memory_bytes, launches)
 
     def signals_of(some: Sequence[Response] | None) -> Signals:
@@ -144,13 +144,13 @@ def transport(
                 glints.add_to(values, glints.channels_error[response])
         return Signals(rig, channels, _energy(channels, radiance, glints), truth, sampling=error)
 
-    left = 0.5 * PATHS_SHARE if adaptive else 0.0  # how much follows is not known
-    estimate.sample(np.arange(h * w), samples, partial(report_part, report, 0.0, PATHS_SHARE - left))
+    left = 0.5 * PATHS_FRACTION if adaptive else 0.0  # how much follows is not known
+    estimate.sample(np.arange(h * w), samples, partial(report_part, report, 0.0, PATHS_FRACTION - left))
     if adaptive and adaptive.max_spp > fewest:
         more = adaptive.samples(truth, lambda sensor: signals_of(sensor.responses())).ravel() - samples
         pixels = np.flatnonzero(more)
         if len(pixels):
-            estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_SHARE - left, left))
+            estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
     signals = signals_of(None)
     report(1.0)
     truncation = estimate_truncation(estimate.mean_tally(), signals.energy, max_depth, maps.cut if maps else 0.0)
@@ -176,7 +176,7 @@ def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Gl
     return EnergySplit(
         direct=radiance.direct,
         multipath=radiance.multipath,
-        via_delta=radiance.via_delta,
+        specular=radiance.specular,
         caustic=radiance.caustic + radiance.faint,
         glint=highlights[0],
         ambient=radiance.ambient,

@@ -13,7 +13,7 @@ from rangesim.light_transport.sampling import Continued, Seed, random_stream
 from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 
-LANDING_SHARE = 0.75
+LANDING_FRACTION = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
 
 
@@ -33,7 +33,7 @@ class Landing(NamedTuple):
 def fly(
     traced: TracedScene, pixel: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
 ) -> tuple[Landing, tuple[Any, ...]]:
-    """Landings of photons sent through projector pixels, and the fates of each that `PhotonBalance` sums up."""
+    """Landings of photons sent through projector pixels, and the parts of each that `EnergyBudget` sums up."""
     pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(traced.projector.size.x)
     photon = mi.UInt32(number.astype(np.uint32))
     rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
@@ -53,7 +53,7 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
     if dr.hint(primary.exists is not None, mode="scalar"):
         flux = dr.select(primary.exists, flux, 0)
     emitted = mi.Float(flux)
-    beam = Beam.start(traced, lanes).begun(True, primary.origin, primary.lead)
+    beam = Beam.start(traced, lanes).begun(True, primary.origin, primary.path_offset)
     chain = dr.zeros(mi.UInt32, lanes)  # delta interactions so far
     left = max_chain + dr.zeros(mi.UInt32, lanes)  # surfaces and boundaries of media that may still be met
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
@@ -93,8 +93,8 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
         # ---- It lands: beyond a delta surface for the map, else for next-event estimation ------------
         direct += dr.select(hit & ~mirrors & (chain == 0), flux, 0)
         mixed = scatters & mirrors & (chain > 0)
-        lands = scatters & (chain > 0) & (~mixed | (rng.next_float32() < LANDING_SHARE))
-        landing_flux = dr.select(mixed, flux / LANDING_SHARE, flux)
+        lands = scatters & (chain > 0) & (~mixed | (rng.next_float32() < LANDING_FRACTION))
+        landing_flux = dr.select(mixed, flux / LANDING_FRACTION, flux)
         stored = dr.select(lands, landing_flux, stored)
         position = dr.select(lands, point, position)
         direction = dr.select(lands, ray.d, direction)
@@ -105,7 +105,7 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
         bs, weight = bsdf.sample(
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), goes_on
         )
-        remains = flux * dr.select(mixed, 1 / (1 - LANDING_SHARE), 1) * mi.unpolarized_spectrum(weight)[0]
+        remains = flux * dr.select(mixed, 1 / (1 - LANDING_FRACTION), 1) * mi.unpolarized_spectrum(weight)[0]
         goes_on &= (remains > 0) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         chance = survival(chain, remains / emitted)
         goes_on &= rng.next_float32() < chance

@@ -29,14 +29,14 @@ import numpy as np
 from rangesim.light_transport.photons import Photons
 
 ALPHA = 2 / 3
-MOST_MAPS = 64
+MAX_MAPS = 64
 """Photon maps; with more samples per pixel than this, several samples share a map."""
 CLASSES_PER_OCTAVE = 4
 STEEPEST = 1 / 12
 """Radius of the brightest level over the distance, at most; that of the faintest is half the distance then."""
 FLATNESS = 0.3
-"""Photons farther than this share of the radius above or below the tangent plane lie on another surface."""
-MOST_LOOKED_AT = 16
+"""Photons farther than this fraction of the radius above or below the tangent plane lie on another surface."""
+MAX_LOOKED_AT = 16
 """Photons that a gather looks at, where there are more."""
 OCCUPANCY_CELLS = 1 << 18
 PRIMES = (73856093, 19349663, 83492791)
@@ -53,14 +53,14 @@ ROW_FACTORS = (0x9E3779B3, 0x85EBCA75)
 CLASS_FACTOR = 0xC2B2AE3D
 UNBOUNDED = 1e30
 """Stands for infinity in single precision."""
-LEAST_M = 1e-9
+MIN_M = 1e-9
 """Least radius: at a device itself."""
 
 
 class Level(NamedTuple):
     """How photons of one brightness are gathered.
 
-    brightest : of the photons of this level, irradiance as a share of the direct light.
+    brightest : of the photons of this level, irradiance as a fraction of the direct light.
     radius : times the radius of the brightest level.
     chance : that a vertex gathers them.
     """
@@ -142,7 +142,7 @@ class PhotonMaps:
     Parameters
     ----------
     photons : Photons, one or more.
-    maps : int in 1..MOST_MAPS, independent maps they were dealt out to.
+    maps : int in 1..MAX_MAPS, independent maps they were dealt out to.
     radius : GatheringRadius, of the first map and the brightest level.
     irradiance : W/m2, direct light of the projector at 1 m.
     wide : radians, radius over the distance from the camera from which on gathered light counts as smooth.
@@ -151,10 +151,10 @@ class PhotonMaps:
     def __init__(
         self, photons: Photons, maps: int, radius: GatheringRadius, irradiance: float, wide: float = np.inf
     ) -> None:
-        at_photons = np.maximum(radius.at(photons.position), LEAST_M)
+        at_photons = np.maximum(radius.at(photons.position), MIN_M)
         # Of a whole level, lest light be smooth on one side of a line and not on the other
         from_camera = np.linalg.norm(photons.position - radius.camera_at, axis=1)
-        usual = float(np.quantile(at_photons / np.maximum(from_camera, LEAST_M), USUAL))
+        usual = float(np.quantile(at_photons / np.maximum(from_camera, MIN_M), USUAL))
         self.is_wide = [usual * one.radius >= wide for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
         self.cut = photons.balance.cut
@@ -197,7 +197,7 @@ class PhotonMaps:
         a, b, c, d = self.bounds
         from_camera = dr.norm(point - self.camera_at)
         radius = dr.fma(b, dr.norm(point - self.projector_at), a)
-        radius = dr.maximum(dr.clip(radius, c * from_camera, d * from_camera), LEAST_M)
+        radius = dr.maximum(dr.clip(radius, c * from_camera, d * from_camera), MIN_M)
         kind = dr.ceil(dr.log2(radius / self.unit) * CLASSES_PER_OCTAVE)
         return Reach(radius, mi.UInt32(mi.Int32(kind)), 2 * self.unit * dr.exp2(kind / CLASSES_PER_OCTAVE))
 
@@ -207,7 +207,7 @@ class PhotonMaps:
         index = _hash(*(mi.UInt32(mi.Int32(x)) for x in cell)) + reach.kind * CLASS_PRIME
         index &= OCCUPANCY_CELLS - 1
         of_map = sample % self.maps
-        bits = dr.gather(mi.UInt32, self.occupied[level], index * (MOST_MAPS // 32) + (of_map >> 5), active)
+        bits = dr.gather(mi.UInt32, self.occupied[level], index * (MAX_MAPS // 32) + (of_map >> 5), active)
         return active & ((bits >> (of_map & 31)) & 1 != 0)
 
     @dr.syntax
@@ -222,7 +222,7 @@ class PhotonMaps:
         one, two = counts[0] + counts[1], counts[0] + counts[1] + counts[2]
         count = two + counts[3]
         # Where photons crowd, every n-th will do; they are in the order in which they left the projector
-        every = (count + (MOST_LOOKED_AT - 1)) // MOST_LOOKED_AT
+        every = (count + (MAX_LOOKED_AT - 1)) // MAX_LOOKED_AT
         k = mi.UInt32(offset * mi.Float(every))
         total, chosen, pick = mi.Float(0), mi.UInt32(0), mi.Float(pick)
         inverse_square, flat = dr.rcp(dr.square(radius)), FLATNESS * radius
@@ -236,10 +236,10 @@ class PhotonMaps:
             beside = (kernel > 0) & (dr.abs(dr.dot(d, normal)) < flat)
             weight = dr.select(beside, kernel * photon.w, 0)
             total += weight
-            share = dr.select(beside, weight / total, 0)
-            taken = pick < share
+            fraction = dr.select(beside, weight / total, 0)
+            taken = pick < fraction
             chosen = dr.select(taken, index, chosen)
-            pick = dr.select(taken, pick / share, (pick - share) / (1 - share))  # as good as new
+            pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))  # as good as new
             k += every
         return Gathered(chosen, total * mi.Float(every) * (2 / dr.pi) * inverse_square)
 
@@ -278,9 +278,9 @@ def levels_of(
     cell_m = 4 * radius_m.min() * (1 + BESIDE) * 2.0**octave
     key = _hash(*_cells(photons.position, cell_m).T) + octave * CLASS_PRIME & (OCCUPANCY_CELLS - 1)
     power = np.bincount(key, photons.flux, OCCUPANCY_CELLS)[key] / maps
-    direct = irradiance / np.maximum(np.sum((photons.position - radius.projector_at) ** 2, axis=1), LEAST_M)
-    share = power / (direct * cell_m**2)
-    return np.count_nonzero([share < one.brightest for one in LEVELS], axis=0) - 1
+    direct = irradiance / np.maximum(np.sum((photons.position - radius.projector_at) ** 2, axis=1), MIN_M)
+    fraction = power / (direct * cell_m**2)
+    return np.count_nonzero([fraction < one.brightest for one in LEVELS], axis=0) - 1
 
 
 def _in_classes(radius: np.ndarray, steepness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -323,12 +323,12 @@ def _row(y: Any, z: Any, kind: Any, mask: Any) -> Any:
 
 
 def _occupancy(position: np.ndarray, of_map: np.ndarray, kind: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """(cells * MOST_MAPS / 32,) uint32: one bit per map and hash of a cell within the radius, half an edge, of some
+    """(cells * MAX_MAPS / 32,) uint32: one bit per map and hash of a cell within the radius, half an edge, of some
     photon of that class."""
-    occupied = np.zeros(OCCUPANCY_CELLS * MOST_MAPS, dtype=bool)
+    occupied = np.zeros(OCCUPANCY_CELLS * MAX_MAPS, dtype=bool)
     low, high = (_cells(position + offset * edge[:, None], edge) for offset in (-0.5, 0.5))
     for corner in range(8):
         cell = [np.where(corner >> axis & 1, high[:, axis], low[:, axis]) for axis in range(3)]
         index = _hash(*cell) + kind * CLASS_PRIME
-        occupied[(index & (OCCUPANCY_CELLS - 1)) * MOST_MAPS + of_map] = True
+        occupied[(index & (OCCUPANCY_CELLS - 1)) * MAX_MAPS + of_map] = True
     return np.packbits(occupied, bitorder="little").view(np.uint32)

@@ -8,7 +8,7 @@ photons by what it scatters out of their way; that scattered light is not follow
 them on their way inside (`rangesim.light_transport.absorption`).
 
 Only pixels whose light meets a delta surface first are worth photons. A pre-pass with one ray per pixel finds them and
-their neighbours; a small share of the photons goes to all other pixels, so that the estimate stays unbiased where
+their neighbours; a small fraction of the photons goes to all other pixels, so that the estimate stays unbiased where
 something is finer than a pixel.
 """
 
@@ -31,20 +31,20 @@ from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.media import is_boundary
 
-DEFENSIVE_SHARE = 0.05
+DEFENSIVE_FRACTION = 0.05
 """Of the photons, for the pixels where the pre-pass found no delta surface."""
 SURFACES_PER_PHOTON = 2
 """About."""
 SUMMED_TOGETHER = 1 << 16
-"""Photons whose fates are added up first, so that the sum does not depend on launches."""
-MOST_AT_ONCE = 1 << 20
+"""Photons whose parts are added up first, so that the sum does not depend on launches."""
+MAX_AT_ONCE = 1 << 20
 """Photons of a launch, so that what NumPy does with them is short as well."""
 BYTES_PER_PHOTON = 128
 """While it flies, an upper bound."""
 
 
 @dataclass(frozen=True, eq=False)
-class PhotonBalance:
+class EnergyBudget:
     """Where the projector's power went, watts; emitted = direct + stored + absorbed + escaped + truncated.
 
     emitted : of the pixels that photons were sent through. direct : landed without a delta surface, left to next-event
@@ -76,7 +76,7 @@ class Photons:
     length_m : (n,) float32, metres, optical length from the projector.
     cosine : (n,) float32, of the direction to the geometric normal where it landed.
     map : (n,) int, which of the independent maps a photon belongs to; each map alone carries all the power.
-    balance : PhotonBalance, the mean over the maps.
+    balance : EnergyBudget, the mean over the maps.
     per_pixel : float, photons of all maps sent through each projector pixel that is worth it.
     """
 
@@ -88,7 +88,7 @@ class Photons:
     length_m: np.ndarray
     cosine: np.ndarray
     map: np.ndarray
-    balance: PhotonBalance
+    balance: EnergyBudget
     per_pixel: float
 
 
@@ -131,28 +131,28 @@ def trace_photons(
 
     `report` is called after each kernel launch.
     """
-    pixels, share = _worthwhile_pixels(traced.scene, traced.projector)
+    pixels, fraction = _worthwhile_pixels(traced.scene, traced.projector)
     per_map = -(-photons // maps)
-    cumulative, shift = np.cumsum(share), shift_of(seed)
+    cumulative, shift = np.cumsum(fraction), shift_of(seed)
     total = per_map * maps
-    most = max(1, min(memory_bytes // BYTES_PER_PHOTON, MOST_AT_ONCE))
+    most = max(1, min(memory_bytes // BYTES_PER_PHOTON, MAX_AT_ONCE))
     landed: list[list[np.ndarray]] = []
-    balance = np.zeros(len(PhotonBalance.__dataclass_fields__))
+    balance = np.zeros(len(EnergyBudget.__dataclass_fields__))
     launches = Launches()
     for begin, end in launches.ranges(total, SURFACES_PER_PHOTON, min(most, SUMMED_TOGETHER), at_most=most):
         number = np.arange(begin, end)
         chosen = stratified_choice(cumulative, number, per_map, shift)
-        flux = power_w / (len(pixels) * per_map * share[chosen] / cumulative[-1])
-        landing, fate = fly(traced, pixels[chosen], flux, number, seed)
-        launches.evaluate([list(landing), list(fate)], SURFACES_PER_PHOTON * (end - begin))
+        flux = power_w / (len(pixels) * per_map * fraction[chosen] / cumulative[-1])
+        landing, parts = fly(traced, pixels[chosen], flux, number, seed)
+        launches.evaluate([list(landing), list(parts)], SURFACES_PER_PHOTON * (end - begin))
         kept = np.flatnonzero(landing.flux)
         landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])
         blocks = np.arange(0, end - begin, SUMMED_TOGETHER)
-        for sums in np.column_stack([np.add.reduceat(x.numpy(), blocks, dtype=np.float64) for x in fate]):
+        for sums in np.column_stack([np.add.reduceat(x.numpy(), blocks, dtype=np.float64) for x in parts]):
             balance += sums
         report()
     position, direction, flux, u, v, length, cosine, of_map = (np.concatenate(c) for c in zip(*landed, strict=True))
-    total_balance = PhotonBalance(*(balance / maps))
+    total_balance = EnergyBudget(*(balance / maps))
     return Photons(position, direction, flux, u, v, length, cosine, of_map, total_balance, total / cumulative[-1])
 
 
@@ -162,7 +162,9 @@ def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.nd
     w, h = (int(n[0]) for n in projector.size)
     mask = binary_dilation(meets.reshape(h, w), np.ones((3, 3))).ravel()
     rest = ~mask
-    chance = np.where(mask, 1.0, DEFENSIVE_SHARE / (1 - DEFENSIVE_SHARE) * max(mask.sum(), 1) / max(rest.sum(), 1))
+    chance = np.where(
+        mask, 1.0, DEFENSIVE_FRACTION / (1 - DEFENSIVE_FRACTION) * max(mask.sum(), 1) / max(rest.sum(), 1)
+    )
     order = np.argsort(_morton(np.arange(w * h) % w, np.arange(w * h) // w))
     return order, chance[order]
 
@@ -190,7 +192,7 @@ def stratified_choice(cumulative: np.ndarray, number: np.ndarray, per_map: int, 
 
     The photons of a map are evenly spaced in 0..1 (systematic sampling), each map shifted against the others (golden
     ratio) and all by `shift`, in spacings. If that is uniform, so is every photon's place in its stratum: the chance of
-    a pixel is its share, and the mean over seeds has no bias.
+    a pixel is its fraction, and the mean over seeds has no bias.
     """
     shifts = (number // per_map * 0.6180339887498949 + shift) % 1.0
     place = (number % per_map + shifts) / per_map

@@ -75,7 +75,7 @@ class Accumulators:
                     brought = [dr.select(is_smooth, 0, radiance), dr.select(is_smooth, radiance, 0)]
                 values = [dr.fma(b, w, v) for v, (b, w) in zip(values, product(brought, weights), strict=True)]
             elif isinstance(response, SparseResponse):
-                for index, weight in response.shares(path, math):
+                for index, weight in response.bin_weights(path, math):
                     target = dr.fma(index, self.stride, place)
                     inside = active & (index < response.channels)
                     if self.parts == 2:

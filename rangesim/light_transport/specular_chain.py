@@ -96,13 +96,13 @@ class Beam:
         return Beam(self.previous, length, ior, inside, sigma_a)
 
 
-def survival(chain: Any, share: Any) -> Any:
-    """Probability of light to go on after `chain` delta interactions that left `share` of it; survivors are divided by
-    it.
+def survival(chain: Any, fraction: Any) -> Any:
+    """Probability of light to go on after `chain` delta interactions that left `fraction` of it; survivors are divided
+    by it.
 
     Lossless glass keeps all: its paths go on to the limit. Light that fades off metals ends in time.
     """
-    return dr.select(chain > ROULETTE_AFTER, dr.minimum(share, 1), 1)
+    return dr.select(chain > ROULETTE_AFTER, dr.minimum(fraction, 1), 1)
 
 
 def corrected_point(si: Any, origin: Any, direction: Any) -> Any:

@@ -19,7 +19,7 @@ from rangesim.light_transport.shapes import number_of, table_of
 
 MANY = 100
 """Shapes from which on tables of them are worth making."""
-MOST_FACES = 4096
+MAX_FACES = 4096
 """Of a mesh that is copied into a joint one."""
 
 
@@ -38,7 +38,7 @@ def _family(shape: Any) -> Any:
     """Equal for shapes that can share a branch; else the shape itself."""
     if _is_sphere(shape):
         return "sphere"
-    if shape.shape_type() == mi.ShapeType.Mesh.value and shape.face_count() <= MOST_FACES:
+    if shape.shape_type() == mi.ShapeType.Mesh.value and shape.face_count() <= MAX_FACES:
         return _kind(shape)
     return shape
 

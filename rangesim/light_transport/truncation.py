@@ -27,8 +27,8 @@ from rangesim.signals import EnergySplit, Truncation
 DIRECT_ALONE = 2
 """The `max_depth` that asks for direct light alone; how much else there would be is not known then."""
 WORTH_A_WARNING = 0.02
-"""Share of the projector's light."""
-STEEPEST_DECAY, FLATTEST_DECAY = 0.0, 0.99
+"""Fraction of the projector's light."""
+MIN_DECAY, MAX_DECAY = 0.0, 0.99
 """Bounds of t: nothing is known about a closed room that absorbs next to nothing."""
 
 
@@ -58,10 +58,10 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
     photons_cut : flux of photons that were cut off, over that of those that landed.
     """
     first, further, before_last, last, indirect, cut = (float(x.sum(dtype=float)) for x in tally)
-    seen = sum(float(x.sum(dtype=float)) for x in (energy.direct, energy.multipath, energy.via_delta, energy.caustic))
+    seen = sum(float(x.sum(dtype=float)) for x in (energy.direct, energy.multipath, energy.specular, energy.caustic))
     by_depth = np.nan
     if max_depth > DIRECT_ALONE:
-        t = min(max(last / before_last, STEEPEST_DECAY), FLATTEST_DECAY) if before_last else 0.0
+        t = min(max(last / before_last, MIN_DECAY), MAX_DECAY) if before_last else 0.0
         by_depth = indirect / further * last * t / (1 - t) if further else 0.0
     by_chains = seen * cut / (first + further) if first + further else 0.0
     by_photons = float(energy.caustic.sum(dtype=float)) * photons_cut

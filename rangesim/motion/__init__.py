@@ -3,7 +3,7 @@
 
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.motion.timing import Timing
-from rangesim.motion.track import Motion, PoseTrack, SteadyTrack, Track
+from rangesim.motion.track import ConstantTwist, Motion, PoseTrack, Track
 from rangesim.motion.transport import transport_moving
 
-__all__ = ["Motion", "MovingSignals", "PoseTrack", "SteadyTrack", "Timing", "Track", "transport_moving"]
+__all__ = ["ConstantTwist", "Motion", "MovingSignals", "PoseTrack", "Timing", "Track", "transport_moving"]

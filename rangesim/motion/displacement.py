@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesim.motion.track import Placement, apply
+from rangesim.motion.track import Poses, apply
 from rangesim.rig import Rig
 from rangesim.signals import GroundTruth
 
@@ -13,7 +13,7 @@ STILL = 1e-9
 """Entries of a transform that differ less from the identity, in metres and radians, are roundings."""
 
 
-def displacement(truth: GroundTruth, rig: Rig, start: Placement, end: Placement) -> np.ndarray:
+def displacement(truth: GroundTruth, rig: Rig, start: Poses, end: Poses) -> np.ndarray:
     """(h, w) float32, metres: how far the surface points that the pixels see move, as seen from the rig.
 
     Parameters
@@ -33,8 +33,8 @@ def displacement(truth: GroundTruth, rig: Rig, start: Placement, end: Placement)
     return np.nan_to_num(result)
 
 
-def _carry(name: str, start: Placement, end: Placement) -> np.ndarray:
-    """(4, 4) world transform that carries an object from one placement to another."""
+def _carry(name: str, start: Poses, end: Poses) -> np.ndarray:
+    """(4, 4) world transform that carries an object from one poses to another."""
     if name not in start.objects:
         return np.eye(4)
     return np.asarray(end.objects[name] @ np.linalg.inv(start.objects[name]))

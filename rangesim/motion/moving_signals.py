@@ -79,15 +79,16 @@ class FrameStack:
         """Take what a pass has for this sensor."""
         frames = signals.frames(self.sensor, 0.0)
         error = None if self.lit_error is None else signals.frames(self.sensor, 0.0, sampling_errors=1.0) - frames
-        for share in one.shares:
-            if share.sensor == self.sensor:
-                one.window.of(self.lit)[share.frames] += np.float32(share.share) * frames[share.frames]
+        for part in one.contributions:
+            if part.sensor == self.sensor:
+                fraction = np.float32(part.fraction)
+                one.window.of(self.lit)[part.frames] += fraction * frames[part.frames]
                 if self.lit_error is not None and error is not None:
-                    one.window.of(self.lit_error)[share.frames] += np.float32(share.share) * error[share.frames]
-                one.window.of(self.ambient)[share.exposure] += np.float32(share.share) * signals.energy.ambient
+                    one.window.of(self.lit_error)[part.frames] += fraction * error[part.frames]
+                one.window.of(self.ambient)[part.exposure] += fraction * signals.energy.ambient
         cropped = replace(self.rig, camera=signals.rig.camera)
-        leaves = displacement(self.at_middle.truth, self.rig, self.middle.placement, one.placement)
-        comes = displacement(signals.truth, cropped, one.placement, self.middle.placement)
+        leaves = displacement(self.at_middle.truth, self.rig, self.middle.poses, one.poses)
+        comes = displacement(signals.truth, cropped, one.poses, self.middle.poses)
         moved = one.window.of(self.motion_m)
         np.maximum(moved, np.maximum(one.window.of(leaves), comes), out=moved)
         # A shadow moves with what casts it, also over what stands still

@@ -9,15 +9,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesim.motion.timing import Instant, Timing, Window
-from rangesim.motion.track import Motion, Placement
+from rangesim.motion.track import Motion, Poses
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.seeds import derived_seed
 
 
 @dataclass(frozen=True, eq=False)
-class Share:
-    """What one sensor takes from a pass: a share (0..1) of the light of these frames, which one exposure fills.
+class Contribution:
+    """What one sensor takes from a pass: a fraction (0..1) of the light of these frames, which one exposure fills.
 
     The pass at the middle of the acquisition may have no frames to give.
     """
@@ -25,7 +25,7 @@ class Share:
     sensor: Sensor
     exposure: int
     frames: np.ndarray
-    share: float
+    fraction: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +35,15 @@ class Pass:
     reference_of : the sensors whose middle of the acquisition this is.
     """
 
-    placement: Placement
+    poses: Poses
     window: Window
-    shares: list[Share] = field(default_factory=list)
+    contributions: list[Contribution] = field(default_factory=list)
     reference_of: list[Sensor] = field(default_factory=list)
 
     @property
     def sensors(self) -> list[Sensor]:
         """Those that take frames from this pass, in order of first appearance."""
-        return list(dict.fromkeys(s.sensor for s in self.shares))
+        return list(dict.fromkeys(s.sensor for s in self.contributions))
 
     def rig(self, rig: Rig) -> Rig:
         """The rig where it is, its camera cropped to the window."""
@@ -56,7 +56,7 @@ class Pass:
                 cx=camera.cx - window.left,
                 cy=camera.cy - window.top,
             )
-        return replace(rig, camera=camera, T_world_camera=self.placement.place(rig))
+        return replace(rig, camera=camera, T_world_camera=self.poses.place(rig))
 
     def seed(self, seed: int) -> int:
         """Seed of the pass: the same at all times, so that what stands still has the same noise in all frames, but
@@ -72,8 +72,8 @@ def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pas
     passes: dict[tuple[bytes, Window], Pass] = {}
 
     def at(time_s: float, window: Window) -> Pass:
-        placement = motion.at(time_s)
-        return passes.setdefault((placement.key, window), Pass(placement, window))
+        poses = motion.at(time_s)
+        return passes.setdefault((poses.key, window), Pass(poses, window))
 
     for sensor, timing in timings.items():
         at(timing.reference_s(sensor, rig.camera), Window.whole(rig.camera)).reference_of.append(sensor)
@@ -82,24 +82,24 @@ def plan(rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> list[Pas
         for exposure, time_s in enumerate(timing.exposure_times_s(sensor)):
             frames = np.flatnonzero(exposures == exposure)
             for instant in _joined(timing.instants(time_s, rig.camera), motion):
-                share = Share(sensor, exposure, frames, instant.share)
-                at(instant.time_s, instant.window).shares.append(share)
+                part = Contribution(sensor, exposure, frames, instant.fraction)
+                at(instant.time_s, instant.window).contributions.append(part)
     return list(passes.values())
 
 
 def _joined(instants: Sequence[Instant], motion: Motion) -> list[Instant]:
     """Fewer instants that mean the same: where nothing has moved from one to the next, equal windows become one
-    share, and then neighbouring bands one window."""
-    shares: dict[tuple[bytes, Window], Instant] = {}
+    fraction, and then neighbouring bands one window."""
+    at_place: dict[tuple[bytes, Window], Instant] = {}
     for instant in instants:
         place = (motion.at(instant.time_s).key, instant.window)
-        before = shares[place].share if place in shares else 0.0
-        shares[place] = instant._replace(share=before + instant.share)
+        before = at_place[place].fraction if place in at_place else 0.0
+        at_place[place] = instant._replace(fraction=before + instant.fraction)
     joined: dict[bytes, Instant] = {}
     result: list[Instant] = []
-    for (key, window), instant in shares.items():
+    for (key, window), instant in at_place.items():
         last = joined.get(key)
-        if last is not None and np.isclose(last.share, instant.share) and _touch(last.window, window):
+        if last is not None and np.isclose(last.fraction, instant.fraction) and _touch(last.window, window):
             result.remove(last)
             instant = last._replace(window=Window(last.window.top, window.bottom, last.window.left, window.right))
         joined[key] = instant

@@ -13,7 +13,7 @@ from rangesim.settings.config import check_keys, from_dict, shown
 def motion_from_dict(data: Any, place: str = "motion") -> Motion:
     """The motion of a table `objects`, a track for each shape name, and a track `rig`; both may be left out.
 
-    A track is a table with a `type`: "steady" (`SteadyTrack`) or "poses" (`PoseTrack`).
+    A track is a table with a `type`: "constant-twist" (`ConstantTwist`) or "poses" (`PoseTrack`).
 
     Raises
     ------

@@ -33,11 +33,11 @@ class Window(NamedTuple):
 
 
 class Instant(NamedTuple):
-    """A time at which a window of the image is exposed, in seconds, and its share of the exposure."""
+    """A time at which a window of the image is exposed, in seconds, and its fraction of the exposure."""
 
     time_s: float
     window: Window
-    share: float
+    fraction: float
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ class PoseTrack(Track):
 
 
 @dataclass(frozen=True)
-class SteadyTrack(Track):
+class ConstantTwist(Track):
     """A motion of constant velocity and rotation rate, without end; at its place in the scene file at time 0.
 
     Parameters
@@ -106,7 +106,7 @@ class SteadyTrack(Track):
     rotation_rad_s: tuple[Rate, Rate, Rate] = (0.0, 0.0, 0.0)
     centre_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
 
-    type_name: ClassVar[str] = "steady"
+    type_name: ClassVar[str] = "constant-twist"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -123,7 +123,7 @@ class SteadyTrack(Track):
         return result
 
 
-class Placement(NamedTuple):
+class Poses(NamedTuple):
     """Where everything that moves is at one time.
 
     objects : shape name -> (4, 4) world transform. rig : (4, 4) world transform of camera and projector.
@@ -163,7 +163,7 @@ class Motion:
             raise ValueError(f"expected objects to map shape names to tracks, got {shown(self.objects)}.")
         for what, track in (*self.objects.items(), *((("rig", self.rig),) if self.rig is not None else ())):
             if not isinstance(track, Track):
-                raise ValueError(f"expected a PoseTrack or a SteadyTrack for {what!r}, got {shown(track)}.")
+                raise ValueError(f"expected a PoseTrack or a ConstantTwist for {what!r}, got {shown(track)}.")
 
     def check(self, names: Iterable[str]) -> None:
         """Raise ValueError if an object that moves is none of these shapes."""
@@ -174,10 +174,10 @@ class Motion:
                     f"expected moving objects out of {', '.join(valid)}, got {name!r}{nearest(name, valid)}."
                 )
 
-    def at(self, time_s: float) -> Placement:
+    def at(self, time_s: float) -> Poses:
         """Where everything that moves is at a time in seconds."""
         rig = np.eye(4) if self.rig is None else self.rig.at(time_s)
-        return Placement({name: track.at(time_s) for name, track in self.objects.items()}, rig)
+        return Poses({name: track.at(time_s) for name, track in self.objects.items()}, rig)
 
 
 def apply(T: ArrayLike, points: np.ndarray) -> np.ndarray:

@@ -44,7 +44,7 @@ def transport_moving(
     timings : sensor -> Timing, when it takes its frames.
     motion : Motion, what moves.
     seed : int, 0 to 2^64 - 1; the same seed gives the same bytes.
-    progress : called with the share done, 0..1.
+    progress : called with the fraction done, 0..1.
     options : spp, max_depth and what else `transport` takes, for each pass. No AdaptiveSampling: passes that sampled
         a thing differently would make it differ from frame to frame.
 
@@ -77,7 +77,7 @@ def transport_moving(
     stacks: dict[Sensor, FrameStack] = {}
     for number, one in enumerate(passes):
         signals = transport(
-            stage.at(one.placement.objects),
+            stage.at(one.poses.objects),
             one.rig(rig),
             [response for sensor in one.sensors for response in sensor.responses()],
             seed=one.seed(seed),
@@ -95,8 +95,8 @@ def transport_moving(
     return {s: at_once[s] if s in at_once else stacks[s].signals() for s in timings}
 
 
-def _report(progress: Callable[[float], None], number: int, passes: int, share: float) -> None:
-    progress((number + share) / passes)
+def _report(progress: Callable[[float], None], number: int, passes: int, fraction: float) -> None:
+    progress((number + fraction) / passes)
 
 
 def _check(scene: Scene, rig: Rig, timings: Mapping[Sensor, Timing], motion: Motion) -> None:

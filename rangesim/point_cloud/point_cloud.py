@@ -21,7 +21,7 @@ NORMAL_RADIUS = 2
 MAX_SLOPE = 4.0
 """Depth step over lateral step between two pixels of one surface: 4 keeps surfaces seen up to 76 degrees off."""
 STEP_FLOOR = 0.005
-"""Share of z by which neighbours may always differ, for noise."""
+"""Fraction of z by which neighbours may always differ, for noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,5 +193,5 @@ def _pixel_size(rays: np.ndarray) -> float:
 def _grey_colors(intensity: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """(h, w, 3) uint8 grey: the 99th percentile of the valid pixels is white, with display gamma 2.2."""
     bright = float(np.percentile(intensity[valid], 99)) if valid.any() else 0.0
-    share = np.clip(np.nan_to_num(intensity) / (bright if bright > 0 else 1.0), 0, 1) ** (1 / 2.2)
-    return np.repeat(np.rint(255 * share).astype(np.uint8)[..., None], 3, axis=-1)
+    fraction = np.clip(np.nan_to_num(intensity) / (bright if bright > 0 else 1.0), 0, 1) ** (1 / 2.2)
+    return np.repeat(np.rint(255 * fraction).astype(np.uint8)[..., None], 3, axis=-1)

@@ -92,7 +92,7 @@ def _maps(m: Measurement, limits: tuple[float, float], depth: Any, error: Any) -
 
 
 def _frames(m: Measurement) -> dict[str, Any]:
-    f = m.facts
+    f = m.metadata
     taken = f"{f.frames} frame{'s' * (f.frames != 1)}"
     if f.exposure_s is not None:
         taken += f", {tables.seconds(f.exposure_s)} each" if f.frames != 1 else f", {tables.seconds(f.exposure_s)}"
@@ -123,7 +123,7 @@ def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
     return [
         {
             "names": ", ".join(names[m.name] for m in result.measurements if m.light_pass == number),
-            "frames": str(sum(m.facts.frames for m in result.measurements if m.light_pass == number)),
+            "frames": str(sum(m.metadata.frames for m in result.measurements if m.light_pass == number)),
             "time": tables.seconds(times[f"transport_{number}"]),
         }
         for number in range(1, len(result.energy) + 1)

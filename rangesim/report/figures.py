@@ -28,8 +28,8 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Share:
-    """A class with its colour and its share of some pixels, in percent: an entry of a legend."""
+class LegendEntry:
+    """A class with its colour and its fraction of some pixels, in percent: an entry of a legend."""
 
     name: str
     color: str
@@ -55,14 +55,14 @@ def png(image: np.ndarray, table: np.ndarray | None = None) -> str:
 
 def grey(image: np.ndarray, white: float, black: float = 0.0) -> str:
     """PNG of a linear image with display gamma; `white` is the value shown as white."""
-    share = (np.nan_to_num(image.astype(np.float64)) - black) / max(white - black, 1e-30)
-    return png(np.rint(255 * np.clip(share, 0, 1) ** (1 / GAMMA)).astype(np.uint8))
+    fraction = (np.nan_to_num(image.astype(np.float64)) - black) / max(white - black, 1e-30)
+    return png(np.rint(255 * np.clip(fraction, 0, 1) ** (1 / GAMMA)).astype(np.uint8))
 
 
-def color_map(share: np.ndarray, table: np.ndarray) -> str:
+def color_map(fraction: np.ndarray, table: np.ndarray) -> str:
     """PNG of values 0..1 through a colour table of 256 entries; NaN becomes light grey."""
-    index = np.rint(np.clip(np.nan_to_num(share), 0, 1) * 254).astype(np.uint8)
-    index[~np.isfinite(share)] = 255
+    index = np.rint(np.clip(np.nan_to_num(fraction), 0, 1) * 254).astype(np.uint8)
+    index[~np.isfinite(fraction)] = 255
     colors = table[np.rint(np.arange(256) / 254 * 255).clip(0, 255).astype(int)].copy()
     colors[255] = palette.NO_DATA
     return png(index, colors)
@@ -81,7 +81,7 @@ def scene_picture(energy: EnergySplit) -> Picture:
     return Picture(grey(image, _bright(image)), f"The scene from the camera, {light}.", "the scene")
 
 
-def material_picture(truth: GroundTruth) -> tuple[Picture, list[Share]]:
+def material_picture(truth: GroundTruth) -> tuple[Picture, list[LegendEntry]]:
     """Material class per pixel, and its legend."""
     classes = np.where(truth.material >= 0, truth.material, len(truth.material_names)).astype(np.uint8)
     colors = [palette.MATERIAL_COLORS.get(n, palette.NO_DATA) for n in truth.material_names]
@@ -99,10 +99,10 @@ def depth_map(measurement: Measurement, limits: tuple[float, float], table: np.n
 
 def error_map(measurement: Measurement, table: np.ndarray) -> str:
     """PNG of z minus true z."""
-    return color_map(palette.error_share(measurement.image.z - measurement.truth.z), table)
+    return color_map(palette.error_fraction(measurement.image.z - measurement.truth.z), table)
 
 
-def cause_map(measurement: Measurement) -> tuple[str, list[Share]]:
+def cause_map(measurement: Measurement) -> tuple[str, list[LegendEntry]]:
     """PNG of why pixels failed, and its legend."""
     classes = palette.outcomes(measurement)
     return png(classes, palette.OUTCOME_COLORS), _legend(classes, palette.OUTCOME_NAMES, palette.OUTCOME_COLORS)
@@ -118,13 +118,14 @@ def captured_frames(capture: Capture) -> list[Picture]:
 
 
 def light_pictures(energy: EnergySplit) -> list[Picture]:
-    """Radiance by the kind of light path, all with the same white, and their shares of the projector's light seen."""
+    """Radiance by the kind of light path, all with the same white, and their fractions of the projector's light
+    seen."""
     white = _bright(energy.projector)
     total = float(energy.projector.sum())
     kinds = {
         "direct": ("emitter, surface, camera", energy.direct),
         "multipath": ("by way of further surfaces", energy.multipath),
-        "via mirror or glass": ("the lit surface is seen off a mirror or through glass", energy.via_delta),
+        "via mirror or glass": ("the lit surface is seen off a mirror or through glass", energy.specular),
         "caustic": ("the surface is lit off a mirror or through glass", energy.caustic),
         "glint": ("the lamp itself is seen off a mirror or through glass", energy.glint),
     }
@@ -149,10 +150,10 @@ def _bright(image: np.ndarray) -> float:
     return float(np.percentile(lit, 99)) if lit.size else 1.0
 
 
-def _legend(classes: np.ndarray, names: list[str], table: np.ndarray) -> list[Share]:
+def _legend(classes: np.ndarray, names: list[str], table: np.ndarray) -> list[LegendEntry]:
     counts = np.bincount(classes.ravel(), minlength=len(names))
     return [
-        Share(name, palette.hexadecimal(table[i]), 100 * float(counts[i]) / classes.size)
+        LegendEntry(name, palette.hexadecimal(table[i]), 100 * float(counts[i]) / classes.size)
         for i, name in enumerate(names)
         if counts[i]
     ]

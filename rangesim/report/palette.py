@@ -23,7 +23,7 @@ STATUS_NAMES = {
     Status.LOW_SIGNAL: "too little light",
     Status.SATURATED: "saturated",
     Status.CODE_ERROR: "code error",
-    Status.WRAPPED: "phases disagree",
+    Status.UNWRAPPING_FAILED: "phases disagree",
     Status.OUT_OF_RANGE: "out of range",
 }
 STATUS_COLORS = np.array(
@@ -95,7 +95,7 @@ def depth_ticks(low: float, high: float, count: int = 5) -> list[Tick]:
     return [Tick(float((v - low) / (high - low)), f"{v:.{digits}f}") for v in values]
 
 
-def error_share(error_m: np.ndarray) -> np.ndarray:
+def error_fraction(error_m: np.ndarray) -> np.ndarray:
     """Place on the error scale, 0..1, of signed errors in metres: 0.5 is none, 0 and 1 are the limits."""
     decades = np.arcsinh(error_m / ERROR_KNEE_M / 2) / np.arcsinh(ERROR_LIMIT_M / ERROR_KNEE_M / 2)
     return np.asarray(0.5 + 0.5 * np.clip(decades, -1, 1))
@@ -104,7 +104,7 @@ def error_share(error_m: np.ndarray) -> np.ndarray:
 def error_ticks() -> list[Tick]:
     """Decades of the error scale, in millimetres."""
     values = [-100, -10, -1, 0, 1, 10, 100]
-    places = error_share(np.array(values) / 1e3)
+    places = error_fraction(np.array(values) / 1e3)
     signs = [f"{v:+d}".replace("-", "−") if v else "0" for v in values]
     return [Tick(float(p), s) for p, s in zip(places, signs, strict=True)]
 

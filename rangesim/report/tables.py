@@ -14,12 +14,12 @@ from rangesim.evaluation.reading_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
 from rangesim.experiment.result_files import Measurement
 from rangesim.report import palette
-from rangesim.report.figures import Share
+from rangesim.report.figures import LegendEntry
 
 Rows = list[dict[str, Any]]
 
 UNRELIABLE = 0.5
-"""Share of outliers or of missing pixels from which a sensor is called unreliable on a material."""
+"""LegendEntry of outliers or of missing pixels from which a sensor is called unreliable on a material."""
 
 _SPECIAL = re.compile(r"([\\`|\[]|<(?! ))")
 """What Markdown reads as more than text; "< 0.1" is none of it."""
@@ -41,14 +41,18 @@ class Column:
 
 COLUMNS = (
     Column(
-        "completeness", "complete", "%", "share of the pixels that the emitter lights which have a measurement", "high"
+        "completeness",
+        "complete",
+        "%",
+        "fraction of the pixels that the emitter lights which have a measurement",
+        "high",
     ),
     Column("bias_m", "bias", "mm", "mean of measured minus true z; positive is too far", "near zero"),
     Column("median_abs_m", "median error", "mm", "median of |z − true z|"),
     Column("rmse_m", "RMSE", "mm", "root mean square of z − true z"),
     Column("p95_abs_m", "95\N{NO-BREAK SPACE}% within", "mm", "95th percentile of |z − true z|"),
-    Column("outlier_rate", "outliers", "%", "share of the measurements off by more than 10 mm"),
-    Column("flying_rate", "flying", "%", "share of the measurements at depth edges that lie on neither side"),
+    Column("outlier_rate", "outliers", "%", "fraction of the measurements off by more than 10 mm"),
+    Column("flying_rate", "flying", "%", "fraction of the measurements at depth edges that lie on neither side"),
 )
 
 
@@ -62,7 +66,7 @@ class Definition:
 
 @dataclass(frozen=True)
 class Cell:
-    """text; best : of the real sensors that are reliable on this material; bar : 0..1 for shares, else None."""
+    """text; best : of the real sensors that are reliable on this material; bar : 0..1 for fractions, else None."""
 
     text: str
     best: bool = False
@@ -80,14 +84,14 @@ def is_reference(measurement: Measurement) -> bool:
     return measurement.capture.sensor.is_ideal
 
 
-def missing_share(row: dict[str, Any]) -> float:
-    """Share of the lit pixels without a measurement; 0 where none is lit."""
+def missing_fraction(row: dict[str, Any]) -> float:
+    """LegendEntry of the lit pixels without a measurement; 0 where none is lit."""
     return 1.0 - row["completeness"] if row["completeness"] is not None else 0.0
 
 
 def is_unreliable(row: dict[str, Any]) -> bool:
     """Whether half of the lit pixels or more have no measurement, or half of the measurements or more are outliers."""
-    return max(missing_share(row), row["outlier_rate"] or 0.0) >= UNRELIABLE
+    return max(missing_fraction(row), row["outlier_rate"] or 0.0) >= UNRELIABLE
 
 
 def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, list[Cell]]]]]:
@@ -103,7 +107,7 @@ def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, lis
     return table
 
 
-def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, str, list[Share]]]]]:
+def failure_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[tuple[str, str, list[LegendEntry]]]]]:
     """Per material class, "all" first: name, failed pixels in percent, and their causes, of each instrument."""
     table = []
     for material in materials(measurements):
@@ -131,10 +135,12 @@ def definitions(measurements: Sequence[Measurement]) -> list[Definition]:
     return [Definition(TITLES[c], DEFINITIONS[c]) for c in Cause if c.name.lower() in found]
 
 
-def parts(row: dict[str, Any]) -> list[Share]:
+def parts(row: dict[str, Any]) -> list[LegendEntry]:
     """Causes of the failed pixels of a row, largest first."""
-    causes = [(Cause[name.upper()], share) for name, share in row["causes"].items()]
-    return [Share(TITLES[c], palette.hexadecimal(palette.OUTCOME_COLORS[c]), 100 * share) for c, share in causes]
+    causes = [(Cause[name.upper()], fraction) for name, fraction in row["causes"].items()]
+    return [
+        LegendEntry(TITLES[c], palette.hexadecimal(palette.OUTCOME_COLORS[c]), 100 * fraction) for c, fraction in causes
+    ]
 
 
 def materials(measurements: Sequence[Measurement]) -> list[str]:
@@ -191,8 +197,8 @@ def _ratio(row: dict[str, Any]) -> str:
     return f"{ratio:.2f}" if ratio else "–"
 
 
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.1f}"
+def _percent(fraction: float | None) -> str:
+    return "–" if fraction is None else f"{100 * fraction:.1f}"
 
 
 def number(column: Column, value: float | None) -> str:
@@ -224,7 +230,7 @@ def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]
     """Per instrument: frames, exposure, acquisition, decoding, segmentation, points per pixel."""
     table = []
     for m in measurements:
-        f, times = m.facts, m.facts.times_s
+        f, times = m.metadata, m.metadata.times_s
         cells = [str(f.frames), seconds(f.exposure_s), seconds(f.acquisition_s)]
         cells += [seconds(times.get(stage)) for stage in ("exposure", "decode", "points", "segmentation")]
         table.append((m.name, [*cells, f"{f.points:,}".replace(",", " "), f"{f.points / f.pixels:.2f}"]))

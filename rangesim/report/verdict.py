@@ -13,14 +13,14 @@ from rangesim.report.tables import (
     is_reference,
     is_unreliable,
     millimetres,
-    missing_share,
+    missing_fraction,
     parts,
     seconds,
     titles,
 )
 
 MAIN_CAUSE = 0.1
-"""Share of the failures from which a cause is named."""
+"""LegendEntry of the failures from which a cause is named."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def _failures(rows: Rows) -> str:
     for row in rows:
         if row["material"] != "all" and is_unreliable(row):
             limit = "" if parts else f" by over {_glued('10 mm')}"
-            missing, wrong = _percent(missing_share(row), 0), _percent(row["outlier_rate"], 0)
+            missing, wrong = _percent(missing_fraction(row), 0), _percent(row["outlier_rate"], 0)
             found = f"{missing} missing, {wrong} of the rest wrong{limit}"
             parts.append(f"{row['material']} ({found})")
     listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
@@ -78,9 +78,9 @@ def _reasons(rows: Rows) -> str:
 
 
 def _main_causes(row: dict[str, Any]) -> str:
-    """The most frequent causes, with their shares of the failures."""
-    shares = [(p.percent / 100 / row["failed"], p.name) for p in parts(row)]
-    main = [f"{_percent(share, 0)} {name}" for share, name in shares if share >= MAIN_CAUSE]
+    """The most frequent causes, with their fractions of the failures."""
+    fractions = [(p.percent / 100 / row["failed"], p.name) for p in parts(row)]
+    main = [f"{_percent(fraction, 0)} {name}" for fraction, name in fractions if fraction >= MAIN_CAUSE]
     return ", ".join(main)
 
 
@@ -92,16 +92,16 @@ def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
 
 
 def _most_complete(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    shares = [(_total(m.rows)["completeness"], names[m.name]) for m in real if _total(m.rows)["completeness"]]
-    return _ranked("Most complete", [(name, _percent(s)) for s, name in sorted(shares, reverse=True)])
+    fractions = [(_total(m.rows)["completeness"], names[m.name]) for m in real if _total(m.rows)["completeness"]]
+    return _ranked("Most complete", [(name, _percent(s)) for s, name in sorted(fractions, reverse=True)])
 
 
 def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    times = [(m.facts.acquisition_s, m) for m in real if m.facts.acquisition_s]
+    times = [(m.metadata.acquisition_s, m) for m in real if m.metadata.acquisition_s]
     times.sort(key=lambda pair: pair[0])
     return _ranked(
         "Shortest exposure of all frames",
-        [(names[m.name], f"{m.facts.frames} frames in {_glued(seconds(t))}") for t, m in times],
+        [(names[m.name], f"{m.metadata.frames} frames in {_glued(seconds(t))}") for t, m in times],
     )
 
 
@@ -118,8 +118,8 @@ def _total(rows: Rows) -> dict[str, Any]:
     return next(row for row in rows if row["material"] == "all")
 
 
-def _percent(share: float | None, digits: int = 1) -> str:
-    return _glued(f"{100 * (share or 0.0):.{digits}f} %")
+def _percent(fraction: float | None, digits: int = 1) -> str:
+    return _glued(f"{100 * (fraction or 0.0):.{digits}f} %")
 
 
 def _mm(metres: float) -> str:

@@ -7,7 +7,7 @@ from rangesim.response.base import (
     GLINT,
     KINDS,
     MULTIPATH,
-    VIA_DELTA,
+    SPECULAR,
     DenseResponse,
     LightPath,
     Math,
@@ -15,7 +15,7 @@ from rangesim.response.base import (
     Response,
     SparseResponse,
 )
-from rangesim.response.lengths import SPEED_OF_LIGHT, FirstReturn, LengthBins, LengthSplit, Phasor
+from rangesim.response.lengths import SPEED_OF_LIGHT, FirstReturn, LengthSplit, Phasor, TransientHistogram
 from rangesim.response.patterns import Fringes, GrayBits, Images
 
 __all__ = [
@@ -24,14 +24,13 @@ __all__ = [
     "GLINT",
     "KINDS",
     "MULTIPATH",
+    "SPECULAR",
     "SPEED_OF_LIGHT",
-    "VIA_DELTA",
     "DenseResponse",
     "FirstReturn",
     "Fringes",
     "GrayBits",
     "Images",
-    "LengthBins",
     "LengthSplit",
     "LightPath",
     "Math",
@@ -39,4 +38,5 @@ __all__ = [
     "Phasor",
     "Response",
     "SparseResponse",
+    "TransientHistogram",
 ]

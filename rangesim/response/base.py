@@ -19,9 +19,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-KINDS = ("direct", "multipath", "via_delta", "caustic", "glint")
+KINDS = ("direct", "multipath", "specular", "caustic", "glint")
 """Kinds of projector light, in the order of `rangesim.signals.EnergySplit`; a path's `kind` is an index."""
-DIRECT, MULTIPATH, VIA_DELTA, CAUSTIC, GLINT = range(len(KINDS))
+DIRECT, MULTIPATH, SPECULAR, CAUSTIC, GLINT = range(len(KINDS))
 
 
 class LightPath(NamedTuple):
@@ -105,12 +105,12 @@ class DenseResponse(Response):
 
 
 class SparseResponse(Response):
-    """A path counts in one bin, with weight one, or in none; or in the few that `shares` names."""
+    """A path counts in one bin, with weight one, or in none; or in the few that `bin_weights` names."""
 
     @abstractmethod
     def bin(self, path: LightPath, m: Math) -> Any:
         """Unsigned bin index; an index >= `channels` means none."""
 
-    def shares(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
+    def bin_weights(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
         """Unsigned bin indices, each with the weight that the path has there."""
         return [(self.bin(path, m), 1.0)]

@@ -53,7 +53,7 @@ def fringe_contrast(period: float, sigma: Any, m: Math) -> Any:
 
 
 FINEST = 0.5
-"""Sigma in pixels up to which the nine nearest pixels are read, each with the Gaussian's share on it."""
+"""Sigma in pixels up to which the nine nearest pixels are read, each with the Gaussian's weight."""
 STEP = 2.0
 """Ratio of variances between blurred copies."""
 COPIES = 9
@@ -84,8 +84,8 @@ class BlurredImage:
         for k in range(1, COPIES - 1):
             beyond = variance >= STEP**k
             copy, base = m.select(beyond, float(k), copy), m.select(beyond, STEP**k, base)
-        share = m.select(variance < STEP ** (COPIES - 1), variance / base, STEP) - 1
-        share = m.select(share > 0, share * (1 / (STEP - 1)), 0.0)
+        fraction = m.select(variance < STEP ** (COPIES - 1), variance / base, STEP) - 1
+        fraction = m.select(fraction > 0, fraction * (1 / (STEP - 1)), 0.0)
         sigma = m.select(sigma < FINEST, sigma, FINEST)
         columns, rows = _taps(u + 1, self.width, sigma, m), _taps(v + 1, self.height, sigma, m)
         copies, offset = m.array(self.copies), m.unsigned(copy) * (self.height * self.width)
@@ -94,12 +94,12 @@ class BlurredImage:
             for column, weight in columns:
                 index = offset + row * self.width + column
                 below, above = m.lookup(copies, index), m.lookup(copies, index + self.height * self.width)
-                total = total + row_weight * weight * (below + share * (above - below))
+                total = total + row_weight * weight * (below + fraction * (above - below))
         return total
 
 
 def _taps(x: Any, size: int, sigma: Any, m: Math) -> list[tuple[Any, Any]]:
-    """Indices and weights of the three pixels about `x`: the shares of a Gaussian on each, 0 outside the image."""
+    """Indices and weights of the three pixels about `x`: the fractions of a Gaussian on each, 0 outside the image."""
     pixel = m.floor(x)
     scale = ROOT_HALF / m.select(sigma > SHARPEST, sigma, SHARPEST)
     before, after = (0.5 + 0.5 * m.erf((pixel + edge - x) * scale) for edge in (0.0, 1.0))

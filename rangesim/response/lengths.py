@@ -59,7 +59,7 @@ class FirstReturn(DenseResponse):
 
 
 @dataclass(frozen=True)
-class LengthBins(SparseResponse):
+class TransientHistogram(SparseResponse):
     """Histogram over the path length (round trip), `channels` bins from `start_m`, `width_m` each.
 
     With a `period_m`, lengths that differ by a multiple of it are one: those of light that is sent out again and again.
@@ -81,9 +81,9 @@ class LengthBins(SparseResponse):
         index, inside = _length_bin(path, m, self.start_m, self.width_m, self.channels, self.period_m)
         return m.unsigned(m.select(inside, index, float(self.channels)))
 
-    def shares(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
+    def bin_weights(self, path: LightPath, m: Math) -> list[tuple[Any, Any]]:
         if not self.is_shared:
-            return super().shares(path, m)
+            return super().bin_weights(path, m)
         start_m = self.start_m - self.width_m / 2  # so that whole numbers are the centres, of the bin before
         place = _place(path, m, start_m, self.width_m, self.channels, self.period_m)
         upper = m.floor(place)
@@ -100,8 +100,8 @@ class LengthBins(SparseResponse):
 class LengthSplit(SparseResponse):
     """The energy split per path length: `bins` bins from `start_m`, `width_m` each, for every one of `KINDS`.
 
-    Channels are kind-major: channel kind * bins + bin. Their sum over the kinds is that of `LengthBins`, their sum over
-    the bins the `rangesim.signals.EnergySplit` of what lies within them. `period_m` as there.
+    Channels are kind-major: channel kind * bins + bin. Their sum over the kinds is that of `TransientHistogram`,
+    their sum over the bins the `rangesim.signals.EnergySplit` of what lies within them. `period_m` as there.
     """
 
     start_m: StartLength

@@ -11,7 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangesim import limits
 from rangesim.rig.distortion import distort, fold_radius2, undistort
-from rangesim.settings.bounds import FARTHEST_M, Bounds, Exponent, Metres, Watts, check_fields, check_number, whole
+from rangesim.settings.bounds import (
+    MAX_COORDINATE_M,
+    Bounds,
+    Exponent,
+    Metres,
+    Watts,
+    check_fields,
+    check_number,
+    whole,
+)
 from rangesim.settings.config import shown, to_dict
 
 Array = NDArray[np.float64]
@@ -129,8 +138,8 @@ def pose(matrix: ArrayLike, name: str) -> Array:
         raise ValueError(f"expected {name} to be a (4, 4) matrix, got {shown(matrix)}.") from None
     if result.shape != (4, 4) or not np.isfinite(result).all():
         raise ValueError(f"expected {name} to be a finite (4, 4) matrix, got shape {result.shape}.")
-    if np.abs(result).max() > FARTHEST_M:
-        raise ValueError(f"expected {name} to move by at most {FARTHEST_M:g} m, got {np.abs(result).max():g}.")
+    if np.abs(result).max() > MAX_COORDINATE_M:
+        raise ValueError(f"expected {name} to move by at most {MAX_COORDINATE_M:g} m, got {np.abs(result).max():g}.")
     rotation = result[:3, :3]
     rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(result[3], [0, 0, 0, 1]):
@@ -143,7 +152,7 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0
     """(4, 4) T_world_device of a device at `origin` that looks at `target`, metres, OpenCV frame."""
     o, t, u = (np.asarray(a, dtype=np.float64) for a in (origin, target, up))
     for name, value in (("origin", o), ("target", t), ("up", u)):
-        if value.shape != (3,) or not (np.abs(value) <= FARTHEST_M).all():
+        if value.shape != (3,) or not (np.abs(value) <= MAX_COORDINATE_M).all():
             raise ValueError(f"expected {name} to be three finite coordinates, got {shown(value.tolist())}.")
     z = t - o
     x = np.cross(z, u)
@@ -221,7 +230,8 @@ class Rig:
 
     @property
     def camera_illumination(self) -> NDArray[np.float32]:
-        """(h, w) float32 in 0..1, share of the light that vignetting leaves a pixel: cos^n of its ray to the axis."""
+        """(h, w) float32 in 0..1, fraction of the light that vignetting leaves a pixel: cos^n of its ray to the
+        axis."""
         rays = self.camera.directions(self.camera.pixel_centres())
-        share = np.linalg.norm(rays, axis=-1) ** -self.camera_vignetting
-        return np.nan_to_num(share, nan=0.0).astype(np.float32)  # no ray, no light
+        fraction = np.linalg.norm(rays, axis=-1) ** -self.camera_vignetting
+        return np.nan_to_num(fraction, nan=0.0).astype(np.float32)  # no ray, no light

@@ -14,7 +14,7 @@ from pcgraph.plain_files import check_file
 from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.scene.origin import Rounding, rounding_of, warn_of_coarse_mesh
-from rangesim.settings.bounds import FARTHEST_M
+from rangesim.settings.bounds import MAX_COORDINATE_M
 from rangesim.settings.config import brief, nearest
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
@@ -48,8 +48,8 @@ def scene_around_mesh(path: Path, material: str, unit_m: float, folder: Path, ad
     vertices = vertices * unit_m
     if path.suffix.lower() in Y_UP_SUFFIXES:
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
-    if not (np.abs(vertices) <= FARTHEST_M).all():
-        raise FileFormatError(f"expected {path} within {FARTHEST_M:g} metres; what is its unit? See unit_m.")
+    if not (np.abs(vertices) <= MAX_COORDINATE_M).all():
+        raise FileFormatError(f"expected {path} within {MAX_COORDINATE_M:g} metres; what is its unit? See unit_m.")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = float(np.linalg.norm(high - low))
     if not size > 0:

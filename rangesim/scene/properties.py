@@ -20,13 +20,13 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
-from rangesim.settings.bounds import FARTHEST_M, Bounds
+from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
 
 ANY = Bounds("finite", -1e30, 1e30)
-PLACE = Bounds("a coordinate in metres", -FARTHEST_M, FARTHEST_M)
+PLACE = Bounds("a coordinate in metres", -MAX_COORDINATE_M, MAX_COORDINATE_M)
 POSITIVE = Bounds("positive and finite", 1e-12, 1e12)
-LENGTH = Bounds("positive and finite", 1e-12, FARTHEST_M)
+LENGTH = Bounds("positive and finite", 1e-12, MAX_COORDINATE_M)
 NOT_NEGATIVE = Bounds("0 or positive, and finite", 0, 1e12)
 FRACTION = Bounds("a fraction", 0, 1)
 WAVELENGTHS_NM = Bounds("nanometres", 1, 1e7)
@@ -148,7 +148,7 @@ def check_vertices(scene: Any, label: str) -> None:
                 f'{label}: shape "{shape.id()}": expected faces of its {len(vertices) // 3} vertices, '
                 f"got vertex {faces.max()}."
             )
-        far = ~(np.abs(vertices) <= FARTHEST_M)
+        far = ~(np.abs(vertices) <= MAX_COORDINATE_M)
         if far.any():
             raise FileFormatError(
                 f'{label}: shape "{shape.id()}": expected the vertices to be {PLACE}, got {vertices[far][0]:g}.'
@@ -256,9 +256,9 @@ def _is_transform(value: Any) -> bool:
 
 def _problem_of_transform(value: Any, key: str) -> str:
     matrix = np.array(value.matrix, dtype=np.float64)
-    if not (np.abs(matrix) <= FARTHEST_M).all():  # also of NaN
+    if not (np.abs(matrix) <= MAX_COORDINATE_M).all():  # also of NaN
         largest = matrix.flat[int(np.argmax(np.where(np.isnan(matrix), math.inf, np.abs(matrix))))]
-        return f"expected {key} to hold finite numbers up to {FARTHEST_M:g}, got {largest:g}"
+        return f"expected {key} to hold finite numbers up to {MAX_COORDINATE_M:g}, got {largest:g}"
     if key == "to_world" and (np.linalg.norm(matrix[:3, :3], axis=0) == 0).any():
         return f"expected {key} to leave the shape an extent, got a scale of 0"
     return ""

@@ -29,7 +29,7 @@ COLOUR_OF = {
 """The colour of a BSDF by its type: what `sensor_reflectance` replaces."""
 GREY = 0.02
 """Difference, at most, between the channels of a colour that counts as grey."""
-MOST_NAMED = 3
+MAX_NAMED = 3
 
 
 def take_sensor_reflectances(state: Any, label: str) -> None:
@@ -63,7 +63,7 @@ def coloured_materials(state: Any) -> list[str]:
 def warn_of_colours(names: list[str], label: str) -> None:
     """Warn once if these BSDFs, or any, are in colours."""
     if names:
-        listed = ", ".join(names[:MOST_NAMED]) + (" ..." if len(names) > MOST_NAMED else "")
+        listed = ", ".join(names[:MAX_NAMED]) + (" ..." if len(names) > MAX_NAMED else "")
         warn(
             f"{label}: colours of {len(names)} material{'s' if len(names) > 1 else ''} ({listed}) are read as their "
             f"luminance, but a sensor sees its own wavelength; state {REFLECTANCE_KEY} in the BSDF, or a grey texture."

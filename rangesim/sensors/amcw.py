@@ -35,7 +35,7 @@ class AmcwToF(Sensor):
     """Amplitude-modulated continuous wave camera with four taps per frequency (0, 90, 180, 270 degrees).
 
     The mean of tap theta is (A + contrast * B cos(phi - theta)) / 2 with phi = 2 pi f l / c over the path length
-    l (there and back); A holds steady and ambient light. Frames: frequency by frequency, four taps each.
+    l (there and back); A holds white and ambient light. Frames: frequency by frequency, four taps each.
 
     Parameters
     ----------
@@ -84,8 +84,8 @@ class AmcwToF(Sensor):
     def responses(self) -> tuple[Response, ...]:
         return tuple(Phasor(f, self.waveform == "square") for f in self.modulation_hz)
 
-    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        offset = steady + ambient
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        offset = white + ambient
         taps = ((s * self.contrast, c[i]) for c in channels for s, i in ((1, 0), (1, 1), (-1, 0), (-1, 1)))
         result = np.empty((self.n_frames, *offset.shape), dtype=np.float32)
         for frame, (factor, phasor) in zip(result, taps, strict=True):
@@ -142,15 +142,15 @@ class AmcwDecoder(Decoder):
     phase : PhaseThresholds.
     correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a
         calibrated camera does with a look-up table), False uses the sine formula and shows the raw wiggling
-        error, up to 0.011 turns. Multipath sums triangles of different phase, for which neither is exact.
-    max_residual_turns : a frequency whose phase is farther off that of the common path length contradicts it.
+        error, up to 0.011 normalised. Multipath sums triangles of different phase, for which neither is exact.
+    max_residual : a frequency whose phase is farther off that of the common path length contradicts it.
     max_ambiguity : misfit of the best wrap counts over that of the second best: above, the choice between them is a
         guess.
     """
 
     phase: PhaseThresholds = field(default_factory=PhaseThresholds)
     correct_wiggling: bool = True
-    max_residual_turns: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.1
+    max_residual: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.1
     max_ambiguity: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.5
 
     type_name: ClassVar[str] = "amcw-tof"
@@ -168,9 +168,9 @@ class AmcwDecoder(Decoder):
         for rows in bands(len(status)):
             phases = [tap_phase(taps[:, rows], exact_square) for taps in groups]
             weights = [_weight(capture, phase, f) for phase, f in zip(phases, sensor.modulation_hz, strict=True)]
-            unwrapped = unwrap([p.turns for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
-            contradiction = unwrapped.residual_turns > self.max_residual_turns
-            status[rows][contradiction | (unwrapped.ambiguity > self.max_ambiguity)] = Status.WRAPPED
+            unwrapped = unwrap([p.normalised for p in phases], sensor.modulation_hz, weights, sensor.searched_m)
+            contradiction = unwrapped.residual > self.max_residual
+            status[rows][contradiction | (unwrapped.ambiguity > self.max_ambiguity)] = Status.UNWRAPPING_FAILED
             for phase in phases:
                 status[rows][modulation_is_weak(capture, phase, len(TAPS_DEG), self.phase)] = Status.LOW_SIGNAL
             status[rows][capture.saturated(capture.frames[:, rows])] = Status.SATURATED

@@ -18,7 +18,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Gate
 from rangesim.electronics.spad import SpadDetector
-from rangesim.response import SPEED_OF_LIGHT, LengthBins, Response
+from rangesim.response import SPEED_OF_LIGHT, Response, TransientHistogram
 from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
@@ -78,9 +78,9 @@ class DirectToF(Sensor):
         fine, c = self._fine, SPEED_OF_LIGHT
         period_m = self.period_s * c if self.laser == "periodic" else None
         width_m, has_pulse = self.bin_s * c / fine, self.pulse_fwhm_s > 0
-        return (LengthBins(self.start_s * c, width_m, self.bins * fine, period_m, is_shared=has_pulse),)
+        return (TransientHistogram(self.start_s * c, width_m, self.bins * fine, period_m, is_shared=has_pulse),)
 
-    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         from pcgraph.parallel import SMALLEST_ROWS, in_blocks
         from rangesim.decoding.histogram_filter import gaussian_filter
 
@@ -150,7 +150,7 @@ class DirectToF(Sensor):
     def representative_frames(self, frames: np.ndarray) -> list[int]:
         """The bins at the quartiles of the light."""
         energy = np.cumsum(frames.reshape(len(frames), -1).sum(axis=1, dtype=np.float64))
-        return sorted({int(np.searchsorted(energy, share * energy[-1])) for share in (0.25, 0.5, 0.75)})
+        return sorted({int(np.searchsorted(energy, fraction * energy[-1])) for fraction in (0.25, 0.5, 0.75)})
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class IdealToF(Sensor):
     def responses(self) -> tuple[Response, ...]:
         return (FirstReturn(),)
 
-    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         return np.asarray(channels[0], dtype=np.float32)
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:

@@ -99,21 +99,21 @@ class StructuredLight(Sensor):
     def responses(self) -> tuple[DenseResponse, ...]:
         return tuple(run.response for run in self.layout())
 
-    def frames(self, channels: Sequence[np.ndarray], steady: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        result = np.empty((self.n_frames, *steady.shape), dtype=np.float32)
+    def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
+        result = np.empty((self.n_frames, *white.shape), dtype=np.float32)
         for run, values in zip(self.layout(), channels, strict=True):
             lit = result[run.frames]
             if isinstance(run.response, GrayBits):
                 for bit, pattern, inverse in zip(values, lit[0::2], lit[1::2], strict=True):
                     np.add(bit, ambient, out=pattern, casting="same_kind")
-                    np.add(steady - bit, ambient, out=inverse, casting="same_kind")
+                    np.add(white - bit, ambient, out=inverse, casting="same_kind")
             else:
                 for s, fringe in enumerate(lit):
                     shift = 2 * math.pi * s / self.steps
-                    shown = 0.5 * (steady + math.cos(shift) * values[0] + math.sin(shift) * values[1])
+                    shown = 0.5 * (white + math.cos(shift) * values[0] + math.sin(shift) * values[1])
                     np.add(shown, ambient, out=fringe, casting="same_kind")
-        np.add(steady, ambient, out=result[WHITE], casting="same_kind")
-        np.add(np.zeros_like(steady), ambient, out=result[BLACK], casting="same_kind")
+        np.add(white, ambient, out=result[WHITE], casting="same_kind")
+        np.add(np.zeros_like(white), ambient, out=result[BLACK], casting="same_kind")
         return result
 
     def check(self, width: int, height: int) -> None:

@@ -51,9 +51,9 @@ def whole(low: int, limit: str = "") -> Bounds:
     return Bounds(f"a whole number of at least {low}", low, limit=limit)
 
 
-FARTHEST_M = 1e7
+MAX_COORDINATE_M = 1e7
 """Metres: room for coordinates of maps, and of the globe; beyond, double precision has no nanometres."""
-Metres = Annotated[float, Bounds("positive and finite", 1e-9, FARTHEST_M)]
+Metres = Annotated[float, Bounds("positive and finite", 1e-9, MAX_COORDINATE_M)]
 Watts = Annotated[float, Bounds("positive and finite", 1e-12, 1e9)]
 HERTZ = Bounds("positive and finite", 1.0, 1e12)
 Hertz = Annotated[float, HERTZ]
@@ -62,7 +62,7 @@ Seconds = Annotated[float, SECONDS]
 Pause = Annotated[float, Bounds("0 or positive", 1e-15, 1e6, or_zero=True)]
 Wavelength = Annotated[float, Bounds("positive and finite", 1e-8, 1e-2)]
 Exponent = Annotated[float, Bounds("an exponent of at least 0", 0, 100)]
-Coordinate = Annotated[float, Bounds("a coordinate", -FARTHEST_M, FARTHEST_M)]
+Coordinate = Annotated[float, Bounds("a coordinate", -MAX_COORDINATE_M, MAX_COORDINATE_M)]
 Fraction = Annotated[float, Bounds("a fraction", 0, 1)]
 PositiveFraction = Annotated[float, Bounds("a positive fraction", 1e-9, 1)]
 

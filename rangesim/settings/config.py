@@ -87,10 +87,10 @@ _SHORT.maxlevel = 3
 
 def brief(error: BaseException) -> str:
     """What an error of a library says, in one line of readable length."""
-    return " ".join(str(error).split())[:LONGEST_REASON]
+    return " ".join(str(error).split())[:MAX_REASON]
 
 
-LONGEST_REASON = 200
+MAX_REASON = 200
 """Characters."""
 
 
