@@ -12,14 +12,15 @@ from rangesim.files.array_files import write_arrays
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
+from rangesim.settings.config import ShortRepr
 
 ALL = "all"
 """Stands for all material classes."""
 NO_SAMPLING_ERROR = "expected signals whose sampling error is known: those of a pass of at least 3 samples per pixel."
 
 
-@dataclass(frozen=True, eq=False)
-class EnergySplit:
+@dataclass(frozen=True, eq=False, repr=False)
+class EnergySplit(ShortRepr):
     """Radiance per pixel by the kind of light path, each (h, w) float32, W/m2/sr; the parts add up to all light.
 
     direct : projector -> surface -> camera.
@@ -43,8 +44,8 @@ class EnergySplit:
         return self.direct + self.multipath + self.specular + self.caustic + self.glint
 
 
-@dataclass(frozen=True, eq=False)
-class GroundTruth:
+@dataclass(frozen=True, eq=False, repr=False)
+class GroundTruth(ShortRepr):
     """First surface behind each pixel centre; NaN (ids: -1) where there is none.
 
     z, range_m : (h, w) float32, metres, depth along the axis and Euclidean distance from the camera centre.
@@ -92,8 +93,8 @@ class Truncation:
         return float(np.nansum([self.depth, self.chains, self.photons]))
 
 
-@dataclass(frozen=True, eq=False)
-class SamplingError:
+@dataclass(frozen=True, eq=False, repr=False)
+class SamplingError(ShortRepr):
     """One draw of the error that the sampling of light paths leaves in signals: half the difference of what two halves
     of the samples say, scaled where these are not equal. It has the variance of the error, and its covariance between
     channels, at each pixel; it is not the error itself.
@@ -105,8 +106,8 @@ class SamplingError:
     projector: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Signals:
+@dataclass(frozen=True, eq=False, repr=False)
+class Signals(ShortRepr):
     """Everything one transport pass accumulated for the sensors that share a rig.
 
     rig : Rig

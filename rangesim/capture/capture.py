@@ -12,6 +12,7 @@ import numpy as np
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
+from rangesim.settings.config import ShortRepr
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
@@ -29,8 +30,8 @@ def bright_level(values: np.ndarray) -> float:
     return float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Capture:
+@dataclass(frozen=True, eq=False, repr=False)
+class Capture(ShortRepr):
     """A stack of frames of one sensor.
 
     Parameters

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rangesim.settings.config import ShortRepr
 from rangesim.signals import GroundTruth
 
 
@@ -71,8 +72,8 @@ TITLES = {
 """Names for tables and legends."""
 
 
-@dataclass(frozen=True, eq=False)
-class CauseMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class CauseMap(ShortRepr):
     """The cause of every failed pixel.
 
     cause : (h, w) uint8, values of `Cause`; `NONE` where the pixel did not fail.

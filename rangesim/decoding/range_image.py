@@ -10,14 +10,15 @@ import numpy as np
 
 from rangesim.decoding.status import Status
 from rangesim.rig import Intrinsics
+from rangesim.settings.config import ShortRepr
 
 if TYPE_CHECKING:
     from rangesim.point_cloud import PointCloud
     from rangesim.sensor import Decoder
 
 
-@dataclass(frozen=True, eq=False)
-class RangeImage:
+@dataclass(frozen=True, eq=False, repr=False)
+class RangeImage(ShortRepr):
     """Depth and range per camera pixel.
 
     Parameters

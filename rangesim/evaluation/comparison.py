@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
-from rangesim.signals import GroundTruth
+from rangesim.settings.config import ShortRepr
+from rangesim.signals import GroundTruth, Signals
 
 OUTLIER_M = 0.010
 EDGE_RADIUS = 2
@@ -52,8 +53,8 @@ class ErrorStatistics:
     flying_rate: float
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(ShortRepr):
     """Statistics per material class, "all" last, and the error map.
 
     table : tuple of ErrorStatistics.
@@ -91,8 +92,13 @@ class Comparison:
         return "\n".join(lines) + "\n"
 
 
-def compare(image: RangeImage, truth: GroundTruth, outlier_m: float = OUTLIER_M) -> Comparison:
+def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = OUTLIER_M) -> Comparison:
     """Errors of a range image, per material class and over all.
+
+    Parameters
+    ----------
+    truth : GroundTruth, or Signals, whose ground truth is taken.
+    outlier_m : float, metres; readings that are off by more are outliers.
 
     Raises
     ------
@@ -104,6 +110,8 @@ def compare(image: RangeImage, truth: GroundTruth, outlier_m: float = OUTLIER_M)
     Flying pixels: Sabov, Krüger: "Identification and correction of flying pixels in range camera data", SCCG
     (2008); there detected from the image alone, here against the true depths.
     """
+    if isinstance(truth, Signals):
+        truth = truth.truth
     if image.z.shape != truth.z.shape:
         raise ValueError(f"expected ground truth of shape {image.z.shape} as the image, got {truth.z.shape}.")
     if not outlier_m > 0:

@@ -46,7 +46,7 @@ from rangesim.files.schema import (
     write_record,
 )
 from rangesim.rig import Rig
-from rangesim.settings.config import from_dict, shown
+from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, EnergySplit, GroundTruth, Truncation
 
 SETTINGS = "experiment.json"
@@ -178,8 +178,8 @@ _SEGMENTATION = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Segmentation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Segmentation(ShortRepr):
     """Supervoxels of a point cloud and the tree that merges them.
 
     supervoxels, labels : (h, w) int32, supervoxel and object per pixel, -1 without a point.
@@ -193,8 +193,8 @@ class Segmentation:
     altitudes: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurement(ShortRepr):
     """What one instrument measured.
 
     capture : Capture. image : RangeImage. truth : GroundTruth of its pass.
@@ -217,8 +217,8 @@ class Measurement:
     light_pass: int
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(ShortRepr):
     """An experiment and its outcome. energy : one EnergySplit per pass. info : scene, versions, times."""
 
     experiment: Experiment

@@ -12,6 +12,7 @@ from numba import njit
 
 from pcgraph.parallel import SMALLEST_ROWS, in_blocks
 from rangesim.decoding.range_image import RangeImage
+from rangesim.settings.config import ShortRepr
 
 FRAMES = ("camera", "world")
 FAR_M = 100.0
@@ -24,8 +25,8 @@ STEP_FLOOR = 0.005
 """Fraction of z by which neighbours may always differ, for noise."""
 
 
-@dataclass(frozen=True, eq=False)
-class PointCloud:
+@dataclass(frozen=True, eq=False, repr=False)
+class PointCloud(ShortRepr):
     """Points, organised as the image they come from (h, w, ...) or as a list (n, ...).
 
     Parameters
@@ -33,7 +34,7 @@ class PointCloud:
     points : (h, w, 3) or (n, 3) float32, metres, in `frame`; NaN where there is none. float64 in a world whose
         origin is more than `FAR_M` from the camera.
     frame : "camera" (OpenCV: x right, y down, z forward) or "world".
-    normals : (..., 3) float32, unit, towards the camera, in `frame`; NaN where unknown. Or None.
+    normals : (..., 3) float32, unit, towards the camera, in `frame`; NaN where unknown (0 of `finite`). Or None.
     intensity : (...) float32, the capture's units. Or None.
     colors : (..., 3) uint8, RGB. Or None.
     confidence : (...) float32 in 0..1, see `RangeImage`. Or None.
@@ -67,9 +68,13 @@ class PointCloud:
         return np.asarray(np.isfinite(self.points).all(axis=-1))
 
     def finite(self) -> PointCloud:
-        """The points that are there, as a list (n, ...), row by row."""
+        """The points that are there, as a list (n, ...), row by row; normals that are not known are 0, as NaN breaks
+        what other programs make of all of them."""
         keep = self.valid
-        return replace(self, points=self.points[keep], **{k: v[keep] for k, v in self.attributes().items()})
+        kept = {k: v[keep] for k, v in self.attributes().items()}
+        if "normals" in kept:
+            kept["normals"] = np.nan_to_num(kept["normals"])
+        return replace(self, points=self.points[keep], **kept)
 
     def save(self, path: str | Path) -> None:
         """Write `.ply` (the finite points) or `.pcd` (organised, NaN kept); see `point_cloud_files`."""

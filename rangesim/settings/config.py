@@ -132,6 +132,30 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     return choices[tag]
 
 
+class ShortRepr:
+    """Mixin of dataclasses of arrays: a `repr` that names shapes and types instead of a thousand numbers.
+
+    For dataclasses made with `repr=False`.
+    """
+
+    def __repr__(self) -> str:
+        parts = [f"{f.name}={_in_short(getattr(self, f.name))}" for f in dataclasses.fields(self)]  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _in_short(value: Any) -> str:
+    """A few words in place of `repr`: type and shape of arrays, the number of what is many."""
+    if isinstance(value, np.ndarray) and value.size > 1:
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, ShortRepr):
+        return f"{type(value).__name__}(...)"
+    if isinstance(value, Mapping) and any(isinstance(v, np.ndarray) for v in value.values()):
+        return "{" + ", ".join(f"{type(k).__name__}: {_in_short(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, (tuple, list)) and len(value) > 3:
+        return f"{len(value)} of {type(value[0]).__name__}"
+    return _SHORT.repr(value) if not dataclasses.is_dataclass(value) else f"{type(value).__name__}(...)"
+
+
 class Named:
     """A family of classes, each of which has a `type_name` of its own, by which files name it.
 
