@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from rangesim import Capture, Signals, decode, expose, load_scene, transport
-from rangesim.evaluation.reading_noise import robust_sigma
+from rangesim.evaluation.range_noise import robust_sigma
 from rangesim.experiment import Experiment
 from rangesim.experiment.instrument import Instrument, instrument
 from rangesim.experiment.pipeline import group_by_rig

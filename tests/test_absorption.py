@@ -27,7 +27,7 @@ from rangesim.light_transport.absorption import absorbers_of
 from rangesim.light_transport.photons import Photons, trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import FirstReturn
-from rangesim.scene.moving import MovingScene
+from rangesim.scene.rigid_motion import MovingScene
 
 CAMERA = Intrinsics.from_fov(64, 48, 60)
 PROJECTOR = Intrinsics.from_fov(160, 120, 60)

@@ -17,7 +17,7 @@ from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.histogram import coates, find_peak, window_reach
-from rangesim.decoding.histogram_filter import gaussian_filter
+from rangesim.decoding.matched_filter import gaussian_filter
 from rangesim.decoding.path_length import range_from_path_length
 from rangesim.decoding.phase_shift import tap_phase
 from rangesim.decoding.status import Status

@@ -16,7 +16,7 @@ import pytest
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, Rig, Scene, Signals, StructuredLight, transport
-from rangesim.light_transport import launches, photons
+from rangesim.light_transport import kernel_launches, photons
 from rangesim.light_transport.loop import _dealt
 from rangesim.light_transport.photons import trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
@@ -121,7 +121,7 @@ def test_after_an_interruption_the_same_process_traces_the_same_bytes(tabletop: 
     while True:
         calls = 0
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(launches, "evaluate", interrupt(launches.evaluate, at))
+            patch.setattr(kernel_launches, "evaluate", interrupt(kernel_launches.evaluate, at))
             try:
                 transport(tabletop, rig, sensors(), **settings)
             except KeyboardInterrupt:
@@ -155,9 +155,9 @@ def test_launches_of_any_size_give_the_same_bytes(
     rig: Rig = tabletop.rig(width=97, height=71)
     settings = {"spp": 5, "photons": 20_000, "seed": 3, "max_depth": 7}
     expected = all_bytes(transport(tabletop, rig, sensors(), **settings))
-    monkeypatch.setattr(launches, "LAUNCH_S", launch_s)
-    monkeypatch.setattr(launches, "LONGEST", 1.0)
-    monkeypatch.setattr(launches, "FIRST_UNITS", units)
+    monkeypatch.setattr(kernel_launches, "LAUNCH_S", launch_s)
+    monkeypatch.setattr(kernel_launches, "LONGEST", 1.0)
+    monkeypatch.setattr(kernel_launches, "FIRST_UNITS", units)
     for module in (rangesim.light_transport.loop, rangesim.light_transport.glint):
         monkeypatch.setattr(module, "fewest_lanes", lambda: lanes)
     number = 0
@@ -168,9 +168,9 @@ def test_launches_of_any_size_give_the_same_bytes(
         original(arrays)
         return 0.0  # says nothing of the work: its size stays
 
-    original = launches.evaluate
-    monkeypatch.setattr(launches, "evaluate", evaluate)
-    monkeypatch.setattr(launches, "STEEPEST", 1.0)
+    original = kernel_launches.evaluate
+    monkeypatch.setattr(kernel_launches, "evaluate", evaluate)
+    monkeypatch.setattr(kernel_launches, "STEEPEST", 1.0)
     assert all_bytes(transport(tabletop, rig, sensors(), **settings)) == expected
     assert (number > 20) == (units < 1 << 30)
 
@@ -180,7 +180,7 @@ def test_the_balance_of_photons_does_not_depend_on_launches(tabletop: Scene, mon
     monkeypatch.setattr(photons, "SUMMED_TOGETHER", 4096)
     found = []
     for units in (1 << 30, 10_000):
-        monkeypatch.setattr(launches, "FIRST_UNITS", units)
+        monkeypatch.setattr(kernel_launches, "FIRST_UNITS", units)
         found.append(trace_photons(traced, 1.0, 50_001, 3, 5, 1 << 30))
     assert astuple(found[0].balance) == astuple(found[1].balance)
     for name in ("position", "flux", "map"):
@@ -202,8 +202,8 @@ def test_runs_of_pixels_are_dealt_out_once_each_and_evenly(n: int) -> None:
 def test_progress_grows_to_one_and_is_told_at_most_ten_times_a_second(
     tabletop: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(launches, "LAUNCH_S", 0.02)
-    monkeypatch.setattr(launches, "FIRST_UNITS", 1 << 15)
+    monkeypatch.setattr(kernel_launches, "LAUNCH_S", 0.02)
+    monkeypatch.setattr(kernel_launches, "FIRST_UNITS", 1 << 15)
     shares: list[float] = []
     times: list[float] = []
 
@@ -215,7 +215,7 @@ def test_progress_grows_to_one_and_is_told_at_most_ten_times_a_second(
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert len(set(shares)) > 4
-    assert (np.diff(times)[:-1] > 0.9 * launches.REPORT_S).all()
+    assert (np.diff(times)[:-1] > 0.9 * kernel_launches.REPORT_S).all()
 
 
 def test_what_progress_raises_ends_the_pass(tabletop: Scene) -> None:

@@ -13,7 +13,7 @@ import pytest
 import rangesim
 from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError, RangesimWarning
-from rangesim.files.catalogue import scene_names
+from rangesim.files.bundled_scenes import scene_names
 from rangesim.scene.materials import material_class
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"

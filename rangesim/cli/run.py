@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
-from rangesim.files.catalogue import scene_names
+from rangesim.files.bundled_scenes import scene_names
 
 if TYPE_CHECKING:
     from rangesim.experiment import Experiment

@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from rangesim.capture import Capture, bright_level
-from rangesim.decoding.bands import bands
+from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.settings.bounds import Bounds, check_fields
 

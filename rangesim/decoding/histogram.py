@@ -15,7 +15,7 @@ def find_peak(
     peak's window less the background, background the sum under that window. `is_cyclic`: a window goes on at the
     other end.
     """
-    from rangesim.decoding.histogram_filter import gaussian_filter
+    from rangesim.decoding.matched_filter import gaussian_filter
     from rangesim.decoding.peaks import measure_peaks
 
     filtered = gaussian_filter(histogram, sigma_bins, "wrap" if is_cyclic else "edge") if sigma_bins > 0 else histogram

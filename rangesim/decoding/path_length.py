@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.bands import bands
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.rig import Rig
 

@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.bands import bands
 from rangesim.decoding.gray import GrayCode, Threshold
+from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.sensor import Background, FrameContent, least_signal_for
 from rangesim.settings.bounds import Bounds, check_fields

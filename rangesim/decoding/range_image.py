@@ -37,7 +37,7 @@ class RangeImage(ShortRepr):
     sampling_sigma_m : (h, w) float32, metres, of a simulated reading: standard deviation of z by the sampling of light
         paths, estimated from one pair of draws for each pixel, so take medians over many; NaN where there is no
         reading, infinite where sampling decides whether there is one. None: not known, see
-        `rangesim.evaluation.reading_noise`.
+        `rangesim.evaluation.range_noise`.
     decoder : Decoder it comes from; None: not known.
     """
 

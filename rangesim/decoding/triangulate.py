@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.bands import bands
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.rig import Intrinsics, Rig
 from rangesim.settings.bounds import Bounds, check_fields

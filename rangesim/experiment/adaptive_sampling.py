@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.ambient import Ambient
-from rangesim.evaluation.reading_noise import TO_SIGMA, reading_noise
+from rangesim.evaluation.range_noise import TO_SIGMA, range_noise
 from rangesim.experiment.instrument import Instrument
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole
@@ -75,7 +75,7 @@ class AdaptiveSampling:
         for one in self.instruments:
             signals = signals_of(one.sensor)
             capture = expose(signals, one.sensor, one.detector, one.exposure_s, 0, self.ambient)
-            noise = reading_noise(decode(capture, one.decoder), capture, signals)
+            noise = range_noise(decode(capture, one.decoder), capture, signals)
             enough = np.full(len(excess), negligible)
             if capture.is_digital:  # where nothing can be read, samples are of no use
                 enough = np.maximum(enough, self.fraction * group_sigma(noise.detector, group, where_unknown=np.inf))

@@ -12,7 +12,7 @@ from rangesim import limits
 from rangesim.electronics.ambient import Ambient
 from rangesim.errors import FileFormatError
 from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
-from rangesim.files.catalogue import scene_names
+from rangesim.files.bundled_scenes import scene_names
 from rangesim.files.text_files import read_toml
 from rangesim.motion import Motion
 from rangesim.motion.settings import motion_from_dict

@@ -18,7 +18,7 @@ from pcgraph.output import new_directory
 from rangesim.capture import Capture
 from rangesim.capture.capture_files import write_capture
 from rangesim.causes import explain
-from rangesim.evaluation.reading_noise import reading_noise, warn_of_sampling
+from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
 from rangesim.experiment import Experiment
 from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.experiment.cost import Cost, estimate_cost
@@ -143,7 +143,7 @@ def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, a
     noise = None
     if signals.knows_sampling_error:
         with timed(times, "noise"):
-            noise = reading_noise(image, capture, signals)
+            noise = range_noise(image, capture, signals)
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
     comparison = rangesim.compare(image, signals.truth)
     with timed(times, "causes"):

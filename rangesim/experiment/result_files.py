@@ -112,7 +112,7 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
 
 class RowRecord(Record, frozen=True, kw_only=True):
     """Statistics of one material class; see `rangesim.evaluation.comparison.ErrorStatistics`,
-    `rangesim.causes.CauseMap` and `rangesim.evaluation.reading_noise.ReadingNoise`."""
+    `rangesim.causes.CauseMap` and `rangesim.evaluation.range_noise.RangeNoise`."""
 
     material: Name
     pixels: Count

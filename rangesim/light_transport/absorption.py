@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.medium import Medium
+from rangesim.light_transport.scattering import Medium
 from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
 

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.medium import Media, Medium
+from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Intrinsics, Rig
 from rangesim.rig.distortion import distort, undistort
 

@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.light_transport.cutouts import first_surface
 from rangesim.light_transport.device import connect
 from rangesim.light_transport.indirect import Guides
-from rangesim.light_transport.launches import Launches
+from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.loop import Budget, Lanes, Settings, View, mono
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of

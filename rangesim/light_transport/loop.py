@@ -12,8 +12,8 @@ A path has two limits. `max_depth` counts the surfaces that scatter it; delta in
 holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.specular_chain`).
 
 Inside a translucent object an iteration of the loop is a scattering event instead of a surface; a stay inside counts as
-one surface towards the depth, however often it scatters (`rangesim.light_transport.medium`). Inside glass that absorbs,
-what a segment leaves of the throughput is exp(-sigma_a d) (`rangesim.light_transport.absorption`).
+one surface towards the depth, however often it scatters (`rangesim.light_transport.scattering`). Inside glass that
+absorbs, what a segment leaves of the throughput is exp(-sigma_a d) (`rangesim.light_transport.absorption`).
 
 The strategies that bring projector light to the camera partition all light paths: next-event estimation (here),
 caustic photons gathered at every non-delta vertex (here, from maps made before), and glint, paths without any
@@ -31,13 +31,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.device import connect
-from rangesim.light_transport.launches import Launches, Report, fewest_lanes
-from rangesim.light_transport.medium import FAINT, MAX_EVENTS
+from rangesim.light_transport.kernel_launches import Launches, Report, fewest_lanes
 from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
 from rangesim.light_transport.photons import has_delta
-from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
+from rangesim.light_transport.scattering import FAINT, MAX_EVENTS
 from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.truncation import Tally

@@ -12,12 +12,12 @@ import numpy as np
 
 from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.caustics import PHOTONS, caustic_maps, check_photons
-from rangesim.light_transport.estimate import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect import LightFilter
-from rangesim.light_transport.launches import Launches, Progress, raised_as_it_is, report_part
+from rangesim.light_transport.kernel_launches import Launches, Progress, raised_as_it_is, report_part
 from rangesim.light_transport.loop import Radiance, Settings, View
+from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.truncation import estimate_truncation, warn_of_truncation
 from rangesim.response import Response

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.launches import Launches
+from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.photon_flight import fly
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.shapes import number_of, table_of

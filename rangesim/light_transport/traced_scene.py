@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from rangesim.light_transport.absorption import absorbers_of
 from rangesim.light_transport.cutouts import cutouts_of
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.medium import media_of
+from rangesim.light_transport.scattering import media_of
 from rangesim.light_transport.surfaces import surfaces_of
 from rangesim.rig import Rig
 

@@ -4,6 +4,6 @@
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.motion.timing import Timing
 from rangesim.motion.track import ConstantTwist, Motion, PoseTrack, Track
-from rangesim.motion.transport import transport_moving
+from rangesim.motion.transport_moving import transport_moving
 
 __all__ = ["ConstantTwist", "Motion", "MovingSignals", "PoseTrack", "Timing", "Track", "transport_moving"]

@@ -10,7 +10,7 @@ from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.errors import visible
-from rangesim.evaluation.reading_noise import SMALL, noise_ratio
+from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
 from rangesim.experiment.result_files import Measurement
 from rangesim.report import palette

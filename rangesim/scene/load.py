@@ -17,7 +17,7 @@ import numpy as np
 
 from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError
-from rangesim.files.catalogue import CATALOGUE, scene_file
+from rangesim.files.bundled_scenes import CATALOGUE, scene_file
 from rangesim.files.text_files import check_xml
 from rangesim.rig import Intrinsics, translation
 from rangesim.scene import retroreflector
@@ -40,7 +40,7 @@ from rangesim.scene.origin import (
 )
 from rangesim.scene.properties import check_depth, check_dictionary, check_properties, check_vertices
 from rangesim.scene.scene import Instance, Scene
-from rangesim.scene.sensor_band import (
+from rangesim.scene.spectral_reflectance import (
     coloured_materials,
     take_sensor_reflectances,
     warn_of_colours,
@@ -64,10 +64,10 @@ def load_scene(
     Parameters
     ----------
     source : path of a Mitsuba 3 XML file or of a mesh (PLY, OBJ, GLB, STL), the name of a scene that comes with the
-        package (`rangesim.files.catalogue.scene_names`; a file of that name goes first), or a Mitsuba scene dictionary.
-        XML and dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter and sampler
-        are ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a camera.
-        A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
+        package (`rangesim.files.bundled_scenes.scene_names`; a file of that name goes first), or a Mitsuba scene
+        dictionary. XML and dictionary must hold a perspective sensor, which becomes the camera; integrator, film filter
+        and sampler are ignored. Projectors in it count as ambient light. A mesh is put on a matte table before a
+        camera. A shape or BSDF may set `<string name="material_class" value="..."/>` to override its derived class.
         `<include filename="materials/silver.xml"/>` finds the material catalogue from anywhere (docs/materials.md);
         files beside the scene come first. BSDFs of type `retroreflector` are known (`rangesim.scene.retroreflector`).
     material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.

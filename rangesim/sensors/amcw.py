@@ -11,11 +11,11 @@ import numpy as np
 
 from rangesim import limits
 from rangesim.capture import Capture
-from rangesim.decoding.bands import bands
 from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.decoding.phase_shift import Phase, PhaseThresholds, modulation_is_weak, phase_sigma, tap_phase
 from rangesim.decoding.phase_unwrapping import unwrap
 from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, Phasor, Response

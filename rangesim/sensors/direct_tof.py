@@ -82,7 +82,7 @@ class DirectToF(Sensor):
 
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         from pcgraph.parallel import SMALLEST_ROWS, in_blocks
-        from rangesim.decoding.histogram_filter import gaussian_filter
+        from rangesim.decoding.matched_filter import gaussian_filter
 
         variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
         beyond: Literal["wrap", "constant"] = "wrap" if self.is_cyclic else "constant"

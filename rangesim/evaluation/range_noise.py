@@ -34,7 +34,7 @@ ENOUGH_PIXELS = 100
 
 
 @dataclass(frozen=True, eq=False)
-class ReadingNoise:
+class RangeNoise:
     """Errors of the readings of a range image, each (h, w) float32, metres, of z; NaN where there is no reading.
 
     detector : the error that the detector's noise made of each reading; NaN also where it is not known.
@@ -60,7 +60,7 @@ class ReadingNoise:
         ]
 
 
-def reading_noise(image: RangeImage, capture: Capture, signals: Signals) -> ReadingNoise:
+def range_noise(image: RangeImage, capture: Capture, signals: Signals) -> RangeNoise:
     """Noise of a range image that was decoded from a capture of these signals.
 
     Raises
@@ -77,7 +77,7 @@ def reading_noise(image: RangeImage, capture: Capture, signals: Signals) -> Read
     detector = image.z - (above + below) / 2 if capture.is_digital else np.full(image.z.shape, np.nan)
     sampling = np.where(np.isnan(above) | np.isnan(below), np.inf, (above - below) / 2)
     sampling[~image.valid] = np.nan
-    return ReadingNoise(detector.astype(np.float32), sampling.astype(np.float32))
+    return RangeNoise(detector.astype(np.float32), sampling.astype(np.float32))
 
 
 def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]]) -> None:
@@ -85,7 +85,7 @@ def warn_of_sampling(tables: Mapping[str, Sequence[dict[str, Any]]]) -> None:
 
     Parameters
     ----------
-    tables : of each instrument by name, rows with `material`, `pixels` and what `ReadingNoise.by_material` gives.
+    tables : of each instrument by name, rows with `material`, `pixels` and what `RangeNoise.by_material` gives.
 
     Warns
     -----

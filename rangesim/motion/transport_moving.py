@@ -65,7 +65,7 @@ def transport_moving(
     """
     from rangesim.experiment.adaptive_sampling import AdaptiveSampling
     from rangesim.light_transport.one_pass import transport
-    from rangesim.scene.moving import MovingScene
+    from rangesim.scene.rigid_motion import MovingScene
 
     _check(scene, rig, timings, motion)
     if isinstance(options.get("spp"), AdaptiveSampling):

@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
+from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.indirect import CHANNELS_AT_ONCE, LightFilter
-from rangesim.light_transport.launches import Launches, Report, report_part
+from rangesim.light_transport.kernel_launches import Launches, Report, report_part
 from rangesim.light_transport.loop import Budget, Radiance, Settings, Traced, View, trace
-from rangesim.light_transport.responses import Accumulators
 from rangesim.light_transport.truncation import Tally
 from rangesim.response import Response
 from rangesim.rig import Rig

@@ -12,11 +12,11 @@ import pytest
 
 from rangesim import AmcwToF, IdealToF, Scene, StructuredLight, decode, expose, load_scene, transport
 from rangesim.errors import SamplingWarning
-from rangesim.evaluation.reading_noise import reading_noise, robust_sigma, warn_of_sampling
+from rangesim.evaluation.range_noise import range_noise, robust_sigma, warn_of_sampling
 from rangesim.experiment.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
 from rangesim.experiment.instrument import Instrument
-from rangesim.light_transport.estimate import Halves
 from rangesim.light_transport.loop import Budget
+from rangesim.light_transport.sampling_error import Halves
 
 SMALL_IMAGE: dict[str, Any] = {"width": 96, "height": 72}
 
@@ -64,7 +64,7 @@ def test_the_estimated_noise_of_a_reading_is_that_between_seeds(matte: Scene, in
             signals = transport(matte, rig, [sensor], spp=16, seed=seed, indirect=indirect)
             capture = expose(signals, sensor)
             image = decode(capture)
-            noise = reading_noise(image, capture, signals)
+            noise = range_noise(image, capture, signals)
             assert not np.isfinite(noise.detector).any()  # there is none
             z.append(image.z)
             estimated.append(robust_sigma(noise.sampling))
@@ -94,7 +94,7 @@ def test_two_samples_know_nothing_of_their_error(matte: Scene) -> None:
     assert not signals.knows_sampling_error
     capture = expose(signals, sensor)
     with pytest.raises(ValueError, match="at least 3 samples"):
-        reading_noise(decode(capture), capture, signals)
+        range_noise(decode(capture), capture, signals)
 
 
 # ---- Adaptive sampling -----------------------------------------------------------------------------------------------
@@ -148,7 +148,7 @@ def test_noise_falls_below_the_share_that_was_asked_for(matte: Scene) -> None:
         adaptive = AdaptiveSampling((one,), max_spp=1024, fraction=fraction)
         signals = transport(matte, rig, [one.sensor], spp=adaptive)
         capture = expose(signals, one.sensor, one.detector)
-        noise = reading_noise(decode(capture), capture, signals)
+        noise = range_noise(decode(capture), capture, signals)
         row = noise.by_material(signals.truth)[-1]
         ratios.append(row["sampling_sigma_m"] / row["detector_sigma_m"])
         assert ratios[-1] < 1.25 * fraction  # few samples say it roughly
@@ -199,7 +199,7 @@ def test_a_reading_that_sampling_takes_away_counts_as_infinitely_noisy(matte: Sc
     for errors in signals.sampling.channels.values():
         errors[:, :6] = -signals.channels[sensor.responses()[0]][:, :6]  # so much that one draw is dark
     capture = expose(signals, sensor)
-    noise = reading_noise(decode(capture), capture, signals)
+    noise = range_noise(decode(capture), capture, signals)
     assert (noise.sampling[:6] == np.inf).all()
     assert np.isfinite(noise.sampling[6:]).all()
 

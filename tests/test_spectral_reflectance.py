@@ -14,7 +14,7 @@ from PIL import Image
 from rangesim import Scene, load_scene, transport
 from rangesim.environment.backend import select_variant
 from rangesim.errors import FileFormatError, RangesimWarning
-from rangesim.files.catalogue import scene_names
+from rangesim.files.bundled_scenes import scene_names
 
 RED = {"type": "rgb", "value": [0.8, 0.1, 0.1]}
 
