@@ -9,8 +9,36 @@ from __future__ import annotations
 from importlib import import_module
 
 TYPE_CHECKING = False  # the module typing would double the time of this import
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from typing import Any
+
+    from rangesim.capture import Capture as Capture
+    from rangesim.capture.capture_files import import_capture as import_capture
+    from rangesim.capture.capture_files import load_capture as load_capture
+    from rangesim.capture.exposure import expose as expose
+    from rangesim.causes import explain as explain
+    from rangesim.decoding import decode as decode
+    from rangesim.decoding.range_image import RangeImage as RangeImage
+    from rangesim.decoding.status import Status as Status
+    from rangesim.electronics.ambient import Ambient as Ambient
+    from rangesim.electronics.detector import Detector as Detector
+    from rangesim.electronics.spad import SpadDetector as SpadDetector
+    from rangesim.evaluation.comparison import compare as compare
+    from rangesim.light_transport.one_pass import transport as transport
+    from rangesim.point_cloud import PointCloud as PointCloud
+    from rangesim.rig import Intrinsics as Intrinsics
+    from rangesim.rig import Rig as Rig
+    from rangesim.rig import look_at as look_at
+    from rangesim.rig.calibration_files import load_calibration as load_calibration
+    from rangesim.scene import Scene as Scene
+    from rangesim.scene import load_scene as load_scene
+    from rangesim.sensors import AmcwToF as AmcwToF
+    from rangesim.sensors import Decoder as Decoder
+    from rangesim.sensors import DirectToF as DirectToF
+    from rangesim.sensors import IdealToF as IdealToF
+    from rangesim.sensors import Sensor as Sensor
+    from rangesim.sensors import StructuredLight as StructuredLight
+    from rangesim.signals import Signals as Signals
 
 _HOME = {
     "Ambient": "rangesim.electronics.ambient",

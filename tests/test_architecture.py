@@ -166,6 +166,14 @@ def test_the_public_surface_is_this() -> None:
     ]
 
 
+def test_type_checkers_see_the_public_names() -> None:
+    """Lazy names are Any to them otherwise."""
+    tree = ast.parse((ROOT / "rangesim" / "__init__.py").read_text())
+    block = next(n for n in tree.body if isinstance(n, ast.If))
+    seen = {a.asname: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names if a.asname}
+    assert seen == rangesim._HOME
+
+
 def test_every_public_name_resolves_and_says_what_it_is() -> None:
     for name in rangesim.__all__:
         thing = getattr(rangesim, name)

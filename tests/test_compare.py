@@ -9,7 +9,9 @@ import math
 
 import numpy as np
 import pytest
+from synthetic import plane_signals, stereo_rig
 
+from rangesim import IdealToF, decode, expose
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.evaluation.comparison import compare
@@ -33,6 +35,12 @@ def truth_of(z: np.ndarray, material: np.ndarray, visible: np.ndarray | None = N
 def image_of(z: np.ndarray) -> RangeImage:
     status = np.where(np.isfinite(z), Status.OK, Status.LOW_SIGNAL).astype(np.uint8)
     return RangeImage(z, z, np.ones_like(z), status, np.ones_like(z))
+
+
+def test_signals_stand_for_their_ground_truth() -> None:
+    signals = plane_signals(stereo_rig(), IdealToF())
+    image = decode(expose(signals, IdealToF()))
+    assert compare(image, signals).rows() == compare(image, signals.truth).rows()
 
 
 @pytest.fixture

@@ -114,6 +114,24 @@ def test_noise_differs_between_instruments_and_follows_the_seed() -> None:
     assert noise_seed(replace(experiment, seed=4), experiment.instruments[0]) not in seeds
 
 
+def test_results_print_in_a_few_lines() -> None:
+    result = load_result(small_result())
+    one = result.measurements[0]
+    for thing in (
+        result,
+        one,
+        one.capture,
+        one.image,
+        one.truth,
+        one.causes,
+        result.energy[0],
+        one.image.to_point_cloud(),
+    ):
+        assert len(repr(thing)) < 600
+    assert "float32[90, 120]" in repr(one.image)
+    assert f"{len(SENSORS)} of Measurement" in repr(result)
+
+
 def test_the_result_holds_every_stage() -> None:
     result = load_result(small_result())
     assert [m.name for m in result.measurements] == list(SENSORS)

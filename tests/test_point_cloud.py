@@ -60,6 +60,20 @@ def test_normals_do_not_round_off_a_depth_edge() -> None:
         assert (cloud.normals[inside] @ unit > 0.99999).all()
 
 
+def test_a_point_without_neighbours_has_no_normal_and_its_file_no_nan(tmp_path: Path) -> None:
+    rig = stereo_rig()
+    z = np.full((120, 160), np.nan)
+    z[20:40, 20:40], z[80, 80] = 1.0, 1.0
+    cloud = range_image(rig, z).to_point_cloud()
+    assert cloud.normals is not None
+    assert np.isnan(cloud.normals[80, 80]).all()
+    cloud.save(tmp_path / "cloud.ply")
+    normals = pcgraph.read_cloud(tmp_path / "cloud.ply").normals
+    assert normals is not None
+    assert np.isfinite(normals).all()
+    assert (np.linalg.norm(normals, axis=1) < 0.5).sum() == 1
+
+
 def test_noise_and_holes_leave_unit_normals_or_nan() -> None:
     rig, sensor = stereo_rig(), StructuredLight()
     image = decode(expose(plane_signals(rig, sensor), sensor, Detector()))
