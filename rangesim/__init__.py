@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.causes import explain as explain
     from rangesim.decoding import decode as decode
     from rangesim.decoding.range_image import RangeImage as RangeImage
+    from rangesim.decoding.range_image_files import load_range_image as load_range_image
     from rangesim.decoding.status import Status as Status
     from rangesim.electronics.ambient import Ambient as Ambient
     from rangesim.electronics.detector import Detector as Detector
@@ -39,6 +40,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.sensors import Sensor as Sensor
     from rangesim.sensors import StructuredLight as StructuredLight
     from rangesim.signals import Signals as Signals
+    from rangesim.signals.signals_files import load_signals as load_signals
 
 _HOME = {
     "Ambient": "rangesim.electronics.ambient",
@@ -65,7 +67,9 @@ _HOME = {
     "import_capture": "rangesim.capture.capture_files",
     "load_calibration": "rangesim.rig.calibration_files",
     "load_capture": "rangesim.capture.capture_files",
+    "load_range_image": "rangesim.decoding.range_image_files",
     "load_scene": "rangesim.scene",
+    "load_signals": "rangesim.signals.signals_files",
     "look_at": "rangesim.rig",
     "transport": "rangesim.light_transport.one_pass",
 }

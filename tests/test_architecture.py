@@ -160,7 +160,9 @@ def test_the_public_surface_is_this() -> None:
         "import_capture",
         "load_calibration",
         "load_capture",
+        "load_range_image",
         "load_scene",
+        "load_signals",
         "look_at",
         "transport",
     ]

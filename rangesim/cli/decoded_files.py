@@ -13,7 +13,6 @@ from pcgraph.output import DirectoryKind, new_directory
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
-from rangesim.experiment.result_files import save_range_image
 from rangesim.files.schema import write_json
 from rangesim.report import figures, palette
 from rangesim.settings.config import to_dict
@@ -32,7 +31,7 @@ def write_decoded(image: RangeImage, capture: Capture, directory: Path) -> None:
     settings = {"sensor": to_dict(capture.sensor), "rig": to_dict(capture.rig), "rangesim": rangesim.__version__}
     with new_directory(directory, DECODED) as folder:
         write_json(folder / SIDECAR, {"format": FORMAT, **settings})
-        save_range_image(image, folder / "range.npz")
+        image.save(folder / "range.npz")
         for name, uri in _pictures(image).items():
             (folder / f"{name}.png").write_bytes(base64.b64decode(uri.partition(",")[2]))
         if image.camera is not None and image.valid.any():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,6 +58,12 @@ class RangeImage(ShortRepr):
     def valid(self) -> np.ndarray:
         """(h, w) bool, where `status` is OK."""
         return np.asarray(self.status == Status.OK)
+
+    def save(self, path: str | Path) -> None:
+        """Write all of it to a compressed .npz file, which `rangesim.load_range_image` reads back equal."""
+        from rangesim.decoding.range_image_files import save_range_image
+
+        save_range_image(self, path)
 
     def to_point_cloud(self, frame: str = "camera") -> PointCloud:
         """Organised point cloud of this image, with normals; see `rangesim.point_cloud`."""

@@ -30,7 +30,6 @@ from rangesim.experiment.result_files import (
     MeasurementRecord,
     load_result,
     save_causes,
-    save_range_image,
     save_rows,
 )
 from rangesim.files.array_files import write_arrays
@@ -38,6 +37,7 @@ from rangesim.files.schema import write_record
 from rangesim.motion import transport_moving
 from rangesim.motion.moving_signals import MovingSignals
 from rangesim.settings.seeds import derived_seed
+from rangesim.signals.signals_files import write_pass
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
@@ -102,7 +102,7 @@ def run(
             compile_kernels()
         for number, (rig, instruments) in enumerate(passes, 1):
             signals = _trace(experiment, scene, rig, instruments, tell, number, len(passes), times)
-            signals.save(str(folder / f"pass_{number}.npz"))
+            write_pass(signals, folder / f"pass_{number}.npz")
             for instrument in instruments:
                 tell(f"Measuring with {instrument.name}", _fraction(number, len(passes), 1.0))
                 seed = noise_seed(experiment, instrument)
@@ -156,7 +156,7 @@ def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, a
     enough = bool(cloud.valid.sum() >= MIN_POINTS)
 
     def write_readings() -> None:
-        save_range_image(image, folder / "range.npz")
+        image.save(folder / "range.npz")
         save_causes(causes, folder / "causes.npz")
         save_rows(comparison.outlier_m, rows, folder)
         if enough:

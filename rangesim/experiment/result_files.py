@@ -16,7 +16,7 @@ DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.outp
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ from rangesim.capture import Capture
 from rangesim.capture.capture_files import load_capture
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
-from rangesim.decoding.status import Status
+from rangesim.decoding.range_image_files import load_range_image
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
@@ -47,7 +47,8 @@ from rangesim.files.schema import (
 )
 from rangesim.rig import Rig
 from rangesim.settings.config import ShortRepr, from_dict, shown
-from rangesim.signals import ALL, EnergySplit, GroundTruth, Truncation
+from rangesim.signals import ALL, EnergySplit, GroundTruth
+from rangesim.signals.signals_files import read_pass
 
 SETTINGS = "experiment.json"
 FORMAT = "rangesim-result"
@@ -145,30 +146,6 @@ _MAX_COORDINATE_M = 1e9
 _RADIANCE = ArraySpec("float32", low=0)
 _DEPTH = ArraySpec("float32", low=-_MAX_COORDINATE_M, high=_MAX_COORDINATE_M, nan=True)
 _TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_MAX_COORDINATE_M, nan=True)
-_PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
-    "truth_z": _TRUE_DEPTH,
-    "truth_range_m": _TRUE_DEPTH,
-    "truth_normal": ArraySpec("float32", ("h", "w", 3), low=-1.01, high=1.01, nan=True),
-    "truth_instance": ArraySpec("int32", low=-1),
-    "truth_material": ArraySpec("int32", low=-1),
-    "truth_projector_uv": ArraySpec("float32", ("h", "w", 2), nan=True, inf=True),
-    "truth_projector_visible": ArraySpec("bool"),
-    "truth_instance_names": ArraySpec("str", ("instances",)),
-    "truth_material_names": ArraySpec("str", ("materials",)),
-    "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
-    "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
-}
-_RANGE = {
-    "z": _DEPTH,
-    "range_m": _DEPTH,
-    "confidence": ArraySpec("float32", low=0, high=1.001, nan=True),
-    "status": ArraySpec("uint8", high=max(Status)),
-    "intensity": ArraySpec("float32", nan=True),
-    "T_world_camera": ArraySpec("float64", (4, 4), required=False),
-    "projector_column": ArraySpec("float32", nan=True, required=False),
-    "projector_row": ArraySpec("float32", nan=True, required=False),
-    "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
-}
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
@@ -230,12 +207,6 @@ class Result(ShortRepr):
 # ---- Writing -------------------------------------------------------------------------------------------------------
 
 
-def save_range_image(image: RangeImage, path: Path) -> None:
-    """Write the arrays of a range image to a compressed .npz file; its camera is in the capture's sidecar."""
-    arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
-    write_arrays(path, arrays)
-
-
 def save_causes(causes: CauseMap, path: Path) -> None:
     """Write a cause map to a compressed .npz file: `cause`, values of `rangesim.causes.Cause`, and `tolerance_m`."""
     write_arrays(path, {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
@@ -271,7 +242,7 @@ def load_result(directory: str | Path) -> Result:
     if missing := [f"transport_{n}" for n in range(1, info.passes + 1) if f"transport_{n}" not in info.times_s]:
         raise FileFormatError(f"{folder / SETTINGS}: expected the time {missing[0]} in times_s.")
     sizes = _image_size(info, folder / SETTINGS)
-    passes = [_load_pass(folder / f"pass_{n}.npz", sizes) for n in range(1, info.passes + 1)]
+    passes = [read_pass(folder / f"pass_{n}.npz", sizes) for n in range(1, info.passes + 1)]
     measurements = tuple(
         _load_measurement(folder / entry.name, passes[entry.light_pass - 1][1], entry.light_pass, sizes)
         for entry in info.instruments
@@ -316,26 +287,13 @@ def _image_size(info: ResultRecord, path: Path) -> dict[str, int]:
     return {"h": h, "w": w}
 
 
-def _load_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
-    data = read_checked_arrays(path, _PASS, dict(sizes))  # passes may see other instances
-    for ids in ("instance", "material"):
-        if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
-            raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
-    energy = EnergySplit(**{f.name: data[f"energy_{f.name}"] for f in fields(EnergySplit)})
-    truth: dict[str, Any] = {f.name: data[f"truth_{f.name}"] for f in fields(GroundTruth)}
-    for name in ("instance_names", "material_names"):
-        truth[name] = tuple(map(str, truth[name]))
-    return energy, GroundTruth(**truth)
-
-
 def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:
     capture = load_capture(folder / "capture")
     if capture.rig is None or capture.frames.shape[1:] != (sizes["h"], sizes["w"]):
         raise FileFormatError(f"{folder / 'capture'}: expected a rig, and frames of the size of the ground truth.")
-    arrays: dict[str, Any] = read_checked_arrays(folder / "range.npz", _RANGE, sizes)
-    if not np.array_equal(np.isfinite(arrays["z"]), arrays["status"] == Status.OK):
-        raise FileFormatError(f"{folder / 'range.npz'}: expected z to be finite where status is {Status.OK.value}.")
-    arrays["T_world_camera"] = capture.rig.T_world_camera
+    image = load_range_image(folder / "range.npz", sizes)
+    if image.camera != capture.rig.camera:
+        raise FileFormatError(f"{folder / 'range.npz'}: expected the camera of the capture.")
     data = read_checked_arrays(folder / "causes.npz", _CAUSES, sizes)
     metadata = read_record(folder / "measurement.json", MeasurementRecord)
     if (metadata.sensor, metadata.frames, metadata.pixels) != (
@@ -345,7 +303,7 @@ def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: 
     return Measurement(
         name=folder.name,
         capture=capture,
-        image=RangeImage(**arrays, camera=capture.rig.camera),
+        image=replace(image, T_world_camera=capture.rig.T_world_camera),
         truth=truth,
         causes=CauseMap(data["cause"], float(data["tolerance_m"])),
         rows=read_rows(folder),

@@ -16,7 +16,7 @@ from rangesim.sensor import Sensor
 from rangesim.signals import NO_SAMPLING_ERROR, Signals
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MovingSignals(Signals):
     """Signals of one sensor whose frames were taken while something moved.
 

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from rangesim.files.array_files import write_arrays
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
@@ -166,17 +165,15 @@ class Signals(ShortRepr):
         return frames
 
     def save(self, path: str | Path) -> None:
-        """Write energy split, ground truth and truncation to a compressed .npz file (for later comparison).
+        """Write everything to a compressed .npz file, which `rangesim.load_signals` reads back equal.
 
         Raises
         ------
+        ValueError
+            The signals are those of something that moves, or a response holds arrays (`Images`).
         FileFormatError
             The place cannot be written.
         """
-        arrays = {f"energy_{f.name}": getattr(self.energy, f.name) for f in fields(self.energy)}
-        arrays |= {f"truth_{f.name}": np.asarray(getattr(self.truth, f.name)) for f in fields(self.truth)}
-        if self.motion_m is not None:
-            arrays["motion_m"] = self.motion_m
-        if self.truncation is not None:
-            arrays["truncation"] = np.array(astuple(self.truncation))
-        write_arrays(path, arrays)
+        from rangesim.signals.signals_files import save_signals
+
+        save_signals(self, path)

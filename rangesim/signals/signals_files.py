@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals as files: whole, to be exposed again without a new trace, and without channels, as results keep each pass."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import astuple, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangesim.errors import FileFormatError
+from rangesim.files.array_files import read_arrays, write_arrays
+from rangesim.files.schema import ArraySpec, read_checked_arrays
+from rangesim.response import Response
+from rangesim.rig import Rig
+from rangesim.settings.config import check_keys, from_dict, shown, to_dict
+from rangesim.signals.signals import EnergySplit, GroundTruth, SamplingError, Signals, Truncation
+
+FORMAT = "rangesim-signals"
+FORMAT_VERSION = 1
+MAX_SETTINGS = 1_000_000
+"""Bytes of the settings in a file."""
+
+_MAX_COORDINATE_M = 1e9
+_RADIANCE = ArraySpec("float32", low=0)
+_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_MAX_COORDINATE_M, nan=True)
+_OPTIONAL = ArraySpec("float32", required=False)
+_PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
+    "truth_z": _TRUE_DEPTH,
+    "truth_range_m": _TRUE_DEPTH,
+    "truth_normal": ArraySpec("float32", ("h", "w", 3), low=-1.01, high=1.01, nan=True),
+    "truth_instance": ArraySpec("int32", low=-1),
+    "truth_material": ArraySpec("int32", low=-1),
+    "truth_projector_uv": ArraySpec("float32", ("h", "w", 2), nan=True, inf=True),
+    "truth_projector_visible": ArraySpec("bool"),
+    "truth_instance_names": ArraySpec("str", ("instances",)),
+    "truth_material_names": ArraySpec("str", ("materials",)),
+    "motion_m": ArraySpec("float32", low=0, nan=True, required=False),
+    "truncation": ArraySpec("float64", (len(fields(Truncation)),), low=0, high=1, nan=True, required=False),
+}
+
+
+def save_signals(signals: Signals, path: str | Path) -> None:
+    """Write signals with their channels and sampling error; see `Signals.save`."""
+    if type(signals) is not Signals:
+        raise ValueError("expected signals of a scene at rest: those of what moves hold frames, and no channels.")
+    responses = list(signals.channels)
+    settings = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "rig": to_dict(signals.rig),
+        "responses": [_plain(response) for response in responses],
+    }
+    arrays = {"settings": np.frombuffer(json.dumps(settings).encode(), np.uint8), **pass_arrays(signals)}
+    arrays |= {f"channels_{i}": signals.channels[response] for i, response in enumerate(responses)}
+    if signals.sampling is not None:
+        arrays |= {f"error_{i}": signals.sampling.channels[response] for i, response in enumerate(responses)}
+        arrays["error_projector"] = signals.sampling.projector
+    write_arrays(path, arrays)
+
+
+def load_signals(path: str | Path) -> Signals:
+    """The signals that `Signals.save` wrote: `expose` makes captures of them as of those traced.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or broken, or holds a response of a class that is not loaded.
+    """
+    path = Path(path)
+    settings = _settings(path)
+    try:
+        check_keys(settings, ("format", "format_version", "rig", "responses"), str(path))
+        rig = from_dict(Rig, settings.get("rig"), "rig")
+        responses = [_response(table, f"responses[{i}]") for i, table in enumerate(settings.get("responses", ()))]
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    if len(set(responses)) < len(responses):
+        raise FileFormatError(f"{path}: expected responses that differ, got one twice.")
+    sizes = {"h": rig.camera.height, "w": rig.camera.width}
+    specs = {**_PASS, "settings": ArraySpec("uint8", ("n",)), "error_projector": _OPTIONAL}
+    for i, response in enumerate(responses):
+        shape = (response.channels, "h", "w")
+        specs |= {
+            f"channels_{i}": ArraySpec("float32", shape),
+            f"error_{i}": ArraySpec("float32", shape, required=False),
+        }
+    data = read_checked_arrays(path, specs, sizes)
+    energy, truth = _energy_and_truth(path, data)
+    has_error = ["error_projector" in data, *(f"error_{i}" in data for i in range(len(responses)))]
+    if any(has_error) and not all(has_error):
+        raise FileFormatError(f"{path}: expected the sampling error of all channels, or of none.")
+    sampling = None
+    if all(has_error):
+        sampling = SamplingError({r: data[f"error_{i}"] for i, r in enumerate(responses)}, data["error_projector"])
+    truncation = Truncation(*map(float, data["truncation"])) if "truncation" in data else None
+    channels = {response: data[f"channels_{i}"] for i, response in enumerate(responses)}
+    return Signals(rig, channels, energy, truth, data.get("motion_m"), truncation, sampling)
+
+
+def write_pass(signals: Signals, path: str | Path) -> None:
+    """Write energy split, ground truth and truncation alone, as a result keeps them of each pass."""
+    write_arrays(path, pass_arrays(signals))
+
+
+def read_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
+    """Energy split and ground truth of a pass of h x w pixels, as `sizes` says; FileFormatError if it is broken."""
+    return _energy_and_truth(path, read_checked_arrays(path, _PASS, dict(sizes)))  # passes may see other instances
+
+
+def pass_arrays(signals: Signals) -> dict[str, np.ndarray]:
+    """Arrays of what signals hold besides channels, by name in files."""
+    arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
+    arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}
+    if signals.motion_m is not None:
+        arrays["motion_m"] = signals.motion_m
+    if signals.truncation is not None:
+        arrays["truncation"] = np.array(astuple(signals.truncation))
+    return arrays
+
+
+def _energy_and_truth(path: Path, data: dict[str, np.ndarray]) -> tuple[EnergySplit, GroundTruth]:
+    for ids in ("instance", "material"):
+        if data[f"truth_{ids}"].max(initial=-1) >= len(data[f"truth_{ids}_names"]):
+            raise FileFormatError(f"{path}: array truth_{ids}: expected indices into truth_{ids}_names.")
+    energy = EnergySplit(**{f.name: data[f"energy_{f.name}"] for f in fields(EnergySplit)})
+    truth: dict[str, Any] = {f.name: data[f"truth_{f.name}"] for f in fields(GroundTruth)}
+    for name in ("instance_names", "material_names"):
+        truth[name] = tuple(map(str, truth[name]))
+    return energy, GroundTruth(**truth)
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    def check(name: str, place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if dtype != np.uint8 or len(shape) != 1 or shape[0] > MAX_SETTINGS:
+            raise FileFormatError(f"{place}: expected up to {MAX_SETTINGS} bytes of text.")
+
+    if not path.is_file():
+        raise FileFormatError(f"{path} is missing.")
+    text = read_arrays(path, ["settings"], check)["settings"].tobytes()
+    try:
+        settings = json.loads(text.decode())
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: expected settings as JSON: {shown(str(error))}.") from error
+    if not isinstance(settings, dict) or settings.get("format") != FORMAT:
+        raise FileFormatError(f"{path} is no {FORMAT} file.")
+    if settings.get("format_version") != FORMAT_VERSION:
+        found = shown(settings.get("format_version"))
+        raise FileFormatError(f"{path}: expected format version {FORMAT_VERSION}, got {found}.")
+    return settings
+
+
+def _plain(response: Response) -> dict[str, Any]:
+    table = {"type": type(response).__name__, **to_dict(response)}
+    if any(isinstance(value, np.ndarray) for value in vars(response).values()):
+        raise ValueError(f"expected responses of numbers, got {type(response).__name__}, which holds arrays.")
+    return table
+
+
+def _response(table: Any, place: str) -> Response:
+    """The response of a table whose `type` is the name of its class."""
+    if not isinstance(table, dict):
+        raise ValueError(f"{place}: expected a table, got {shown(table)}.")
+    values = dict(table)
+    name, kinds = values.pop("type", None), _kinds()
+    if not isinstance(name, str) or name not in kinds:
+        raise ValueError(f"{place}: expected 'type' to be one of {', '.join(kinds)}, got {shown(name)}.")
+    return from_dict(kinds[name], values, place)
+
+
+def _kinds() -> dict[str, type[Response]]:
+    """Classes of responses by name, those of the package first."""
+    found: dict[str, type[Response]] = {}
+    level = Response.__subclasses__()
+    while level:
+        for kind in level:
+            found.setdefault(kind.__name__, kind)
+        level = [deeper for kind in level for deeper in kind.__subclasses__()]
+    return found

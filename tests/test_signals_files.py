@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals and range images come back from their files as they were; what is no such file is refused in a sentence."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic import plane_signals, stereo_rig
+
+import rangesim
+from rangesim import (
+    AmcwToF,
+    DirectToF,
+    IdealToF,
+    Sensor,
+    Signals,
+    StructuredLight,
+    decode,
+    explain,
+    expose,
+    load_range_image,
+    load_signals,
+)
+from rangesim.decoding.phase_shift import PhaseThresholds
+from rangesim.errors import FileFormatError
+from rangesim.response import Images
+from rangesim.sensors import AmcwDecoder
+
+ROOT = Path(__file__).resolve().parent.parent
+SENSORS: list[Sensor] = [
+    StructuredLight(256, 160, axes=("columns", "rows")),
+    AmcwToF(waveform="square"),
+    DirectToF(bins=32, bin_s=400e-12),
+    IdealToF(),
+]
+
+
+@pytest.fixture(scope="module")
+def traced() -> Signals:
+    scene = rangesim.load_scene(ROOT / "scenes" / "matte.xml")
+    return rangesim.transport(scene, scene.rig(None, (256, 160), width=48, height=36), SENSORS, spp=4)
+
+
+def test_signals_are_exposed_again_as_those_traced(traced: Signals, tmp_path: Path) -> None:
+    traced.save(tmp_path / "signals.npz")
+    loaded = load_signals(tmp_path / "signals.npz")
+    assert loaded.rig == traced.rig
+    assert loaded.truncation == traced.truncation
+    for sensor in SENSORS:
+        for noise in (sensor.default_detector, None):
+            first, again = (expose(signals, sensor, noise, seed=5) for signals in (traced, loaded))
+            assert first.frames.tobytes() == again.frames.tobytes()
+            causes = (explain(decode(c), c, s) for c, s in ((first, traced), (again, loaded)))
+            np.testing.assert_array_equal(*(c.cause for c in causes))
+        np.testing.assert_array_equal(*(s.frames(sensor, sampling_errors=1.0) for s in (traced, loaded)))
+
+
+def test_signals_without_a_sampling_error_have_none_afterwards(tmp_path: Path) -> None:
+    signals = plane_signals(stereo_rig(40, 30), AmcwToF())
+    signals.save(tmp_path / "plane.npz")
+    loaded = load_signals(tmp_path / "plane.npz")
+    assert loaded.sampling is None
+    assert loaded.truncation is None
+    np.testing.assert_array_equal(loaded.frames(AmcwToF()), signals.frames(AmcwToF()))
+
+
+def test_what_cannot_be_read_back_is_not_written(tmp_path: Path) -> None:
+    signals = plane_signals(stereo_rig(40, 30), AmcwToF())
+    images = Images(np.ones((2, 800, 1280), np.float32))
+    with pytest.raises(ValueError, match="expected responses of numbers, got Images"):
+        replace(signals, channels={images: np.ones((2, 30, 40), np.float32)}).save(tmp_path / "images.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def changed(path: Path, settings: dict[str, Any] | None = None, **arrays: Any) -> None:
+    """Rewrite a file with other settings and arrays; None leaves an array out."""
+    with np.load(path) as file:
+        data = {**{name: file[name] for name in file.files}, **arrays}
+    if settings is not None:
+        kept = json.loads(data["settings"].tobytes())
+        data["settings"] = np.frombuffer(json.dumps({**kept, **settings}).encode(), np.uint8)
+    np.savez(path, **{name: values for name, values in data.items() if values is not None})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"settings": {"format": "other"}}, "is no rangesim-signals file"),
+        ({"settings": {"format_version": 2}}, "expected format version 1, got 2"),
+        ({"settings": {"more": 1}}, "unknown key 'more'"),
+        ({"settings": {"rig": {}}}, "rig"),
+        ({"settings": {"rig": None}}, "expected a table"),
+        ({"settings": {"responses": 3}}, "not iterable"),
+        ({"settings": {"responses": [{"type": "Nothing"}]}}, "expected 'type' to be one of .*, got 'Nothing'"),
+        ({"settings": {"responses": [{"type": "Phasor", "modulation_hz": -1}]}}, "modulation_hz"),
+        ({"settings": {"responses": [{"type": "FirstReturn"}] * 3}}, "got one twice"),
+        ({"channels_0": None}, "expected an array 'channels_0'"),
+        ({"channels_0": np.ones((2, 3, 4), np.float32)}, "channels_0'?: expected shape 2 x 30 x 40"),
+        ({"channels_0": np.full((2, 30, 40), np.nan, np.float32)}, "expected numbers, got NaN"),
+        ({"error_projector": np.zeros((30, 40), np.float32)}, "sampling error of all channels, or of none"),
+        ({"energy_direct": np.zeros((30, 41), np.float32)}, "expected shape"),
+        ({"truth_instance": np.full((30, 40), 7, np.int32)}, "expected indices into truth_instance_names"),
+        ({"more": np.zeros(3)}, "'more' as well"),
+    ],
+)
+def test_damaged_signals_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "signals.npz"
+    plane_signals(stereo_rig(40, 30), AmcwToF()).save(path)
+    changed(path, **change)
+    with pytest.raises(FileFormatError, match=message) as error:
+        load_signals(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04", b"{}"])
+def test_what_is_no_file_of_arrays_is_refused(content: bytes | None, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "x.npz").write_bytes(content)
+    for load in (load_signals, load_range_image):
+        with pytest.raises(FileFormatError, match=r"x\.npz"):
+            load(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("is_calibrated", [True, False])
+def test_range_images_come_back_with_camera_and_decoder(is_calibrated: bool, tmp_path: Path) -> None:
+    sensor, decoder = AmcwToF(), AmcwDecoder(phase=PhaseThresholds(max_sigma_rad=0.1))
+    capture = expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor, sensor.default_detector)
+    image = decode(capture if is_calibrated else replace(capture, rig=None), decoder)
+    image.save(tmp_path / "range.npz")
+    loaded = load_range_image(tmp_path / "range.npz")
+    assert loaded.decoder == decoder
+    assert loaded.camera == image.camera
+    for f in fields(image):
+        if isinstance(getattr(image, f.name), np.ndarray):
+            np.testing.assert_array_equal(getattr(loaded, f.name), getattr(image, f.name))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"settings": {"decoder": {"type": "other"}}}, "expected 'type' to be one of"),
+        ({"settings": {"camera": {"width": 1}}}, "camera"),
+        ({"settings": {"more": 1}}, "unknown key 'more'"),
+        ({"status": np.ones((30, 40), np.uint8)}, "expected z to be finite where status is 0"),
+        ({"status": np.full((30, 40), 99, np.uint8)}, "expected values from"),
+        ({"z": np.ones((2, 2), np.float32)}, "expected shape"),
+    ],
+)
+def test_damaged_range_images_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    sensor = AmcwToF()
+    path = tmp_path / "range.npz"
+    decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)).save(path)
+    changed(path, **change)
+    with pytest.raises(FileFormatError, match=message) as error:
+        load_range_image(path)
+    assert "\n" not in str(error.value)
