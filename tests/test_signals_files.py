@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -138,6 +140,14 @@ def test_range_images_come_back_with_camera_and_decoder(is_calibrated: bool, tmp
     for f in fields(image):
         if isinstance(getattr(image, f.name), np.ndarray):
             np.testing.assert_array_equal(getattr(loaded, f.name), getattr(image, f.name))
+
+
+def test_a_range_image_is_read_where_no_sensor_is_loaded_yet(tmp_path: Path) -> None:
+    sensor = AmcwToF()
+    decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)).save(tmp_path / "range.npz")
+    code = f"import rangesim; print(rangesim.load_range_image({str(tmp_path / 'range.npz')!r}).decoder)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.startswith("AmcwDecoder(")
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,8 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
     FileFormatError
         The file is missing or broken, or its decoder is of a class that is not loaded.
     """
+    import rangesim.sensors  # noqa: F401  (so that its decoders are known)
+
     path = Path(path)
     arrays: dict[str, Any] = read_checked_arrays(path, _RANGE, dict(sizes or {}))
     text = arrays.pop("settings", np.zeros(0, np.uint8)).tobytes() or b"{}"

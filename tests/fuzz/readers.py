@@ -177,6 +177,18 @@ def _result(path: Path, _: Arguments) -> Any:
     return load_result(path)
 
 
+def _signals(path: Path, _: Arguments) -> Any:
+    import rangesim
+
+    return rangesim.load_signals(path)
+
+
+def _range_image(path: Path, _: Arguments) -> Any:
+    import rangesim
+
+    return rangesim.load_range_image(path)
+
+
 def _rangesim(path: Path, arguments: Arguments) -> Any:
     from rangesim.cli import main
 
@@ -484,6 +496,8 @@ READERS = {
             "calibration-xml", _calibration, seeds.opencv_files, by_hand=(hostile.opencv_calibrations,),
             check=_rig_is_finite,
         ),
+        Reader("signals", _signals, seeds.signals_files, by_hand=(hostile.npz_files,), share=0.3),
+        Reader("range-image", _range_image, seeds.range_image_files, by_hand=(hostile.npz_files,), share=0.3),
         *(
             Reader(f"result-{part}", _result, seeds.results, targets, (_by_suffix,), share=0.3)
             for part, targets in _RESULT_PARTS.items()

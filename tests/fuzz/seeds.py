@@ -88,6 +88,29 @@ def captures() -> Seeds:
     return seeds
 
 
+def signals_files() -> Seeds:
+    """Signals of two sensors."""
+    from synthetic import plane_signals, stereo_rig
+
+    from rangesim import AmcwToF, StructuredLight
+
+    rig = stereo_rig(12, 8)
+    sensors = {"codes": StructuredLight(), "amcw": AmcwToF((20e6, 50e6))}
+    return {k: of_file("signals.npz", written("s.npz", plane_signals(rig, s).save)) for k, s in sensors.items()}
+
+
+def range_image_files() -> Seeds:
+    """Range images with camera and decoder."""
+    from synthetic import plane_signals, stereo_rig
+
+    from rangesim import IdealToF, StructuredLight, decode, expose
+
+    images = {
+        s.type_name: decode(expose(plane_signals(stereo_rig(12, 8), s), s)) for s in (IdealToF(), StructuredLight())
+    }
+    return {name: of_file("range.npz", written("r.npz", image.save)) for name, image in images.items()}
+
+
 def experiments() -> Seeds:
     """Experiment files: the examples, and one with every kind of sensor."""
     seeds = {p.stem: of_file("experiment.toml", p.read_bytes()) for p in sorted((ROOT / "examples").glob("*.toml"))}
