@@ -96,7 +96,7 @@ def channels(response: Response, path: LightPath, radiance: np.ndarray) -> np.nd
     if not isinstance(response, TransientHistogram):
         return np.stack([radiance * w for w in response.weights(path, NumpyMath())]).astype(np.float32)  # type: ignore[attr-defined]
     result = np.zeros((response.channels + 1, *radiance.shape), dtype=np.float32)  # the last takes what is in no bin
-    for index, weight in response.shares(path, NumpyMath()):
+    for index, weight in response.bin_weights(path, NumpyMath()):
         place = np.asarray(index)[None]
         np.put_along_axis(result, place, np.take_along_axis(result, place, 0) + radiance * weight, 0)
     return result[:-1]

@@ -45,12 +45,12 @@ def timed(task: Callable[[], Any]) -> tuple[Any, np.ndarray]:
 def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.ndarray]:
     """Photons that landed, and (repeats, 2) seconds to trace them and to build their maps."""
     from rangesim.light_transport.caustics import PHOTONS, gathering_radius
-    from rangesim.light_transport.device import Device
     from rangesim.light_transport.photon_maps import MAX_MAPS, PhotonMaps
     from rangesim.light_transport.photons import trace_photons
+    from rangesim.light_transport.traced_scene import TracedScene
 
     maps = min(spp, MAX_MAPS)
-    trace = partial(trace_photons, scene.mitsuba, Device.projector(rig), rig.projector_power_w, PHOTONS, maps)
+    trace = partial(trace_photons, TracedScene.of(scene.mitsuba, rig), rig.projector_power_w, PHOTONS, maps)
     seconds = []
     for seed in range(repeats + 1):
         landed, tracing = timed(partial(trace, seed=seed, memory_bytes=2 << 30))

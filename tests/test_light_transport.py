@@ -250,7 +250,7 @@ def test_independent_seeds_are_unbiased(corner: rangesim.Scene) -> None:
     assert (np.abs(short.mean(axis=0) - long)[lit] < 5 * error[lit]).all()
 
 
-def test_a_mirror_beside_the_view_is_multipath_not_via_delta() -> None:
+def test_a_mirror_beside_the_view_is_multipath_not_a_specular_chain() -> None:
     """The camera sees matte surfaces only; some of their light has come over the mirror."""
     import mitsuba as mi
 
