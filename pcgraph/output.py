@@ -339,16 +339,18 @@ class _Staging:
         A user may move or remove it meanwhile, and another process may work in a new one of that name; and a child of
         this process shares the claim.
         """
-        if self.handle is None or self.process != os.getpid():
-            return False
-        try:
-            return os.path.samestat(os.stat(self.path / _LOCK), os.fstat(self.handle))
-        except FileNotFoundError:
-            return False
+        with _claims_lock:  # a thread that ends the process may give up the claim meanwhile
+            if self.handle is None or self.process != os.getpid():
+                return False
+            try:
+                return os.path.samestat(os.stat(self.path / _LOCK), os.fstat(self.handle))
+            except FileNotFoundError:
+                return False
 
     def was_moved(self) -> bool:
         """Whether the directory is no longer where this process made it."""
-        return self.handle is not None and self.process == os.getpid() and not self.is_ours()
+        with _claims_lock:
+            return self.handle is not None and self.process == os.getpid() and not self.is_ours()
 
     def commit(self, named: Path, kind: DirectoryKind) -> None:
         """List the new files in a manifest, flush them, and let them take their places."""
