@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rangesim.decoding.range_image import RangeImage
     from rangesim.sensors import Sensor, StructuredLight
 
-CODES = ("gray", "gray-phase")
 OF_PATTERNS = ("code", "projector", "axes", "period", "steps")
 OF_BARE_IMAGES = (*OF_PATTERNS, "bits")
 OF_XML_CALIBRATIONS = ("code_step", "unit")
@@ -160,8 +159,9 @@ def _structured_light(code: str, projector: str, axes: str, period: float, steps
     from rangesim.sensors import StructuredLight
     from rangesim.settings.config import nearest, shown
 
-    if code not in CODES:
-        raise ValueError(f"expected a code out of {', '.join(CODES)}, got {code!r}{nearest(code, CODES)}.")
+    codes = StructuredLight.presets()
+    if code not in codes:
+        raise ValueError(f"expected a code out of {', '.join(codes)}, got {code!r}{nearest(code, codes)}.")
     size = re.fullmatch(r"(\d+)[x×](\d+)", projector)
     if not size:
         raise ValueError(f"expected --projector as WIDTHxHEIGHT in pixels, such as 1024x768, got {shown(projector)}.")

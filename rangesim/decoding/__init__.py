@@ -5,11 +5,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
-from rangesim.decoding.status import Status
 from rangesim.sensor import Decoder
 from rangesim.settings.config import shown
 
@@ -48,6 +45,5 @@ def _check(image: RangeImage, capture: Capture, decoder: Decoder) -> None:
                 f"expected {name} to return {key} of shape {shape} and type {dtype}, "
                 f"got {values.shape} and {values.dtype}."
             )
-    ok, finite = image.status == Status.OK, np.isfinite(image.z)
-    if bool((finite > ok).any()) or (image.camera is not None and bool((finite < ok).any())):
+    if not image.is_consistent:
         raise ValueError(f"expected {name} to return z where status is OK, and NaN everywhere else.")

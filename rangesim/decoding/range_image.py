@@ -59,6 +59,12 @@ class RangeImage(ShortRepr):
         """(h, w) bool, where `status` is OK."""
         return np.asarray(self.status == Status.OK)
 
+    @property
+    def is_consistent(self) -> bool:
+        """Whether z is finite where `status` is OK and NaN elsewhere; without a camera it may be NaN anywhere."""
+        finite, ok = np.isfinite(self.z), self.valid
+        return not (finite > ok).any() and (self.camera is None or not (finite < ok).any())
+
     def save(self, path: str | Path) -> None:
         """Write all of it to a compressed .npz file, which `rangesim.load_range_image` reads back equal."""
         from rangesim.decoding.range_image_files import save_range_image

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,12 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.errors import FileFormatError
 from rangesim.files.array_files import write_arrays
-from rangesim.files.schema import ArraySpec, read_checked_arrays
+from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
 from rangesim.rig import Intrinsics
 from rangesim.sensor import Decoder
-from rangesim.settings.config import check_keys, from_dict, shown, to_dict
+from rangesim.settings.config import check_keys, from_dict, to_dict
 
-_MAX_COORDINATE_M = 1e9
-_DEPTH = ArraySpec("float32", low=-_MAX_COORDINATE_M, high=_MAX_COORDINATE_M, nan=True)
+_DEPTH = ArraySpec("float32", low=-MAX_METRES, high=MAX_METRES, nan=True)
 _RANGE = {
     "z": _DEPTH,
     "range_m": _DEPTH,
@@ -31,7 +29,7 @@ _RANGE = {
     "projector_column": ArraySpec("float32", nan=True, required=False),
     "projector_row": ArraySpec("float32", nan=True, required=False),
     "sampling_sigma_m": ArraySpec("float32", low=0, nan=True, inf=True, required=False),
-    "settings": ArraySpec("uint8", ("n",), required=False),
+    "settings": replace(SETTINGS, required=False),
 }
 
 
@@ -39,7 +37,7 @@ def save_range_image(image: RangeImage, path: str | Path) -> None:
     """Write the arrays of a range image, its camera and its decoder to a compressed .npz file."""
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
     settings = {"camera": to_dict(image.camera), "decoder": to_dict(image.decoder)}
-    write_arrays(path, {**arrays, "settings": np.frombuffer(json.dumps(settings).encode(), np.uint8)})
+    write_arrays(path, {**arrays, "settings": settings_array(settings)})
 
 
 def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> RangeImage:
@@ -56,11 +54,8 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
 
     path = Path(path)
     arrays: dict[str, Any] = read_checked_arrays(path, _RANGE, dict(sizes or {}))
-    text = arrays.pop("settings", np.zeros(0, np.uint8)).tobytes() or b"{}"
+    settings = settings_of(arrays.pop("settings"), path) if "settings" in arrays else {}
     try:
-        settings = json.loads(text.decode())
-        if not isinstance(settings, dict):
-            raise ValueError(f"expected settings as a table, got {shown(settings)}.")
         check_keys(settings, ("camera", "decoder"), "settings")
         camera, decoder = settings.get("camera"), settings.get("decoder")
         image = RangeImage(
@@ -68,10 +63,9 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
             camera=None if camera is None else from_dict(Intrinsics, camera, "camera"),
             decoder=None if decoder is None else from_dict(Decoder, decoder, "decoder"),  # type: ignore[type-abstract]
         )
-    except (ValueError, TypeError, RecursionError) as error:
-        raise FileFormatError(f"{path}: {shown(str(error)) if isinstance(error, RecursionError) else error}") from error
-    finite, ok = np.isfinite(image.z), image.status == Status.OK
-    if (finite > ok).any() or (image.camera is not None and (finite < ok).any()):
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    if not image.is_consistent:
         raise FileFormatError(f"{path}: expected z to be finite where status is {Status.OK.value}.")
     if image.camera is not None and image.z.shape != (image.camera.height, image.camera.width):
         raise FileFormatError(f"{path}: expected arrays of the size of the camera.")

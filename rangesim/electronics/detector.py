@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from rangesim.rig import Rig
 from rangesim.settings.bounds import Bounds, Fraction, Metres, PositiveFraction, Seconds, Wavelength, check_fields
+from rangesim.settings.config import Named
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
@@ -41,13 +42,14 @@ class Gate(NamedTuple):
     bins: int
 
 
-class PhotoDetector(ABC):
+class PhotoDetector(Named, ABC):
     """What turns the radiance of a sensor's frames into digital numbers. Subclasses are frozen dataclasses.
 
     Where a method takes a `gate`, it is `Sensor.gate`: when photons are counted; None for a sensor whose frames
     integrate all light of an exposure.
     """
 
+    known: ClassVar[dict[str, type[Any]]] = {}
     type_name: ClassVar[str]
     wavelength_m: float
     quantum_efficiency: float

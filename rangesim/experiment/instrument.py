@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
-from rangesim.sensors import Decoder, Sensor, check_sensor, presets, sensor_from_dict, sensor_of
+from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict, sensor_of
 from rangesim.settings.bounds import Exponent, Metres, Seconds, Watts, check_fields
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 
@@ -97,7 +97,12 @@ DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
 def instrument(name: str, **settings: Any) -> Instrument:
     """The instrument with the sensor of a name, see `rangesim.sensors.sensor_of`; errors as there."""
     sensor = sensor_of(name)
-    return Instrument(name if name in presets() else sensor.type_name, sensor, **settings)
+    return Instrument(_name_of(name, sensor), sensor, **settings)
+
+
+def _name_of(given: str, sensor: Sensor) -> str:
+    """The name of an instrument given by its sensor alone: of the preset, or the type of a sensor from a file."""
+    return sensor.type_name if is_file_name(given) else given
 
 
 def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -> Instrument:
@@ -116,7 +121,7 @@ def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -
     if given is not None:
         values["sensor"] = sensor = sensor_from_dict(given, f"{place}.sensor", files_in)
         if isinstance(given, str):
-            values.setdefault("name", given if given in presets() else sensor.type_name)
+            values.setdefault("name", _name_of(given, sensor))
     for key, kind, default in (
         ("detector", PhotoDetector, getattr(sensor, "default_detector", None)),
         ("decoder", Decoder, getattr(sensor, "default_decoder", None)),

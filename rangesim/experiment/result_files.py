@@ -142,10 +142,6 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
     rows: list[RowRecord]
 
 
-_MAX_COORDINATE_M = 1e9
-_RADIANCE = ArraySpec("float32", low=0)
-_DEPTH = ArraySpec("float32", low=-_MAX_COORDINATE_M, high=_MAX_COORDINATE_M, nan=True)
-_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_MAX_COORDINATE_M, nan=True)
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
@@ -177,7 +173,7 @@ class Measurement(ShortRepr):
     capture : Capture. image : RangeImage. truth : GroundTruth of its pass.
     causes : CauseMap, why pixels failed.
     rows : statistics per material class, "all" last; see `rangesim.evaluation.comparison.ErrorStatistics` and
-        `rangesim.causes.CauseMap.contributions`.
+        `rangesim.causes.CauseMap.fractions`.
     segmentation : Segmentation, or None if there were no points to group.
     metadata : MeasurementRecord, frames, exposure and time per stage.
     light_pass : int from 1, the transport pass the instrument took part in.

@@ -28,7 +28,8 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
-Metres = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+MAX_METRES = 1e9
+Metres = Annotated[float, msgspec.Meta(ge=-MAX_METRES, le=MAX_METRES)]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
 
 
@@ -127,6 +128,26 @@ def read_checked_arrays(path: Path, specs: Mapping[str, ArraySpec], sizes: dict[
         elif spec.required:
             raise FileFormatError(f"{path}: expected an array {name!r}, found none of that name.")
     return arrays
+
+
+SETTINGS = ArraySpec("uint8", ("settings",))
+"""An array of settings in a file of arrays; see `settings_array`."""
+
+
+def settings_array(data: Mapping[str, Any]) -> np.ndarray:
+    """Plain data as an array of bytes, JSON, to stand beside others in a file of arrays."""
+    return np.frombuffer(json.dumps(data).encode(), np.uint8)
+
+
+def settings_of(array: np.ndarray, path: Path) -> dict[str, Any]:
+    """The plain data that `settings_array` made an array of; FileFormatError if it is no table."""
+    try:
+        settings = json.loads(array.tobytes().decode())
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: expected settings as JSON: {shown(str(error))}.") from error
+    if not isinstance(settings, dict):
+        raise FileFormatError(f"{path}: expected settings as a table, got {shown(settings)}.")
+    return settings
 
 
 MAX_TEXT = 1000

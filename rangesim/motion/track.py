@@ -13,17 +13,18 @@ from numpy.typing import ArrayLike
 
 from rangesim.rig import Array, Rig, pose
 from rangesim.settings.bounds import Bounds, Coordinate, check_fields
-from rangesim.settings.config import nearest, shown, to_dict
+from rangesim.settings.config import Named, nearest, shown, to_dict
 
 Rate = Annotated[float, Bounds("a rate per second", -1e6, 1e6)]
 
 
-class Track(ABC):
+class Track(Named, ABC):
     """A rigid motion: a world transform T(t), applied to a thing as it stands in the scene file.
 
     The identity means at rest. A world point x of the thing is at T(t) x at time t. Subclasses are frozen dataclasses.
     """
 
+    known: ClassVar[dict[str, type[Any]]] = {}
     type_name: ClassVar[str]
     """Name in configuration files."""
 

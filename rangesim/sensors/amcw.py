@@ -142,7 +142,7 @@ class AmcwDecoder(Decoder):
     phase : PhaseThresholds.
     correct_wiggling : bool; for a square waveform, True inverts the triangle correlation exactly (what a
         calibrated camera does with a look-up table), False uses the sine formula and shows the raw wiggling
-        error, up to 0.011 normalised. Multipath sums triangles of different phase, for which neither is exact.
+        error, up to 0.011 periods. Multipath sums triangles of different phase, for which neither is exact.
     max_residual : a frequency whose phase is farther off that of the common path length contradicts it.
     max_ambiguity : misfit of the best wrap counts over that of the second best: above, the choice between them is a
         guess.

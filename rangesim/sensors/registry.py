@@ -88,7 +88,8 @@ def sensor_from_dict(data: Any, place: str, files_in: Path | None = None) -> Sen
         if isinstance(data, Mapping):
             given = data.get("type")
             if files_in is not None and isinstance(given, str) and is_file_name(given):
-                data = {**to_dict(sensor_of(given, files_in)), **data, "type": sensor_of(given, files_in).type_name}
+                named = to_dict(sensor_of(given, files_in))
+                data = {**named, **data, "type": named["type"]}
             elif isinstance(given, str) and given not in Sensor.known:
                 raise ValueError(
                     f"expected 'type' to be one of {', '.join(Sensor.known)}, got {shown(given)}"

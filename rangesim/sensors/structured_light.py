@@ -82,7 +82,8 @@ class StructuredLight(Sensor):
         """The runs of frames before white and black, in order."""
         runs, start = [], 0
         for axis in self.axes:
-            coded: list[tuple[GrayBits | Fringes, int]] = [(self._gray(axis), 2 * self._gray(axis).channels)]
+            gray = self._gray(axis)
+            coded: list[tuple[GrayBits | Fringes, int]] = [(gray, 2 * gray.channels)]
             if self.code == "gray-phase":
                 coded.append((Fringes(AXES.index(axis), self.period_px), self.steps))
             for response, length in coded:

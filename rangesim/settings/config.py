@@ -114,16 +114,10 @@ def _required(field: dataclasses.Field[Any]) -> bool:
 
 def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
     """`cls` itself, or the subclass that the key `type` names; removes that key from `values`."""
-    choices: dict[str, type[T]] = getattr(cls, "known", None) or {
-        kind.type_name: kind  # type: ignore[attr-defined]
-        for kind in cls.__subclasses__()
-        if hasattr(kind, "type_name")
-    }
-    own = getattr(cls, "type_name", None)
-    if own:
-        choices = {own: cls}
-    if not choices:
+    if not issubclass(cls, Named):
         return cls
+    own = getattr(cls, "type_name", None)
+    choices: dict[str, type[Any]] = {own: cls} if own else cls.known
     tag = values.pop("type", own)
     if not isinstance(tag, str) or tag not in choices:
         raise ValueError(

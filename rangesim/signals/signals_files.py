@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from rangesim.errors import FileFormatError
 from rangesim.files.array_files import read_arrays, write_arrays
-from rangesim.files.schema import ArraySpec, read_checked_arrays
+from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
@@ -23,9 +22,8 @@ FORMAT_VERSION = 1
 MAX_SETTINGS = 1_000_000
 """Bytes of the settings in a file."""
 
-_MAX_COORDINATE_M = 1e9
 _RADIANCE = ArraySpec("float32", low=0)
-_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=_MAX_COORDINATE_M, nan=True)
+_TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
 _OPTIONAL = ArraySpec("float32", required=False)
 _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
     "truth_z": _TRUE_DEPTH,
@@ -53,7 +51,7 @@ def save_signals(signals: Signals, path: str | Path) -> None:
         "rig": to_dict(signals.rig),
         "responses": [_plain(response) for response in responses],
     }
-    arrays = {"settings": np.frombuffer(json.dumps(settings).encode(), np.uint8), **pass_arrays(signals)}
+    arrays = {"settings": settings_array(settings), **_pass_arrays(signals)}
     arrays |= {f"channels_{i}": signals.channels[response] for i, response in enumerate(responses)}
     if signals.sampling is not None:
         arrays |= {f"error_{i}": signals.sampling.channels[response] for i, response in enumerate(responses)}
@@ -80,7 +78,7 @@ def load_signals(path: str | Path) -> Signals:
     if len(set(responses)) < len(responses):
         raise FileFormatError(f"{path}: expected responses that differ, got one twice.")
     sizes = {"h": rig.camera.height, "w": rig.camera.width}
-    specs = {**_PASS, "settings": ArraySpec("uint8", ("n",)), "error_projector": _OPTIONAL}
+    specs = {**_PASS, "settings": SETTINGS, "error_projector": _OPTIONAL}
     for i, response in enumerate(responses):
         shape = (response.channels, "h", "w")
         specs |= {
@@ -102,7 +100,7 @@ def load_signals(path: str | Path) -> Signals:
 
 def write_pass(signals: Signals, path: str | Path) -> None:
     """Write energy split, ground truth and truncation alone, as a result keeps them of each pass."""
-    write_arrays(path, pass_arrays(signals))
+    write_arrays(path, _pass_arrays(signals))
 
 
 def read_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
@@ -110,7 +108,7 @@ def read_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTru
     return _energy_and_truth(path, read_checked_arrays(path, _PASS, dict(sizes)))  # passes may see other instances
 
 
-def pass_arrays(signals: Signals) -> dict[str, np.ndarray]:
+def _pass_arrays(signals: Signals) -> dict[str, np.ndarray]:
     """Arrays of what signals hold besides channels, by name in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}
@@ -139,12 +137,8 @@ def _settings(path: Path) -> dict[str, Any]:
 
     if not path.is_file():
         raise FileFormatError(f"{path} is missing.")
-    text = read_arrays(path, ["settings"], check)["settings"].tobytes()
-    try:
-        settings = json.loads(text.decode())
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: expected settings as JSON: {shown(str(error))}.") from error
-    if not isinstance(settings, dict) or settings.get("format") != FORMAT:
+    settings = settings_of(read_arrays(path, ["settings"], check)["settings"], path)
+    if settings.get("format") != FORMAT:
         raise FileFormatError(f"{path} is no {FORMAT} file.")
     if settings.get("format_version") != FORMAT_VERSION:
         found = shown(settings.get("format_version"))
