@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.light_transport.one_pass import transport as transport
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.rig import Intrinsics as Intrinsics
+    from rangesim.rig import Lens as Lens
     from rangesim.rig import Rig as Rig
     from rangesim.rig import look_at as look_at
     from rangesim.rig.calibration_files import load_calibration as load_calibration
@@ -51,6 +52,7 @@ _HOME = {
     "DirectToF": "rangesim.sensors",
     "IdealToF": "rangesim.sensors",
     "Intrinsics": "rangesim.rig",
+    "Lens": "rangesim.rig",
     "PointCloud": "rangesim.point_cloud",
     "RangeImage": "rangesim.decoding.range_image",
     "Rig": "rangesim.rig",

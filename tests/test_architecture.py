@@ -144,6 +144,7 @@ def test_the_public_surface_is_this() -> None:
         "DirectToF",
         "IdealToF",
         "Intrinsics",
+        "Lens",
         "PointCloud",
         "RangeImage",
         "Rig",

@@ -23,7 +23,7 @@ from rangesim.electronics.ambient import Ambient, Tungsten
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
-from rangesim.experiment.instrument import Optics, instrument
+from rangesim.experiment.instrument import instrument
 from rangesim.motion import ConstantTwist, Motion, PoseTrack, Timing
 from rangesim.response import (
     FirstReturn,
@@ -36,7 +36,7 @@ from rangesim.response import (
     Phasor,
     TransientHistogram,
 )
-from rangesim.rig import Intrinsics, Rig, translation
+from rangesim.rig import Intrinsics, Lens, Rig, translation
 from rangesim.sensors import (
     AmcwDecoder,
     AmcwToF,
@@ -131,7 +131,8 @@ def use_detector(detector: Any) -> None:
 
 
 def use_instrument(one: Any) -> None:
-    use_rig(dataclasses.replace(RIG, **vars(one.optics), projector_power_w=one.power_w))
+    lenses = {"camera_lens": one.camera_lens, "projector_lens": one.projector_lens}
+    use_rig(dataclasses.replace(RIG, **lenses, projector_power_w=one.power_w))
     if one.detector is not None and isinstance(one.detector, Detector):
         use_detector(one.detector)
 
@@ -187,7 +188,7 @@ CASES: list[tuple[Any, Callable[[Any], None]]] = [
     (Ambient("tungsten", irradiance_w_m2=10.0), use_ambient),
     (Ambient("led", illuminance_lux=100.0), use_ambient),
     (Tungsten(), lambda t: use_ambient(Ambient("tungsten", 10.0, temperature_k=t.temperature_k))),
-    (Optics(), lambda o: use_rig(dataclasses.replace(RIG, **vars(o)))),
+    (Lens(1e-3), lambda x: use_rig(dataclasses.replace(RIG, camera_lens=x, projector_lens=x))),
     (instrument("amcw"), use_instrument),
     (instrument("gray"), use_instrument),
     (Experiment("a.xml"), use_experiment),

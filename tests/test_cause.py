@@ -19,6 +19,7 @@ from rangesim import (
     Detector,
     DirectToF,
     IdealToF,
+    Lens,
     Sensor,
     SpadDetector,
     StructuredLight,
@@ -156,10 +157,13 @@ def _power_at_threshold(rig: Any, sensor: Sensor, detector: Any, exposure_s: flo
 def test_a_lens_that_darkens_the_corners_asks_for_more_light_there(noise: bool) -> None:
     """The detector needs what it needs, so before the lens 1 / cos^n as much; ambient light is darkened alike."""
     sensor, detector = SENSORS["gray"]
-    rig = replace(stereo_rig(), camera_vignetting=4.0)
+    rig = replace(stereo_rig(), camera_lens=Lens(0.75e-3, vignetting=4.0))
     even, darkened = (
         light_budget(signals, expose(signals, sensor, detector if noise else None, 2e-3), sensor.default_decoder)
-        for signals in (plane_signals(replace(rig, camera_vignetting=n), sensor, ambient=0.0) for n in (0.0, 4.0))
+        for signals in (
+            plane_signals(replace(rig, camera_lens=Lens(0.75e-3, vignetting=n)), sensor, ambient=0.0)
+            for n in (0.0, 4.0)
+        )
     )
     np.testing.assert_array_equal(darkened.signal, even.signal)
     needed = darkened.needed * rig.camera_illumination
@@ -172,7 +176,9 @@ def test_a_white_surface_returns_what_lambert_s_law_says() -> None:
     points = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]])
     white = white_radiance(rig, points, np.array([[0.0, 0.0, -1.0]] * 2))
     np.testing.assert_allclose(white, rig.projector_irradiance / np.pi / 4)
-    darkened = white_radiance(replace(rig, projector_vignetting=4.0), points, np.array([[0.0, 0.0, -1.0]] * 2))
+    darkened = white_radiance(
+        replace(rig, projector_lens=Lens(2e-3, vignetting=4.0)), points, np.array([[0.0, 0.0, -1.0]] * 2)
+    )
     np.testing.assert_allclose(darkened / white, [1.0, (2 / np.sqrt(5)) ** 4])
 
 
@@ -221,7 +227,7 @@ def test_a_detector_that_the_sun_fills_is_swamped_and_one_that_the_projector_fil
 def test_the_lens_in_a_mirror_is_glint_where_the_law_of_reflection_puts_it() -> None:
     """A mirror square to the camera shows the lens, 5 cm wide for once, as far behind it as it is before."""
     scene = cause_scenes.room(mirror=cause_scenes.board(0, 0, 1.0, 0.5, cause_scenes.SILVER))
-    rig = replace(scene.rig(0.2, **cause_scenes.SIZE), projector_aperture_radius_m=0.05)
+    rig = replace(scene.rig(0.2, **cause_scenes.SIZE), projector_lens=Lens(0.05))
     sensor, detector = AmcwToF(), Detector.time_of_flight()
     signals = rangesim.transport(scene, rig, [sensor], spp=16)
     capture = expose(signals, sensor, detector, 1e-3)

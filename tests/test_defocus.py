@@ -16,9 +16,9 @@ from rangesim.capture.capture_files import load_capture
 from rangesim.capture.exposure import expose
 from rangesim.response import Fringes, GrayBits, Images, LightPath, NumpyMath
 from rangesim.response.defocus import SWITCH, blurred_stripes
-from rangesim.rig import Intrinsics, Rig
+from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.sensors import IdealToF
-from rangesim.settings.config import from_dict, to_dict
+from rangesim.settings.config import to_dict
 
 MATH = NumpyMath()
 STRONG = (-0.3, 0.12, 2e-3, -1e-3, 0.01)
@@ -115,30 +115,35 @@ def test_what_lies_beyond_the_fold_has_no_image() -> None:
 
 def test_a_rig_s_optics_read_back_and_may_be_missing() -> None:
     lens = Intrinsics.from_fov(64, 48, 50)
-    rig = Rig(lens, lens, camera_focus_m=0.8, projector_focus_m=1.2, camera_vignetting=4.0, projector_vignetting=2.0)
+    rig = Rig(lens, lens, camera_lens=Lens(0.75e-3, 0.8, 4.0), projector_lens=Lens(2e-3, 1.2, 2.0))
     data = to_dict(rig)
-    assert from_dict(Rig, data) == rig
-    for key in ("camera_focus_m", "projector_focus_m", "camera_vignetting", "projector_vignetting"):
-        del data[key]
-    assert from_dict(Rig, data) == Rig(lens, lens)
+    assert Rig.from_dict(data) == rig
+    data["projector_lens"] = {"focus_m": 1.2}  # on top of the default
+    assert Rig.from_dict(data) == dataclasses.replace(rig, projector_lens=Lens(2e-3, 1.2))
+    del data["camera_lens"], data["projector_lens"]
+    assert Rig.from_dict(data) == Rig(lens, lens)
 
 
 def test_captures_keep_the_optics_and_older_ones_load_without(tmp_path: Path) -> None:
     sensor, plain = IdealToF(), stereo_rig(8, 6)
-    rig = dataclasses.replace(plain, camera_focus_m=0.8, projector_vignetting=2.0)
+    rig = dataclasses.replace(plain, camera_lens=Lens(0.75e-3, focus_m=0.8), projector_lens=Lens(1e-3, vignetting=2.0))
     expose(plane_signals(rig, sensor), sensor).save(tmp_path / "new")
     assert load_capture(tmp_path / "new").rig == rig
     expose(plane_signals(plain, sensor), sensor).save(tmp_path / "old")
     sidecar = tmp_path / "old" / "capture.json"
     data = json.loads(sidecar.read_text())
-    for key in ("camera_focus_m", "projector_focus_m", "camera_vignetting", "projector_vignetting"):
-        del data["rig"][key]
+    del data["rig"]["camera_lens"], data["rig"]["projector_lens"]
     sidecar.write_text(json.dumps(data))
     assert load_capture(tmp_path / "old").rig == plain
+    data["rig"] |= {"camera_focus_m": 0.8, "camera_vignetting": 0.0}  # as before lenses were structures
+    data["rig"] |= {"projector_aperture_radius_m": 1e-3, "projector_focus_m": None, "projector_vignetting": 2.0}
+    sidecar.write_text(json.dumps(data))
+    assert load_capture(tmp_path / "old").rig == rig
 
 
-@pytest.mark.parametrize("wrong", [{"camera_focus_m": 0.0}, {"projector_focus_m": np.inf}, {"camera_vignetting": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"focus_m": 0.0}, {"focus_m": np.inf}, {"vignetting": -1.0}, {"aperture_radius_m": 0.0}]
+)
 def test_optics_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
-    lens = Intrinsics.from_fov(64, 48, 50)
     with pytest.raises(ValueError, match=f"expected {next(iter(wrong))} to be"):
-        Rig(lens, lens, **wrong)  # type: ignore[arg-type]
+        Lens(**{"aperture_radius_m": 1e-3} | wrong)

@@ -20,10 +20,11 @@ from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment
-from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, Optics, instrument
+from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument
 from rangesim.experiment.pipeline import group_by_rig, noise_seed, run
 from rangesim.experiment.result_files import load_result
 from rangesim.motion import ConstantTwist, Motion, Timing
+from rangesim.rig import Lens
 from rangesim.sensors import DirectToF, IdealToF
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
@@ -211,14 +212,15 @@ def test_optics_photons_and_glint_reach_the_pass() -> None:
         "scene": "x.xml",
         "photons": 0,
         "glint": False,
-        "instrument": [{"sensor": "gray", "optics": {"projector_focus_m": 0.8, "camera_vignetting": 4.0}}],
+        "instrument": [{"sensor": "gray", "projector_lens": {"focus_m": 0.8}, "camera_lens": {"vignetting": 4.0}}],
     }
     experiment = experiment_from_dict(settings)
-    assert experiment.instruments[0].optics == Optics(projector_focus_m=0.8, camera_vignetting=4.0)
+    lenses = {"projector_lens": Lens(2e-3, focus_m=0.8), "camera_lens": Lens(0.75e-3, vignetting=4.0)}
+    assert {name: getattr(experiment.instruments[0], name) for name in lenses} == lenses
     assert experiment_from_dict(experiment_to_dict(experiment)) == experiment
     scene = rangesim.load_scene(ROOT / "scenes" / "plane.xml")
     rig = experiment.instruments[0].rig(scene)
-    assert (rig.projector_focus_m, rig.camera_focus_m, rig.camera_vignetting) == (0.8, None, 4.0)
+    assert {name: getattr(rig, name) for name in lenses} == lenses
     with pytest.raises(ValueError, match="expected photons to be a whole number of at least 0, got -1"):
         Experiment("x.xml", photons=-1)
 
@@ -230,8 +232,8 @@ def test_a_detector_table_changes_the_usual_detector_of_the_sensor() -> None:
     table["detector"] = {"type": "emva1288", "full_well_e": 5e4}
     one = experiment_from_dict({"scene": "x.xml", "instrument": [table]}).instruments[0]
     assert one.detector == replace(Detector.time_of_flight(), full_well_e=5e4)
-    with pytest.raises(ValueError, match=r"instrument\[0\].*expected camera_focus_m to be positive"):
-        experiment_from_dict({"scene": "x.xml", "instrument": [{"sensor": "gray", "optics": {"camera_focus_m": 0}}]})
+    with pytest.raises(ValueError, match=r"instrument\[0\].camera_lens: expected focus_m to be positive"):
+        experiment_from_dict({"scene": "x.xml", "instrument": [{"sensor": "gray", "camera_lens": {"focus_m": 0}}]})
 
 
 def test_the_experiment_of_the_docs_is_one() -> None:
@@ -240,7 +242,7 @@ def test_the_experiment_of_the_docs_is_one() -> None:
     experiment = experiment_from_dict({"scene": "x.xml", **tomllib.loads(snippet)})
     assert experiment.ambient is not None
     assert experiment.motion is not None
-    assert experiment.instruments[0].optics.camera_focus_m == 0.8
+    assert experiment.instruments[0].camera_lens == Lens(0.75e-3, focus_m=0.8)
 
 
 def test_exposures_end_before_the_next_frame_of_what_moves() -> None:

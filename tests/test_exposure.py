@@ -32,7 +32,7 @@ def test_photons_follow_from_the_etendue() -> None:
     """E = L pi (a/f)^2 on a pixel of 5 um, by hand."""
     detector = Detector(quantum_efficiency=0.5)
     rig = dataclasses.replace(stereo_rig(), camera=Intrinsics(100, 100, 800, 800, 50, 50))
-    irradiance = 2.0 * np.pi * (rig.camera_aperture_radius_m / (800 * 5e-6)) ** 2
+    irradiance = 2.0 * np.pi * (rig.camera_lens.aperture_radius_m / (800 * 5e-6)) ** 2
     photons = irradiance * (5e-6) ** 2 * 1e-3 * detector.wavelength_m / (6.62607015e-34 * 299792458)
     assert np.isclose(detector.electrons_per_radiance(rig) * 2.0 * 1e-3, 0.5 * photons)
 

@@ -12,10 +12,10 @@ import pytest
 from scipy.ndimage import binary_erosion, map_coordinates
 
 import rangesim
-from rangesim import Detector, IdealToF, Intrinsics, Rig, StructuredLight, decode, expose, look_at, transport
+from rangesim import Detector, IdealToF, Intrinsics, Lens, Rig, StructuredLight, decode, expose, look_at, transport
 from rangesim.environment.backend import select_variant
 from rangesim.response import FirstReturn, Fringes, GrayBits, Images, LightPath, NumpyMath
-from rangesim.rig import translation
+from rangesim.rig import CAMERA_LENS, translation
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 BARREL = (-0.25, 0.08, 1e-3, -2e-3, 0.01)
@@ -99,7 +99,7 @@ def test_rays_of_the_renderer_are_those_of_the_intrinsics(distortion: tuple[floa
 
     lens = distorted(Intrinsics.from_fov(320, 240, 75), distortion)
     pixels = lens.pixel_centres().reshape(-1, 2)
-    device = Device(lens, np.eye(4))
+    device = Device(lens, np.eye(4), CAMERA_LENS)
     ray = device.centre_ray(mi.Point2f(pixels.T))
     exists = np.ones(len(pixels), bool) if ray.exists is None else ray.exists.numpy()
     expected = lens.directions(pixels)
@@ -219,7 +219,7 @@ def test_paths_through_a_lens_meet_in_focus_and_are_equally_long_there() -> None
 
     from rangesim.light_transport.device import Device
 
-    device = Device(Intrinsics.from_fov(320, 240, 60), np.eye(4), aperture_radius_m=0.02, focus_m=0.8)
+    device = Device(Intrinsics.from_fov(320, 240, 60), np.eye(4), Lens(0.02, focus_m=0.8))
     rng = np.random.default_rng(0)
     pixel, lens = mi.Point2f(rng.uniform([0, 0], [320, 240], (999, 2)).T), mi.Point2f(rng.random((2, 999)))
     ray = device.sample_ray(pixel, lens)
@@ -238,7 +238,7 @@ def test_defocus_leaves_the_path_length_of_a_plane_in_focus(plane: rangesim.Scen
     camera = Intrinsics.from_fov(32, 24, 30)
     length = []
     for focus in (None, 1.0):
-        rig = before_plane(plane, camera=camera, camera_aperture_radius_m=0.02, camera_focus_m=focus)
+        rig = before_plane(plane, camera=camera, camera_lens=Lens(0.02, focus))
         radiance, moment = transport(plane, rig, [FirstReturn()], spp=1024).channels[FirstReturn()]
         length.append(moment / radiance)
     assert abs((length[1] - length[0]).mean()) < 1e-5
@@ -260,7 +260,7 @@ def test_the_blur_circle_has_the_diameter_of_the_thin_lens(z: float, focus: floa
     sensor = {"type": "perspective", "fov": 30.0, "film": {"type": "hdrfilm", "width": 40, "height": 40}}
     scene = rangesim.load_scene({"type": "scene", "sensor": sensor, "square": square})
     camera = Intrinsics(40, 40, 180, 180, 20, 20)
-    rig = Rig(camera, Intrinsics.from_fov(400, 400, 60), camera_aperture_radius_m=aperture, camera_focus_m=focus)
+    rig = Rig(camera, Intrinsics.from_fov(400, 400, 60), camera_lens=Lens(aperture, focus))
     image = transport(scene, rig, [], spp=8192).energy.direct.astype(float)
     image /= image.sum()
     c = 2 * aperture * camera.fx * abs(1 / z - 1 / focus)
@@ -281,8 +281,8 @@ def test_a_camera_out_of_focus_agrees_with_mitsuba_s_thinlens() -> None:
     from rangesim.scene.camera import MITSUBA_FROM_OPENCV
 
     scene = under_a_sky()
-    base = dataclasses.replace(scene.rig(), camera_aperture_radius_m=0.04)
-    rig = dataclasses.replace(base, camera_focus_m=0.7)
+    base = scene.rig()
+    rig = dataclasses.replace(base, camera_lens=Lens(0.04, focus_m=0.7))
     ours = transport(scene, rig, [], spp=512, max_depth=3, rr_depth=99).energy.ambient
     sharp = transport(scene, base, [], spp=64, max_depth=3, rr_depth=99).energy.ambient
     fov = np.degrees(2 * np.arctan(0.5 * rig.camera.width / rig.camera.fx))
@@ -310,7 +310,7 @@ def test_rays_from_the_projector_s_lens_spread_as_its_blur_says() -> None:
     from rangesim.light_transport.device import Device
 
     lens = Intrinsics.from_fov(1280, 800, 60)
-    rig = Rig(lens, lens, projector_aperture_radius_m=4e-3, projector_focus_m=0.9)
+    rig = Rig(lens, lens, projector_lens=Lens(4e-3, focus_m=0.9))
     projector = Device.projector(rig)
     rng = np.random.default_rng(1)
     n = 20_000
@@ -327,11 +327,19 @@ def test_rays_from_the_projector_s_lens_spread_as_its_blur_says() -> None:
 
 @pytest.mark.parametrize("focus", [0.6, 1.0, 3.0])
 def test_fringes_lose_the_contrast_that_the_formula_says(plane: rangesim.Scene, focus: float) -> None:
-    rig = before_plane(plane, projector_aperture_radius_m=4e-3, projector_focus_m=focus)
+    rig = before_plane(plane, projector_lens=Lens(4e-3, focus))
     fringes = Fringes(0, 16.0)
     for base, signals in (
         (rig, transport(plane, rig, [fringes], spp=256)),
-        (None, transport(plane, dataclasses.replace(rig, projector_focus_m=None), [fringes], spp=256)),
+        (
+            None,
+            transport(
+                plane,
+                dataclasses.replace(rig, projector_lens=dataclasses.replace(rig.projector_lens, focus_m=None)),
+                [fringes],
+                spp=256,
+            ),
+        ),
     ):
         modulation = np.hypot(*signals.channels[fringes]) / signals.energy.direct
         if base:
@@ -346,8 +354,8 @@ def test_the_modulation_that_a_camera_measures_falls_with_depth(plane: rangesim.
     sensor = StructuredLight(320, 200, steps=4)
     turn = look_at((0.05, 0, 0), (0.9, 0, 1.0), (0, -1, 0))  # 42 degrees: the plane recedes along the projector's x
     rig = before_plane(plane, 96, 72, projector=Intrinsics.from_fov(320, 200, 60), T_camera_projector=turn)
-    rig = dataclasses.replace(rig, projector_aperture_radius_m=0.05, projector_focus_m=0.7)
-    sharp = dataclasses.replace(rig, projector_focus_m=None)
+    rig = dataclasses.replace(rig, projector_lens=Lens(0.05, focus_m=0.7))
+    sharp = dataclasses.replace(rig, projector_lens=dataclasses.replace(rig.projector_lens, focus_m=None))
     modulation, truth = [], None
     for one in (rig, sharp):
         signals = transport(plane, one, [sensor], spp=256)
@@ -368,8 +376,8 @@ def test_images_out_of_focus_in_the_renderer_are_those_of_numpy(plane: rangesim.
     images = Images(pattern[None])
     offsets = (np.arange(12) + 0.5) / 12 - 0.5
     for focus in (0.9, 0.35):
-        rig = before_plane(plane, projector=Intrinsics.from_fov(320, 200, 70), projector_aperture_radius_m=6e-3)
-        rig = dataclasses.replace(rig, projector_focus_m=focus)
+        rig = before_plane(plane, projector=Intrinsics.from_fov(320, 200, 70))
+        rig = dataclasses.replace(rig, projector_lens=Lens(6e-3, focus))
         signals = transport(plane, rig, [images], spp=1024)
         pixels = rig.camera.pixel_centres()[..., None, None, :] + np.stack(np.meshgrid(offsets, offsets), axis=-1)
         uv = rig.projector.project(rig.camera.directions(pixels))
@@ -389,7 +397,6 @@ def test_prefiltered_patterns_are_the_mean_over_the_projector_s_lens(matte: rang
     focus, aperture, n = 0.6, 8e-3, 37
     rig = matte.rig(width=64, height=48, projector_size=(320, 200))
     fringes, gray = Fringes(0, 16.0), GrayBits(0, 9, 3)
-    rig = dataclasses.replace(rig, projector_aperture_radius_m=aperture)
     total: dict[Any, Any] = {fringes: 0.0, gray: 0.0}
     for i in range(n):  # Vogel's spiral fills the disc evenly
         radius, angle = aperture * np.sqrt((i + 0.5) / n), i * 2.399963229728653
@@ -401,7 +408,7 @@ def test_prefiltered_patterns_are_the_mean_over_the_projector_s_lens(matte: rang
         signals = transport(matte, one, [fringes, gray], spp=16, max_depth=2, seed=i)
         total = {r: total[r] + signals.channels[r].astype(float) / n for r in total}
     blurred = transport(
-        matte, dataclasses.replace(rig, projector_focus_m=focus), [fringes, gray], spp=n * 16, max_depth=2
+        matte, dataclasses.replace(rig, projector_lens=Lens(aperture, focus)), [fringes, gray], spp=n * 16, max_depth=2
     )
     sharp = transport(matte, rig, [fringes, gray], spp=n * 16, max_depth=2)
     white = sharp.energy.direct
@@ -417,7 +424,7 @@ def test_prefiltered_patterns_are_the_mean_over_the_projector_s_lens(matte: rang
 def test_structured_light_decodes_out_of_focus(matte: rangesim.Scene) -> None:
     sensor = StructuredLight(320, 200, axes=("columns", "rows"))
     rig = matte.rig(width=64, height=48, projector_size=(320, 200))
-    rig = dataclasses.replace(rig, projector_focus_m=0.5, projector_aperture_radius_m=8e-3)
+    rig = dataclasses.replace(rig, projector_lens=Lens(8e-3, focus_m=0.5))
     signals = transport(matte, rig, [sensor], spp=256)
     image = decode(expose(signals, sensor))
     lit = signals.truth.projector_visible
@@ -431,7 +438,8 @@ def test_structured_light_decodes_out_of_focus(matte: rangesim.Scene) -> None:
 def test_the_projector_darkens_towards_its_corners_as_cos_n(plane: rangesim.Scene) -> None:
     rig = before_plane(plane)
     even, dark = (
-        transport(plane, dataclasses.replace(rig, projector_vignetting=n), [], spp=64).energy.direct for n in (0.0, 3.0)
+        transport(plane, dataclasses.replace(rig, projector_lens=Lens(2e-3, vignetting=n)), [], spp=64).energy.direct
+        for n in (0.0, 3.0)
     )
     rays = rig.camera.directions(rig.camera.pixel_centres())
     cos = 1 / np.linalg.norm(rays, axis=-1)
@@ -441,7 +449,7 @@ def test_the_projector_darkens_towards_its_corners_as_cos_n(plane: rangesim.Scen
 
 def test_the_camera_darkens_at_exposure_and_signals_stay_radiance(plane: rangesim.Scene) -> None:
     even = before_plane(plane, projector_power_w=5.0)
-    rig = dataclasses.replace(even, camera_vignetting=4.0)
+    rig = dataclasses.replace(even, camera_lens=Lens(0.75e-3, vignetting=4.0))
     sensor = StructuredLight(640, 400)
     rig, even = (dataclasses.replace(r, projector=Intrinsics.from_fov(640, 400, 70)) for r in (rig, even))
     signals, plain = (transport(plane, r, [sensor, IdealToF()], spp=16) for r in (rig, even))
@@ -486,8 +494,13 @@ def test_photons_through_a_pane_that_does_nothing_bring_the_light_that_connectio
     pane = standing(0.6, {"type": "thindielectric", "int_ior": 1.00001, "ext_ior": 1.0})
     clear, behind = rangesim.load_scene(parts), rangesim.load_scene({**parts, "pane": pane})
     projector = distorted(Intrinsics.from_fov(320, 200, 60), distortion)
-    rig = Rig(clear.camera, projector, clear.T_world_camera, translation(0.4, 0, 0), projector_vignetting=vignetting)
-    rig = dataclasses.replace(rig, projector_focus_m=focus)
+    rig = Rig(
+        clear.camera,
+        projector,
+        clear.T_world_camera,
+        translation(0.4, 0, 0),
+        projector_lens=Lens(2e-3, focus, vignetting),
+    )
     fringes = Fringes(0, 32.0)
     by_connection, by_photons = (transport(s, rig, [fringes], spp=64, photons=1_000_000) for s in (clear, behind))
     inner = binary_erosion(by_connection.energy.direct > 0, iterations=2)
@@ -507,7 +520,9 @@ def test_a_lens_without_effects_gives_the_same_bytes(matte: rangesim.Scene) -> N
     sensor = StructuredLight(axes=("columns", "rows"))
     rig = matte.rig(width=32, height=24)
     zero = distorted(rig.camera, (0.0, 0.0)), distorted(rig.projector, (0.0, 0.0, 0.0))
-    off = dataclasses.replace(rig, camera=zero[0], projector=zero[1], projector_vignetting=0.0, camera_vignetting=0.0)
+    off = dataclasses.replace(
+        rig, camera=zero[0], projector=zero[1], projector_lens=Lens(2e-3, vignetting=0.0), camera_lens=Lens(0.75e-3)
+    )
     a, b = (transport(matte, r, [sensor], spp=4) for r in (rig, off))
     for response in sensor.responses():
         assert a.channels[response].tobytes() == b.channels[response].tobytes()

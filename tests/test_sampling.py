@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rangesim import AmcwToF, DirectToF, Signals, StructuredLight, decode, expose, load_scene, transport
+from rangesim import AmcwToF, DirectToF, Lens, Signals, StructuredLight, decode, expose, load_scene, transport
 from rangesim.environment.backend import select_variant
 from rangesim.light_transport.indirect import Guides, LightFilter, level_weights, mixed_pixels
 
@@ -66,7 +66,7 @@ def test_defocus_blurs_a_plane_without_sampling_noise() -> None:
     scene = load_scene(SCENES / "plane.xml")
     sensor = StructuredLight()
     sharp = scene.rig(width=160, height=120)
-    soft = replace(sharp, camera_aperture_radius_m=3e-3, camera_focus_m=0.5)
+    soft = replace(sharp, camera_lens=Lens(3e-3, focus_m=0.5))
     image = decode(expose(transport(scene, soft, [sensor], spp=16), sensor))
     error = (image.z - transport(scene, sharp, [], spp=1).truth.z)[10:-10, 10:-10]
     assert 1.4826 * np.nanmedian(np.abs(error - np.nanmedian(error))) < 0.02e-3

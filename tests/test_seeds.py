@@ -16,7 +16,7 @@ import pytest
 from delta_scenes import GLASS, matte, scene_of, wall
 
 import rangesim
-from rangesim import AmcwToF, Detector, DirectToF, Scene, SpadDetector, expose, transport
+from rangesim import AmcwToF, Detector, DirectToF, Lens, Scene, SpadDetector, expose, transport
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict
 from rangesim.experiment.pipeline import noise_seed
 from rangesim.light_transport.glint import trace_glint
@@ -70,7 +70,7 @@ def caustics(scene: Scene, seed: int) -> list[np.ndarray]:
 
 
 def glint(scene: Scene, seed: int) -> list[np.ndarray]:
-    rig = replace(scene.rig(width=48, height=36), projector_aperture_radius_m=0.02)
+    rig = replace(scene.rig(width=48, height=36), projector_lens=Lens(0.02))
     found = trace_glint(TracedScene.of(scene.mitsuba, rig), rig, [], seed)
     assert found.radiance.any()
     return [found.radiance]

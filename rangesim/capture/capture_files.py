@@ -102,7 +102,7 @@ def load_capture(directory: str | Path) -> Capture:
     try:
         check_keys(settings, _KEYS, str(sidecar))
         sensor = sensor_from_dict(settings.get("sensor"), "sensor")
-        rig = from_dict(Rig, settings["rig"], "rig") if settings.get("rig") is not None else None
+        rig = Rig.from_dict(settings["rig"]) if settings.get("rig") is not None else None
         given = settings.get("detector")
         detector = from_dict(PhotoDetector, given, "detector") if given is not None else None  # type: ignore[type-abstract]
         light = settings.get("ambient")

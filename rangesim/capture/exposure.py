@@ -79,7 +79,7 @@ def noise_free_capture(
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
     """Frames (k, h, w) as the camera's vignetting leaves them."""
-    return frames * rig.camera_illumination if rig.camera_vignetting else frames
+    return frames * rig.camera_illumination if rig.camera_lens.vignetting else frames
 
 
 def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetector, rig: Rig) -> float:

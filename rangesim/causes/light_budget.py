@@ -81,6 +81,6 @@ def white_radiance(rig: Rig, points: np.ndarray, normals: np.ndarray) -> np.ndar
     """
     distance = np.linalg.norm(points, axis=-1)
     cosine = np.abs((normals * points).sum(axis=-1)) / distance
-    irradiance = rig.projector_irradiance * (np.abs(points[:, 2]) / distance) ** rig.projector_vignetting
+    irradiance = rig.projector_irradiance * (np.abs(points[:, 2]) / distance) ** rig.projector_lens.vignetting
     with np.errstate(divide="ignore"):
         return np.asarray(irradiance / np.pi * cosine * distance / points[:, 2] ** 3)

@@ -4,7 +4,7 @@
 A pixel of a camera with entrance pupil radius a and focal length f collects from radiance L the irradiance
 E = L pi (a/f)^2, so E A t lambda / (h c) photons on its area A in the exposure t. With f = fx sqrt(A) the
 pixel pitch drops out: photons = L pi a^2 / (fx fy) t lambda / (h c), radiance times etendue. The fall-off
-towards the corners is the rig's (`camera_vignetting`), and comes before the detector.
+towards the corners is the rig's (`Lens.vignetting`), and comes before the detector.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class PhotoDetector(Named, ABC):
     def electrons_per_radiance(self, rig: Rig) -> float:
         """Electrons per second of exposure for a radiance of 1 W/m2/sr."""
         camera = rig.camera
-        etendue = np.pi * rig.camera_aperture_radius_m**2 / (camera.fx * camera.fy)
+        etendue = np.pi * rig.camera_lens.aperture_radius_m**2 / (camera.fx * camera.fy)
         return float(etendue * self.quantum_efficiency * self.wavelength_m / PLANCK_TIMES_C)
 
     def _check(self) -> None:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.motion import Timing
+from rangesim.rig import CAMERA_LENS, PROJECTOR_LENS, Lens
 from rangesim.sensors import Decoder, Sensor, check_sensor, is_file_name, sensor_from_dict, sensor_of
-from rangesim.settings.bounds import Exponent, Metres, Seconds, Watts, check_fields
-from rangesim.settings.config import check_keys, from_dict, shown, to_dict
+from rangesim.settings.bounds import Metres, Seconds, Watts, check_fields
+from rangesim.settings.config import check_keys, from_dict, on_top_of, shown
 
 if TYPE_CHECKING:
     from rangesim.rig import Rig
@@ -22,21 +23,6 @@ if TYPE_CHECKING:
 MAX_NAME = 100
 """Characters; the name becomes that of a directory."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-
-
-@dataclass(frozen=True)
-class Optics:
-    """Lenses of an instrument; see `rangesim.rig.Rig` for the parameters. The default is a sharp, even pinhole."""
-
-    camera_aperture_radius_m: Metres = 0.75e-3
-    projector_aperture_radius_m: Metres = 2e-3
-    camera_focus_m: Metres | None = None
-    projector_focus_m: Metres | None = None
-    camera_vignetting: Exponent = 0.0
-    projector_vignetting: Exponent = 0.0
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -54,7 +40,7 @@ class Instrument:
         structured light, 0.03 m for time of flight.
     power_w : watts, mean radiant power of the emitter when it is fully on.
     exposure_s : seconds per frame; None: automatic.
-    optics : Optics, aperture, focus and vignetting of camera and projector.
+    camera_lens, projector_lens : Lens, aperture, focus and vignetting.
     timing : when its frames are taken, in an experiment in which something moves.
     """
 
@@ -66,7 +52,8 @@ class Instrument:
     baseline_m: Metres | None = None
     power_w: Watts = 1.0
     exposure_s: Seconds | None = None
-    optics: Optics = field(default_factory=Optics)
+    camera_lens: Lens = CAMERA_LENS
+    projector_lens: Lens = PROJECTOR_LENS
     timing: Timing = field(default_factory=Timing)
 
     def __post_init__(self) -> None:
@@ -87,7 +74,7 @@ class Instrument:
         if self.baseline_m is not None:
             baseline_m = self.baseline_m
         rig = scene.rig(baseline_m, size, self.power_w, width, height)
-        return replace(rig, **vars(self.optics))
+        return replace(rig, camera_lens=self.camera_lens, projector_lens=self.projector_lens)
 
 
 DEFAULT_SENSORS = ("gray-phase", "amcw", "ideal-tof")
@@ -127,12 +114,5 @@ def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -
         ("decoder", Decoder, getattr(sensor, "default_decoder", None)),
     ):
         if values.get(key) is not None:
-            values[key] = _on_top_of(default, kind, values[key], f"{place}.{key}")
+            values[key] = from_dict(kind, on_top_of(default, values[key]), f"{place}.{key}")
     return from_dict(Instrument, values, place)
-
-
-def _on_top_of(default: Any, kind: type, table: Any, place: str) -> Any:
-    """Settings of a table: those of the default, but for what the table says."""
-    if isinstance(table, Mapping) and default is not None and table.get("type", default.type_name) == default.type_name:
-        table = {**to_dict(default), **table}
-    return from_dict(kind, table, place)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -10,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.scattering import Media, Medium
-from rangesim.rig import Intrinsics, Rig
+from rangesim.rig import Intrinsics, Lens, Rig
 from rangesim.rig.distortion import distort, undistort
 
 NO_RAY_PX = 1e-2
@@ -44,19 +45,10 @@ class Device:
     ----------
     intrinsics : Intrinsics
     T_world_device : (4, 4) float, maps device coordinates to world coordinates, metres.
-    aperture_radius_m : float, metres, of the lens; counts where `focus_m` is set.
-    focus_m : float, metres, depth z of the plane in focus; None: a sharp pinhole.
-    vignetting : float, exponent n of the relative illumination cos^n.
+    lens : Lens; its aperture counts where it has a focus.
     """
 
-    def __init__(
-        self,
-        intrinsics: Intrinsics,
-        T_world_device: np.ndarray,
-        aperture_radius_m: float = 0.0,
-        focus_m: float | None = None,
-        vignetting: float = 0.0,
-    ) -> None:
+    def __init__(self, intrinsics: Intrinsics, T_world_device: np.ndarray, lens: Lens) -> None:
         opaque = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731
         self.f = mi.Vector2f(opaque(intrinsics.fx), opaque(intrinsics.fy))
         self.c = mi.Vector2f(opaque(intrinsics.cx), opaque(intrinsics.cy))
@@ -68,22 +60,21 @@ class Device:
         if any(intrinsics.distortion):
             self.distortion = [opaque(k) for k in intrinsics.coefficients]
             self.fold_radius2 = opaque(min(intrinsics.fold_radius2, FAR))
-        self.has_lens = focus_m is not None
+        self.has_lens = lens.focus_m is not None
         """Whether rays start on a lens of finite size, and `sample_ray` needs a sample."""
-        if focus_m is not None:
-            self.aperture, self.focus = opaque(aperture_radius_m), opaque(focus_m)
-        self.vignetting = opaque(vignetting) if vignetting else None
+        if lens.focus_m is not None:
+            self.aperture, self.focus = opaque(lens.aperture_radius_m), opaque(lens.focus_m)
+        self.vignetting = opaque(lens.vignetting) if lens.vignetting else None
 
     @classmethod
     def camera(cls, rig: Rig) -> Device:
         """The rig's camera. Its vignetting is left to the exposure: signals are radiance."""
-        return cls(rig.camera, rig.T_world_camera, rig.camera_aperture_radius_m, rig.camera_focus_m)
+        return cls(rig.camera, rig.T_world_camera, replace(rig.camera_lens, vignetting=0.0))
 
     @classmethod
     def projector(cls, rig: Rig) -> Device:
         """The rig's projector."""
-        aperture, focus = rig.projector_aperture_radius_m, rig.projector_focus_m
-        return cls(rig.projector, rig.T_world_projector, aperture, focus, rig.projector_vignetting)
+        return cls(rig.projector, rig.T_world_projector, rig.projector_lens)
 
     # ---- From pixels to rays -----------------------------------------------------------------------------
 

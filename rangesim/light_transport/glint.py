@@ -268,7 +268,7 @@ def _near_the_lens(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Those of the pixels whose probes come near the lens, as measured by how far they spread; and for each of them
     the radius in metres of the disc to hit."""
-    aperture = np.full(len(pixel), rig.projector_aperture_radius_m)
+    aperture = np.full(len(pixel), rig.projector_lens.aperture_radius_m)
     lens = Lens(rig, view.traced.projector, aperture[:1], aperture[:1])
     nearest, spread = np.empty(len(pixel), np.float32), np.empty(len(pixel), np.float32)
     launches = Launches()
@@ -278,7 +278,7 @@ def _near_the_lens(
         state = ProbeState(lanes.start(), far, mi.Float(far), dr.full(mi.Point2f, dr.inf, n))
         state, _ = launches.run(partial(_probe, lanes, lens), state, n, report=lambda state: report())
         nearest[some], spread[some] = state.nearest.numpy(), state.spread.numpy()
-    spread = np.where(np.isfinite(spread), spread, np.float32(UNKNOWN_SPREAD * rig.projector_aperture_radius_m))
+    spread = np.where(np.isfinite(spread), spread, np.float32(UNKNOWN_SPREAD * rig.projector_lens.aperture_radius_m))
     near = nearest < aperture + NEAR * spread
     return pixel[near], np.clip(FINEST * spread, aperture, MAX_ENLARGEMENT * aperture)[near]
 

@@ -2,11 +2,14 @@
 """Camera and emitter: intrinsics, poses, lenses, calibration files."""
 
 from rangesim.rig.rig import (
+    CAMERA_LENS,
+    PROJECTOR_LENS,
     RESIDUAL_PX,
     Array,
     Coefficient,
     FocalLength,
     Intrinsics,
+    Lens,
     PrincipalPoint,
     Rig,
     look_at,
@@ -15,11 +18,14 @@ from rangesim.rig.rig import (
 )
 
 __all__ = [
+    "CAMERA_LENS",
+    "PROJECTOR_LENS",
     "RESIDUAL_PX",
     "Array",
     "Coefficient",
     "FocalLength",
     "Intrinsics",
+    "Lens",
     "PrincipalPoint",
     "Rig",
     "look_at",

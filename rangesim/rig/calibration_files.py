@@ -20,7 +20,7 @@ from rangesim.errors import FileFormatError
 from rangesim.files.text_files import check_xml, read_json
 from rangesim.rig import Intrinsics, Rig
 from rangesim.settings.bounds import Bounds, check_number, whole
-from rangesim.settings.config import from_dict, shown, to_dict
+from rangesim.settings.config import shown, to_dict
 
 LARGEST = 1e9
 """Of a number in a calibration file: pixels, millimetres, coefficients."""
@@ -87,7 +87,7 @@ def save_calibration(rig: Rig, path: str | Path) -> None:
 
 def _load_json(path: Path) -> Rig:
     try:
-        return from_dict(Rig, read_json(path), "rig")
+        return Rig.from_dict(read_json(path))
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ from rangesim.settings.bounds import (
     check_number,
     whole,
 )
-from rangesim.settings.config import shown, to_dict
+from rangesim.settings.config import from_dict, shown, to_dict
 
 Array = NDArray[np.float64]
 
@@ -164,11 +165,43 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0
     return result
 
 
+@dataclass(frozen=True)
+class Lens:
+    """The lens of a camera or a projector: thin, or a pinhole.
+
+    Parameters
+    ----------
+    aperture_radius_m : metres, radius of the entrance (exit) pupil.
+    focus_m : metres, depth z of the plane in focus of a thin lens with this aperture; None: sharp everywhere. See
+        docs/optics.md for what a projector out of focus does to its patterns.
+    vignetting : exponent n >= 0 of the relative illumination cos^n of the angle to the optical axis: 4 is the natural
+        law, 0 an even image. It takes from a projector's power what it darkens.
+    """
+
+    aperture_radius_m: Metres
+    focus_m: Metres | None = None
+    vignetting: Exponent = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+CAMERA_LENS, PROJECTOR_LENS = Lens(0.75e-3), Lens(2e-3)
+"""The defaults: sharp and even."""
+
+
 def translation(x: float, y: float, z: float) -> Array:
     """(4, 4) pure translation in metres."""
     result = np.eye(4)
     result[:3, 3] = x, y, z
     return result
+
+
+_FLAT = {
+    f"{device}_{setting}": (f"{device}_lens", setting)
+    for device in ("camera", "projector")
+    for setting in ("aperture_radius_m", "focus_m", "vignetting")
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,25 +214,17 @@ class Rig:
     projector : Intrinsics; of a ToF lamp, its field of illumination (the pixel count only names coordinates).
     T_world_camera : (4, 4) float64, maps camera coordinates to world coordinates, metres.
     T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres.
-    camera_aperture_radius_m, projector_aperture_radius_m : float, metres, radius of the entrance (exit) pupil.
+    camera_lens, projector_lens : Lens
     projector_power_w : float, mean radiant power that leaves the projector when it shows white.
-    camera_focus_m, projector_focus_m : float, metres, depth z of the plane in focus of a thin lens with the aperture
-        above; None: sharp everywhere. See docs/optics.md for what a projector out of focus does to its patterns.
-    camera_vignetting, projector_vignetting : float >= 0, exponent n of the relative illumination cos^n of the angle to
-        the optical axis: 4 is the natural law, 0 an even image. It takes from `projector_power_w` what it darkens.
     """
 
     camera: Intrinsics
     projector: Intrinsics
     T_world_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     T_camera_projector: np.ndarray = field(default_factory=lambda: np.eye(4))
-    camera_aperture_radius_m: Metres = 0.75e-3
-    projector_aperture_radius_m: Metres = 2e-3
+    camera_lens: Lens = CAMERA_LENS
+    projector_lens: Lens = PROJECTOR_LENS
     projector_power_w: Watts = 1.0
-    camera_focus_m: Metres | None = None
-    projector_focus_m: Metres | None = None
-    camera_vignetting: Exponent = 0.0
-    projector_vignetting: Exponent = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
@@ -211,6 +236,20 @@ class Rig:
 
     def __hash__(self) -> int:
         return hash((self.camera, self.projector, self.T_world_camera.tobytes(), self.T_camera_projector.tobytes()))
+
+    @classmethod
+    def from_dict(cls, data: Any, where: str = "rig") -> Rig:
+        """The rig of plain data, see `rangesim.settings.config.from_dict`.
+
+        In captures and calibrations of before lenses were structures, each had its settings beside the others'.
+        """
+        if isinstance(data, Mapping):
+            values = {key: value for key, value in data.items() if key not in _FLAT}
+            for key in data.keys() & _FLAT.keys():
+                device, setting = _FLAT[key]
+                values[device] = {**values.get(device, {}), setting: data[key]}
+            data = values
+        return from_dict(cls, data, where)
 
     @property
     def T_world_projector(self) -> Array:
@@ -233,5 +272,5 @@ class Rig:
         """(h, w) float32 in 0..1, fraction of the light that vignetting leaves a pixel: cos^n of its ray to the
         axis."""
         rays = self.camera.directions(self.camera.pixel_centres())
-        fraction = np.linalg.norm(rays, axis=-1) ** -self.camera_vignetting
+        fraction = np.linalg.norm(rays, axis=-1) ** -self.camera_lens.vignetting
         return np.nan_to_num(fraction, nan=0.0).astype(np.float32)  # no ray, no light

@@ -44,7 +44,8 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
     Parameters
     ----------
     cls : dataclass type; if it is abstract, `data["type"]` names one of its subclasses' `type_name`.
-    data : mapping of field names to plain values.
+    data : mapping of field names to plain values; where the default of a field has settings itself, a table changes
+        some of them.
     where : name of the place in the file, for messages, for example "sensors[0].rig".
 
     Raises
@@ -63,11 +64,20 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
     missing = [n for n, f in names.items() if n not in values and _required(f)]
     if missing:
         raise ValueError(f"{place}: missing {', '.join(map(repr, missing))}.")
+    values = {key: on_top_of(names[key].default, value) for key, value in values.items()}
     arguments = {key: _value(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in values.items()}
     try:
         return cls(**arguments)
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
+
+
+def on_top_of(default: Any, table: Any) -> Any:
+    """The settings of a default, but for what a table says; what is given if it is of another type, or no table."""
+    if not isinstance(table, Mapping) or not dataclasses.is_dataclass(default) or isinstance(default, type):
+        return table
+    settings = to_dict(default)
+    return {**settings, **table} if table.get("type", settings.get("type")) == settings.get("type") else table
 
 
 def shown(value: Any) -> str:

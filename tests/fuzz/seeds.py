@@ -133,8 +133,8 @@ projector_width = 64
 projector_height = 48
 code = "gray"
 axes = ["columns", "rows"]
-[instrument.optics]
-camera_focus_m = 1.0
+[instrument.camera_lens]
+focus_m = 1.0
 [[instrument]]
 name = "amcw"
 [instrument.sensor]
