@@ -21,7 +21,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rangesim import Intrinsics, Rig, Sensor, Signals, decode, expose
+from rangesim import Intrinsics, Rig, Sensor, Signals, StillSignals, decode, expose
 from rangesim.response import LightPath, NumpyMath, Response, TransientHistogram
 from rangesim.rig import translation
 from rangesim.sensors import presets
@@ -88,7 +88,7 @@ def plane(width: int, height: int, name: str) -> Signals:
         z.astype(np.float32), range_m.astype(np.float32), normal, ids, ids, uv.astype(np.float32), lit,
         ("plane",), ("matte",),
     )  # fmt: skip
-    return Signals(rig, {r: channels(r, path, radiance) for r in sensor.responses()}, energy, truth)
+    return StillSignals(rig, energy, truth, channels={r: channels(r, path, radiance) for r in sensor.responses()})
 
 
 def channels(response: Response, path: LightPath, radiance: np.ndarray) -> np.ndarray:

@@ -44,10 +44,11 @@ def timed(task: Callable[[], Any]) -> tuple[Any, np.ndarray]:
 
 def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.ndarray]:
     """Photons that landed, and (repeats, 2) seconds to trace them and to build their maps."""
-    from rangesim.light_transport.caustics import PHOTONS, gathering_radius
+    from rangesim.light_transport.caustics import gathering_radius
     from rangesim.light_transport.photon_maps import MAX_MAPS, PhotonMaps
     from rangesim.light_transport.photons import trace_photons
     from rangesim.light_transport.traced_scene import TracedScene
+    from rangesim.light_transport.transport_settings import PHOTONS
 
     maps = min(spp, MAX_MAPS)
     trace = partial(trace_photons, TracedScene.of(scene.mitsuba, rig), rig.projector_power_w, PHOTONS, maps)
@@ -55,7 +56,7 @@ def photon_times(scene: Any, rig: Any, spp: int, repeats: int) -> tuple[int, np.
     for seed in range(repeats + 1):
         landed, tracing = timed(partial(trace, seed=seed, memory_bytes=2 << 30))
         radius = gathering_radius(rig, landed.per_pixel)
-        _, building = timed(partial(PhotonMaps, landed, maps, radius, rig.projector_irradiance))
+        _, building = timed(partial(PhotonMaps, landed, radius, rig.projector_irradiance))
         seconds.append([tracing[0], building[0]])
     return len(landed.flux), np.array(seconds[1:])
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.electronics.spad import SpadDetector as SpadDetector
     from rangesim.evaluation.comparison import compare as compare
     from rangesim.light_transport.one_pass import transport as transport
+    from rangesim.light_transport.transport_settings import TransportSettings as TransportSettings
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
@@ -41,6 +42,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.sensors import Sensor as Sensor
     from rangesim.sensors import StructuredLight as StructuredLight
     from rangesim.signals import Signals as Signals
+    from rangesim.signals import StillSignals as StillSignals
     from rangesim.signals.signals_files import load_signals as load_signals
 
 _HOME = {
@@ -61,7 +63,9 @@ _HOME = {
     "Signals": "rangesim.signals",
     "SpadDetector": "rangesim.electronics.spad",
     "Status": "rangesim.decoding.status",
+    "StillSignals": "rangesim.signals",
     "StructuredLight": "rangesim.sensors",
+    "TransportSettings": "rangesim.light_transport.transport_settings",
     "compare": "rangesim.evaluation.comparison",
     "decode": "rangesim.decoding",
     "explain": "rangesim.causes",

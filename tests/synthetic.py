@@ -11,7 +11,7 @@ import numpy as np
 from rangesim.response import DenseResponse, FirstReturn, LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import Sensor
-from rangesim.signals import EnergySplit, GroundTruth, Signals
+from rangesim.signals import EnergySplit, GroundTruth, StillSignals
 
 
 def stereo_rig(width: int = 160, height: int = 120, baseline_m: float = 0.2, **changes: object) -> Rig:
@@ -35,7 +35,7 @@ def plane_depth(rig: Rig, distance_m: float = 1.0, normal: tuple[float, float, f
 
 def signals_of_depth(
     rig: Rig, z: np.ndarray, sensors: Sequence[Sensor], albedo: float = 0.5, ambient: float = 0.0
-) -> Signals:
+) -> StillSignals:
     """Signals of a matte surface at depth z (h, w), NaN for nothing, direct light only, no shadows."""
     points = rig.camera.directions(rig.camera.pixel_centres()) * z[..., None]
     in_projector = (points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3]
@@ -63,10 +63,10 @@ def signals_of_depth(
         instance_names=("plane",),
         material_names=("matte",),
     )
-    return Signals(rig, channels, energy, truth)
+    return StillSignals(rig, energy, truth, channels=channels)
 
 
-def plane_signals(rig: Rig, *sensors: Sensor, distance_m: float = 1.0, **changes: float) -> Signals:
+def plane_signals(rig: Rig, *sensors: Sensor, distance_m: float = 1.0, **changes: float) -> StillSignals:
     """Signals of a tilted matte plane."""
     return signals_of_depth(rig, plane_depth(rig, distance_m), sensors, **changes)
 

@@ -354,10 +354,11 @@ def test_a_gather_is_the_sum_over_all_photons_of_its_map(
     position, of_map, nothing = on_the_plane(photons), np.arange(photons) % maps, np.zeros(photons, np.float32)
     flux = rng.uniform(0.5, 1.5, photons).astype(np.float32)
     none = EnergyBudget(0, 0, 0, 0, 0, 0)
-    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map, none, per_pixel=1.0)
+    columns = position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map
+    landed = Photons(*columns, maps, none, per_pixel=1.0)
     there = np.array([0.0, 0.0, 3.0])
     radius = GatheringRadius(0.0, (0.0, 0.0), there, there, fixed_m=radius_m)
-    built = photon_maps.PhotonMaps(landed, maps, radius, irradiance=1e-9)  # all brighter than the first level
+    built = photon_maps.PhotonMaps(landed, radius, irradiance=1e-9)  # all brighter than the first level
     points, repeats = on_the_plane(1000), 64
     sample = np.arange(1000) % maps
     many = mi.UInt32(np.tile(sample, repeats).astype(np.uint32))
@@ -394,9 +395,10 @@ def test_a_gather_whose_radius_grows_with_distance_is_the_sum_over_all_photons(
     position, of_map, nothing = on_the_plane(n), np.arange(n) % maps, np.zeros(n, np.float32)
     flux = rng.uniform(0.5, 1.5, n).astype(np.float32)
     none = EnergyBudget(0, 0, 0, 0, 0, 0)
-    landed = Photons(position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map, none, per_pixel=1.0)
+    columns = position, 0 * position, flux, nothing, nothing, nothing, nothing + 1, of_map
+    landed = Photons(*columns, maps, none, per_pixel=1.0)
     radius = GatheringRadius(0.05, (0.02, 0.07), np.array([-1.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.05]))
-    built = photon_maps.PhotonMaps(landed, maps, radius, irradiance=1e-9)
+    built = photon_maps.PhotonMaps(landed, radius, irradiance=1e-9)
     points, sample = on_the_plane(2000), np.arange(2000) % maps
     place, many = mi.Point3f(points.T), mi.UInt32(sample.astype(np.uint32))
     active, half = dr.full(mi.Bool, True, 2000), dr.full(mi.Float, 0.5, 2000)

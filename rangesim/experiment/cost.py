@@ -30,7 +30,7 @@ LONG_S = 30.0
 """A run that takes longer is announced."""
 LARGE_BYTES = 1e9
 """A run that takes more is announced."""
-USUAL_SPP = 24
+TYPICAL_SPP = 24
 """Of light paths per pixel, if their number is not given: 16 to 64, by the surface."""
 PATHS_PER_CORE_S = 1.1e6
 """Camera paths per second and core: tabletop and matte scenes, 5 segments, LLVM."""
@@ -104,18 +104,16 @@ def estimate_cost(
     passes : as `rangesim.experiment.pipeline.group_by_rig` returns.
     trial : whether small passes may be timed where the run is long.
     """
-    from rangesim.light_transport.caustics import PHOTONS
     from rangesim.light_transport.photons import has_delta
 
-    photons = PHOTONS if experiment.photons is None else experiment.photons
-    photons = photons if has_delta(scene.mitsuba) else 0
+    photons = experiment.transport_settings(()).photons if has_delta(scene.mitsuba) else 0
     pixels, count = 0, 0
     for rig, instruments in passes:
         size = rig.camera.width * rig.camera.height * TRUTH_BYTES  # read back for the report
         limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
         pixels, count = pixels + traced, count + n
-    paths, all_photons = pixels * (experiment.spp or USUAL_SPP), photons * count
+    paths, all_photons = pixels * (experiment.spp or TYPICAL_SPP), photons * count
     rest_s = START_S + sum(_rest_s(rig, instruments) for rig, instruments in passes)
     seconds = rest_s + count * PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
     cost = Cost(paths, experiment.max_depth, all_photons, count, _memory_bytes(passes, photons), seconds)
@@ -176,15 +174,12 @@ def _timed_trial(
 
     rig, instruments = one_pass
     camera = rig.camera.resized(TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width)))
-    settings = {"max_depth": experiment.max_depth, "glint": experiment.glint, "photons": experiment.photons}
-    if settings["photons"] is None:
-        del settings["photons"]
-    sensors, took = [one.sensor for one in instruments], []
+    settings, sensors, took = experiment.transport_settings(instruments), [one.sensor for one in instruments], []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TruncationWarning)  # the run itself will tell
         for spp in (TRIAL_SPP[0], *TRIAL_SPP):  # the first compiles
             start = time.monotonic()
-            rangesim.transport(scene, replace(rig, camera=camera), sensors, spp=spp, **settings)  # type: ignore[arg-type]
+            rangesim.transport(scene, replace(rig, camera=camera), sensors, settings, spp=spp)
             took.append(time.monotonic() - start)
     paths = camera.width * camera.height * (TRIAL_SPP[1] - TRIAL_SPP[0])
     path_s = max((took[2] - took[1]) / paths, 0.1 / _paths_per_s())

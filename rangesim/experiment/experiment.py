@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim import limits
 from rangesim.electronics.ambient import Ambient
@@ -19,6 +19,9 @@ from rangesim.motion.settings import motion_from_dict
 from rangesim.settings.bounds import Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 from rangesim.settings.seeds import check_seed
+
+if TYPE_CHECKING:
+    from rangesim.light_transport.transport_settings import TransportSettings
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class Experiment:
     max_spp : light paths per pixel, at most, where `spp` is None.
     max_depth : longest path, in segments between surfaces that scatter it, up to the light; 2 is direct light alone.
         Glass and mirrors do not count.
-    photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the usual number.
+    photons : caustic photons of each pass; 0: no light through glass or off mirrors; None: the default of `transport`.
     glint : whether the camera sees the projector's lens in mirrors.
     seed : of transport and noise, 0 to 2^64 - 1; the same seed gives the same bytes.
     ambient : what kind of light the scene's own emitters give, and how strong; None: not stated, see `expose`.
@@ -79,6 +82,19 @@ class Experiment:
             raise ValueError("expected at least one instrument, got none.")
         if twice := [n for n in names if names.count(n) > 1]:
             raise ValueError(f"expected instruments of different names, got {twice[0]!r} twice.")
+
+    def transport_settings(self, instruments: Sequence[Instrument]) -> TransportSettings:
+        """How the light of a pass for these instruments is sampled."""
+        from rangesim.experiment.adaptive_sampling import AdaptiveSampling
+        from rangesim.light_transport.transport_settings import PHOTONS, TransportSettings
+
+        spp: int | Literal["auto"] | AdaptiveSampling = "auto"
+        if self.spp is not None:
+            spp = self.spp
+        elif self.motion is None:
+            spp = AdaptiveSampling(tuple(instruments), self.max_spp, ambient=self.ambient)
+        photons = PHOTONS if self.photons is None else self.photons
+        return TransportSettings(spp, self.max_depth, seed=self.seed, photons=photons, glint=self.glint)
 
 
 def load_experiment(path: str | Path) -> Experiment:

@@ -20,7 +20,6 @@ from rangesim.capture.capture_files import write_capture
 from rangesim.causes import explain
 from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
 from rangesim.experiment import Experiment
-from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.experiment.cost import Cost, estimate_cost
 from rangesim.experiment.instrument import Instrument
 from rangesim.experiment.provenance import provenance
@@ -35,7 +34,6 @@ from rangesim.experiment.result_files import (
 from rangesim.files.array_files import write_arrays
 from rangesim.files.schema import write_record
 from rangesim.motion import transport_moving
-from rangesim.motion.moving_signals import MovingSignals
 from rangesim.settings.seeds import derived_seed
 from rangesim.signals.signals_files import write_pass
 
@@ -134,7 +132,7 @@ def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, a
 
     folder.mkdir()
     times: dict[str, float] = {}
-    moves = isinstance(signals, MovingSignals)
+    moves = signals.motion_m is not None
     with timed(times, "exposure"):
         detector = _in_time(instrument) if moves else instrument.detector
         capture = rangesim.expose(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
@@ -259,29 +257,14 @@ def _trace(
 ) -> Signals:
     stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
     tell(stage, _fraction(number, passes, 0.0))
-    settings: dict[str, Any] = {
-        "spp": _spp(experiment, instruments),
-        "max_depth": experiment.max_depth,
-        "glint": experiment.glint,
-        "seed": experiment.seed,
-        "progress": None if tell is _unwatched else lambda fraction: tell(stage, _fraction(number, passes, fraction)),
-    }
-    if experiment.photons is not None:
-        settings["photons"] = experiment.photons
+    progress = None if tell is _unwatched else lambda fraction: tell(stage, _fraction(number, passes, fraction))
+    settings = experiment.transport_settings(instruments)
     with timed(times, f"transport_{number}"):
         if experiment.motion is None:
-            return rangesim.transport(scene, rig, [i.sensor for i in instruments], **settings)
-        (instrument,) = instruments
-        timings = {instrument.sensor: instrument.timing}
-        return transport_moving(scene, rig, timings, experiment.motion, **settings)[instrument.sensor]
-
-
-def _spp(experiment: Experiment, instruments: list[Instrument]) -> int | str | AdaptiveSampling:
-    if experiment.spp is not None:
-        return experiment.spp
-    if experiment.motion is not None:
-        return "auto"
-    return AdaptiveSampling(tuple(instruments), experiment.max_spp, ambient=experiment.ambient)
+            return rangesim.transport(scene, rig, [i.sensor for i in instruments], settings, progress=progress)
+        (one,) = instruments
+        timings = {one.sensor: one.timing}
+        return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[one.sensor]
 
 
 def _fraction(number: int, passes: int, of_pass: float) -> float:

@@ -13,7 +13,7 @@ from rangesim.light_transport.cutouts import first_surface
 from rangesim.light_transport.device import connect
 from rangesim.light_transport.indirect import Guides
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.loop import Budget, Lanes, Settings, View, mono
+from rangesim.light_transport.loop import Budget, Lanes, PathSettings, View, mono
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.shapes import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -61,7 +61,7 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
 
 
 @dr.syntax
-def mean_reflectance(view: View, settings: Settings, rig: Rig, has_cutouts: bool, samples: int) -> np.ndarray:
+def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: bool, samples: int) -> np.ndarray:
     """(h, w) float32, mean diffuse reflectance of the first surfaces behind a pixel's first samples."""
     launches, parts = Launches(), []
     surfaces, camera, shape = view.traced.surfaces, view.traced.camera, (rig.camera.height, rig.camera.width)

@@ -40,6 +40,7 @@ from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs,
 from rangesim.light_transport.scattering import FAINT, MAX_EVENTS
 from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
+from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import Tally
 from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, SPECULAR, LightPath
 from rangesim.scene import Scene
@@ -52,7 +53,7 @@ MAX_BENT = 4.0
 """Cosine of a photon to the surface at a vertex, at most, over that where it landed."""
 
 
-class Settings(NamedTuple):
+class PathSettings(NamedTuple):
     """Sampling of the loop. Numbers are opaque; the flags shape the kernel.
 
     delta : whether some surface of the scene has a delta interaction.
@@ -68,10 +69,10 @@ class Settings(NamedTuple):
     lamps: bool
 
     @classmethod
-    def of(cls, scene: Scene, seed: int, max_depth: int, rr_depth: int) -> Settings:
+    def of(cls, scene: Scene, settings: TransportSettings) -> PathSettings:
         """Those of a pass."""
-        most, rr = dr.opaque(mi.UInt32, max_depth), dr.opaque(mi.UInt32, rr_depth)
-        return cls(Seed.of(seed), most, rr, has_delta(scene.mitsuba), scene.has_ambient, scene.has_lamps)
+        most, rr = dr.opaque(mi.UInt32, settings.max_depth), dr.opaque(mi.UInt32, settings.rr_depth)
+        return cls(Seed.of(settings.seed), most, rr, has_delta(scene.mitsuba), scene.has_ambient, scene.has_lamps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +188,7 @@ class View(NamedTuple):
 
 def trace(
     view: View,
-    settings: Settings,
+    settings: PathSettings,
     budget: Budget,
     accumulators: Accumulators,
     launches: Launches,
@@ -234,12 +235,12 @@ class Lanes:
 
     Parameters
     ----------
-    view, settings, budget : View, Settings and Budget.
+    view, settings, budget : View, PathSettings and Budget.
     places : (lanes,) int, numbers of the pixels in budget and accumulators. Random numbers depend on a pixel's flat
         index in the whole image, the part and the seed alone.
     """
 
-    def __init__(self, view: View, settings: Settings, budget: Budget, places: np.ndarray) -> None:
+    def __init__(self, view: View, settings: PathSettings, budget: Budget, places: np.ndarray) -> None:
         self.place = mi.UInt32(places.astype(np.uint32))
         self.pixel = mi.UInt32(budget.pixels[places].astype(np.uint32))
         self.samples, self.total = mi.UInt32(budget.samples[places]), mi.UInt32(budget.total[places])
@@ -261,7 +262,7 @@ class Lanes:
         return self.first + (taken >> 1) * self.stride + (taken & 1)
 
 
-def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes) -> State:
+def start(view: View, settings: PathSettings, accumulators: Accumulators, at: Lanes) -> State:
     """The state of lanes that have done nothing yet."""
     lanes, gathers, in_media = dr.width(at.pixel), view.maps is not None, view.traced.media is not None
     shines = [True, True, True, gathers, settings.ambient, gathers]
@@ -296,7 +297,7 @@ def start(view: View, settings: Settings, accumulators: Accumulators, at: Lanes)
 
 @dr.syntax
 def walk(
-    view: View, settings: Settings, accumulators: Accumulators, at: Lanes, state: State, most: Any
+    view: View, settings: PathSettings, accumulators: Accumulators, at: Lanes, state: State, most: Any
 ) -> tuple[State, Any]:
     """The state of the lanes after at most so many iterations of the loop, and those that each one took."""
     traced, maps = view

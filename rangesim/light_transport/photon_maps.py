@@ -45,7 +45,7 @@ CLASS_PRIME = 50331653
 """The same for the number of a class."""
 BESIDE = 1e-4
 """Relative error of a radius that does not put a photon into the wrong class."""
-USUAL = 0.05
+TYPICAL = 0.05
 """Quantile of the radii, over the distance from the camera, that stands for them all."""
 FOLD = 1024
 """Cells along x after which a row turns back on itself, so that the table stays small in a large scene."""
@@ -142,22 +142,19 @@ class PhotonMaps:
     Parameters
     ----------
     photons : Photons, one or more.
-    maps : int in 1..MAX_MAPS, independent maps they were dealt out to.
     radius : GatheringRadius, of the first map and the brightest level.
     irradiance : W/m2, direct light of the projector at 1 m.
     wide : radians, radius over the distance from the camera from which on gathered light counts as smooth.
     """
 
-    def __init__(
-        self, photons: Photons, maps: int, radius: GatheringRadius, irradiance: float, wide: float = np.inf
-    ) -> None:
+    def __init__(self, photons: Photons, radius: GatheringRadius, irradiance: float, wide: float = np.inf) -> None:
+        maps = photons.maps
         at_photons = np.maximum(radius.at(photons.position), MIN_M)
         # Of a whole level, lest light be smooth on one side of a line and not on the other
         from_camera = np.linalg.norm(photons.position - radius.camera_at, axis=1)
-        usual = float(np.quantile(at_photons / np.maximum(from_camera, MIN_M), USUAL))
-        self.is_wide = [usual * one.radius >= wide for one in LEVELS]
+        typical = float(np.quantile(at_photons / np.maximum(from_camera, MIN_M), TYPICAL))
+        self.is_wide = [typical * one.radius >= wide for one in LEVELS]
         self.maps = dr.opaque(mi.UInt32, maps)
-        self.cut = photons.balance.cut
         unit = float(at_photons.min()) * (1 + BESIDE)
         level = levels_of(photons, maps, at_photons, radius, irradiance)
         factors = np.array([one.radius for one in LEVELS])

@@ -75,7 +75,8 @@ class Photons:
     u, v : (n,) float32, projector pixel coordinates.
     length_m : (n,) float32, metres, optical length from the projector.
     cosine : (n,) float32, of the direction to the geometric normal where it landed.
-    map : (n,) int, which of the independent maps a photon belongs to; each map alone carries all the power.
+    map : (n,) int in 0..maps - 1, which of the independent maps a photon belongs to; each alone carries all the power.
+    maps : int >= 1, how many there are.
     balance : EnergyBudget, the mean over the maps.
     per_pixel : float, photons of all maps sent through each projector pixel that is worth it.
     """
@@ -88,6 +89,7 @@ class Photons:
     length_m: np.ndarray
     cosine: np.ndarray
     map: np.ndarray
+    maps: int
     balance: EnergyBudget
     per_pixel: float
 
@@ -153,7 +155,7 @@ def trace_photons(
         report()
     position, direction, flux, u, v, length, cosine, of_map = (np.concatenate(c) for c in zip(*landed, strict=True))
     total_balance = EnergyBudget(*(balance / maps))
-    return Photons(position, direction, flux, u, v, length, cosine, of_map, total_balance, total / cumulative[-1])
+    return Photons(position, direction, flux, u, v, length, cosine, of_map, maps, total_balance, total / cumulative[-1])
 
 
 def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:

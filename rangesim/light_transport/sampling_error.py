@@ -11,7 +11,7 @@ import numpy as np
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.indirect import CHANNELS_AT_ONCE, LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Report, report_part
-from rangesim.light_transport.loop import Budget, Radiance, Settings, Traced, View, trace
+from rangesim.light_transport.loop import Budget, PathSettings, Radiance, Traced, View, trace
 from rangesim.light_transport.truncation import Tally
 from rangesim.response import Response
 from rangesim.rig import Rig
@@ -91,7 +91,7 @@ class Estimate:
 
     Parameters
     ----------
-    view, settings : View and Settings, what is sampled.
+    view, settings : View and PathSettings, what is sampled.
     rig, responses : whose image, and what is summed up.
     keeps_apart : whether smooth light is kept apart, to be shared by neighbours.
     has_halves : whether samples are dealt into halves; every pixel then needs `MIN_FOR_HALVES` at once.
@@ -101,7 +101,7 @@ class Estimate:
     def __init__(
         self,
         view: View,
-        settings: Settings,
+        settings: PathSettings,
         rig: Rig,
         responses: Sequence[Response],
         keeps_apart: bool,

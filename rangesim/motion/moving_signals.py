@@ -13,15 +13,14 @@ from rangesim.motion.passes import Pass
 from rangesim.motion.timing import Timing
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
-from rangesim.signals import NO_SAMPLING_ERROR, Signals
+from rangesim.signals import NO_SAMPLING_ERROR, Signals, StillSignals
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MovingSignals(Signals):
     """Signals of one sensor whose frames were taken while something moved.
 
-    `rig`, `energy` and `truth` are those at the middle of the acquisition; `channels` is empty, as there is no one
-    time for them.
+    `rig`, `energy` and `truth` are those at the middle of the acquisition.
 
     sensor : the one sensor these signals are of.
     lit : (k, h, w) float32, W/m2/sr, the frames without ambient light.
@@ -65,9 +64,9 @@ class FrameStack:
     middle, at_middle : the pass at the middle of the acquisition, and its signals.
     """
 
-    def __init__(self, sensor: Sensor, timing: Timing, rig: Rig, middle: Pass, at_middle: Signals) -> None:
+    def __init__(self, sensor: Sensor, timing: Timing, rig: Rig, middle: Pass, at_middle: StillSignals) -> None:
         self.sensor, self.rig = sensor, rig
-        self.middle, self.at_middle = middle, replace(at_middle, channels={}, sampling=None)
+        self.middle, self.at_middle = middle, replace(at_middle, channels={}, sampling=None)  # without what is large
         self.exposure_of_frames = timing.exposure_of_frames(sensor)
         image = (rig.camera.height, rig.camera.width)
         self.lit = np.zeros((sensor.n_frames, *image), dtype=np.float32)
@@ -75,7 +74,7 @@ class FrameStack:
         self.ambient = np.zeros((len(timing.exposure_times_s(sensor)), *image), dtype=np.float32)
         self.motion_m = np.zeros(image, dtype=np.float32)
 
-    def add(self, one: Pass, signals: Signals) -> None:
+    def add(self, one: Pass, signals: StillSignals) -> None:
         """Take what a pass has for this sensor."""
         frames = signals.frames(self.sensor, 0.0)
         error = None if self.lit_error is None else signals.frames(self.sensor, 0.0, sampling_errors=1.0) - frames
@@ -101,7 +100,6 @@ class FrameStack:
         """The signals, when all passes are in."""
         return MovingSignals(
             rig=self.at_middle.rig,
-            channels={},
             energy=self.at_middle.energy,
             truth=self.at_middle.truth,
             motion_m=self.motion_m,

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack
 
 from rangesim.motion.moving_signals import FrameStack
 from rangesim.motion.passes import plan
@@ -13,10 +14,10 @@ from rangesim.motion.timing import Timing
 from rangesim.motion.track import Motion
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
-from rangesim.settings.seeds import check_seed
 from rangesim.signals import Signals
 
 if TYPE_CHECKING:
+    from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings
     from rangesim.scene import Scene
 
 
@@ -25,10 +26,10 @@ def transport_moving(
     rig: Rig,
     timings: Mapping[Sensor, Timing],
     motion: Motion,
+    settings: TransportSettings | None = None,
     *,
-    seed: int = 0,
     progress: Callable[[float], None] | None = None,
-    **options: Any,
+    **options: Unpack[TransportOptions],
 ) -> dict[Sensor, Signals]:
     """Signals of sensors in a world that moves: every exposure, and every band of a scan, at its own time.
 
@@ -43,10 +44,10 @@ def transport_moving(
     rig : Rig, where it stands without motion.
     timings : sensor -> Timing, when it takes its frames.
     motion : Motion, what moves.
-    seed : int, 0 to 2^64 - 1; the same seed gives the same bytes.
+    settings : TransportSettings, of each pass; None: the defaults. No AdaptiveSampling: passes that sampled a thing
+        differently would make it differ from frame to frame.
     progress : called with the fraction done, 0..1.
-    options : spp, max_depth and what else `transport` takes, for each pass. No AdaptiveSampling: passes that sampled
-        a thing differently would make it differ from frame to frame.
+    options : fields of `settings` in place of those, such as spp=64 or seed=1.
 
     Returns
     -------
@@ -65,12 +66,13 @@ def transport_moving(
     """
     from rangesim.experiment.adaptive_sampling import AdaptiveSampling
     from rangesim.light_transport.one_pass import transport
+    from rangesim.light_transport.transport_settings import chosen
     from rangesim.scene.rigid_motion import MovingScene
 
     _check(scene, rig, timings, motion)
-    if isinstance(options.get("spp"), AdaptiveSampling):
+    settings = chosen(settings, options)
+    if isinstance(settings.spp, AdaptiveSampling):
         raise ValueError('expected a number of samples or "auto" where something moves, got AdaptiveSampling.')
-    seed = check_seed(seed)
     passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
     at_once: dict[Sensor, Signals] = {}
@@ -80,9 +82,8 @@ def transport_moving(
             stage.at(one.poses.objects),
             one.rig(rig),
             [response for sensor in one.sensors for response in sensor.responses()],
-            seed=one.seed(seed),
+            replace(settings, seed=one.seed(settings.seed)),
             progress=progress and partial(_report, progress, number, len(passes)),
-            **options,
         )
         for sensor in one.reference_of:
             if any(sensor in other.sensors for other in passes if other is not one):

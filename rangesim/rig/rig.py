@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -250,6 +250,31 @@ class Rig:
                 values[device] = {**values.get(device, {}), setting: data[key]}
             data = values
         return from_dict(cls, data, where)
+
+    def with_camera(
+        self, T_camera_other: ArrayLike, intrinsics: Intrinsics | None = None, lens: Lens | None = None
+    ) -> Rig:
+        """The rig of another camera beside the same emitter, as for active stereo: `transport` takes several at once.
+
+        Parameters
+        ----------
+        T_camera_other : (4, 4) float64, maps the other camera's coordinates to those of this one, metres.
+        intrinsics, lens : of the other camera; None: as this one's.
+        """
+        T = pose(T_camera_other, "T_camera_other")
+        return replace(
+            self,
+            camera=intrinsics or self.camera,
+            camera_lens=lens or self.camera_lens,
+            T_world_camera=self.T_world_camera @ T,
+            T_camera_projector=np.linalg.inv(T) @ self.T_camera_projector,
+        )
+
+    def shares_emitter(self, other: Rig) -> bool:
+        """Whether the emitters of two rigs are one and the same: in one place, with one lens and power."""
+        kept = ("projector", "projector_lens", "projector_power_w")
+        a, b = self.T_world_projector, other.T_world_projector
+        return all(getattr(self, k) == getattr(other, k) for k in kept) and np.allclose(a, b, rtol=1e-9, atol=1e-9)
 
     @property
     def T_world_projector(self) -> Array:

@@ -97,7 +97,10 @@ def _checked(hint: Any, value: Any, name: str) -> Any:
     if get_origin(hint) in (Union, types.UnionType):
         if value is None and type(None) in get_args(hint):
             return None
-        hint = next(arg for arg in get_args(hint) if arg is not type(None))
+        hint, *others = (arg for arg in get_args(hint) if arg is not type(None))
+        for other in others:
+            if value in get_args(other) if get_origin(other) is typing.Literal else type(value) is other:
+                return value
     bounds = None
     if get_origin(hint) is Annotated:
         hint, bounds = get_args(hint)[:2]

@@ -8,6 +8,7 @@ from rangesim.signals.signals import (
     GroundTruth,
     SamplingError,
     Signals,
+    StillSignals,
     Truncation,
 )
 
@@ -18,5 +19,6 @@ __all__ = [
     "GroundTruth",
     "SamplingError",
     "Signals",
+    "StillSignals",
     "Truncation",
 ]

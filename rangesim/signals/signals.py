@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -106,28 +107,48 @@ class SamplingError(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Signals(ShortRepr):
-    """Everything one transport pass accumulated for the sensors that share a rig.
+class Signals(ShortRepr, ABC):
+    """The light that sensors expose, of one time (`StillSignals`) or of several (`rangesim.motion.MovingSignals`).
 
     rig : Rig
-    channels : response -> (c, h, w) float32, W/m2/sr.
     energy : EnergySplit
     truth : GroundTruth
     motion_m : (h, w) float32, metres, how far what a pixel sees moves while its frames are taken, see
         `rangesim.motion`; None: nothing moves.
-    truncation : what the pass left out, an estimate; None: not known.
-    sampling : SamplingError; None: not known.
+    truncation : what the light transport left out, an estimate; None: not known.
     """
 
     rig: Rig
-    channels: dict[Response, np.ndarray]
     energy: EnergySplit
     truth: GroundTruth
-    motion_m: np.ndarray | None = None
-    truncation: Truncation | None = None
-    sampling: SamplingError | None = None
+    motion_m: np.ndarray | None = field(kw_only=True, default=None)
+    truncation: Truncation | None = field(kw_only=True, default=None)
 
-    def only(self, sensor: Sensor) -> Signals:
+    @property
+    @abstractmethod
+    def knows_sampling_error(self) -> bool:
+        """Whether `frames` can have its sampling error added."""
+
+    @abstractmethod
+    def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
+        """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass.
+
+        sampling_errors : so many times a draw of the error that the sampling of light paths leaves is added.
+        """
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StillSignals(Signals):
+    """Everything one transport pass accumulated for the sensors that share a rig.
+
+    channels : response -> (c, h, w) float32, W/m2/sr.
+    sampling : SamplingError; None: not known.
+    """
+
+    channels: dict[Response, np.ndarray] = field(kw_only=True)
+    sampling: SamplingError | None = field(kw_only=True, default=None)
+
+    def only(self, sensor: Sensor) -> StillSignals:
         """These signals without what other sensors need."""
         kept = sensor.responses()
         sampling = self.sampling
@@ -137,14 +158,9 @@ class Signals(ShortRepr):
 
     @property
     def knows_sampling_error(self) -> bool:
-        """Whether `frames` can have its sampling error added."""
         return self.sampling is not None
 
     def frames(self, sensor: Sensor, ambient_transmission: float = 1.0, sampling_errors: float = 0.0) -> np.ndarray:
-        """(k, h, w) float32, W/m2/sr: the noise-free frames of `sensor`, which must have been part of the pass.
-
-        sampling_errors : so many times `sampling` is added to the signals.
-        """
         missing = [r for r in sensor.responses() if r not in self.channels]
         if missing:
             raise ValueError(
@@ -170,7 +186,7 @@ class Signals(ShortRepr):
         Raises
         ------
         ValueError
-            The signals are those of something that moves, or a response holds arrays (`Images`).
+            A response holds arrays (`Images`).
         FileFormatError
             The place cannot be written.
         """

@@ -15,7 +15,7 @@ from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
-from rangesim.signals.signals import EnergySplit, GroundTruth, SamplingError, Signals, Truncation
+from rangesim.signals.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
 
 FORMAT = "rangesim-signals"
 FORMAT_VERSION = 1
@@ -40,10 +40,8 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
 }
 
 
-def save_signals(signals: Signals, path: str | Path) -> None:
-    """Write signals with their channels and sampling error; see `Signals.save`."""
-    if type(signals) is not Signals:
-        raise ValueError("expected signals of a scene at rest: those of what moves hold frames, and no channels.")
+def save_signals(signals: StillSignals, path: str | Path) -> None:
+    """Write signals with their channels and sampling error; see `StillSignals.save`."""
     responses = list(signals.channels)
     settings = {
         "format": FORMAT,
@@ -59,8 +57,8 @@ def save_signals(signals: Signals, path: str | Path) -> None:
     write_arrays(path, arrays)
 
 
-def load_signals(path: str | Path) -> Signals:
-    """The signals that `Signals.save` wrote: `expose` makes captures of them as of those traced.
+def load_signals(path: str | Path) -> StillSignals:
+    """The signals that `StillSignals.save` wrote: `expose` makes captures of them as of those traced.
 
     Raises
     ------
@@ -95,7 +93,7 @@ def load_signals(path: str | Path) -> Signals:
         sampling = SamplingError({r: data[f"error_{i}"] for i, r in enumerate(responses)}, data["error_projector"])
     truncation = Truncation(*map(float, data["truncation"])) if "truncation" in data else None
     channels = {response: data[f"channels_{i}"] for i, response in enumerate(responses)}
-    return Signals(rig, channels, energy, truth, data.get("motion_m"), truncation, sampling)
+    return StillSignals(rig, energy, truth, truncation=truncation, channels=channels, sampling=sampling)
 
 
 def write_pass(signals: Signals, path: str | Path) -> None:
