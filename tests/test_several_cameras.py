@@ -80,9 +80,9 @@ def test_each_camera_has_its_own_signals_and_photons_are_traced_once(
 def test_cameras_of_different_size_measure_the_same_surface() -> None:
     """Each camera triangulates with the projector; both clouds lie on the plane, in one world."""
     scene = rangesim.load_scene(SCENES / "plane.xml")
-    rig = scene.rig(width=64)
+    rig = scene.rig(projector_size=(160, 100), width=64)
     rigs = [rig, rig.with_camera(translation(0.05, 0.02, 0), Intrinsics.from_fov(40, 30, 30))]
-    sensor = StructuredLight()
+    sensor = StructuredLight(160, 100)
     points = []
     for one in transport(scene, rigs, [sensor], spp=16, max_depth=2):
         image = decode(expose(one, sensor, None))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -10,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.causes.edges import depth_edges, error_off_edge
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
 from rangesim.causes.light_paths import clean_frames, points_in_projector, single_path_frames
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.evaluation.comparison import neighbours
+from rangesim.evaluation.depth_edges import across, depth_edges
 from rangesim.response import DIRECT, KINDS, MULTIPATH
 from rangesim.sensor import Decoder
 from rangesim.signals import GroundTruth
@@ -24,6 +25,8 @@ from rangesim.signals import GroundTruth
 if TYPE_CHECKING:
     from rangesim.signals import Signals
 
+NEAR = 2
+"""Pixels around an edge pixel, in both directions, that show how its surface fares off the edge."""
 FAINT = 0.1
 """Less than this fraction of what white paper would return here is little light."""
 DISTURBING = 0.005
@@ -224,3 +227,24 @@ class Evidence:
     def _in_projector(self) -> np.ndarray:
         """(n, 3) true surface points of the failed pixels in the frame of the projector, metres."""
         return points_in_projector(self.signals.rig, self.truth.z, self.failed)
+
+
+def error_off_edge(
+    where: np.ndarray, error: np.ndarray, edge: np.ndarray, z: np.ndarray, instance: np.ndarray, tolerance_m: float
+) -> np.ndarray:
+    """(n,) float: median error of the same surface off the edge, around each of the n pixels `where`; NaN for none.
+
+    Parameters
+    ----------
+    where, edge : (h, w) bool. error : (h, w) float, metres, not negative; infinity without a reading.
+    z : (h, w) float, metres, true depth. instance : (h, w) int, of the surface.
+    """
+    rows, columns = np.nonzero(where)
+    steps = np.arange(-NEAR, NEAR + 1)
+    y = np.clip(rows[:, None, None] + steps[:, None], 0, z.shape[0] - 1)
+    x = np.clip(columns[:, None, None] + steps, 0, z.shape[1] - 1)
+    own_z, own = z[where][:, None, None], instance[where][:, None, None]
+    same = (instance[y, x] == own) & ~edge[y, x] & (z[y, x] <= across(own_z, tolerance_m))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # windows without any such pixel: NaN
+        return np.asarray(np.nanmedian(np.where(same, error[y, x], np.nan), axis=(1, 2)))

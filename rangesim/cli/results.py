@@ -105,7 +105,7 @@ def _print(markdown: str) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from rangesim.report.tables import cells
+    from rangesim.report.markdown_table import cells
 
     head, _, *lines = (cells(line) for line in markdown.splitlines())
     table = Table(box=box.SIMPLE_HEAD)

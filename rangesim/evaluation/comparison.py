@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
+from rangesim.evaluation.depth_edges import depth_edges
 from rangesim.settings.config import ShortRepr
 from rangesim.signals import GroundTruth, Signals
 
 OUTLIER_M = 0.010
 EDGE_RADIUS = 2
 """Pixels from a depth edge within which a pixel can be a flying pixel."""
-EDGE_FRACTION = 0.02
-"""A depth edge is where neighbours' true depths differ by more than this fraction of the nearer, and `outlier_m`."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +84,11 @@ class Comparison(ShortRepr):
 
     def to_markdown(self) -> str:
         """Table in Markdown; lengths in millimetres, fractions in percent."""
+        from rangesim.report.markdown_table import markdown_table
+
         heads = [f.name.replace("_m", "_mm") if f.name.endswith("_m") else f.name for f in fields(ErrorStatistics)]
-        lines = ["| " + " | ".join(h.replace("_", " ") for h in heads) + " |", "|" + " --- |" * len(heads)]
-        for row in self.table:
-            lines.append("| " + " | ".join(_cell(k, v) for k, v in asdict(row).items()) + " |")
-        return "\n".join(lines) + "\n"
+        rows = [[_cell(name, value) for name, value in asdict(row).items()] for row in self.table]
+        return markdown_table([head.replace("_", " ") for head in heads], rows)
 
 
 def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = OUTLIER_M) -> Comparison:
@@ -167,23 +166,8 @@ def _flying(z: np.ndarray, true_z: np.ndarray, outlier_m: float) -> tuple[np.nda
     measured = np.where(np.isfinite(z), z, np.nan)
     for shifted in neighbours(far, EDGE_RADIUS):
         np.fmin(nearest, np.abs(measured - shifted), out=nearest)
-    step = _has_step(far, outlier_m)
-    edge = np.any(list(neighbours(step, EDGE_RADIUS)), axis=0) & np.isfinite(true_z)
+    edge = np.any(neighbours(depth_edges(true_z, outlier_m), EDGE_RADIUS), axis=0) & np.isfinite(true_z)
     return edge, edge & np.isfinite(measured) & (nearest > outlier_m)
-
-
-def _has_step(depth: np.ndarray, outlier_m: float) -> np.ndarray:
-    """(h, w) bool, pixels with a 4-neighbour across a depth edge; nothing (infinity) counts as far away."""
-    result = np.zeros(depth.shape, dtype=bool)
-    for a, b in (
-        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
-        ((slice(1, None),), (slice(None, -1),)),
-    ):
-        one, two = np.minimum(depth[a], depth[b]), np.maximum(depth[a], depth[b])
-        jump = (two > one * (1 + EDGE_FRACTION)) & (two > one + outlier_m)
-        result[a] |= jump
-        result[b] |= jump
-    return result
 
 
 def neighbours(values: np.ndarray, radius: int) -> list[np.ndarray]:

@@ -3,29 +3,22 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
-from rangesim.errors import visible
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
 from rangesim.experiment.result_files import Measurement
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
+from rangesim.report.markdown_table import markdown_table
 
 Rows = list[dict[str, Any]]
 
 UNRELIABLE = 0.5
-"""LegendEntry of outliers or of missing pixels from which a sensor is called unreliable on a material."""
-
-_SPECIAL = re.compile(r"([\\`|\[]|<(?! ))")
-"""What Markdown reads as more than text; "< 0.1" is none of it."""
-_ESCAPED = re.compile(r"\\([\\`|\[<])")
-_BORDER = re.compile(r"(?<!\\)\|")
-_BREAKS = re.compile(r"[\t\r\n]+")
+"""Fraction of outliers or of missing pixels from which a sensor is called unreliable on a material."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +78,7 @@ def is_reference(measurement: Measurement) -> bool:
 
 
 def missing_fraction(row: dict[str, Any]) -> float:
-    """LegendEntry of the lit pixels without a measurement; 0 where none is lit."""
+    """Fraction of the lit pixels without a measurement; 0 where none is lit."""
     return 1.0 - row["completeness"] if row["completeness"] is not None else 0.0
 
 
@@ -161,24 +154,14 @@ def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
     )
 
 
-def cells(line: str) -> list[str]:
-    """Cells of a line of such a table, as they were before they became Markdown."""
-    return [_ESCAPED.sub(r"\1", cell.strip()) for cell in _BORDER.split(line)[1:-1]]
-
-
-def _line(texts: Sequence[str]) -> str:
-    """A line of a table; what Markdown or a terminal would take for more than text is escaped or spelt out."""
-    return "| " + " | ".join(_SPECIAL.sub(r"\\\1", visible(_BREAKS.sub(" ", text))) for text in texts) + " |"
-
-
 def _markdown(
     tables: Sequence[tuple[str, Rows]], heads: list[str], texts: Callable[[dict[str, Any]], list[str]]
 ) -> str:
-    lines = [_line(["material", "sensor", *heads]), "|" + " --- |" * (2 + len(heads))]
+    lines = []
     for material in dict.fromkeys(row["material"] for _, rows in tables for row in rows):
         for name, rows in tables:
-            lines += [_line([material, name, *texts(row)]) for row in rows if row["material"] == material]
-    return "\n".join(lines) + "\n"
+            lines += [[material, name, *texts(row)] for row in rows if row["material"] == material]
+    return markdown_table(["material", "sensor", *heads], lines)
 
 
 def _failures(row: dict[str, Any]) -> list[str]:

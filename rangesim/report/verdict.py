@@ -20,7 +20,7 @@ from rangesim.report.tables import (
 )
 
 MAIN_CAUSE = 0.1
-"""LegendEntry of the failures from which a cause is named."""
+"""Fraction of the failures from which a cause is named."""
 
 
 @dataclass(frozen=True)
