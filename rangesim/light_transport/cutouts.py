@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.light_transport.spectrum import mono
+from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.materials import holes
 
 MAX_CUTOUTS = 8
@@ -58,4 +59,4 @@ def _openness(si: Any) -> Any:
     """
     grazing = mi.SurfaceInteraction3f(si)
     grazing.wi = mi.Vector3f(1, 0, 0)
-    return mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(grazing))[0]
+    return mono(si.bsdf().eval_null_transmission(grazing))

@@ -23,10 +23,10 @@ from scipy.ndimage import binary_dilation
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.kernel_launches import Launches, fewest_lanes
-from rangesim.light_transport.loop import mono
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.sampling import Continued, Seed, of_part, random_stream, stratified
 from rangesim.light_transport.scattering import bounded
+from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import GLINT, LightPath, Response

@@ -13,9 +13,10 @@ from rangesim.light_transport.cutouts import first_surface
 from rangesim.light_transport.device import connect
 from rangesim.light_transport.indirect import Guides
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.loop import Budget, Lanes, PathSettings, View, mono
+from rangesim.light_transport.loop import Budget, Lanes, PathSettings, View
 from rangesim.light_transport.sampling import in_pairs
-from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.light_transport.spectrum import mono
+from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.rig import Rig
 from rangesim.scene import Scene

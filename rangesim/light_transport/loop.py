@@ -32,25 +32,26 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
+from rangesim.light_transport.caustics import Vertex, caustic_light, gather
 from rangesim.light_transport.device import connect
+from rangesim.light_transport.emitters import emission, emission_through, sampled_emission
 from rangesim.light_transport.kernel_launches import Launches, Report, fewest_lanes
-from rangesim.light_transport.photon_maps import LEVELS, PhotonMaps
+from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
 from rangesim.light_transport.scattering import FAINT, MAX_EVENTS
+from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import Tally
-from rangesim.response import CAUSTIC, DIRECT, MULTIPATH, SPECULAR, LightPath
+from rangesim.response import DIRECT, MULTIPATH, SPECULAR, LightPath
 from rangesim.scene import Scene
 
 NEIGHBOURS = 256
 """Pixels in a row that share a launch. Launches take such runs from all over the image: so their times are alike."""
 ITERATIONS_PER_SAMPLE = 2
 """As long as nothing is known."""
-MAX_BENT = 4.0
-"""Cosine of a photon to the surface at a vertex, at most, over that where it landed."""
 
 
 class PathSettings(NamedTuple):
@@ -133,17 +134,6 @@ class Traced(NamedTuple):
 
     radiance: np.ndarray
     tally: np.ndarray
-
-
-class Vertex(NamedTuple):
-    """A vertex of a camera path: surface, throughput, optical length from the camera, and whether light that reaches it
-    is the first to do so."""
-
-    si: Any
-    bsdf: Any
-    throughput: Any
-    length: Any
-    is_first: Any
 
 
 @dataclass
@@ -409,7 +399,7 @@ def walk(
             rotation += 2654435769  # 2^32 over the golden ratio
             chance, gathers = mi.Float(rotation >> 8) * 2**-24, may_connect & ~scatters
             photon, brought, is_wide = gather(maps, vertex, number, xi, chance, gathers)
-            channels, radiance = caustics(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
+            channels, radiance = caustic_light(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
             caustic += dr.select(is_wide, 0, radiance)
             faint += dr.select(is_wide, radiance, 0)
             indirect += dr.select(is_later, radiance, 0)
@@ -510,112 +500,3 @@ def walk(
         events=events,
         stays=stays,
     ), most - left
-
-
-@dr.syntax
-def gather(
-    maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance: Any, active: Any
-) -> tuple[Any, Any, Any]:
-    """The photon that stands for all around a vertex, their irradiance, and whether it was found in a wide circle.
-
-    `chance` decides which levels are gathered. Neighbouring lanes share it, so that they skip a level together.
-    """
-    photon, irradiance = dr.zeros(mi.UInt32, dr.width(sample)), dr.zeros(mi.Float, dr.width(sample))
-    pick, is_wide = mi.Float(xi[2]), dr.full(mi.Bool, False, dr.width(sample))
-    reach = maps.reach(vertex.si.p)
-    for level, kind in enumerate(LEVELS):
-        p, n = vertex.si.p, vertex.si.n
-        if maps.near(level, p, reach, sample, active & (chance < kind.chance)):
-            found = maps.gather(level, p, n, reach, sample, xi[0], xi[1], active)
-            irradiance += found.irradiance / kind.chance
-            fraction = dr.select(irradiance > 0, found.irradiance / kind.chance / irradiance, 0)
-            taken = pick < fraction
-            photon = dr.select(taken, found.photon, photon)
-            is_wide = dr.select(taken, maps.is_wide[level], is_wide)
-            pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))
-    return photon, irradiance, is_wide
-
-
-@dr.syntax
-def caustics(
-    maps: PhotonMaps,
-    accumulators: Accumulators,
-    channels: list[list[Any]],
-    vertex: Vertex,
-    photon: Any,
-    irradiance: Any,
-    is_wide: Any,
-    place: Any,
-) -> tuple[list[list[Any]], Any]:
-    """Channels with the light of the photons at a vertex added, and the radiance they bring to the camera."""
-    radiance = dr.zeros(mi.Float, dr.width(place))
-    found = irradiance > 0
-    if found:
-        flight = maps.flight(photon, found)
-        wi, wo = vertex.si.wi, vertex.si.to_local(-flight.direction)
-        value = vertex.bsdf.eval(mi.BSDFContext(), vertex.si, wo, found)
-        # Photons count flux per area, so the geometric cosine is in them already; the BSDF counts that to the shading
-        # normal (Veach 1997, 5.3). Where a photon landed beside an edge, its own facet is the one that counts
-        seen, lit = dr.dot(vertex.si.to_world(wi), vertex.si.n), -dr.dot(flight.direction, vertex.si.n)
-        cosine = dr.maximum(flight.cosine, dr.abs(lit) / MAX_BENT)
-        on_one_side = seen * lit * wi.z * wo.z > 0  # for both normals, or for neither
-        radiance = vertex.throughput * irradiance * mono(value) / cosine
-        radiance = dr.select(found & on_one_side, radiance, 0)
-        length = vertex.length + flight.length
-        path = LightPath(flight.u, flight.v, length, vertex.is_first, mi.UInt32(CAUSTIC))
-        channels = accumulators.add(channels, path, radiance, place, found, is_wide)
-    return channels, radiance
-
-
-def emission(scene: Any, si: Any, previous: Any, pdf: Any, alone: Any, active: Any) -> Any:
-    """Radiance that a scene emitter sends along the ray, weighted against having been sampled at `previous`."""
-    emitter = si.emitter(scene, active)
-    ds = mi.DirectionSample3f(scene, si, previous)
-    emitter_pdf = scene.pdf_emitter_direction(previous, ds, active & ~alone)
-    weight = dr.select(alone, 1, power_heuristic(pdf, emitter_pdf))
-    return dr.select(active, weight * mono(emitter.eval(si, active)), 0)
-
-
-def sampled_emission(traced: TracedScene, bsdf: Any, si: Any, beam: Beam, xi: Any, active: Any) -> Any:
-    """Reflected radiance of one sampled direction to a scene emitter, weighted against BSDF sampling.
-
-    `beam` : that which met `si`.
-    """
-    ds, radiance = traced.scene.sample_emitter_direction(si, xi, True, active)
-    active &= ds.pdf != 0
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
-    weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
-    absorbers = traced.absorbers
-    if absorbers is not None:
-        weight *= absorbers.transmittance(absorbers.beyond(si, ds.d, beam.sigma_a, active), ds.dist)
-    return dr.select(active, weight * mono(value) * mono(radiance), 0)
-
-
-def emission_through(
-    traced: TracedScene, bsdf: Any, si: Any, direction: Any, beam: Beam, scatters: Any, xi: Any, active: Any
-) -> Any:
-    """Like `sampled_emission`, through media as well, and also at scattering events.
-
-    Lamps of finite size are left to random walks there and beyond boundaries, so that none is counted twice.
-    """
-    scene, media, absorbers, inside = traced.scene, traced.media, traced.absorbers, beam.inside
-    ds, radiance = scene.sample_emitter_direction(si, xi, False, active)
-    active &= ds.pdf != 0
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)
-    value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
-    around = None if absorbers is None else absorbers.beyond(si, ds.d, beam.sigma_a, active & ~scatters)
-    fraction, crossed = media.transmittance(scene, si, ds.p, inside, active, around)
-    weight = dr.select(scatters | crossed, 0, power_heuristic(ds.pdf, pdf))
-    weight = dr.select(ds.delta, 1, weight)
-    return dr.select(active, weight * fraction * value * mono(radiance), 0)
-
-
-def power_heuristic(a: Any, b: Any) -> Any:
-    """Weight of a sample of density `a` that density `b` could have made too (Veach 1997)."""
-    weight = dr.square(a) / (dr.square(a) + dr.square(b))
-    return dr.select(dr.isfinite(weight), weight, 0)
-
-
-def mono(spectrum: Any) -> Any:
-    """The single channel of a monochrome spectrum."""
-    return mi.unpolarized_spectrum(spectrum)[0]

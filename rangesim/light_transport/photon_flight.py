@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.sampling import Continued, Seed, random_stream
+from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 
@@ -105,7 +106,7 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
         bs, weight = bsdf.sample(
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), goes_on
         )
-        remains = flux * dr.select(mixed, 1 / (1 - LANDING_FRACTION), 1) * mi.unpolarized_spectrum(weight)[0]
+        remains = flux * dr.select(mixed, 1 / (1 - LANDING_FRACTION), 1) * mono(weight)
         goes_on &= (remains > 0) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         chance = survival(chain, remains / emitted)
         goes_on &= rng.next_float32() < chance

@@ -27,7 +27,7 @@ from rangesim.light_transport.device import Device
 from rangesim.light_transport.kernel_launches import Launches
 from rangesim.light_transport.photon_flight import fly
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
-from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene.media import is_boundary
 

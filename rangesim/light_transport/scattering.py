@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.shapes import number_of, table_of
+from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
 
 MAX_EVENTS = 1 << 14

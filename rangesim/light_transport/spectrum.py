@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Spectra of the renderer: one channel, unpolarised. The one place that says so."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+
+def mono(spectrum: Any) -> Any:
+    """The single channel of a monochrome spectrum."""
+    return mi.unpolarized_spectrum(spectrum)[0]
