@@ -21,7 +21,7 @@ from rangesim import Capture, Decoder, RangeImage, Sensor, Status, compare, deco
 from rangesim.decoding.phase_shift import PhaseThresholds, modulation_is_weak, phase_of
 from rangesim.decoding.triangulate import TriangulationLimits, range_image_from_coordinates
 from rangesim.response import Fringes
-from rangesim.sensor import Background, Emitter, FrameContent
+from rangesim.sensor import Background, Emitter, FrameContent, of_type
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,10 @@ class TemporalUnwrapping(Decoder):
     triangulation: TriangulationLimits = field(default_factory=TriangulationLimits)
 
     type_name: ClassVar[str] = "temporal-unwrapping"
+    reads: ClassVar[type[Sensor]] = MultiFrequency
 
     def decode(self, capture: Capture) -> RangeImage:
-        sensor = capture.sensor
-        if not isinstance(sensor, MultiFrequency):
-            raise ValueError(f"expected a multi-frequency capture, got {sensor.type_name}.")
+        sensor = of_type(capture.sensor, MultiFrequency)
         phases = [phase_of(frames) for frames in np.split(capture.frames, sensor.periods)]
         column = phases[0].normalised * sensor.periods_px[0]
         for phase, period_px in zip(phases[1:], sensor.periods_px[1:], strict=True):
@@ -120,8 +119,7 @@ class TemporalUnwrapping(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        assert isinstance(sensor, MultiFrequency)
-        least = self.phase.least_signal(sensor.steps, 0.5, FrameContent(), background)
+        least = self.phase.least_signal(of_type(sensor, MultiFrequency).steps, 0.5, FrameContent(), background)
         return np.maximum(least, background.floor(0.0))
 
 

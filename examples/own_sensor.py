@@ -26,7 +26,7 @@ from rangesim.capture import bright_level
 from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, DenseResponse, LightPath, Math
-from rangesim.sensor import Background, Emitter, FrameContent, least_signal_for
+from rangesim.sensor import Background, Emitter, FrameContent, least_signal_for, of_type
 
 
 @dataclass(frozen=True)
@@ -120,11 +120,10 @@ class GateRatio(Decoder):
     relative_light: float = 1e-3
 
     type_name: ClassVar[str] = "gate-ratio"
+    reads: ClassVar[type[Sensor]] = GatedCamera
 
     def decode(self, capture: Capture) -> RangeImage:
-        sensor = capture.sensor
-        if not isinstance(sensor, GatedCamera):
-            raise ValueError(f"expected a gated-camera capture, got {sensor.type_name}.")
+        sensor = of_type(capture.sensor, GatedCamera)
         *gates, off = capture.frames.astype(np.float64)
         light = np.stack(gates) - off
         pairs = light[:-1] + light[1:]
@@ -152,8 +151,7 @@ class GateRatio(Decoder):
         return least_signal_for(self.sigmas**2, 1.0, 6 * frame)  # two gates, and twice the frame without the laser
 
     def content(self, sensor: Sensor) -> FrameContent:
-        assert isinstance(sensor, GatedCamera)
-        return FrameContent(signal=0.5, ambient=sensor.duty)
+        return FrameContent(signal=0.5, ambient=of_type(sensor, GatedCamera).duty)
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -155,6 +155,9 @@ class Sensor(Named, ABC):
         return sorted({0, self.n_frames // 2, self.n_frames - 1})
 
 
+S = TypeVar("S", bound=Sensor)
+
+
 @dataclass(frozen=True)
 class Background:
     """What comes on top of the projector's light in each pixel, as far as the thresholds of decoders depend on it.
@@ -198,6 +201,12 @@ class Decoder(Named, ABC):
     known: ClassVar[dict[str, type[Any]]] = {}
     type_name: ClassVar[str]
     """Name in configuration files."""
+    reads: ClassVar[type[Sensor]] = Sensor  # type: ignore[type-abstract]
+    """The sensors whose captures it takes."""
+
+    def check(self, sensor: Sensor) -> None:
+        """Raise ValueError if it takes no captures of the sensor."""
+        of_type(sensor, self.reads)
 
     @abstractmethod
     def decode(self, capture: Capture) -> RangeImage:
@@ -217,6 +226,13 @@ class Decoder(Named, ABC):
     def content(self, sensor: Sensor) -> FrameContent:
         """What the frame that decides about a reading holds, on average over the patterns."""
         return FrameContent()
+
+
+def of_type(sensor: Sensor, kind: type[S]) -> S:
+    """The sensor, which has to be of that type; ValueError if it is not."""
+    if not isinstance(sensor, kind):
+        raise ValueError(f"expected a capture of {kind.type_name}, got one of {sensor.type_name}.")
+    return sensor
 
 
 def least_signal_for(sigmas2: float, signal: float, noise2: np.ndarray) -> np.ndarray:

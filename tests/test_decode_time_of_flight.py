@@ -23,6 +23,7 @@ from rangesim.decoding.phase_shift import tap_phase
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
+from rangesim.experiment.instrument import Instrument
 from rangesim.response import SPEED_OF_LIGHT, LightPath, NumpyMath, TransientHistogram
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import AmcwDecoder, AmcwToF, DirectToF, DirectToFDecoder, IdealToF
@@ -364,5 +365,9 @@ def test_wrong_sensors_are_refused() -> None:
     capture = Capture(np.ones((2, 4, 4), np.float32), IdealToF())
     with pytest.raises(ValueError, match="amcw-tof"):
         decode(capture, AmcwDecoder())
-    with pytest.raises(ValueError, match="direct-tof"):
+    with pytest.raises(ValueError, match="expected a capture of direct-tof, got one of ideal-tof"):
         decode(capture, DirectToFDecoder())
+    with pytest.raises(ValueError, match="amcw-tof"):
+        AmcwDecoder().decode(capture)
+    with pytest.raises(ValueError, match="expected a capture of amcw-tof, got one of ideal-tof"):
+        Instrument("one", IdealToF(), decoder=AmcwDecoder())

@@ -28,6 +28,7 @@ def decode(capture: Capture, decoder: Decoder | None = None) -> RangeImage:
     if not isinstance(capture, Capture):
         raise ValueError(f"expected a Capture, as expose, load_capture or import_capture return, got {capture!r}.")
     decoder = decoder or capture.sensor.default_decoder
+    decoder.check(capture.sensor)
     image = decoder.decode(capture)
     _check(image, capture, decoder)
     return replace(image, decoder=decoder)

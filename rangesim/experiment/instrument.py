@@ -63,6 +63,8 @@ class Instrument:
                 f"expected a name of letters, digits, - and _, at most {MAX_NAME}, got {shown(self.name)}."
             )
         check_sensor(self.sensor)
+        if self.decoder is not None:
+            self.decoder.check(self.sensor)
         detector = self.detector or self.sensor.default_detector
         if detector is not None and not self.sensor.is_ideal:
             detector.check(self.sensor.gate)

@@ -19,7 +19,7 @@ from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.response import SPEED_OF_LIGHT, Phasor, Response
-from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_number
 
 MAX_RANGE_M = 100.0
@@ -154,12 +154,13 @@ class AmcwDecoder(Decoder):
     max_ambiguity: Annotated[float, Bounds("0 or positive", 0, 1)] = 0.5
 
     type_name: ClassVar[str] = "amcw-tof"
+    reads: ClassVar[type[Sensor]] = AmcwToF
 
     def __post_init__(self) -> None:
         check_fields(self)
 
     def decode(self, capture: Capture) -> RangeImage:
-        sensor = _amcw(capture.sensor)
+        sensor = of_type(capture.sensor, AmcwToF)
         exact_square = sensor.waveform == "square" and self.correct_wiggling
         groups = np.split(capture.frames, len(sensor.modulation_hz))
         shape = capture.frames.shape[1:]
@@ -186,7 +187,7 @@ class AmcwDecoder(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        visibility = _amcw(sensor).contrast / 2
+        visibility = of_type(sensor, AmcwToF).contrast / 2
         least = self.phase.least_signal(len(TAPS_DEG), visibility, self.content(sensor), background)
         if background.noise2 is None:
             least = np.maximum(least, background.floor(RELATIVE_SIGNAL))
@@ -194,12 +195,6 @@ class AmcwDecoder(Decoder):
 
     def content(self, sensor: Sensor) -> FrameContent:
         return FrameContent(signal=0.5, ambient=0.5)
-
-
-def _amcw(sensor: Sensor) -> AmcwToF:
-    if not isinstance(sensor, AmcwToF):
-        raise ValueError(f"expected an amcw-tof capture, got {sensor.type_name}.")
-    return sensor
 
 
 def _weight(capture: Capture, phase: Phase, modulation_hz: float) -> np.ndarray:

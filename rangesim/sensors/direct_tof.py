@@ -19,7 +19,7 @@ from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Gate
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT, Response, TransientHistogram
-from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 OVERSAMPLING = (1, 2, 4)
@@ -173,6 +173,7 @@ class DirectToFDecoder(Decoder):
     relative_peak: Threshold = 1e-4
 
     type_name: ClassVar[str] = "direct-tof"
+    reads: ClassVar[type[Sensor]] = DirectToF
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -180,7 +181,7 @@ class DirectToFDecoder(Decoder):
     def decode(self, capture: Capture) -> RangeImage:
         from pcgraph.parallel import SMALLEST_ROWS, in_blocks
 
-        sensor = _direct(capture.sensor)
+        sensor = of_type(capture.sensor, DirectToF)
         height, width = capture.frames.shape[1:]
         position, peak, background, intensity = np.empty((4, height, width))
 
@@ -204,7 +205,7 @@ class DirectToFDecoder(Decoder):
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         if background.noise2 is None:
             return background.floor(self.relative_peak)
-        window, bins = _window_bins(_direct(sensor)), _direct(sensor).bins
+        window, bins = _window_bins(of_type(sensor, DirectToF)), of_type(sensor, DirectToF).bins
         return self._least_counts(window * (background.dark + background.ambient / bins))
 
     def _least_counts(self, background: np.ndarray) -> np.ndarray:
@@ -213,14 +214,8 @@ class DirectToFDecoder(Decoder):
 
     def content(self, sensor: Sensor) -> FrameContent:
         """What the window of a peak holds."""
-        window = _window_bins(_direct(sensor))
-        return FrameContent(signal=1.0, ambient=window / _direct(sensor).bins, dark=window)
-
-
-def _direct(sensor: Sensor) -> DirectToF:
-    if not isinstance(sensor, DirectToF):
-        raise ValueError(f"expected a direct-tof capture, got {sensor.type_name}.")
-    return sensor
+        window = _window_bins(of_type(sensor, DirectToF))
+        return FrameContent(signal=1.0, ambient=window / of_type(sensor, DirectToF).bins, dark=window)
 
 
 def _window_bins(sensor: DirectToF) -> int:

@@ -14,7 +14,7 @@ from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.response import FirstReturn, Response
-from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor
+from rangesim.sensor import TOF_BASELINE_M, Background, Decoder, Emitter, FrameContent, Sensor, of_type
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class IdealToFDecoder(Decoder):
     """Path length = radiance_x_length / radiance; no radiance is LOW_SIGNAL."""
 
     type_name: ClassVar[str] = "ideal-tof"
+    reads: ClassVar[type[Sensor]] = IdealToF
 
     def decode(self, capture: Capture) -> RangeImage:
-        if not isinstance(capture.sensor, IdealToF):
-            raise ValueError(f"expected an ideal-tof capture, got {capture.sensor.type_name}.")
+        of_type(capture.sensor, IdealToF)
         radiance, weighted = (frame.astype(np.float64) for frame in capture.frames)
         dark = ~(radiance > 0)
         length = weighted / np.where(dark, 1.0, radiance)

@@ -18,7 +18,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulate import TriangulationLimits, range_image_from_coordinates
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
-from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for
+from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for, of_type
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 AXES = ("columns", "rows")
@@ -192,13 +192,14 @@ class StructuredLightDecoder(Decoder):
     triangulation: TriangulationLimits = field(default_factory=TriangulationLimits)
 
     type_name: ClassVar[str] = "structured-light"
+    reads: ClassVar[type[Sensor]] = StructuredLight
 
     def __post_init__(self) -> None:
         check_fields(self)
 
     def decode(self, capture: Capture) -> RangeImage:
         """Range image of a `StructuredLight` capture; ValueError also if the rig's projector is not of its size."""
-        sensor = _structured_light(capture.sensor)
+        sensor = of_type(capture.sensor, StructuredLight)
         if capture.rig is not None:
             sensor.check(capture.rig.projector.width, capture.rig.projector.height)
         contrast = direct_contrast(capture, capture.frames[WHITE], capture.frames[BLACK], self.gray)
@@ -226,7 +227,7 @@ class StructuredLightDecoder(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        sensor, ambient, noise2 = _structured_light(sensor), background.ambient, background.noise2
+        sensor, ambient, noise2 = of_type(sensor, StructuredLight), background.ambient, background.noise2
         if noise2 is None:
             least = background.floor(self.gray.relative_contrast)
         else:  # white - black holds the noise of two frames
@@ -234,12 +235,6 @@ class StructuredLightDecoder(Decoder):
         if sensor.code == "gray-phase":
             least = np.maximum(least, self.phase.least_signal(sensor.steps, 0.5, FrameContent(), background))
         return least
-
-
-def _structured_light(sensor: Sensor) -> StructuredLight:
-    if not isinstance(sensor, StructuredLight):
-        raise ValueError(f"expected a structured-light capture, got {sensor.type_name}.")
-    return sensor
 
 
 def _worst(statuses: list[np.ndarray]) -> np.ndarray:
