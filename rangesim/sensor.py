@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 TOF_BASELINE_M = 0.03
-"""Metres from the camera's lens to the lamp beside it, of a usual time-of-flight camera."""
+"""Metres from the camera's lens to the lamp beside it, of a common time-of-flight camera."""
 
 
 class Emitter(NamedTuple):

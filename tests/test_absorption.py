@@ -136,15 +136,15 @@ def photons_of(scene: Scene, rig: Rig) -> Photons:
 
 def test_photons_into_an_absorbing_slab_land_are_absorbed_or_escape() -> None:
     scene = scene_of(pane=filled(slab()), wall=wall(1.0, matte()))
-    balance = photons_of(scene, rig_of(CAMERA, PROJECTOR)).balance
-    parts = balance.direct + balance.stored + balance.absorbed + balance.escaped + balance.truncated
-    assert parts == pytest.approx(balance.emitted, rel=1e-6)
+    energy = photons_of(scene, rig_of(CAMERA, PROJECTOR)).energy
+    parts = energy.direct + energy.stored + energy.absorbed + energy.escaped + energy.truncated
+    assert parts == pytest.approx(energy.emitted, rel=1e-6)
     rays = PROJECTOR.normalise(PROJECTOR.pixel_centres())
     passed, reflected = (x.mean() for x in of_slab(np.linalg.norm(rays, axis=-1)))
-    assert balance.stored == pytest.approx(POWER_W * passed, rel=2e-3)
-    assert balance.escaped == pytest.approx(POWER_W * reflected, rel=2e-2)
-    assert balance.absorbed == pytest.approx(POWER_W * (1 - passed - reflected), rel=3e-3)
-    assert balance.direct == balance.truncated == 0
+    assert energy.stored == pytest.approx(POWER_W * passed, rel=2e-3)
+    assert energy.escaped == pytest.approx(POWER_W * reflected, rel=2e-2)
+    assert energy.absorbed == pytest.approx(POWER_W * (1 - passed - reflected), rel=3e-3)
+    assert energy.direct == energy.truncated == 0
 
 
 def test_a_photon_keeps_its_way_and_length_and_loses_by_the_way_inside() -> None:
@@ -292,11 +292,11 @@ def test_nothing_is_absorbed_outside() -> None:
         rig = rig_of(CAMERA, PROJECTOR, (0.1, 0.0, 0.0))
         direct.append(transport(scene, rig, [], spp=16, max_depth=2, photons=0).energy.direct)
     np.testing.assert_array_equal(*direct)
-    balance = photons_of(scene_of(pane=filled(slab(), 1e5), wall=wall(1.0, matte())), rig).balance
+    energy = photons_of(scene_of(pane=filled(slab(), 1e5), wall=wall(1.0, matte())), rig).energy
     rays = PROJECTOR.normalise(PROJECTOR.pixel_centres())
     _, reflected = of_slab(np.linalg.norm(rays, axis=-1), 1e5)
-    assert balance.escaped == pytest.approx(POWER_W * reflected.mean(), rel=0.02)
-    assert balance.absorbed == pytest.approx(POWER_W - balance.escaped, rel=1e-5)
+    assert energy.escaped == pytest.approx(POWER_W * reflected.mean(), rel=0.02)
+    assert energy.absorbed == pytest.approx(POWER_W - energy.escaped, rel=1e-5)
 
 
 def test_glass_that_absorbs_nothing_is_the_same_to_the_byte() -> None:

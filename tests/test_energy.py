@@ -42,7 +42,7 @@ def mean_over_the_field(function: Any) -> float:
 
 
 def check_identity(photons: Photons, maps: int = 4) -> None:
-    b = photons.balance
+    b = photons.energy
     assert b.direct + b.stored + b.absorbed + b.escaped + b.truncated == pytest.approx(b.emitted, rel=1e-6)
     assert b.emitted == pytest.approx(POWER_W, rel=2e-3)
     assert photons.flux.sum(dtype=float) / maps == pytest.approx(b.stored, rel=1e-5)
@@ -58,11 +58,11 @@ def test_a_mirror_absorbs_one_minus_its_reflectance() -> None:
     photons = photons_of(scene, rig)
     check_identity(photons)
     reflected = mean_over_the_field(lambda t: fresnel_conductor(1 / np.hypot(1, t)))
-    assert photons.balance.absorbed == pytest.approx(POWER_W / 2 * (1 - reflected), rel=0.01)
-    assert photons.balance.direct == pytest.approx(POWER_W / 2, rel=0.01)
+    assert photons.energy.absorbed == pytest.approx(POWER_W / 2 * (1 - reflected), rel=0.01)
+    assert photons.energy.direct == pytest.approx(POWER_W / 2, rel=0.01)
     # The wall is 10 m wide, so none of the reflected light comes back
-    assert photons.balance.escaped == pytest.approx(POWER_W / 2 * reflected, rel=0.01)
-    assert photons.balance.stored == 0
+    assert photons.energy.escaped == pytest.approx(POWER_W / 2 * reflected, rel=0.01)
+    assert photons.energy.stored == 0
 
 
 @pytest.mark.parametrize("kind", ["dielectric", "thindielectric"])
@@ -77,10 +77,10 @@ def test_a_slab_passes_one_minus_r_over_one_plus_r(kind: str) -> None:
         return (1 - r) / (1 + r)
 
     expected = mean_over_the_field(passed)
-    assert photons.balance.stored == pytest.approx(POWER_W * expected, rel=2e-3)
-    assert photons.balance.escaped == pytest.approx(POWER_W * (1 - expected), rel=0.02)
-    assert photons.balance.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
-    assert photons.balance.direct == 0
+    assert photons.energy.stored == pytest.approx(POWER_W * expected, rel=2e-3)
+    assert photons.energy.escaped == pytest.approx(POWER_W * (1 - expected), rel=0.02)
+    assert photons.energy.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
+    assert photons.energy.direct == 0
 
 
 def test_polished_plastic_scatters_what_it_does_not_mirror() -> None:
@@ -95,8 +95,8 @@ def test_polished_plastic_scatters_what_it_does_not_mirror() -> None:
     photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
     check_identity(photons)
     mirrored = mean_over_the_field(lambda t: fresnel_dielectric(t / np.hypot(1, t)))
-    assert photons.balance.escaped == pytest.approx(POWER_W * mirrored, rel=0.01)
-    assert photons.balance.stored == photons.balance.direct == 0
+    assert photons.energy.escaped == pytest.approx(POWER_W * mirrored, rel=0.01)
+    assert photons.energy.stored == photons.energy.direct == 0
 
 
 def test_in_a_closed_box_all_light_lands_or_is_absorbed() -> None:
@@ -105,14 +105,14 @@ def test_in_a_closed_box_all_light_lands_or_is_absorbed() -> None:
     scene = scene_of(box=box, ball=ball)
     photons = photons_of(scene, rig_of(CAMERA, PROJECTOR, projector_power_w=POWER_W))
     check_identity(photons)
-    assert photons.balance.escaped == 0
-    assert photons.balance.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
+    assert photons.energy.escaped == 0
+    assert photons.energy.absorbed == pytest.approx(0, abs=1e-6 * POWER_W)
     rays = PROJECTOR.directions(PROJECTOR.pixel_centres())
     meets = (
         np.linalg.norm(rays[..., :2], axis=-1) / np.linalg.norm(rays, axis=-1) < 0.2
     )  # sine of the ball's half angle
-    assert photons.balance.stored + photons.balance.truncated == pytest.approx(POWER_W * meets.mean(), rel=0.005)
-    assert photons.balance.truncated < 1e-4 * POWER_W
+    assert photons.energy.stored + photons.energy.truncated == pytest.approx(POWER_W * meets.mean(), rel=0.005)
+    assert photons.energy.truncated < 1e-4 * POWER_W
 
 
 # ---- Closed boxes and white furnaces ----------------------------------------------------------------

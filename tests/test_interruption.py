@@ -159,7 +159,7 @@ def test_launches_of_any_size_give_the_same_bytes(
     monkeypatch.setattr(kernel_launches, "LONGEST", 1.0)
     monkeypatch.setattr(kernel_launches, "FIRST_UNITS", units)
     for module in (rangesim.light_transport.loop, rangesim.light_transport.glint):
-        monkeypatch.setattr(module, "fewest_lanes", lambda: lanes)
+        monkeypatch.setattr(module, "min_lanes", lambda: lanes)
     number = 0
 
     def evaluate(arrays: Any) -> float:
@@ -175,14 +175,14 @@ def test_launches_of_any_size_give_the_same_bytes(
     assert (number > 20) == (units < 1 << 30)
 
 
-def test_the_balance_of_photons_does_not_depend_on_launches(tabletop: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_energy_of_photons_does_not_depend_on_launches(tabletop: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     traced = TracedScene.of(tabletop.mitsuba, tabletop.rig(width=64, height=48))
     monkeypatch.setattr(photons, "SUMMED_TOGETHER", 4096)
     found = []
     for units in (1 << 30, 10_000):
         monkeypatch.setattr(kernel_launches, "FIRST_UNITS", units)
         found.append(trace_photons(traced, 1.0, 50_001, 3, 5, 1 << 30))
-    assert astuple(found[0].balance) == astuple(found[1].balance)
+    assert astuple(found[0].energy) == astuple(found[1].energy)
     for name in ("position", "flux", "map"):
         np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
 

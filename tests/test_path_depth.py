@@ -125,16 +125,16 @@ def gem(folder: Path, bsdf: dict[str, Any]) -> dict[str, Any]:
     return {"type": "ply", "filename": str(folder / "gem.ply"), "face_normals": True, "bsdf": bsdf}
 
 
-def balance(scene: Scene) -> EnergyBudget:
+def energy_of_photons(scene: Scene) -> EnergyBudget:
     rig = rig_of(CAMERA, PROJECTOR, projector_power_w=2.0)
-    return trace_photons(TracedScene.of(scene.mitsuba, rig), 2.0, 100_000, 1, 1, 2 << 30).balance
+    return trace_photons(TracedScene.of(scene.mitsuba, rig), 2.0, 100_000, 1, 1, 2 << 30).energy
 
 
 def test_what_enters_a_diamond_comes_out(tmp_path: Path) -> None:
     """Total reflection keeps light in a faceted body of n = 2.4 for long; lossless, it gives all of it back."""
     diamond = {"type": "dielectric", "int_ior": 2.4, "ext_ior": 1.0}
     box = {"type": "cube", "to_world": transform().scale(2.5), "bsdf": matte()}
-    b = balance(scene_of(gem=gem(tmp_path, diamond), box=box))
+    b = energy_of_photons(scene_of(gem=gem(tmp_path, diamond), box=box))
     assert b.direct + b.stored + b.truncated == pytest.approx(b.emitted, rel=1e-6)
     assert b.truncated < 3e-3 * (b.stored + b.truncated)  # after 16 surfaces 5.8 %, after 64 0.9 %
 
@@ -158,7 +158,7 @@ def test_roulette_between_mirrors_takes_no_light_and_gives_none(monkeypatch: pyt
         stored[after] = trace_photons(TracedScene.of(scene.mitsuba, rig), 2.0, 200_000, 1, 1, 2 << 30)
     few, all_of_them = stored[2], stored[1000]
     assert len(few.flux) < 0.7 * len(all_of_them.flux)
-    assert few.balance.stored == pytest.approx(all_of_them.balance.stored, rel=0.01)
+    assert few.energy.stored == pytest.approx(all_of_them.energy.stored, rel=0.01)
 
 
 # ---- What is left out -------------------------------------------------------------------------------

@@ -311,10 +311,10 @@ def test_photons_that_cross_a_medium_are_weakened_by_it() -> None:
         scene = scene_of(slab(depth_m=0.02), medium(sigma_t, 0.0), wall=wall, pane=pane)
         traced = TracedScene.of(scene.mitsuba, scene.rig(baseline_m=0.01))
         landed = trace_photons(traced, 1.0, 50_000, 1, 7, 1 << 30)
-        balance = landed.balance
-        rest = balance.direct + balance.stored + balance.absorbed + balance.escaped + balance.truncated
-        assert balance.emitted == pytest.approx(rest, rel=1e-4)
-        stored.append(balance.stored)
+        energy = landed.energy
+        rest = energy.direct + energy.stored + energy.absorbed + energy.escaped + energy.truncated
+        assert energy.emitted == pytest.approx(rest, rel=1e-4)
+        stored.append(energy.stored)
     assert stored[1] / stored[0] == pytest.approx(np.exp(-1.0), rel=0.01)
 
 

@@ -204,7 +204,10 @@ class Evidence:
 
     @cached_property
     def _half_of_error(self) -> np.ndarray:
-        """Half of the error, of which what exceeds it made most; the tolerance where there is no reading."""
+        """Half of the error, in metres; the tolerance where there is no reading.
+
+        An effect that shifts a reading by more than that made most of its error.
+        """
         return np.asarray(np.where(self.missing, self.tolerance_m, np.abs(self.error) / 2))
 
     def _read(self, frames: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from rangesim.rig import Intrinsics, Rig
 from rangesim.settings.bounds import Bounds, check_fields
 
 ITERATIONS = 20
-"""Most rounds to find the undecoded projector coordinate, which matters through the lens distortion only."""
+"""Iterations, at most, that find the undecoded projector coordinate, which matters through the lens distortion only."""
 CONVERGED_PX = 1e-4
 COORDINATE_ERROR_PX = 0.5
 """Projector pixels of error that the working range must allow for."""

@@ -94,7 +94,7 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
     """The library named by `DRJIT_LIBLLVM_PATH`, otherwise the newest suitable one of this machine.
 
     Args:
-        folders: where to look instead of the usual places of this platform.
+        folders: where to look instead of the standard library folders of this platform.
 
     Raises:
         EnvironmentProblem: the named library, or every library found, is missing or unsuitable.
@@ -155,7 +155,7 @@ def _libraries_in(folders: Iterable[Path]) -> list[LlvmLibrary]:
 
 
 def _libraries_of_linker() -> list[LlvmLibrary]:
-    """What the dynamic linker's cache knows; asked only if the usual folders hold nothing suitable."""
+    """What the dynamic linker's cache knows; asked only if the standard folders hold nothing suitable."""
     try:
         listing = subprocess.run(["/sbin/ldconfig", "-p"], capture_output=True, text=True, timeout=10).stdout
     except (OSError, subprocess.TimeoutExpired):

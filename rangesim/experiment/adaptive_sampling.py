@@ -58,7 +58,7 @@ class AdaptiveSampling:
 
     @classmethod
     def of(cls, sensors: Sequence[Sensor]) -> AdaptiveSampling:
-        """For sensors with their usual detectors."""
+        """For sensors with their default detectors."""
         return cls(tuple(Instrument(f"sensor-{i}", sensor) for i, sensor in enumerate(sensors)))
 
     @property
@@ -72,10 +72,10 @@ class AdaptiveSampling:
         excess = np.zeros(group.max() + 1)  # of the variance, over what is small enough
         z = truth.z[np.isfinite(truth.z)]
         negligible = NEGLIGIBLE * float(np.median(z)) if z.size else 0.0
-        for one in self.instruments:
-            signals = signals_of(one.sensor)
-            capture = expose(signals, one.sensor, one.detector, one.exposure_s, 0, self.ambient)
-            noise = range_noise(decode(capture, one.decoder), capture, signals)
+        for instrument in self.instruments:
+            signals = signals_of(instrument.sensor)
+            capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, 0, self.ambient)
+            noise = range_noise(decode(capture, instrument.decoder), capture, signals)
             enough = np.full(len(excess), negligible)
             if capture.is_digital:  # where nothing can be read, samples are of no use
                 enough = np.maximum(enough, self.fraction * group_sigma(noise.detector, group, where_unknown=np.inf))

@@ -137,14 +137,16 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
         return rig.camera.width * rig.camera.height, 1
     from rangesim.motion.passes import plan
 
-    planned = [p for one in instruments for p in plan(rig, {one.sensor: one.timing}, experiment.motion)]
+    planned = [
+        p for instrument in instruments for p in plan(rig, {instrument.sensor: instrument.timing}, experiment.motion)
+    ]
     windows = [p.window for p in planned]
     return sum((w.bottom - w.top) * (w.right - w.left) for w in windows), len(planned)
 
 
 def _rest_s(rig: Rig, instruments: Sequence[Instrument]) -> float:
     pixels = rig.camera.width * rig.camera.height
-    return sum(pixels * (PIXEL_S + FRAME_S * one.sensor.n_frames) for one in instruments)
+    return sum(pixels * (PIXEL_S + FRAME_S * instrument.sensor.n_frames) for instrument in instruments)
 
 
 def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> int:
@@ -152,17 +154,17 @@ def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) 
     at_once, report = 0.0, 0.0
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
-        responses = dict.fromkeys(r for one in instruments for r in one.sensor.responses())
+        responses = dict.fromkeys(r for instrument in instruments for r in instrument.sensor.responses())
         channels = sum(r.channels for r in responses)
         tiles = min(TRANSPORT_BYTES, pixels * (LANE_BYTES + 2 * 4 * channels))  # indirect light apart
-        of_one = max(sum(r.channels for r in one.sensor.responses()) for one in instruments)
-        frames = max(one.sensor.n_frames for one in instruments)
+        largest = max(sum(r.channels for r in instrument.sensor.responses()) for instrument in instruments)
+        frames = max(instrument.sensor.n_frames for instrument in instruments)
         exposed = pixels * 14 * frames  # three times float32, and the digital numbers
-        judged = pixels * 2 * 4 * of_one + exposed  # means and their error
+        judged = pixels * 2 * 4 * largest + exposed  # means and their error
         tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES) + photons * PHOTON_BYTES
-        exposing = pixels * (2 * 4 * channels + 4 * of_one + TRUTH_BYTES) + exposed  # signals and their error
+        exposing = pixels * (2 * 4 * channels + 4 * largest + TRUTH_BYTES) + exposed  # signals and their error
         at_once = max(at_once, tracing, exposing)
-        report += pixels * sum(2 * one.sensor.n_frames + RESULT_BYTES for one in instruments)
+        report += pixels * sum(2 * instrument.sensor.n_frames + RESULT_BYTES for instrument in instruments)
     return int(BASE_BYTES + max(at_once, report))
 
 
@@ -174,7 +176,11 @@ def _timed_trial(
 
     rig, instruments = one_pass
     camera = rig.camera.resized(TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width)))
-    settings, sensors, took = experiment.transport_settings(instruments), [one.sensor for one in instruments], []
+    settings, sensors, took = (
+        experiment.transport_settings(instruments),
+        [instrument.sensor for instrument in instruments],
+        [],
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TruncationWarning)  # the run itself will tell
         for spp in (TRIAL_SPP[0], *TRIAL_SPP):  # the first compiles

@@ -70,12 +70,12 @@ class Experiment:
         limits.check("pixels", (self.width or 1) * (self.height or 1), f"pixels, not {self.width} x {self.height}")
         limits.check("instruments", len(self.instruments), "instruments")
         object.__setattr__(self, "seed", check_seed(self.seed))
-        for one in self.instruments if self.motion else ():
-            period_s = one.timing.frame_period_s
-            if one.exposure_s is not None and 0 < period_s < one.exposure_s:
+        for each in self.instruments if self.motion else ():
+            period_s = each.timing.frame_period_s
+            if each.exposure_s is not None and 0 < period_s < each.exposure_s:
                 raise ValueError(
-                    f"expected exposure_s of {one.name} within its frame_period_s of {period_s:g} s, "
-                    f"got {one.exposure_s:g} s."
+                    f"expected exposure_s of {each.name} within its frame_period_s of {period_s:g} s, "
+                    f"got {each.exposure_s:g} s."
                 )
         names = [i.name for i in self.instruments]
         if not names:

@@ -262,9 +262,9 @@ def _trace(
     with timed(times, f"transport_{number}"):
         if experiment.motion is None:
             return rangesim.transport(scene, rig, [i.sensor for i in instruments], settings, progress=progress)
-        (one,) = instruments
-        timings = {one.sensor: one.timing}
-        return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[one.sensor]
+        (instrument,) = instruments
+        timings = {instrument.sensor: instrument.timing}
+        return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[instrument.sensor]
 
 
 def _fraction(number: int, passes: int, of_pass: float) -> float:

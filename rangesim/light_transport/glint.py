@@ -22,7 +22,7 @@ from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.kernel_launches import Launches, fewest_lanes
+from rangesim.light_transport.kernel_launches import Launches, min_lanes
 from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.sampling import Continued, Seed, of_part, random_stream, stratified
 from rangesim.light_transport.scattering import bounded
@@ -134,7 +134,7 @@ def _sums(
     nearest, total = (np.zeros(len(pixel), np.float32) for _ in range(2))
     radiance = rig.projector_irradiance / (np.pi * radius_m**2)
     accumulators, launches, projector = Accumulators(responses, len(pixel)), Launches(), view.traced.projector
-    for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=fewest_lanes()):
+    for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=min_lanes()):
         some, n = slice(begin, end), end - begin
         lens = Lens(rig, projector, radius_m[some], radiance[some])
         lanes = Lanes(view, pixel[some], paths, begin, first, part)
@@ -272,7 +272,7 @@ def _near_the_lens(
     lens = Lens(rig, view.traced.projector, aperture[:1], aperture[:1])
     nearest, spread = np.empty(len(pixel), np.float32), np.empty(len(pixel), np.float32)
     launches = Launches()
-    for begin, end in launches.ranges(len(pixel), SEGMENTS * PROBES, at_least=fewest_lanes()):
+    for begin, end in launches.ranges(len(pixel), SEGMENTS * PROBES, at_least=min_lanes()):
         some, n = slice(begin, end), end - begin
         lanes, far = Lanes(view, pixel[some], PROBES), dr.full(mi.Float, dr.inf, n)
         state = ProbeState(lanes.start(), far, mi.Float(far), dr.full(mi.Point2f, dr.inf, n))

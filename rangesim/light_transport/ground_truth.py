@@ -54,9 +54,9 @@ def ground_truth(scene: Scene, traced: TracedScene, rig: Rig) -> tuple[GroundTru
         instance_names=tuple(i.name for i in scene.instances),
         material_names=MATERIAL_CLASSES,
     )
-    shares = (instance >= 0) & matte[instance] & (reflectance > 0)
+    is_shared = (instance >= 0) & matte[instance] & (reflectance > 0)
     guides = Guides(
-        np.where(shares, instance, np.int32(-1)), np.stack(position, -1), np.stack(shading_normal, -1), reflectance
+        np.where(is_shared, instance, np.int32(-1)), np.stack(position, -1), np.stack(shading_normal, -1), reflectance
     )
     return truth, guides
 

@@ -123,7 +123,7 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
             if instance[y, x] < 0:
                 weights[y, 4, x] = 1.0
                 continue
-            shares = np.zeros(9, np.bool_)
+            is_shared = np.zeros(9, np.bool_)
             n = sx = sy = sxx = sxy = syy = 0.0
             for k in range(9):
                 dy, dx = k // 3 - 1, k % 3 - 1
@@ -141,7 +141,7 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
                         distance += d * d
                     if cosine < SAME_NORMAL or off * off > OFF_PLANE * OFF_PLANE * distance:
                         continue
-                shares[k] = True
+                is_shared[k] = True
                 n += 1
                 sx += dx
                 sy += dy
@@ -154,7 +154,7 @@ def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # ty
             a, b, c = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
             total = 0.0
             for k in range(9):
-                if shares[k]:
+                if is_shared[k]:
                     weights[y, k, x] = max(0.0, a + b * (k % 3 - 1) + c * (k // 3 - 1))  # no negative light
                     total += weights[y, k, x]
             for k in range(9):

@@ -141,7 +141,7 @@ def evaluate(arrays: Any) -> float:
     return time.perf_counter() - start
 
 
-def fewest_lanes() -> int:
+def min_lanes() -> int:
     """Lanes that keep all of the device busy."""
     return 1 << 18 if mi.variant().startswith("cuda") else max(4096, 512 * dr.thread_count())
 

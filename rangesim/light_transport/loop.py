@@ -35,7 +35,7 @@ from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.caustics import Vertex, caustic_light, gather
 from rangesim.light_transport.device import connect
 from rangesim.light_transport.emitters import emission, emission_through, sampled_emission
-from rangesim.light_transport.kernel_launches import Launches, Report, fewest_lanes
+from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
@@ -72,8 +72,10 @@ class PathSettings(NamedTuple):
     @classmethod
     def of(cls, scene: Scene, settings: TransportSettings) -> PathSettings:
         """Those of a pass."""
-        most, rr = dr.opaque(mi.UInt32, settings.max_depth), dr.opaque(mi.UInt32, settings.rr_depth)
-        return cls(Seed.of(settings.seed), most, rr, has_delta(scene.mitsuba), scene.has_ambient, scene.has_lamps)
+        max_depth, rr_depth = dr.opaque(mi.UInt32, settings.max_depth), dr.opaque(mi.UInt32, settings.rr_depth)
+        return cls(
+            Seed.of(settings.seed), max_depth, rr_depth, has_delta(scene.mitsuba), scene.has_ambient, scene.has_lamps
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +200,7 @@ def trace(
 
     while begin < len(runs):
         per_sample = iterations / finished if finished else ITERATIONS_PER_SAMPLE
-        most = max(fewest_lanes(), int(launches.units / (per_sample * total / pixels))) // NEIGHBOURS
+        most = max(min_lanes(), int(launches.units / (per_sample * total / pixels))) // NEIGHBOURS
         left = len(runs) - begin
         end = begin + -(-left // -(-left // most))  # launches of even size
         places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()

@@ -32,7 +32,7 @@ from rangesim.settings.seeds import derived_seed
 from rangesim.signals import EnergySplit, StillSignals, Truncation
 
 MATTE_SPP, OTHER_SPP = 16, 64
-"""Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
+"""Samples of a pixel that is_shared its indirect light, and of others, where no sensor says how many it needs."""
 PATHS_FRACTION = 0.95
 """Of the progress, that the samples make."""
 TEXTURE_SAMPLES = 64
@@ -153,8 +153,8 @@ class _View:
         elif isinstance(spp, int):
             self.samples = np.full(pixels, spp)
         else:
-            shares = (settings.indirect == "filtered") & (self.guides.instance.ravel() >= 0)
-            self.samples = np.where(shares, MATTE_SPP, OTHER_SPP)
+            is_shared = (settings.indirect == "filtered") & (self.guides.instance.ravel() >= 0)
+            self.samples = np.where(is_shared, MATTE_SPP, OTHER_SPP)
 
     def trace(
         self,
@@ -197,7 +197,7 @@ class _View:
                 estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
         signals = signals_of(None)
         report(1.0)
-        cut = photons.balance.cut if photons else 0.0
+        cut = photons.energy.cut if photons else 0.0
         return signals, estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
 
 
@@ -206,9 +206,11 @@ def _adaptive(
 ) -> AdaptiveSampling | None:
     """How the number of samples follows from readings; None: it does not."""
     if isinstance(settings.spp, AdaptiveSampling):
-        for one in settings.spp.instruments:
-            if missing := set(one.sensor.responses()) - set(responses):
-                raise ValueError(f"expected sensors that have {missing.pop()}, for instrument {one.name!r} of spp.")
+        for instrument in settings.spp.instruments:
+            if missing := set(instrument.sensor.responses()) - set(responses):
+                raise ValueError(
+                    f"expected sensors that have {missing.pop()}, for instrument {instrument.name!r} of spp."
+                )
         return settings.spp
     if settings.spp != "auto" or not settings.sampling_error:
         return None

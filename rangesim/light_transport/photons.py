@@ -77,7 +77,7 @@ class Photons:
     cosine : (n,) float32, of the direction to the geometric normal where it landed.
     map : (n,) int in 0..maps - 1, which of the independent maps a photon belongs to; each alone carries all the power.
     maps : int >= 1, how many there are.
-    balance : EnergyBudget, the mean over the maps.
+    energy : EnergyBudget, the mean over the maps.
     per_pixel : float, photons of all maps sent through each projector pixel that is worth it.
     """
 
@@ -90,7 +90,7 @@ class Photons:
     cosine: np.ndarray
     map: np.ndarray
     maps: int
-    balance: EnergyBudget
+    energy: EnergyBudget
     per_pixel: float
 
 
@@ -139,7 +139,7 @@ def trace_photons(
     total = per_map * maps
     most = max(1, min(memory_bytes // BYTES_PER_PHOTON, MAX_AT_ONCE))
     landed: list[list[np.ndarray]] = []
-    balance = np.zeros(len(EnergyBudget.__dataclass_fields__))
+    energy = np.zeros(len(EnergyBudget.__dataclass_fields__))
     launches = Launches()
     for begin, end in launches.ranges(total, SURFACES_PER_PHOTON, min(most, SUMMED_TOGETHER), at_most=most):
         number = np.arange(begin, end)
@@ -151,11 +151,11 @@ def trace_photons(
         landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])
         blocks = np.arange(0, end - begin, SUMMED_TOGETHER)
         for sums in np.column_stack([np.add.reduceat(x.numpy(), blocks, dtype=np.float64) for x in parts]):
-            balance += sums
+            energy += sums
         report()
     position, direction, flux, u, v, length, cosine, of_map = (np.concatenate(c) for c in zip(*landed, strict=True))
-    total_balance = EnergyBudget(*(balance / maps))
-    return Photons(position, direction, flux, u, v, length, cosine, of_map, maps, total_balance, total / cumulative[-1])
+    mean_budget = EnergyBudget(*(energy / maps))
+    return Photons(position, direction, flux, u, v, length, cosine, of_map, maps, mean_budget, total / cumulative[-1])
 
 
 def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from rangesim.report import palette
 NO_ERROR = -32768
 ERROR_STEP_M = 1e-5
 DEFLATE_LEVEL = 4
-"""The usual 6 makes a page of 7 MB 1 % smaller, in twice the time."""
+"""The default, 6, makes a page of 7 MB 1 % smaller, in twice the time."""
 FAR = 1.5
 """Points beyond this multiple of the farthest true depth are not drawn."""
 

@@ -25,9 +25,9 @@ MAIN_CAUSE = 0.1
 
 @dataclass(frozen=True)
 class Finding:
-    """A short paragraph. lead : its subject, shown first and in bold."""
+    """A short paragraph. subject : what it is about, shown first and in bold."""
 
-    lead: str
+    subject: str
     text: str
 
 

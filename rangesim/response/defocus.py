@@ -29,12 +29,12 @@ def blurred_stripes(x: Any, period: float, sigma: Any, m: Math) -> Any:
     Gaussian's tail. Much blur: mean and harmonics k = 1, 3, 5 of the square wave, each times
     exp(-2 (pi k sigma / P)^2); the seventh is below 2 / (7 pi) exp(-98 (pi SWITCH)^2).
     """
-    turns = x * (1 / period)
-    turns = turns - m.floor(turns)
-    into = 0.25 - m.abs(turns - 0.5)  # periods from the nearest edge, > 0 inside the bright stripe
+    phase = x * (1 / period)
+    phase = phase - m.floor(phase)
+    into = 0.25 - m.abs(phase - 0.5)  # periods from the nearest edge, > 0 inside the bright stripe
     spread = sigma * (1 / period)
     edge = 0.5 + 0.5 * m.erf(into * (ROOT_HALF / m.select(spread > SHARPEST, spread, SHARPEST)))
-    h, c = m.exp(-2 * np.pi**2 * spread * spread), m.cos(2 * np.pi * turns)
+    h, c = m.exp(-2 * np.pi**2 * spread * spread), m.cos(2 * np.pi * phase)
     h4, cc = h * h * h * h, c * c
     h9, h16 = h4 * h4 * h, h4 * h4 * h4 * h4
     third, fifth = 4 * cc - 3, (16 * cc - 20) * cc + 5  # cos 3x and cos 5x, over cos x

@@ -36,15 +36,15 @@ class Phasor(DenseResponse):
         check_fields(self)
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
-        turns = path.path_length_m * (self.modulation_hz / SPEED_OF_LIGHT)
+        phase = path.path_length_m * (self.modulation_hz / SPEED_OF_LIGHT)
         if self.square:
-            return [_triangle(turns, m), _triangle(turns - 0.25, m)]
-        return [m.cos(2 * np.pi * turns), m.sin(2 * np.pi * turns)]
+            return [_triangle(phase, m), _triangle(phase - 0.25, m)]
+        return [m.cos(2 * np.pi * phase), m.sin(2 * np.pi * phase)]
 
 
-def _triangle(turns: Any, m: Math) -> Any:
+def _triangle(phase: Any, m: Math) -> Any:
     """Triangle wave of period 1 with value 1 at 0 and -1 at 1/2."""
-    return 4 * m.abs(turns - m.floor(turns) - 0.5) - 1
+    return 4 * m.abs(phase - m.floor(phase) - 0.5) - 1
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from rangesim.rig import Intrinsics, Rig
 from rangesim.settings.bounds import Bounds, check_number, whole
 from rangesim.settings.config import shown, to_dict
 
-LARGEST = 1e9
+MAX_NUMBER = 1e9
 """Of a number in a calibration file: pixels, millimetres, coefficients."""
 _SHAPES = {
     "img_shape": 2,
@@ -104,9 +104,9 @@ def _read_opencv(path: Path) -> dict[str, np.ndarray]:
             values[name] = np.array(text.split(), dtype=np.float64)
         except ValueError as error:
             raise FileFormatError(f"{path}: matrix {name!r} does not hold numbers.") from error
-        if not (np.abs(values[name]) < LARGEST).all():
+        if not (np.abs(values[name]) < MAX_NUMBER).all():
             raise FileFormatError(
-                f"{path}: expected numbers below {LARGEST:g} in {name!r}, got {shown(values[name].tolist())}."
+                f"{path}: expected numbers below {MAX_NUMBER:g} in {name!r}, got {shown(values[name].tolist())}."
             )
         if values[name].size != size:
             raise FileFormatError(f"{path}: expected {size} numbers in {name!r}, got {values[name].size}.")

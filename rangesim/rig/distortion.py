@@ -70,7 +70,7 @@ NEGLIGIBLE = 1e-100
 
 
 def fold_radius2(coefficients: Sequence[float]) -> float:
-    """Square of the image-plane radius at which the radial polynomial turns round; infinite if it does not.
+    """Square of the image-plane radius at which the radial polynomial folds round; infinite if it does not.
 
     d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6, and its first positive root ends the
     image: what lies beyond would appear where nearer points are already.
@@ -78,5 +78,5 @@ def fold_radius2(coefficients: Sequence[float]) -> float:
     k1, k2, _, _, k3 = coefficients
     slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
     roots = np.roots(np.where(np.abs(slope) < NEGLIGIBLE, 0.0, slope))
-    turns = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return float(turns.min(initial=np.inf))
+    folds = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    return float(folds.min(initial=np.inf))

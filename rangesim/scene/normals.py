@@ -36,8 +36,8 @@ def repeat_normals(scene: Any) -> Any:
         clear = lengths > errors
         loaded = np.array(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
         agrees = np.linalg.norm(sums - lengths[:, None] * loaded, axis=1) <= errors
-        telling = clear & is_exact
-        if not telling.any() or not agrees[telling].all():  # those of the file
+        decisive = clear & is_exact
+        if not decisive.any() or not agrees[decisive].all():  # those of the file
             continue
         normals = np.tile(UNKNOWN, (len(sums), 1))
         normals[clear] = sums[clear] / lengths[clear, None]
