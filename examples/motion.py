@@ -42,7 +42,7 @@ def main() -> None:
         for name, (sensor, timing) in CAMERAS.items():
             # All see the ball at its place in the scene file in the middle of their acquisition
             centred = replace(timing, start_s=-timing.reference_s(sensor, rig.camera))
-            signals = transport_moving(scene, rig, {sensor: centred}, motion, spp=16, max_depth=2)[sensor]
+            signals = transport_moving(scene, rig, {sensor: centred}, motion, spp=8, max_depth=2)[sensor]
             z = decode(expose(signals, sensor)).z
             ball = signals.truth.instance == signals.truth.instance_names.index(BALL)
             error = np.abs(z - signals.truth.z)[ball]

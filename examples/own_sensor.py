@@ -145,9 +145,9 @@ class GateRatio(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        if background.noise2 is None:
+        if background.noise_variance is None:
             return background.floor(self.relative_light)
-        frame = self.content(sensor).ambient * background.ambient + background.noise2
+        frame = self.content(sensor).ambient * background.ambient + background.noise_variance
         return least_signal_for(self.sigmas**2, 1.0, 6 * frame)  # two gates, and twice the frame without the laser
 
     def content(self, sensor: Sensor) -> FrameContent:

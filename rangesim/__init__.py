@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.electronics.detector import Detector as Detector
     from rangesim.electronics.spad import SpadDetector as SpadDetector
     from rangesim.evaluation.comparison import compare as compare
-    from rangesim.light_transport.one_pass import transport as transport
+    from rangesim.light_transport.transport import transport as transport
     from rangesim.light_transport.transport_settings import TransportSettings as TransportSettings
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.rig import Intrinsics as Intrinsics
@@ -77,7 +77,7 @@ _HOME = {
     "load_scene": "rangesim.scene",
     "load_signals": "rangesim.signals.signals_files",
     "look_at": "rangesim.rig",
-    "transport": "rangesim.light_transport.one_pass",
+    "transport": "rangesim.light_transport.transport",
 }
 
 __all__ = sorted(_HOME)

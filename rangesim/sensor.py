@@ -167,13 +167,13 @@ class Background:
     ambient : (h, w) float64, ambient light in a frame that integrates all of it.
     bright : projector light in bright pixels, see `rangesim.capture.bright_level`.
     dark : mean of a frame without light.
-    noise2 : variance of what the detector itself adds to a frame; None for a noise-free capture.
+    noise_variance : variance of what the detector itself adds to a frame; None for a noise-free capture.
     """
 
     ambient: np.ndarray
     bright: float
     dark: float = 0.0
-    noise2: float | None = None
+    noise_variance: float | None = None
 
     def floor(self, fraction: float) -> np.ndarray:
         """(h, w) least signal of a noise-free capture: that fraction of the bright pixels', and more than nothing."""
@@ -235,11 +235,11 @@ def of_type(sensor: Sensor, kind: type[S]) -> S:
     return sensor
 
 
-def least_signal_for(sigmas2: float, signal: float, noise2: np.ndarray) -> np.ndarray:
-    """(h, w) least S with S^2 = `sigmas2` (`signal` S + `noise2`), electrons.
+def least_signal_for(sigmas2: float, signal: float, noise_variance: np.ndarray) -> np.ndarray:
+    """(h, w) least S with S^2 = `sigmas2` (`signal` S + `noise_variance`), electrons.
 
     That is a threshold of so many standard deviations, squared, against the shot noise of a fraction `signal` of the
-    light itself and against all other noise, of variance `noise2`: a quadratic with one positive root.
+    light itself and against all other noise, of variance `noise_variance`: a quadratic with one positive root.
     """
     half = 0.5 * sigmas2 * signal
-    return np.asarray(half + np.sqrt(half**2 + sigmas2 * noise2))
+    return np.asarray(half + np.sqrt(half**2 + sigmas2 * noise_variance))

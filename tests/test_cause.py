@@ -29,7 +29,7 @@ from rangesim import (
 from rangesim.causes import Cause, CauseMap, explain
 from rangesim.causes.cause import DEFINITIONS, TITLES
 from rangesim.causes.light_budget import light_budget, white_radiance
-from rangesim.causes.light_paths import single_path_frames
+from rangesim.causes.reference_frames import single_path_frames
 from rangesim.decoding.status import Status
 from rangesim.response import (
     CAUSTIC,

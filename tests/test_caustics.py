@@ -450,7 +450,6 @@ def test_flux_depends_on_neither_radius_nor_number_of_photons(photons: int, radi
 
 
 def test_levels_change_the_noise_and_not_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    from rangesim.light_transport import loop
 
     scene, rig = ball_over_a_plane()
 
@@ -459,7 +458,7 @@ def test_levels_change_the_noise_and_not_the_mean(monkeypatch: pytest.MonkeyPatc
         return energy.caustic.reshape(4, 16, 4, 16).mean(axis=(1, 3))
 
     with_levels = np.stack([render(s) for s in range(6)])
-    for module in (photon_maps, loop):
+    for module in (photon_maps, caustics):
         monkeypatch.setattr(module, "LEVELS", (Level(np.inf, 1.0, 1.0),))
     without = np.stack([render(s) for s in range(6)])
     # Faint light around the bright spot is blurred more; mirrored parts of the image alike

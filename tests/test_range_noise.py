@@ -15,7 +15,7 @@ from rangesim.errors import SamplingWarning
 from rangesim.evaluation.range_noise import range_noise, robust_sigma, warn_of_sampling
 from rangesim.experiment.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
 from rangesim.experiment.instrument import Instrument
-from rangesim.light_transport.loop import Budget
+from rangesim.light_transport.loop import SampleAllocation
 from rangesim.light_transport.sampling_error import Halves
 
 SMALL_IMAGE: dict[str, Any] = {"width": 96, "height": 72}
@@ -34,7 +34,7 @@ def test_two_halves_have_every_sample_once_and_whole_pairs(first: int) -> None:
     for n in range(3, 70):
         count = np.array([n], np.uint32)
         taken = []
-        for half in Budget(np.arange(1), count, count + first, 1.0, first, part=3).halves():
+        for half in SampleAllocation(np.arange(1), count, count + first, 1.0, first, part=3).halves():
             k = np.arange(half.samples[0])
             taken.append(half.first + (k >> 1) * half.stride + (k & 1))  # as `Lanes.number`
         assert np.array_equal(np.sort(np.concatenate(taken)), first + np.arange(n))

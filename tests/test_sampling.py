@@ -12,7 +12,7 @@ import pytest
 
 from rangesim import AmcwToF, DirectToF, Lens, Signals, StructuredLight, decode, expose, load_scene, transport
 from rangesim.environment.backend import select_variant
-from rangesim.light_transport.indirect import Guides, LightFilter, level_weights, mixed_pixels
+from rangesim.light_transport.indirect_filter import Guides, LightFilter, level_weights, mixed_pixels
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 

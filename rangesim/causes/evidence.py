@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
-from rangesim.causes.light_paths import clean_frames, points_in_projector, single_path_frames
+from rangesim.causes.reference_frames import clean_frames, points_in_projector, single_path_frames
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 NEAR = 2
 """Pixels around an edge pixel, in both directions, that show how its surface fares off the edge."""
-FAINT = 0.1
+DIM = 0.1
 """Less than this fraction of what white paper would return here is little light."""
 DISTURBING = 0.005
 """Fraction of the projector's light, other than direct, from which it can shift a reading by the tolerance."""
@@ -154,10 +154,10 @@ class Evidence:
 
     @cached_property
     def faint(self) -> np.ndarray:
-        """Less direct light than `FAINT` of what a white Lambertian surface would return in this place."""
+        """Less direct light than `DIM` of what a white Lambertian surface would return in this place."""
         rig, normal = self.signals.rig, self.truth.normal[self.failed] @ self.signals.rig.T_world_projector[:3, :3]
         white = white_radiance(rig, self._in_projector, normal)
-        return self._of_failed(self.signals.energy.direct[self.failed] < FAINT * white)
+        return self._of_failed(self.signals.energy.direct[self.failed] < DIM * white)
 
     @cached_property
     def disturbed(self) -> np.ndarray:

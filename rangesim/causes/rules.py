@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a range image and the light that made it to the cause of every failed pixel."""
+"""Rules that name the cause of every failed pixel, from its range image and the light that made it."""
 
 from __future__ import annotations
 

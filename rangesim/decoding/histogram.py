@@ -15,8 +15,8 @@ def find_peak(
     peak's window less the background, background the sum under that window. `is_cyclic`: a window goes on at the
     other end.
     """
+    from rangesim.decoding.histogram_kernels import measure_peaks
     from rangesim.decoding.matched_filter import gaussian_filter
-    from rangesim.decoding.peaks import measure_peaks
 
     filtered = gaussian_filter(histogram, sigma_bins, "wrap" if is_cyclic else "edge") if sigma_bins > 0 else histogram
     place, height, background = np.empty((3, histogram.shape[1]))
@@ -38,7 +38,7 @@ def coates(counts: np.ndarray, pulses: int) -> np.ndarray:
     ----------
     Coates: "The correction for photon 'pile-up' in the measurement of radiative lifetimes", J. Phys. E 1 (1968).
     """
-    from rangesim.decoding.peaks import detected_fraction
+    from rangesim.decoding.histogram_kernels import detected_fraction
 
     fraction = np.empty((len(counts), counts[0].size))
     detected_fraction(counts.reshape(fraction.shape), pulses, fraction)

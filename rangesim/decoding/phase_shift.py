@@ -18,7 +18,7 @@ from rangesim.settings.bounds import Bounds, check_fields
 
 @dataclass(frozen=True)
 class PhaseThresholds:
-    """Phases that count.
+    """Thresholds below which a phase is refused.
 
     max_sigma_rad : a phase with a larger standard deviation is refused, where the detector is known.
     modulation_of_scale : least modulation as a fraction of full scale, for digital captures of unknown detectors.
@@ -38,10 +38,10 @@ class PhaseThresholds:
         With a modulation of `visibility` times S, sigma = sqrt(2 / steps) noise / (visibility S), see `phase_sigma`.
         """
         ambient = content.ambient * background.ambient
-        if background.noise2 is None:
+        if background.noise_variance is None:
             return np.asarray(self.relative_modulation * ambient / visibility)
         sigmas2 = 2.0 / (steps * (visibility * self.max_sigma_rad) ** 2)
-        return least_signal_for(sigmas2, content.signal, ambient + background.noise2)
+        return least_signal_for(sigmas2, content.signal, ambient + background.noise_variance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images band by band: what NumPy makes of a band in between stays in the processor's cache."""
+"""Work on images in bands of rows, so that intermediate arrays stay in the processor's cache."""
 
 from __future__ import annotations
 

@@ -258,7 +258,8 @@ class Detector(PhotoDetector):
         )
 
     def noise_dn(self, dn: np.ndarray) -> np.ndarray:
-        """Standard deviation of a pixel whose mean is `dn`, digital numbers: K^2 sigma_d^2 + 1/12 + K (mu - offset)."""
+        """Standard deviation of a pixel whose mean is `dn`, digital numbers:
+        sqrt(K^2 sigma_d^2 + 1/12 + K (mu - offset))."""
         k = self.gain_dn_e
         shot = k * np.maximum(np.asarray(dn, dtype=np.float32) - self.offset_dn, 0)
         return np.asarray(np.sqrt(np.float32(k**2 * self.read_noise_e**2 + 1 / 12) + shot), dtype=np.float32)

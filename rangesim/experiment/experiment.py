@@ -15,7 +15,7 @@ from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrume
 from rangesim.files.bundled_scenes import scene_names
 from rangesim.files.text_files import read_toml
 from rangesim.motion import Motion
-from rangesim.motion.settings import motion_from_dict
+from rangesim.motion.track import motion_from_dict
 from rangesim.settings.bounds import Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 from rangesim.settings.seeds import check_seed

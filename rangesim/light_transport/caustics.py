@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
-from rangesim.light_transport.indirect import REACH_PX
+from rangesim.light_transport.indirect_filter import REACH_PX
 from rangesim.light_transport.photon_maps import LEVELS, MAX_MAPS, GatheringRadius, PhotonMaps
 from rangesim.light_transport.photons import Photons, has_delta, trace_photons
 from rangesim.light_transport.spectrum import mono

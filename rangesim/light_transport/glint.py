@@ -27,7 +27,7 @@ from rangesim.light_transport.photons import meets_delta
 from rangesim.light_transport.sampling import Continued, Seed, of_part, random_stream, stratified
 from rangesim.light_transport.scattering import bounded
 from rangesim.light_transport.spectrum import mono
-from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, spawn_specular_ray, survival
+from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
@@ -45,13 +45,13 @@ MAX_ENLARGEMENT = 16.0
 MAX_PATHS = 1 << 22
 """Of all pixels together."""
 PATHS_PER_PIXEL = (64, 4096)
-"""Fewest and most."""
+"""Least and largest number."""
 SCREENING, CLOSE = 8, 8.0
 """Fraction of the paths that look first, as its inverse; the others are sent where one of them came so close to the
 centre of the lens, in radii. A lens that one path in 4000 hits has eight of 512 come as close; it is missed by chance
 once in 3000 times."""
 SEGMENTS = 4
-"""Of a path, about."""
+"""Segments of a path, about, on which the size of launches rests."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def trace_glint(
     report: Callable[[], None] = lambda: None,
 ) -> Glint:
     """What the camera of the rig sees of the projector's lens; `report` is called after each kernel launch."""
-    view = View(traced, Seed.of(seed))
+    view = GlintView(traced, Seed.of(seed))
     worth_probing = _worth_probing(traced, rig.camera.height, rig.camera.width)
     pixel, radius_m = _near_the_lens(view, rig, worth_probing, report)
     if len(pixel) == 0:
@@ -110,7 +110,7 @@ def trace_glint(
     )
 
 
-class Sums(NamedTuple):
+class GlintSums(NamedTuple):
     """Sums over paths of n pixels: how near one came to the centre of the lens, in radii of the disc that stands for
     it; radiance; response -> (c, n) channels."""
 
@@ -120,7 +120,7 @@ class Sums(NamedTuple):
 
 
 def _sums(
-    view: View,
+    view: GlintView,
     rig: Rig,
     responses: Sequence[Response],
     pixel: np.ndarray,
@@ -129,19 +129,19 @@ def _sums(
     paths: int,
     part: int,
     report: Callable[[], None],
-) -> Sums:
+) -> GlintSums:
     """Sums over the paths of each pixel from number `first` on; each part has random numbers of its own."""
     nearest, total = (np.zeros(len(pixel), np.float32) for _ in range(2))
     radiance = rig.projector_irradiance / (np.pi * radius_m**2)
     accumulators, launches, projector = Accumulators(responses, len(pixel)), Launches(), view.traced.projector
     for begin, end in launches.ranges(len(pixel), SEGMENTS * paths, at_least=min_lanes()):
         some, n = slice(begin, end), end - begin
-        lens = Lens(rig, projector, radius_m[some], radiance[some])
-        lanes = Lanes(view, pixel[some], paths, begin, first, part)
+        lens = LensDisc(rig, projector, radius_m[some], radiance[some])
+        lanes = GlintLanes(view, pixel[some], paths, begin, first, part)
         state = PathState(
             chain=lanes.start(),
             throughput=dr.ones(mi.Float, n),
-            beam=Beam.start(view.traced._replace(media=None), n),  # boundaries of media end its paths
+            ray_state=RayState.start(view.traced._replace(media=None), n),  # boundaries of media end its paths
             channels=accumulators.zeros(n),
             total=dr.zeros(mi.Float, n),
             nearest=dr.full(mi.Float, dr.inf, n),
@@ -151,10 +151,10 @@ def _sums(
         accumulators.store(state.channels, some)
         total[some], nearest[some] = state.total.numpy(), state.nearest.numpy()
     channels = {r: parts[0] for r, parts in zip(responses, accumulators.images(), strict=True)}
-    return Sums(nearest / radius_m.astype(np.float32), total, channels)
+    return GlintSums(nearest / radius_m.astype(np.float32), total, channels)
 
 
-class View(NamedTuple):
+class GlintView(NamedTuple):
     """What the camera looks into, and the seed of its random numbers."""
 
     traced: TracedScene
@@ -176,12 +176,12 @@ class Chain:
     direction: Any
 
 
-class Lanes:
+class GlintLanes:
     """Pixels at work, a lane for each, and how many paths each of them sends.
 
     Parameters
     ----------
-    view : View
+    view : GlintView
     pixel : (lanes,) int, flat indices.
     paths : int, for each pixel.
     first_place : int, the number of the first pixel in the accumulators.
@@ -189,7 +189,7 @@ class Lanes:
     """
 
     def __init__(
-        self, view: View, pixel: np.ndarray, paths: int, first_place: int = 0, first: int = 0, part: int = 0
+        self, view: GlintView, pixel: np.ndarray, paths: int, first_place: int = 0, first: int = 0, part: int = 0
     ) -> None:
         self.traced, seed = view
         self.pixel, self.paths = mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, paths)
@@ -224,13 +224,13 @@ class PathState:
 
     chain: Chain
     throughput: Any
-    beam: Beam
+    ray_state: RayState
     channels: list[list[Any]]
     total: Any
     nearest: Any
 
 
-class Lens:
+class LensDisc:
     """The projector's lens as the camera may see it: a disc that faces along the projector's axis.
 
     Where a curved mirror makes its image too small for a pixel's paths to hit, a larger and dimmer disc stands for it:
@@ -264,17 +264,17 @@ def _worth_probing(traced: TracedScene, h: int, w: int) -> np.ndarray:
 
 
 def _near_the_lens(
-    view: View, rig: Rig, pixel: np.ndarray, report: Callable[[], None]
+    view: GlintView, rig: Rig, pixel: np.ndarray, report: Callable[[], None]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Those of the pixels whose probes come near the lens, as measured by how far they spread; and for each of them
     the radius in metres of the disc to hit."""
     aperture = np.full(len(pixel), rig.projector_lens.aperture_radius_m)
-    lens = Lens(rig, view.traced.projector, aperture[:1], aperture[:1])
+    lens = LensDisc(rig, view.traced.projector, aperture[:1], aperture[:1])
     nearest, spread = np.empty(len(pixel), np.float32), np.empty(len(pixel), np.float32)
     launches = Launches()
     for begin, end in launches.ranges(len(pixel), SEGMENTS * PROBES, at_least=min_lanes()):
         some, n = slice(begin, end), end - begin
-        lanes, far = Lanes(view, pixel[some], PROBES), dr.full(mi.Float, dr.inf, n)
+        lanes, far = GlintLanes(view, pixel[some], PROBES), dr.full(mi.Float, dr.inf, n)
         state = ProbeState(lanes.start(), far, mi.Float(far), dr.full(mi.Point2f, dr.inf, n))
         state, _ = launches.run(partial(_probe, lanes, lens), state, n, report=lambda state: report())
         nearest[some], spread[some] = state.nearest.numpy(), state.spread.numpy()
@@ -284,7 +284,7 @@ def _near_the_lens(
 
 
 @dr.syntax
-def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[ProbeState, Any]:
+def _probe(lanes: GlintLanes, lens: LensDisc, state: ProbeState, most: Any) -> tuple[ProbeState, Any]:
     """The state after at most so many iterations, and those taken: the least distance at which each pixel's delta paths
     pass the lens's centre, and how far apart they cross its plane (infinite where fewer than two do).
 
@@ -324,16 +324,16 @@ def _probe(lanes: Lanes, lens: Lens, state: ProbeState, most: Any) -> tuple[Prob
 
 @dr.syntax
 def _paths_to_the_lens(
-    lanes: Lanes, lens: Lens, accumulators: Accumulators, state: PathState, most: Any
+    lanes: GlintLanes, lens: LensDisc, accumulators: Accumulators, state: PathState, most: Any
 ) -> tuple[PathState, Any]:
     """The state after at most so many iterations, and those taken: dense channels and radiance of the delta paths
     from each pixel to the lens; bins go to the accumulators."""
     traced, camera = lanes.traced, lanes.traced.camera
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
-    throughput, beam, channels, total, nearest = (
+    throughput, ray_state, channels, total, nearest = (
         state.throughput,
-        state.beam,
+        state.ray_state,
         state.channels,
         state.total,
         state.nearest,
@@ -350,12 +350,12 @@ def _paths_to_the_lens(
         )
         primary = camera.sample_ray(lanes.corner + stratified(lanes.shift, lanes.first + k), on_lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, direction))
-        beam = beam.begun(starts, primary.origin, primary.path_offset)
+        ray_state = ray_state.restarted(starts, primary.origin, primary.path_offset)
         si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False)
 
         # ---- Does this segment meet the lens? --------------------------------------------------------
         across, way, crosses = lens.offset(ray, si)
-        uv, z = lens.projector.project(beam.previous)
+        uv, z = lens.projector.project(ray_state.previous)
         size = lens.projector.size
         nearest = dr.select(crosses, dr.minimum(nearest, dr.norm(across)), nearest)
         meets = crosses & (dr.norm(across) < lens.radius) & (z > 0)
@@ -366,31 +366,31 @@ def _paths_to_the_lens(
             throughput * lens.radiance * lens.projector.relative_illumination(-ray.d) / dr.square(dr.square(cosine))
         )
         radiance = dr.select(meets, radiance * lens.projector.pixel_density(-ray.d), 0)
-        u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, dr.fma(beam.ior, way, beam.length)))
+        u, v, path_length = (dr.select(meets, x, 0) for x in (uv.x, uv.y, dr.fma(ray_state.ior, way, ray_state.length)))
         path = LightPath(u, v, path_length, dr.full(mi.Bool, False, dr.width(k)), mi.UInt32(GLINT))
         channels = accumulators.add(channels, path, radiance, lanes.place, meets)
         total += radiance
 
         # ---- On through delta interactions, or the next path -----------------------------------------
         hit = si.is_valid() & ~meets & ~bounded(traced.media, si)
-        beam.length = beam.length_to(si.p, hit)
+        ray_state.length = ray_state.length_to(si.p, hit)
         if dr.hint(traced.absorbers is not None, mode="scalar"):
-            throughput *= beam.unabsorbed(traced, si.p, hit)
+            throughput *= ray_state.unabsorbed(traced, si.p, hit)
         bs, weight = si.bsdf(ray).sample(
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), hit
         )
         throughput *= mono(weight)
-        beam = beam.refracted(bs, hit).begun(True, si.p, beam.length)
+        ray_state = ray_state.refracted(bs, hit).restarted(True, si.p, ray_state.length)
         ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
         chain += 1
-        chance = survival(chain, throughput * dr.square(beam.ior))
+        chance = survival(chain, throughput * dr.square(ray_state.ior))
         ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
         ends |= rng.next_float32() >= chance
         throughput /= chance
-        beam = beam.beyond(traced, si, ray.d, hit, mi.Bool(False)).ended(traced, ends)
+        ray_state = ray_state.entering(traced, si, ray.d, hit, mi.Bool(False)).reset(traced, ends)
         chain, k = dr.select(ends, 0, chain), dr.select(ends, k + 1, k)
         throughput = dr.select(ends, 1, throughput)
         random, origin, direction = rng.state, ray.o, ray.d
         left -= 1
     at = Chain(random, k, chain, origin, direction)
-    return PathState(at, throughput, beam, channels, total, nearest), most - left
+    return PathState(at, throughput, ray_state, channels, total, nearest), most - left

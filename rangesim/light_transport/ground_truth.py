@@ -11,9 +11,9 @@ import numpy as np
 
 from rangesim.light_transport.cutouts import first_surface
 from rangesim.light_transport.device import connect
-from rangesim.light_transport.indirect import Guides
+from rangesim.light_transport.indirect_filter import Guides
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.loop import Budget, Lanes, PathSettings, View
+from rangesim.light_transport.loop import Lanes, PathSettings, SampleAllocation, View
 from rangesim.light_transport.sampling import in_pairs
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of, table_of
@@ -67,9 +67,9 @@ def mean_reflectance(view: View, settings: PathSettings, rig: Rig, has_cutouts: 
     launches, parts = Launches(), []
     surfaces, camera, shape = view.traced.surfaces, view.traced.camera, (rig.camera.height, rig.camera.width)
     count = np.full(shape[0] * shape[1], samples, np.uint32)
-    budget = Budget(np.arange(len(count)), count, count, rig.projector_irradiance)
+    allocation = SampleAllocation(np.arange(len(count)), count, count, rig.projector_irradiance)
     for begin, end in launches.ranges(len(count), samples):
-        lanes = Lanes(view, settings, budget, np.arange(begin, end))
+        lanes = Lanes(view, settings, allocation, np.arange(begin, end))
         total, sample = dr.zeros(mi.Float, end - begin), dr.zeros(mi.UInt32, end - begin)
         most = dr.opaque(mi.UInt32, samples)
         while sample < most:

@@ -26,7 +26,7 @@ LAUNCH_S = 1.0
 UNWATCHED_LAUNCH_S = 20.0
 """The same where nobody waits: no report of progress, and signals that end the process from a thread of their own."""
 LONGEST = 1.5
-"""After which a launch of a loop should end, its lanes finished or not."""
+"""Times the duration of a launch, after which it ends even if lanes have not finished."""
 FIRST_UNITS = 1 << 21
 """Work of a first launch: as many iterations of a loop, rays or photons."""
 LONGER_WHERE_PREPARED_LONG = 2.0

@@ -39,9 +39,9 @@ from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
 from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
-from rangesim.light_transport.scattering import FAINT, MAX_EVENTS
+from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.spectrum import mono
-from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
+from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import Tally
@@ -51,7 +51,7 @@ from rangesim.scene import Scene
 NEIGHBOURS = 256
 """Pixels in a row that share a launch. Launches take such runs from all over the image: so their times are alike."""
 ITERATIONS_PER_SAMPLE = 2
-"""As long as nothing is known."""
+"""Iterations of the loop that a sample takes, before any were counted."""
 
 
 class PathSettings(NamedTuple):
@@ -79,7 +79,7 @@ class PathSettings(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Budget:
+class SampleAllocation:
     """Samples that some pixels get, and the projector's light.
 
     pixels : (n,) flat indices in the whole image. samples : (n,) uint32, how many of each pixel are taken.
@@ -97,11 +97,11 @@ class Budget:
     stride: int = 2
     part: int = 0
 
-    def of(self, some: slice) -> Budget:
-        """The budget of some of the pixels."""
+    def of(self, some: slice) -> SampleAllocation:
+        """The allocation of some of the pixels."""
         return replace(self, pixels=self.pixels[some], samples=self.samples[some], total=self.total[some])
 
-    def halves(self) -> list[Budget]:
+    def halves(self) -> list[SampleAllocation]:
         """Two budgets that have every second pair of samples each, so that both fill the pixel evenly."""
         pairs, odd = (self.samples + 1) >> 1, self.samples & 1
         return [
@@ -124,11 +124,11 @@ class Radiance(NamedTuple):
     specular: Any
     caustic: Any
     ambient: Any
-    faint: Any
+    smooth_caustic: Any
     """Caustics that were gathered from afar, and are smooth therefore; `caustic` has the others."""
 
 
-class Traced(NamedTuple):
+class PathSums(NamedTuple):
     """Sums over the samples of each pixel, besides channels.
 
     radiance : (6, n) float32, in the order of `Radiance`. tally : (6, n) float32, in the order of `Tally`.
@@ -158,7 +158,7 @@ class State:
     origin: Any
     direction: Any
     throughput: Any
-    beam: Beam
+    ray_state: RayState
     first: Any
     via: Any
     previous_pdf: Any
@@ -181,18 +181,18 @@ class View(NamedTuple):
 def trace(
     view: View,
     settings: PathSettings,
-    budget: Budget,
+    allocation: SampleAllocation,
     accumulators: Accumulators,
     launches: Launches,
     report: Report,
-) -> Traced:
+) -> PathSums:
     """Radiance by kind of path, and what tells how much is left out; channels go to the accumulators.
 
-    The pixels of the budget are those of the accumulators. `report` gets the fraction done.
+    The pixels of the allocation are those of the accumulators. `report` gets the fraction done.
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
-    traced = Traced(*(np.empty((len(kind._fields), pixels), np.float32) for kind in (Radiance, Tally)))
-    samples = budget.samples
+    traced = PathSums(*(np.empty((len(kind._fields), pixels), np.float32) for kind in (Radiance, Tally)))
+    samples = allocation.samples
     total, begin, finished, iterations = int(samples.sum(dtype=np.int64)), 0, 0, 0
 
     def tell(state: State) -> None:
@@ -205,7 +205,7 @@ def trace(
         end = begin + -(-left // -(-left // most))  # launches of even size
         places = (np.sort(runs[begin:end])[:, None] * NEIGHBOURS + np.arange(NEIGHBOURS)).ravel()
         places = places[places < pixels]
-        lanes = Lanes(view, settings, budget, places)
+        lanes = Lanes(view, settings, allocation, places)
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
         accumulators.store(state.channels, places)
@@ -227,19 +227,19 @@ class Lanes:
 
     Parameters
     ----------
-    view, settings, budget : View, PathSettings and Budget.
-    places : (lanes,) int, numbers of the pixels in budget and accumulators. Random numbers depend on a pixel's flat
+    view, settings, allocation : View, PathSettings and SampleAllocation.
+    places : (lanes,) int, numbers of the pixels in allocation and accumulators. Random numbers depend on a pixel's flat
         index in the whole image, the part and the seed alone.
     """
 
-    def __init__(self, view: View, settings: PathSettings, budget: Budget, places: np.ndarray) -> None:
+    def __init__(self, view: View, settings: PathSettings, allocation: SampleAllocation, places: np.ndarray) -> None:
         self.place = mi.UInt32(places.astype(np.uint32))
-        self.pixel = mi.UInt32(budget.pixels[places].astype(np.uint32))
-        self.samples, self.total = mi.UInt32(budget.samples[places]), mi.UInt32(budget.total[places])
+        self.pixel = mi.UInt32(allocation.pixels[places].astype(np.uint32))
+        self.samples, self.total = mi.UInt32(allocation.samples[places]), mi.UInt32(allocation.total[places])
         self.first, self.stride, self.part = (
-            dr.opaque(mi.UInt32, n) for n in (budget.first, budget.stride, budget.part)
+            dr.opaque(mi.UInt32, n) for n in (allocation.first, allocation.stride, allocation.part)
         )
-        self.irradiance = dr.opaque(mi.Float, budget.irradiance)
+        self.irradiance = dr.opaque(mi.Float, allocation.irradiance)
         width = mi.UInt32(view.traced.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
         rng = random_stream(settings.seed, self.pixel)
@@ -276,7 +276,7 @@ def start(view: View, settings: PathSettings, accumulators: Accumulators, at: La
         origin=dr.zeros(mi.Point3f, lanes),  # of the ray
         direction=dr.zeros(mi.Vector3f, lanes),
         throughput=dr.ones(mi.Float, lanes),  # radiance at the camera per radiance along the ray
-        beam=Beam.start(view.traced, lanes),  # from the last vertex on; its length counts from the camera
+        ray_state=RayState.start(view.traced, lanes),  # from the last vertex on; its length counts from the camera
         first=dr.full(mi.Bool, True, lanes),  # no non-delta surface so far
         via=dr.full(mi.Bool, False, lanes),  # some delta surface so far
         previous_pdf=dr.zeros(mi.Float, lanes),  # of the BSDF sample that made the ray; for MIS with ambient light
@@ -303,9 +303,9 @@ def walk(
         state.sample,
     )
     origin, towards = state.origin, state.direction
-    direct, multipath, specular, caustic, ambient, faint = state.radiance
+    direct, multipath, specular, caustic, ambient, smooth_caustic = state.radiance
     at_first, further, before_last, at_last, indirect, cut = state.tally
-    depth, chain, throughput, beam = state.depth, state.chain, state.throughput, state.beam
+    depth, chain, throughput, ray_state = state.depth, state.chain, state.throughput, state.ray_state
     first, via, was_bent = state.first, state.via, state.was_bent
     previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
     events, stays = state.events, state.stays
@@ -330,7 +330,7 @@ def walk(
         jitter, lens = in_pairs(at.shift, at.lens_shift, number, at.total)
         primary = camera.sample_ray(at.corner + jitter, lens)
         ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
-        beam = beam.begun(starts, primary.origin, primary.path_offset)
+        ray_state = ray_state.restarted(starts, primary.origin, primary.path_offset)
         if dr.hint(camera.distortion is not None, mode="scalar"):
             throughput = dr.select(starts & ~primary.exists, 0, throughput)  # no ray, no light
 
@@ -338,9 +338,9 @@ def walk(
         si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
-        si.p = dr.select(was_bent, corrected_point(si, beam.previous, ray.d), met)
+        si.p = dr.select(was_bent, corrected_point(si, ray_state.previous, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
-            scatters, crosses = media.event(beam.inside, beam.previous, ray.d, si, hit, rng.next_float32())
+            scatters, crosses = media.event(ray_state.inside, ray_state.previous, ray.d, si, hit, rng.next_float32())
         at_surface = hit & ~scatters
         # It counts if it scatters the path; whether it does is known when the next direction is
         if dr.hint(media is not None, mode="scalar"):
@@ -349,9 +349,9 @@ def walk(
         else:
             arrives = mi.Bool(True)
             depth += 1
-        beam.length = beam.length_to(si.p, hit)
+        ray_state.length = ray_state.length_to(si.p, hit)
         if dr.hint(absorbers is not None, mode="scalar"):
-            throughput *= beam.unabsorbed(traced, si.p, hit)
+            throughput *= ray_state.unabsorbed(traced, si.p, hit)
         bsdf = si.bsdf(ray)
         may_connect = hit & (depth < settings.max_depth) & (scatters | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
 
@@ -364,7 +364,7 @@ def walk(
         at_last += dr.select(depth + 1 == settings.max_depth, arriving, 0)
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
-        link = connect(scene, projector, si, may_connect, media, beam.inside)
+        link = connect(scene, projector, si, may_connect, media, ray_state.inside)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
@@ -376,14 +376,16 @@ def walk(
         value, bs_weight = mono(value), mono(bs_weight)
         wo = si.to_world(bs.wo)
         if dr.hint(media is not None, mode="scalar"):
-            medium = beam.inside
+            medium = ray_state.inside
             value = dr.select(scatters, medium.albedo * medium.phase(dr.dot(ray.d, link.direction)), value)
             bs_weight = dr.select(scatters, medium.albedo, bs_weight)
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
             wo = dr.select(scatters, medium.scattered(ray.d, xi), wo)
         radiance = dr.select(link.lit, throughput * value * link.geometry * at.irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
-        u, v, path_length = (dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, beam.length + link.distance))
+        u, v, path_length = (
+            dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, ray_state.length + link.distance)
+        )
         kind = dr.select(first, dr.select(via, mi.UInt32(SPECULAR), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
         light = LightPath(u, v, path_length, first, kind, link.blur_px)
         channels = accumulators.add(channels, light, radiance, at.place, link.lit, kind == MULTIPATH)
@@ -394,7 +396,7 @@ def walk(
 
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
-            vertex = Vertex(si, bsdf, throughput, beam.length, first & ~link.lit)
+            vertex = Vertex(si, bsdf, throughput, ray_state.length, first & ~link.lit)
             chosen = at.choice.at(choice)
             xi = [chosen.next_float32() for _ in range(3)]
             choice = chosen.state
@@ -403,38 +405,38 @@ def walk(
             photon, brought, is_wide = gather(maps, vertex, number, xi, chance, gathers)
             channels, radiance = caustic_light(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
             caustic += dr.select(is_wide, 0, radiance)
-            faint += dr.select(is_wide, radiance, 0)
+            smooth_caustic += dr.select(is_wide, radiance, 0)
             indirect += dr.select(is_later, radiance, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
             alone = previous_delta | (not settings.lamps)  # no other strategy finds this light
             before = dr.zeros(mi.Interaction3f, lanes)
-            before.p = beam.previous
+            before.p = ray_state.previous
             ambient += throughput * emission(scene, si, before, previous_pdf, alone, active & ~scatters)
             if dr.hint(settings.lamps, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
                 if dr.hint(media is None, mode="scalar"):
-                    lamp = sampled_emission(traced, bsdf, si, beam, xi, may_connect)
+                    lamp = sampled_emission(traced, bsdf, si, ray_state, xi, may_connect)
                     ambient += throughput * lamp
                 else:
-                    lamp = emission_through(traced, bsdf, si, ray.d, beam, scatters, xi, may_connect)
+                    lamp = emission_through(traced, bsdf, si, ray.d, ray_state, scatters, xi, may_connect)
                     ambient += throughput * lamp
 
         # ---- Next direction --------------------------------------------------------------------------
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         throughput *= bs_weight
-        beam = beam.refracted(bs, at_surface)
+        ray_state = ray_state.refracted(bs, at_surface)
         was_bent = is_delta & ~crosses
         if dr.hint(settings.delta, mode="scalar"):
             depth -= dr.select(was_bent, mi.UInt32(1), mi.UInt32(0))
             chain = dr.select(crosses, chain, dr.select(was_bent, chain + 1, 0))
-        fraction = throughput * dr.square(beam.ior)  # of the light, that this path stands for
+        fraction = throughput * dr.square(ray_state.ior)  # of the light, that this path stands for
         chance = dr.select(depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
             chance = dr.minimum(chance, survival(chain, fraction))
         if dr.hint(media is not None, mode="scalar"):
-            chance = dr.select(scatters, dr.minimum(throughput / FAINT, 1), dr.select(crosses, 1, chance))
+            chance = dr.select(scatters, dr.minimum(throughput / ROULETTE_BELOW, 1), dr.select(crosses, 1, chance))
         survives = rng.next_float32() < chance
         throughput /= chance
         passes = mi.Bool(False)  # through a hole, as if nothing were there
@@ -442,7 +444,7 @@ def walk(
             passes = cutouts.passed(si, bs, at_surface)
         first &= ~scatters & (passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         via |= is_delta & ~passes
-        beam = beam.begun(True, si.p, beam.length)
+        ray_state = ray_state.restarted(True, si.p, ray_state.length)
         previous_pdf = mi.Float(bs.pdf)
         previous_delta = is_delta | scatters
         ray = si.spawn_ray(wo)
@@ -450,7 +452,7 @@ def walk(
         if dr.hint(media is not None, mode="scalar"):
             events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
             stays = scatters | (stays & ~crosses)
-        beam = beam.beyond(traced, si, wo, at_surface, crosses)
+        ray_state = ray_state.entering(traced, si, wo, at_surface, crosses)
 
         # ---- Or next sample --------------------------------------------------------------------------
         # The last surface can only be seen to emit, so it is needed for ambient light alone
@@ -460,7 +462,7 @@ def walk(
             goes_on |= (scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS)
         goes_on &= hit & survives & (throughput > 0)
         if dr.hint(settings.delta, mode="scalar"):
-            cut += dr.select(goes_on & (chain >= MAX_CHAIN), throughput * dr.square(beam.ior), 0)
+            cut += dr.select(goes_on & (chain >= MAX_CHAIN), throughput * dr.square(ray_state.ior), 0)
             goes_on &= chain < MAX_CHAIN
         ends = ~goes_on
         sample = dr.select(ends, sample + 1, sample)
@@ -468,7 +470,7 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             chain = dr.select(ends, 0, chain)
         throughput = dr.select(ends, 1, throughput)
-        beam = beam.ended(traced, ends)
+        ray_state = ray_state.reset(traced, ends)
         first |= ends
         via &= ~ends
         previous_delta |= ends
@@ -485,7 +487,7 @@ def walk(
         choice=choice,
         rotation=rotation,
         channels=channels,
-        radiance=[direct, multipath, specular, caustic, ambient, faint],
+        radiance=[direct, multipath, specular, caustic, ambient, smooth_caustic],
         tally=[at_first, further, before_last, at_last, indirect, cut],
         sample=sample,
         depth=depth,
@@ -493,7 +495,7 @@ def walk(
         origin=origin,
         direction=towards,
         throughput=throughput,
-        beam=beam,
+        ray_state=ray_state,
         first=first,
         via=via,
         previous_pdf=previous_pdf,

@@ -11,14 +11,14 @@ import numpy as np
 
 from rangesim.light_transport.sampling import Continued, Seed, random_stream
 from rangesim.light_transport.spectrum import mono
-from rangesim.light_transport.specular_chain import MAX_CHAIN, Beam, corrected_point, spawn_specular_ray, survival
+from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
 
 LANDING_FRACTION = 0.75
 """Of the photons on a surface that both scatters and mirrors (polished plastic), those that land there."""
 
 
-class Landing(NamedTuple):
+class PhotonDeposit(NamedTuple):
     """Where a photon landed; flux 0 where it did not."""
 
     position: Any
@@ -28,12 +28,12 @@ class Landing(NamedTuple):
     v: Any
     length: Any
     cosine: Any
-    """Of its direction to the geometric normal; its flux is that of so much of a surface that faces it."""
+    """Of its direction to the geometric normal of the surface on which it landed."""
 
 
-def fly(
+def trace_photon_paths(
     traced: TracedScene, pixel: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
-) -> tuple[Landing, tuple[Any, ...]]:
+) -> tuple[PhotonDeposit, tuple[Any, ...]]:
     """Landings of photons sent through projector pixels, and the parts of each that `EnergyBudget` sums up."""
     pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(traced.projector.size.x)
     photon = mi.UInt32(number.astype(np.uint32))
@@ -45,7 +45,7 @@ def fly(
 
 
 @dr.syntax
-def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -> tuple[Landing, tuple[Any, ...]]:
+def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -> tuple[PhotonDeposit, tuple[Any, ...]]:
     """Follow photons through delta interactions until they land, leave, are absorbed, or the chain is too long."""
     lanes, projector, media, absorbers = dr.width(power), traced.projector, traced.media, traced.absorbers
     lens = mi.Point2f(rng.next_float32(), rng.next_float32()) if dr.hint(projector.has_lens, mode="scalar") else None
@@ -54,7 +54,7 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
     if dr.hint(primary.exists is not None, mode="scalar"):
         flux = dr.select(primary.exists, flux, 0)
     emitted = mi.Float(flux)
-    beam = Beam.start(traced, lanes).begun(True, primary.origin, primary.path_offset)
+    ray_state = RayState.start(traced, lanes).restarted(True, primary.origin, primary.path_offset)
     chain = dr.zeros(mi.UInt32, lanes)  # delta interactions so far
     left = max_chain + dr.zeros(mi.UInt32, lanes)  # surfaces and boundaries of media that may still be met
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
@@ -73,20 +73,20 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
         # ---- Next surface ----------------------------------------------------------------------------
         si = traced.surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
-        point = dr.select(chain > 0, corrected_point(si, beam.previous, ray.d), si.p)
+        point = dr.select(chain > 0, corrected_point(si, ray_state.previous, ray.d), si.p)
         if dr.hint(absorbers is not None, mode="scalar"):
-            lost = dr.select(active, flux * (1 - beam.unabsorbed(traced, point, hit)), 0)
+            lost = dr.select(active, flux * (1 - ray_state.unabsorbed(traced, point, hit)), 0)
             flux -= lost
             absorbed += lost
         escaped += dr.select(active & ~hit, flux, 0)
         if dr.hint(media is not None, mode="scalar"):
             crosses = hit & media.bounded_by(si, hit)
-            through = dr.exp(-beam.inside.sigma_t * dr.norm(point - beam.previous))
+            through = dr.exp(-ray_state.inside.sigma_t * dr.norm(point - ray_state.previous))
             lost = dr.select(hit, flux * (1 - through), 0)
             flux -= lost
             direct += dr.select(chain == 0, lost, 0)
             absorbed += dr.select(chain == 0, 0, lost)
-        beam.length = beam.length_to(point, hit)
+        ray_state.length = ray_state.length_to(point, hit)
         bsdf = si.bsdf(ray)
         scatters = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
@@ -114,13 +114,13 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
         absorbed += dr.select(hit & ~(~mirrors & (chain == 0)), flux - remains - dr.select(lands, landing_flux, 0), 0)
         flux = dr.select(active, remains, flux)
         chain += dr.select(goes_on & ~crosses, mi.UInt32(1), mi.UInt32(0))
-        beam = beam.refracted(bs, goes_on).begun(goes_on, point, beam.length)
+        ray_state = ray_state.refracted(bs, goes_on).restarted(goes_on, point, ray_state.length)
         ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
-        beam = beam.beyond(traced, si, ray.d, goes_on, crosses)
+        ray_state = ray_state.entering(traced, si, ray.d, goes_on, crosses)
         left -= dr.select(goes_on | crosses, mi.UInt32(1), mi.UInt32(0))
         truncated += dr.select(goes_on & (left == 0), flux, 0)
         active = goes_on & (left > 0)
         random, origin, towards = rng.state, ray.o, ray.d
 
-    landing = Landing(position, direction, stored, uv.x, uv.y, beam.length, cosine)
+    landing = PhotonDeposit(position, direction, stored, uv.x, uv.y, ray_state.length, cosine)
     return landing, (emitted, direct, stored, absorbed, escaped, truncated)

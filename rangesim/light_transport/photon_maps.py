@@ -114,7 +114,7 @@ class Gathered(NamedTuple):
     irradiance: Any
 
 
-class Reach(NamedTuple):
+class GatherRadius(NamedTuple):
     """How far a gather reaches at a point: radius of the brightest level in the first map, metres; number of the class
     of that radius; and edge of the cells of this class, metres."""
 
@@ -188,7 +188,7 @@ class PhotonMaps:
         self.occupied = [mi.UInt32(_occupancy(*(x[level == i] for x in occupancy_of))) for i in range(len(LEVELS))]
         dr.eval([self.starts, self.points, self.flights, self.shrinkage, *self.occupied])
 
-    def reach(self, point: Any) -> Reach:
+    def reach(self, point: Any) -> GatherRadius:
         """How far photons of the brightest level are gathered around a point."""
         point = mi.Vector3f(point)
         a, b, c, d = self.bounds
@@ -196,9 +196,9 @@ class PhotonMaps:
         radius = dr.fma(b, dr.norm(point - self.projector_at), a)
         radius = dr.maximum(dr.clip(radius, c * from_camera, d * from_camera), MIN_M)
         kind = dr.ceil(dr.log2(radius / self.unit) * CLASSES_PER_OCTAVE)
-        return Reach(radius, mi.UInt32(mi.Int32(kind)), 2 * self.unit * dr.exp2(kind / CLASSES_PER_OCTAVE))
+        return GatherRadius(radius, mi.UInt32(mi.Int32(kind)), 2 * self.unit * dr.exp2(kind / CLASSES_PER_OCTAVE))
 
-    def near(self, level: int, point: Any, reach: Reach, sample: Any, active: Any) -> Any:
+    def near(self, level: int, point: Any, reach: GatherRadius, sample: Any, active: Any) -> Any:
         """Whether there may be photons of a level within its radius, in the map of `sample`."""
         cell = dr.floor((mi.Vector3f(point) - self.origin) / (reach.edge * LEVELS[level].radius))
         index = _hash(*(mi.UInt32(mi.Int32(x)) for x in cell)) + reach.kind * CLASS_PRIME
@@ -209,7 +209,7 @@ class PhotonMaps:
 
     @dr.syntax
     def gather(
-        self, level: int, point: Any, normal: Any, reach: Reach, sample: Any, pick: Any, offset: Any, active: Any
+        self, level: int, point: Any, normal: Any, reach: GatherRadius, sample: Any, pick: Any, offset: Any, active: Any
     ) -> Gathered:
         """Photons of a level around a surface point, in the map of `sample`; `pick`, `offset` are uniform in 0..1."""
         of_map = sample % self.maps

@@ -25,7 +25,7 @@ from scipy.ndimage import binary_dilation
 
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.kernel_launches import Launches
-from rangesim.light_transport.photon_flight import fly
+from rangesim.light_transport.photon_flight import trace_photon_paths
 from rangesim.light_transport.sampling import Seed, Stream, random_stream
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
@@ -34,7 +34,7 @@ from rangesim.scene.media import is_boundary
 DEFENSIVE_FRACTION = 0.05
 """Of the photons, for the pixels where the pre-pass found no delta surface."""
 SURFACES_PER_PHOTON = 2
-"""About."""
+"""Surfaces that a photon meets on average, about, on which the size of launches rests."""
 SUMMED_TOGETHER = 1 << 16
 """Photons whose parts are added up first, so that the sum does not depend on launches."""
 MAX_AT_ONCE = 1 << 20
@@ -145,7 +145,7 @@ def trace_photons(
         number = np.arange(begin, end)
         chosen = stratified_choice(cumulative, number, per_map, shift)
         flux = power_w / (len(pixels) * per_map * fraction[chosen] / cumulative[-1])
-        landing, parts = fly(traced, pixels[chosen], flux, number, seed)
+        landing, parts = trace_photon_paths(traced, pixels[chosen], flux, number, seed)
         launches.evaluate([list(landing), list(parts)], SURFACES_PER_PHOTON * (end - begin))
         kept = np.flatnonzero(landing.flux)
         landed.append([_columns(x)[kept] for x in landing] + [number[kept] // per_map])

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
-from rangesim.light_transport.indirect import CHANNELS_AT_ONCE, LightFilter
+from rangesim.light_transport.indirect_filter import CHANNELS_AT_ONCE, LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Report, report_part
-from rangesim.light_transport.loop import Budget, PathSettings, Radiance, Traced, View, trace
+from rangesim.light_transport.loop import PathSettings, PathSums, Radiance, SampleAllocation, View, trace
 from rangesim.light_transport.truncation import Tally
 from rangesim.response import Response
 from rangesim.rig import Rig
@@ -21,7 +21,7 @@ BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 MIN_FOR_HALVES = 3
 """Samples of a pixel: two and one."""
-SMOOTH = [Radiance._fields.index("multipath"), Radiance._fields.index("faint")]
+SMOOTH = [Radiance._fields.index("multipath"), Radiance._fields.index("smooth_caustic")]
 """Light that neighbouring pixels may share."""
 
 
@@ -38,7 +38,7 @@ class Sums:
         self.smooth: dict[Response, np.ndarray] = {}
         self.radiance = np.zeros((len(Radiance._fields), h, w), np.float32)
 
-    def add(self, pixels: np.ndarray, traced: Traced, accumulators: Accumulators) -> None:
+    def add(self, pixels: np.ndarray, traced: PathSums, accumulators: Accumulators) -> None:
         """Add the sums of pixels with these flat indices, in ascending order."""
         some: slice | np.ndarray = pixels
         if pixels[-1] - pixels[0] + 1 == len(pixels):
@@ -124,19 +124,19 @@ class Estimate:
         """
         first = int(sum(taken.ravel()[pixels[0]] for taken in self.samples))
         samples = samples.astype(np.uint32)
-        whole = Budget(pixels, samples, samples + np.uint32(first), self.irradiance, first, part=self.rounds)
+        whole = SampleAllocation(pixels, samples, samples + np.uint32(first), self.irradiance, first, part=self.rounds)
         parts = whole.halves() if len(self.halves) == 2 else [whole]
         total, done = int(samples.sum(dtype=np.int64)), 0
         for begin, end in self._tiles(len(pixels)):
             for part, sums, taken in zip(parts, self.halves, self.samples, strict=True):
-                budget = part.of(slice(begin, end))
-                of_tile = int(budget.samples.sum(dtype=np.int64))
+                allocation = part.of(slice(begin, end))
+                of_tile = int(allocation.samples.sum(dtype=np.int64))
                 accumulators = Accumulators(self.responses, end - begin, self.keeps_apart)
                 so_far = partial(report_part, report, done / total, of_tile / total)
-                traced = trace(self.view, self.settings, budget, accumulators, self.launches, so_far)
-                sums.add(budget.pixels, traced, accumulators)
-                taken.ravel()[budget.pixels] += budget.samples
-                self.tally.reshape(len(self.tally), -1)[:, budget.pixels] += traced.tally
+                traced = trace(self.view, self.settings, allocation, accumulators, self.launches, so_far)
+                sums.add(allocation.pixels, traced, accumulators)
+                taken.ravel()[allocation.pixels] += allocation.samples
+                self.tally.reshape(len(self.tally), -1)[:, allocation.pixels] += traced.tally
                 done += of_tile
         self.rounds += 1
 
@@ -195,4 +195,6 @@ class Estimate:
 
 def projector_light(radiance: Radiance) -> np.ndarray:
     """All light of the projector, without glint, (h, w)."""
-    return np.asarray(radiance.direct + radiance.multipath + radiance.specular + radiance.caustic + radiance.faint)
+    return np.asarray(
+        radiance.direct + radiance.multipath + radiance.specular + radiance.caustic + radiance.smooth_caustic
+    )

@@ -22,7 +22,7 @@ from rangesim.scene.media import is_boundary, medium_numbers
 
 MAX_EVENTS = 1 << 14
 """Scattering events and crossed boundaries of a path, after which it is cut off; apart from `max_depth`."""
-FAINT = 0.2
+ROULETTE_BELOW = 0.2
 """Throughput below which Russian roulette may end a walk inside a medium."""
 OPAQUE = 30.0
 """Optical thickness that counts as a wall: exp(-30) = 1e-13."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spectra of the renderer: one channel, unpolarised. The one place that says so."""
+"""Spectra of the renderer in kernels: one channel, unpolarised (`rangesim.environment.backend.VARIANTS`)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 """Specular chains: light on its way through glass, off mirrors, through thin panes, coats and holes.
 
 Delta interactions scatter nothing, so they do not count towards `max_depth`; they have a limit of their own, of
-surfaces in a row. Photons, camera paths and glint share it, and walk with the same `Beam`.
+surfaces in a row. Photons, camera paths and glint share it, and walk with the same `RayState`.
 
 Mitsuba's `spawn_ray` starts rays a little off a surface, along its normal: about 0.1 mm at 1 m. So an oblique ray runs
 beside its true line, by a twentieth of a projector pixel or more, and mirrors and glass pass the error on. Starting
@@ -32,7 +32,7 @@ MIN_COSINE = 0.05
 
 
 @dataclass
-class Beam:
+class RayState:
     """What light carries along its ray. Not frozen, so that it can be the state of a loop of Dr.Jit.
 
     previous : Point3f, the vertex that the ray left. length : Float, metres, optical length up to there.
@@ -48,7 +48,7 @@ class Beam:
     sigma_a: Any = None
 
     @classmethod
-    def start(cls, traced: TracedScene, lanes: int) -> Beam:
+    def start(cls, traced: TracedScene, lanes: int) -> RayState:
         """Light in air that has gone no way yet."""
         return cls(
             dr.zeros(mi.Point3f, lanes),
@@ -58,7 +58,7 @@ class Beam:
             None if traced.absorbers is None else dr.zeros(mi.Float, lanes),
         )
 
-    def begun(self, where: Any, origin: Any, length: Any) -> Beam:
+    def restarted(self, where: Any, origin: Any, length: Any) -> RayState:
         """With a new start of the ray `where` it says so; what lies around it is kept."""
         return replace(
             self, previous=dr.select(where, origin, self.previous), length=dr.select(where, length, self.length)
@@ -73,12 +73,12 @@ class Beam:
         distance = dr.select(hit, dr.norm(point - self.previous), ENDLESS)
         return traced.absorbers.transmittance(self.sigma_a, distance, self.inside)
 
-    def refracted(self, bs: Any, where: Any) -> Beam:
+    def refracted(self, bs: Any, where: Any) -> RayState:
         """With the refractive index beyond the surface at which `bs` was sampled."""
         is_transmitted = where & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
         return replace(self, ior=dr.select(is_transmitted, self.ior * bs.eta, self.ior))
 
-    def beyond(self, traced: TracedScene, si: Any, direction: Any, where: Any, crosses: Any) -> Beam:
+    def entering(self, traced: TracedScene, si: Any, direction: Any, where: Any, crosses: Any) -> RayState:
         """With the media that light enters which leaves the surface in a direction; `crosses` : boundaries of media
         that scatter."""
         inside, sigma_a = self.inside, self.sigma_a
@@ -88,12 +88,12 @@ class Beam:
             sigma_a = traced.absorbers.beyond(si, direction, sigma_a, where)
         return replace(self, inside=inside, sigma_a=sigma_a)
 
-    def ended(self, traced: TracedScene, where: Any) -> Beam:
+    def reset(self, traced: TracedScene, where: Any) -> RayState:
         """In air again, without a length, `where` a path ends."""
         inside = None if self.inside is None else self.inside.replaced(where, traced.media.none(dr.width(where)))
         sigma_a = None if self.sigma_a is None else dr.select(where, 0, self.sigma_a)
         length, ior = dr.select(where, 0, self.length), dr.select(where, 1, self.ior)
-        return Beam(self.previous, length, ior, inside, sigma_a)
+        return RayState(self.previous, length, ior, inside, sigma_a)
 
 
 def survival(chain: Any, fraction: Any) -> Any:

@@ -38,7 +38,7 @@ class TransportSettings:
         blurred by about half of it.
     glint : whether the camera sees the projector's lens, in a mirror, through glass or directly.
     indirect : "filtered": neighbouring pixels of a matte surface share their multipath, with a small bias and far less
-        noise (`rangesim.light_transport.indirect`); "raw": the unbiased sum over each pixel's own paths.
+        noise (`rangesim.light_transport.indirect_filter`); "raw": the unbiased sum over each pixel's own paths.
     sampling_error : whether `StillSignals.sampling` is estimated, which takes as much memory again as the signals and
         some time; adaptive sampling needs it.
     memory_bytes : the image is rendered in tiles that keep the renderer's arrays below this size; photons that landed

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which transport passes a set of captures needs: what is taken at equal places of everything shares one."""
+"""Which transport passes a set of captures needs: exposures between which nothing has moved share one."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rangesim.rig import Array, Rig, pose
 from rangesim.settings.bounds import Bounds, Coordinate, check_fields
-from rangesim.settings.config import Named, nearest, shown, to_dict
+from rangesim.settings.config import Named, check_keys, from_dict, nearest, shown, to_dict
 
 Rate = Annotated[float, Bounds("a rate per second", -1e6, 1e6)]
 
@@ -185,3 +186,25 @@ def apply(T: ArrayLike, points: np.ndarray) -> np.ndarray:
     """Points (..., 3) under a rigid transform (4, 4)."""
     matrix = np.asarray(T)
     return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+# ---- Motion as plain data, as in experiment files --------------------------------------------------------
+
+
+def motion_from_dict(data: Any, place: str = "motion") -> Motion:
+    """The motion of a table `objects`, a track for each shape name, and a track `rig`; both may be left out.
+
+    A track is a table with a `type`: "constant-twist" (`ConstantTwist`) or "poses" (`PoseTrack`).
+
+    Raises
+    ------
+    ValueError
+        Unknown keys or kinds of track, or values that a track refuses; the message names the place.
+    """
+    if not isinstance(data, Mapping) or not isinstance(data.get("objects", {}), Mapping):
+        raise ValueError(f"{place}: expected a table of settings, got {shown(data)}.")
+    check_keys(data, ("objects", "rig"), place)
+    read = partial(from_dict, Track)  # type: ignore[type-abstract]
+    objects = {name: read(table, f"{place}.objects.{name}") for name, table in data.get("objects", {}).items()}
+    rig = data.get("rig")
+    return Motion(objects, None if rig is None else read(rig, f"{place}.rig"))

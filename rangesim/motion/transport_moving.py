@@ -65,7 +65,7 @@ def transport_moving(
         No such shape, one that cannot be moved, or what `transport` refuses.
     """
     from rangesim.experiment.adaptive_sampling import AdaptiveSampling
-    from rangesim.light_transport.one_pass import transport
+    from rangesim.light_transport.transport import transport
     from rangesim.light_transport.transport_settings import chosen
     from rangesim.scene.rigid_motion import MovingScene
 

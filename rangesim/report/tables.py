@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
+from rangesim.evaluation.comparison import OUTLIER_M
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
 from rangesim.experiment.result_files import Measurement
@@ -44,7 +45,7 @@ COLUMNS = (
     Column("median_abs_m", "median error", "mm", "median of |z − true z|"),
     Column("rmse_m", "RMSE", "mm", "root mean square of z − true z"),
     Column("p95_abs_m", "95\N{NO-BREAK SPACE}% within", "mm", "95th percentile of |z − true z|"),
-    Column("outlier_rate", "outliers", "%", "fraction of the measurements off by more than 10 mm"),
+    Column("outlier_rate", "outliers", "%", f"fraction of the measurements off by more than {1e3 * OUTLIER_M:g} mm"),
     Column("flying_rate", "flying", "%", "fraction of the measurements at depth edges that lie on neither side"),
 )
 

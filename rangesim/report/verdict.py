@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rangesim.evaluation.comparison import OUTLIER_M
 from rangesim.experiment.result_files import Measurement
 from rangesim.report.tables import (
     Rows,
@@ -59,7 +60,7 @@ def _failures(rows: Rows) -> str:
     parts: list[str] = []
     for row in rows:
         if row["material"] != "all" and is_unreliable(row):
-            limit = "" if parts else f" by over {_glued('10 mm')}"
+            limit = "" if parts else f" by over {_glued(f'{1e3 * OUTLIER_M:g} mm')}"
             missing, wrong = _percent(missing_fraction(row), 0), _percent(row["outlier_rate"], 0)
             found = f"{missing} missing, {wrong} of the rest wrong{limit}"
             parts.append(f"{row['material']} ({found})")

@@ -25,7 +25,7 @@ from rangesim.settings.bounds import HERTZ, Bounds, Hertz, check_fields, check_n
 MAX_RANGE_M = 100.0
 """Ranges beyond are not searched by phase unwrapping, even if the frequencies were unambiguous farther out."""
 TAPS_DEG = (0, 90, 180, 270)
-"""Delays of the taps of each frequency, in degrees of its phase."""
+"""Delays of the taps of each frequency, in degrees of its phase; `frames` and `tap_phase` are for quarter turns."""
 RELATIVE_SIGNAL = 1e-4
 """Light of noise-free captures that counts as none, as a fraction of that of the bright pixels."""
 
@@ -86,10 +86,11 @@ class AmcwToF(Sensor):
 
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
         offset = white + ambient
-        taps = ((s * self.contrast, c[i]) for c in channels for s, i in ((1, 0), (1, 1), (-1, 0), (-1, 1)))
         result = np.empty((self.n_frames, *offset.shape), dtype=np.float32)
-        for frame, (factor, phasor) in zip(result, taps, strict=True):
-            np.multiply(0.5, offset + factor * phasor, out=frame, casting="same_kind")
+        taps = ((phasor, tap) for phasor in channels for tap in TAPS_DEG)
+        for frame, (phasor, tap) in zip(result, taps, strict=True):
+            axis, sign = tap // 90 % 2, 1 - tap // 180 * 2  # cos or sin of the phase, and its sign
+            np.multiply(0.5, offset + sign * self.contrast * phasor[axis], out=frame, casting="same_kind")
         return result
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:
@@ -189,7 +190,7 @@ class AmcwDecoder(Decoder):
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
         visibility = of_type(sensor, AmcwToF).contrast / 2
         least = self.phase.least_signal(len(TAPS_DEG), visibility, self.content(sensor), background)
-        if background.noise2 is None:
+        if background.noise_variance is None:
             least = np.maximum(least, background.floor(RELATIVE_SIGNAL))
         return least
 

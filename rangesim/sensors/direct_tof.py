@@ -203,7 +203,7 @@ class DirectToFDecoder(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        if background.noise2 is None:
+        if background.noise_variance is None:
             return background.floor(self.relative_peak)
         window, bins = _window_bins(of_type(sensor, DirectToF)), of_type(sensor, DirectToF).bins
         return self._least_counts(window * (background.dark + background.ambient / bins))

@@ -227,11 +227,15 @@ class StructuredLightDecoder(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        sensor, ambient, noise2 = of_type(sensor, StructuredLight), background.ambient, background.noise2
-        if noise2 is None:
+        sensor, ambient, noise_variance = (
+            of_type(sensor, StructuredLight),
+            background.ambient,
+            background.noise_variance,
+        )
+        if noise_variance is None:
             least = background.floor(self.gray.relative_contrast)
         else:  # white - black holds the noise of two frames
-            least = least_signal_for(self.gray.contrast_sigmas**2, 1.0, 2 * (ambient + noise2))
+            least = least_signal_for(self.gray.contrast_sigmas**2, 1.0, 2 * (ambient + noise_variance))
         if sensor.code == "gray-phase":
             least = np.maximum(least, self.phase.least_signal(sensor.steps, 0.5, FrameContent(), background))
         return least

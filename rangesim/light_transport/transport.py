@@ -15,7 +15,7 @@ from rangesim.light_transport.caustics import caustic_maps, caustic_photons
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
-from rangesim.light_transport.indirect import LightFilter
+from rangesim.light_transport.indirect_filter import LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Progress, Report, raised_as_it_is, report_part
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.photons import Photons
@@ -32,7 +32,7 @@ from rangesim.settings.seeds import derived_seed
 from rangesim.signals import EnergySplit, StillSignals, Truncation
 
 MATTE_SPP, OTHER_SPP = 16, 64
-"""Samples of a pixel that is_shared its indirect light, and of others, where no sensor says how many it needs."""
+"""Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
 PATHS_FRACTION = 0.95
 """Of the progress, that the samples make."""
 TEXTURE_SAMPLES = 64
@@ -110,7 +110,7 @@ def transport(
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     adaptive = _adaptive(settings, sensors, responses)
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
-    views = [_View(scene, traced, one, settings, adaptive, number) for number, one in enumerate(rigs)]
+    views = [_CameraPass(scene, traced, one, settings, adaptive, number) for number, one in enumerate(rigs)]
     fewest = min(int(view.samples.min()) for view in views)
     at_work = partial(report, 0.0)
     photons = caustic_photons(traced, rigs[0], settings, fewest, at_work)
@@ -123,7 +123,7 @@ def transport(
     return signals[0] if isinstance(rig, Rig) else signals
 
 
-class _View:
+class _CameraPass:
     """What one camera sees, before and after its light is traced.
 
     Parameters
@@ -229,7 +229,7 @@ def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Gl
         direct=radiance.direct,
         multipath=radiance.multipath,
         specular=radiance.specular,
-        caustic=radiance.caustic + radiance.faint,
+        caustic=radiance.caustic + radiance.smooth_caustic,
         glint=highlights[0],
         ambient=radiance.ambient,
     )
