@@ -27,7 +27,7 @@ from delta_scenes import (
 import rangesim
 from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight, transport
 from rangesim.environment.backend import select_variant
-from rangesim.light_transport import photon_maps
+from rangesim.light_transport import caustics, photon_maps
 from rangesim.light_transport.photon_maps import ALPHA, GatheringRadius, Level, radii_of_maps
 from rangesim.light_transport.photons import EnergyBudget, Photons, shift_of, stratified_choice, trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
