@@ -17,7 +17,7 @@ import argparse
 import hashlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import astuple, fields, replace
 from pathlib import Path
 from typing import Any
@@ -145,15 +145,13 @@ def of_motion() -> Iterator[tuple[str, Any]]:
             yield from ((f"motion/{key}/{k}", v) for k, v in of_readings(signals, one, True))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+def compared(description: str, values: Iterable[tuple[str, Any]]) -> None:
+    """Write or compare digests of named values, as the command line asks; ends the process."""
+    parser = argparse.ArgumentParser(description=description.partition("\n")[0])
     parser.add_argument("--out", type=Path, help="write the digests to this file")
     parser.add_argument("--against", type=Path, help="compare with the digests of this file")
     options = parser.parse_args()
-    found: dict[str, str] = {}
-    for name in NAMES:
-        found |= {k: digest(v) for k, v in of_scene(name)}
-    found |= {k: digest(v) for k, v in (*of_media(), *of_motion())}
+    found = {name: digest(value) for name, value in values}
     if options.out:
         options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     before = json.loads(options.against.read_text(encoding="utf-8")) if options.against else found
@@ -163,5 +161,12 @@ def main() -> None:
     sys.exit(1 if differ else 0)
 
 
+def all_values() -> Iterator[tuple[str, Any]]:
+    for name in NAMES:
+        yield from of_scene(name)
+    yield from of_media()
+    yield from of_motion()
+
+
 if __name__ == "__main__":
-    main()
+    compared(__doc__ or "", all_values())
