@@ -29,7 +29,7 @@ SLOW_MACHINE = 2.5
 
 LONG = {
     "many pixels": ("tabletop.xml", "width=1920, height=1440", "spp=4096, photons=0, glint=False"),
-    "many samples": ("tabletop.xml", "width=64, height=48", "spp=10_000_000, photons=0, glint=False"),
+    "many samples": ("tabletop.xml", "width=64, height=48", "spp=1_000_000, photons=0, glint=False"),
     "deep paths": ("cornell.xml", "width=160, height=120", "spp=100_000, max_depth=64, rr_depth=64"),
     "many photons": ("tabletop.xml", "width=64, height=48", "spp=1, photons=100_000_000"),
 }

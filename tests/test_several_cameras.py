@@ -12,7 +12,21 @@ import numpy as np
 import pytest
 
 import rangesim
-from rangesim import IdealToF, Intrinsics, Lens, Rig, Scene, StructuredLight, decode, expose, look_at, transport
+from rangesim import (
+    IdealToF,
+    Intrinsics,
+    Lens,
+    Rig,
+    Scene,
+    StructuredLight,
+    compare,
+    decode,
+    explain,
+    expose,
+    look_at,
+    transport,
+)
+from rangesim.errors import TruncationWarning
 from rangesim.light_transport import caustics
 from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings
 from rangesim.rig import translation
@@ -111,13 +125,59 @@ def test_the_adaptive_number_of_samples_is_each_camera_s_own(tabletop: Scene) ->
         (lambda a, b: [], "expected one Rig or more"),
         (lambda a, b: [a, 3], "expected one Rig or more"),
         (lambda a, b: 3, "or a list of them, got int"),
-        (lambda a, b: [a, replace(b, projector_power_w=2.0)], "expected rigs that share their emitter"),
+        (lambda a, b: [a, replace(b, projector_power_w=2.0)], "rig 1 has another projector_power_w than rig 0"),
+        (lambda a, b: [a, b, replace(b, T_world_camera=np.eye(4))], "rig 2 has another T_world_projector than rig 0"),
     ],
 )
 def test_what_is_no_rig_with_several_cameras_is_refused(tabletop: Scene, rigs: Any, message: str) -> None:
     given: Sequence[Rig] = rigs(*pair(tabletop))
     with pytest.raises(ValueError, match=message):
         transport(tabletop, given, [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.full((4, 4), np.nan),), "expected T_camera_other to hold finite numbers"),
+        ((np.eye(4)[:3],), r"expected T_camera_other to be a \(4, 4\) matrix, got shape \(3, 4\)"),
+        ((2 * np.eye(4),), "expected T_camera_other to be rigid"),
+        ((np.eye(4), 0), "expected intrinsics as Intrinsics, got 0"),
+        ((np.eye(4), None, 0.02), "expected lens as Lens, got 0.02"),
+    ],
+)
+def test_what_makes_no_camera_is_refused_by_name(tabletop: Scene, arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        tabletop.rig(width=16).with_camera(*arguments)
+
+
+def test_emitters_apart_are_told_apart_far_from_the_origin(tabletop: Scene) -> None:
+    rig = tabletop.rig(width=16)
+    far = replace(rig, T_world_camera=translation(5e6, 0, 0) @ rig.T_world_camera)
+    assert far.with_camera(look_at((0.1, 0, 0), (0, 0, 0.8), (0, -1, 0))).shares_emitter(far)
+    assert not replace(far, T_world_camera=translation(1e-3, 0, 0) @ far.T_world_camera).shares_emitter(far)
+
+
+def test_cameras_mixed_up_are_noticed() -> None:
+    scene = rangesim.load_scene(SCENES / "plane.xml")
+    rig = scene.rig(projector_size=(160, 100), width=32)
+    rigs = [rig, rig.with_camera(translation(0.05, 0, 0))]
+    sensor = StructuredLight(160, 100)
+    left, right = transport(scene, rigs, [sensor], spp=2, max_depth=2)
+    capture = expose(left, sensor)
+    image = decode(capture)
+    assert compare(image, left).row("all").outlier_rate < 0.1
+    with pytest.raises(ValueError, match="signals that the range image comes from, got those of a camera elsewhere"):
+        compare(image, right)
+    with pytest.raises(ValueError, match="exposed from these signals, got that of a camera elsewhere"):
+        explain(image, capture, right)
+
+
+def test_the_warning_of_light_left_out_says_of_which_camera() -> None:
+    scene = rangesim.load_scene(SCENES / "corner.xml")
+    rig = scene.rig(width=16)
+    with pytest.warns(TruncationWarning) as caught:
+        transport(scene, [rig, rig.with_camera(translation(0.01, 0, 0))], [], spp=16, max_depth=3, glint=False)
+    assert sorted("of camera 0" in str(w.message) for w in caught) == [False, True]
 
 
 # ---- Settings of a pass -------------------------------------------------------------------------------
@@ -146,6 +206,13 @@ def test_settings_and_options_mean_the_same(tabletop: Scene) -> None:
         ({"seed": -1}, "seed"),
         ({"glint": 1}, "expected glint to be true or false"),
         ({"memory_bytes": 0}, "expected memory_bytes"),
+        ({"spp": np.array([2, 3])}, "expected spp to be a whole number"),
+        ({"spp": 2**32}, "expected at most 1000000"),
+        ({"max_depth": 10**40}, "expected at most 10000"),
+        ({"photons": 2**40}, "expected at most 1000000000"),
+        ({"settings": {"spp": 2}}, "expected settings as TransportSettings, got {'spp': 2}"),
+        ({"settings": {}}, "expected settings as TransportSettings, got {}"),
+        ({"progress": 3}, "expected progress as a function, got 3"),
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(tabletop: Scene, options: dict[str, Any], message: str) -> None:

@@ -55,6 +55,8 @@ def explain(
             f"expected image and capture of shape {shape} as the signals, got {image.z.shape} and "
             f"{capture.frames.shape[1:]}."
         )
+    if capture.rig is not None and not capture.rig.shares_camera_pose(signals.rig):
+        raise ValueError("expected a capture that was exposed from these signals, got that of a camera elsewhere.")
     if not tolerance_m > 0:
         raise ValueError(f"expected a positive tolerance_m in metres, got {tolerance_m}.")
     evidence = Evidence(image, capture, signals, tolerance_m)

@@ -11,6 +11,7 @@ import numpy as np
 
 from rangesim.decoding.range_image import RangeImage
 from rangesim.evaluation.depth_edges import depth_edges
+from rangesim.rig import is_same_pose
 from rangesim.settings.config import ShortRepr
 from rangesim.signals import GroundTruth, Signals
 
@@ -110,7 +111,10 @@ def compare(image: RangeImage, truth: GroundTruth | Signals, outlier_m: float = 
     (2008); there detected from the image alone, here against the true depths.
     """
     if isinstance(truth, Signals):
+        there = truth.rig.T_world_camera
         truth = truth.truth
+        if image.T_world_camera is not None and not is_same_pose(image.T_world_camera, there):
+            raise ValueError("expected the signals that the range image comes from, got those of a camera elsewhere.")
     if image.z.shape != truth.z.shape:
         raise ValueError(f"expected ground truth of shape {image.z.shape} as the image, got {truth.z.shape}.")
     if not outlier_m > 0:

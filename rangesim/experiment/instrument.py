@@ -105,6 +105,10 @@ def instrument_from_dict(table: Any, place: str, files_in: Path | None = None) -
     if not isinstance(table, Mapping):
         raise ValueError(f"{place}: expected a table of settings, got {shown(table)}.")
     values = dict(table)
+    if "optics" in values:
+        raise ValueError(
+            f"{place}: expected tables camera_lens and projector_lens in place of optics, see docs/optics.md."
+        )
     check_keys(values, [f.name for f in fields(Instrument)], place)
     given, sensor = values.get("sensor"), None
     if given is not None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Unpack, overload
+from typing import Any, Unpack, overload
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def transport(
     """
     rigs = [rig] if isinstance(rig, Rig) else rig
     settings = chosen(settings, options)
-    _check(scene, rigs, sensors)
+    _check(scene, rigs, sensors, progress)
     report, launches = Progress(progress), Launches(is_watched=progress is not None)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     adaptive = _adaptive(settings, sensors, responses)
@@ -118,7 +118,8 @@ def transport(
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))
         one, truncation = view.trace(responses, photons, adaptive, launches, part)
-        warn_of_truncation(truncation, settings.max_depth, stacklevel=3)  # where `transport` was called
+        of = f" of camera {number}" if len(views) > 1 else ""
+        warn_of_truncation(truncation, settings.max_depth, of, stacklevel=3)  # where `transport` was called
         signals.append(replace(one, truncation=truncation))
     return signals[0] if isinstance(rig, Rig) else signals
 
@@ -235,15 +236,21 @@ def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Gl
     )
 
 
-def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Response]) -> None:
+def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Response], progress: Any) -> None:
     if not isinstance(scene, Scene):
         raise ValueError(f"expected a Scene, as load_scene returns, got {type(scene).__name__}.")
     if not isinstance(rigs, Sequence):
         raise ValueError(f"expected a Rig, as scene.rig() returns, or a list of them, got {type(rigs).__name__}.")
     if not rigs or not all(isinstance(rig, Rig) for rig in rigs):
         raise ValueError(f"expected one Rig or more, got {shown(list(rigs))}.")
-    if not all(rig.shares_emitter(rigs[0]) for rig in rigs):
-        raise ValueError("expected rigs that share their emitter, and differ in their cameras alone.")
+    for number, rig in enumerate(rigs):
+        if differ := rigs[0].differences_of_emitter(rig):
+            raise ValueError(
+                f"expected rigs that share their emitter, as of `Rig.with_camera`; rig {number} has another "
+                f"{', another '.join(differ)} than rig 0."
+            )
+    if progress is not None and not callable(progress):
+        raise ValueError(f"expected progress as a function, got {shown(progress)}.")
     if not isinstance(sensors, Sequence) or not all(isinstance(s, (Sensor, Response)) for s in sensors):
         raise ValueError(f"expected a list of sensors, for example [StructuredLight()], got {sensors!r}.")
     for sensor in sensors:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, TypedDict
 
 from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.settings.bounds import Bounds, check_fields, whole
-from rangesim.settings.config import check_keys
+from rangesim.settings.config import check_keys, shown
 from rangesim.settings.seeds import check_seed
 
 Indirect = Literal["filtered", "raw"]
@@ -23,8 +23,8 @@ class TransportSettings:
     ----------
     spp : int >= 1, samples (camera paths) per pixel. Or AdaptiveSampling: 8, and then up to 64, as many as it takes
         until the renderer's noise in the readings of its instruments is small against that of their detectors. "auto":
-        this, for the sensors with their default detectors; for bare responses, 16 where pixels share their indirect
-        light and 64 elsewhere.
+        this, for the sensors with their default detectors; for bare responses, and without `sampling_error`, 16 where
+        pixels share their indirect light and 64 elsewhere.
     max_depth : int >= 1, segments of a path between surfaces that scatter it, up to the light: 2 is direct light alone,
         as in Mitsuba. Delta interactions (glass, mirrors, thin panes, coats, holes) do not count; they have a limit of
         their own, `rangesim.light_transport.specular_chain.MAX_CHAIN` in a row.
@@ -50,11 +50,11 @@ class TransportSettings:
         A setting is out of its range, or adaptive sampling has no sampling error to go by.
     """
 
-    spp: Annotated[int, whole(1)] | Literal["auto"] | AdaptiveSampling = "auto"
-    max_depth: Annotated[int, whole(1)] = 5
-    rr_depth: Annotated[int, whole(1)] = 5
+    spp: Annotated[int, whole(1, "spp")] | Literal["auto"] | AdaptiveSampling = "auto"
+    max_depth: Annotated[int, whole(1, "depth")] = 5
+    rr_depth: Annotated[int, whole(1, "depth")] = 5
     seed: int = 0
-    photons: Annotated[int, whole(0)] = PHOTONS
+    photons: Annotated[int, whole(0, "photons")] = PHOTONS
     caustic_radius_m: Annotated[float, Bounds("metres of at least 1e-06", 1e-6)] | None = None
     glint: bool = True
     indirect: Indirect = "filtered"
@@ -86,4 +86,8 @@ class TransportOptions(TypedDict, total=False):
 def chosen(settings: TransportSettings | None, options: TransportOptions) -> TransportSettings:
     """The settings, or the defaults, with some changed; ValueError names one that is not there or out of its range."""
     check_keys(options, [f.name for f in fields(TransportSettings)], "options")
-    return replace(settings or TransportSettings(), **options)
+    if settings is None:
+        settings = TransportSettings()
+    if not isinstance(settings, TransportSettings):
+        raise ValueError(f"expected settings as TransportSettings, got {shown(settings)}.")
+    return replace(settings, **options)

@@ -70,12 +70,12 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
     return Truncation(*(float(x) for x in parts / total)) if total else Truncation(0.0 * by_depth, 0.0, 0.0)
 
 
-def warn_of_truncation(truncation: Truncation, max_depth: int, stacklevel: int) -> None:
-    """Warn if a pass left out more than `WORTH_A_WARNING`."""
+def warn_of_truncation(truncation: Truncation, max_depth: int, of: str, stacklevel: int) -> None:
+    """Warn if a pass left out more than `WORTH_A_WARNING`; `of` says of which camera, if there are several."""
     if truncation.total <= WORTH_A_WARNING:
         return
     why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
     if not truncation.depth > truncation.chains + truncation.photons:
         why = f"it meets more than {MAX_CHAIN} surfaces of glass and mirrors in a row"
-    text = f"about {truncation.total:.0%} of the projector's light is left out: {why}."
+    text = f"about {truncation.total:.0%} of the projector's light is left out{of}: {why}."
     warnings.warn(TruncationWarning(text, truncation.total), stacklevel=stacklevel + 1)

@@ -26,6 +26,8 @@ from rangesim.settings.config import from_dict, shown, to_dict
 
 Array = NDArray[np.float64]
 
+SAME_PLACE = 1e-5
+"""Metres and radians; emitters no farther apart are in one place."""
 RESIDUAL_PX = 1e-3
 """Where the inverse of a lens model reprojects worse than this, there is none."""
 
@@ -137,8 +139,10 @@ def pose(matrix: ArrayLike, name: str) -> Array:
         result: Array = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"expected {name} to be a (4, 4) matrix, got {shown(matrix)}.") from None
-    if result.shape != (4, 4) or not np.isfinite(result).all():
-        raise ValueError(f"expected {name} to be a finite (4, 4) matrix, got shape {result.shape}.")
+    if result.shape != (4, 4):
+        raise ValueError(f"expected {name} to be a (4, 4) matrix, got shape {result.shape}.")
+    if not np.isfinite(result).all():
+        raise ValueError(f"expected {name} to hold finite numbers, got {result.tolist()}.")
     if np.abs(result).max() > MAX_COORDINATE_M:
         raise ValueError(f"expected {name} to move by at most {MAX_COORDINATE_M:g} m, got {np.abs(result).max():g}.")
     rotation = result[:3, :3]
@@ -147,6 +151,11 @@ def pose(matrix: ArrayLike, name: str) -> Array:
         raise ValueError(f"expected {name} to be rigid (a rotation and metres of translation), got {result.tolist()}.")
     result.setflags(write=False)
     return result
+
+
+def is_same_pose(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two poses (4, 4) differ by no more than `SAME_PLACE`."""
+    return bool(np.abs(np.linalg.inv(first) @ second - np.eye(4)).max() <= SAME_PLACE)
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
@@ -246,8 +255,10 @@ class Rig:
         if isinstance(data, Mapping):
             values = {key: value for key, value in data.items() if key not in _FLAT}
             for key in data.keys() & _FLAT.keys():
-                device, setting = _FLAT[key]
-                values[device] = {**values.get(device, {}), setting: data[key]}
+                lens, setting = _FLAT[key]
+                if not isinstance(values.setdefault(lens, {}), Mapping):
+                    raise ValueError(f"{where}.{lens}: expected a table of settings, got {shown(values[lens])}.")
+                values[lens] = {**values[lens], setting: data[key]}
             data = values
         return from_dict(cls, data, where)
 
@@ -258,23 +269,42 @@ class Rig:
 
         Parameters
         ----------
-        T_camera_other : (4, 4) float64, maps the other camera's coordinates to those of this one, metres.
+        T_camera_other : (4, 4) float64, maps the other camera's coordinates to those of this one, metres. One 0.1 m
+            to the right that looks at the same point 0.8 m away: ``look_at((0.1, 0, 0), (0, 0, 0.8), (0, -1, 0))``.
         intrinsics, lens : of the other camera; None: as this one's.
+
+        Raises
+        ------
+        ValueError
+            The matrix is not rigid, or intrinsics or lens are something else.
         """
         T = pose(T_camera_other, "T_camera_other")
+        for name, value, kind in (("intrinsics", intrinsics, Intrinsics), ("lens", lens, Lens)):
+            if value is not None and not isinstance(value, kind):
+                raise ValueError(f"expected {name} as {kind.__name__}, got {shown(value)}.")
         return replace(
             self,
-            camera=intrinsics or self.camera,
-            camera_lens=lens or self.camera_lens,
+            camera=self.camera if intrinsics is None else intrinsics,
+            camera_lens=self.camera_lens if lens is None else lens,
             T_world_camera=self.T_world_camera @ T,
             T_camera_projector=np.linalg.inv(T) @ self.T_camera_projector,
         )
 
     def shares_emitter(self, other: Rig) -> bool:
         """Whether the emitters of two rigs are one and the same: in one place, with one lens and power."""
-        kept = ("projector", "projector_lens", "projector_power_w")
-        a, b = self.T_world_projector, other.T_world_projector
-        return all(getattr(self, k) == getattr(other, k) for k in kept) and np.allclose(a, b, rtol=1e-9, atol=1e-9)
+        return not self.differences_of_emitter(other)
+
+    def differences_of_emitter(self, other: Rig) -> list[str]:
+        """What is not the same of the emitters of two rigs, by name; places may differ by `SAME_PLACE`."""
+        found = [
+            k for k in ("projector", "projector_lens", "projector_power_w") if getattr(self, k) != getattr(other, k)
+        ]
+        same = is_same_pose(self.T_world_projector, other.T_world_projector)
+        return found if same else [*found, "T_world_projector"]
+
+    def shares_camera_pose(self, other: Rig) -> bool:
+        """Whether the cameras of two rigs stand in one place and look the same way."""
+        return is_same_pose(self.T_world_camera, other.T_world_camera)
 
     @property
     def T_world_projector(self) -> Array:

@@ -99,7 +99,8 @@ def _checked(hint: Any, value: Any, name: str) -> Any:
             return None
         hint, *others = (arg for arg in get_args(hint) if arg is not type(None))
         for other in others:
-            if value in get_args(other) if get_origin(other) is typing.Literal else type(value) is other:
+            is_literal = get_origin(other) is typing.Literal
+            if (isinstance(value, str) and value in get_args(other)) if is_literal else type(value) is other:
                 return value
     bounds = None
     if get_origin(hint) is Annotated:

@@ -69,7 +69,7 @@ def load_signals(path: str | Path) -> StillSignals:
     settings = _settings(path)
     try:
         check_keys(settings, ("format", "format_version", "rig", "responses"), str(path))
-        rig = from_dict(Rig, settings.get("rig"), "rig")
+        rig = Rig.from_dict(settings.get("rig"))
         responses = [_response(table, f"responses[{i}]") for i, table in enumerate(settings.get("responses", ()))]
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
