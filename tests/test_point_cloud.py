@@ -44,7 +44,7 @@ def test_world_frame_is_the_camera_frame_moved() -> None:
     assert world.normals is not None
     towards = np.einsum("...i,...i", world.normals, origin - world.points)[world.valid]
     assert (towards > 0).all()
-    assert world.frame == "world"
+    assert world.coordinates == "world"
 
 
 def test_normals_do_not_round_off_a_depth_edge() -> None:
@@ -138,8 +138,8 @@ def test_bad_clouds_are_refused(tmp_path: Path, cloud: PointCloud) -> None:
         PointCloud(np.zeros((4, 2), np.float32))
     with pytest.raises(ValueError, match="normals"):
         PointCloud(np.zeros((4, 3), np.float32), normals=np.zeros((5, 3), np.float32))
-    with pytest.raises(ValueError, match="frame"):
-        PointCloud(np.zeros((4, 3), np.float32), frame="table")
+    with pytest.raises(ValueError, match="coordinates"):
+        PointCloud(np.zeros((4, 3), np.float32), coordinates="table")
 
 
 def test_uncalibrated_images_have_no_points() -> None:

@@ -228,7 +228,7 @@ class Evidence:
 
     @cached_property
     def _in_projector(self) -> np.ndarray:
-        """(n, 3) true surface points of the failed pixels in the frame of the projector, metres."""
+        """(n, 3) true surface points of the failed pixels in projector coordinates, metres."""
         return points_in_projector(self.signals.rig, self.truth.z, self.failed)
 
 

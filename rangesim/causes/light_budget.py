@@ -77,7 +77,7 @@ def _in_electrons(
 def white_radiance(rig: Rig, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(n,) float, W/m2/sr: what white Lambertian surfaces return of the projector's light.
 
-    points, normals : (n, 3) float, metres and unit, frame of the projector.
+    points, normals : (n, 3) float, metres and unit, in projector coordinates.
     """
     distance = np.linalg.norm(points, axis=-1)
     cosine = np.abs((normals * points).sum(axis=-1)) / distance

@@ -45,7 +45,7 @@ def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarr
 
 
 def points_in_projector(rig: Rig, z: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(n, 3) float64, metres: surface points at depths z (h, w) of the n pixels `where`, frame of the projector."""
+    """(n, 3) float64, metres: surface points at depths z (h, w) of the n pixels `where`, in projector coordinates."""
     points = rig.camera.directions(rig.camera.pixel_centres()[where]) * z[where].astype(np.float64)[:, None]
     return np.asarray((points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3])
 

@@ -15,14 +15,14 @@ from rangesim.rig import Rig
 def range_from_path_length(length_m: np.ndarray, directions: np.ndarray, rig: Rig) -> np.ndarray:
     """(...) range in metres along camera rays at which the path emitter -> point -> camera has this length.
 
-    With unit ray d and emitter centre b (camera frame) the length is l = r + |r d - b|. Squaring (l - r)^2 =
+    With unit ray d and emitter centre b (camera coordinates) the length is l = r + |r d - b|. Squaring (l - r)^2 =
     r^2 - 2 r d.b + b^2 leaves r linear: r = (l^2 - b^2) / (2 (l - d.b)), where the ray meets the ellipsoid
     with foci at camera and emitter. NaN where the length is not larger than the baseline |b|: no such point
     is in front.
 
     Parameters
     ----------
-    length_m : (...) float, metres. directions : (..., 3) float, camera rays of any length, camera frame.
+    length_m : (...) float, metres. directions : (..., 3) float, camera rays of any length, camera coordinates.
     """
     b = rig.T_camera_projector[:3, 3]
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)

@@ -71,8 +71,8 @@ class RangeImage(ShortRepr):
 
         save_range_image(self, path)
 
-    def to_point_cloud(self, frame: str = "camera") -> PointCloud:
+    def to_point_cloud(self, coordinates: str = "camera") -> PointCloud:
         """Organised point cloud of this image, with normals; see `rangesim.point_cloud`."""
         from rangesim.point_cloud import from_range_image
 
-        return from_range_image(self, frame)
+        return from_range_image(self, coordinates)

@@ -42,7 +42,7 @@ class TriangulationLimits:
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """z : (n,) float64, metres, camera frame; NaN if not in front of both devices.
+    """z : (n,) float64, metres, camera coordinates; NaN if not in front of both devices.
 
     epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected
         coordinate; zero if only one axis was decoded.
@@ -57,7 +57,7 @@ class Triangulation:
 def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row: np.ndarray | None) -> Triangulation:
     """Depth of camera rays from projector coordinates.
 
-    With a = R^T d and b = -R^T t (camera ray d and camera centre in the projector frame), the point at depth
+    With a = R^T d and b = -R^T t (camera ray d and camera centre in projector coordinates), the point at depth
     z projects to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z. Column x_p and row y_p each
     give an equation linear in w (ray meets plane); with both, w is their least-squares solution in projector
     pixels. The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w b_z), axes in
@@ -65,7 +65,7 @@ def triangulate(directions: np.ndarray, rig: Rig, column: np.ndarray | None, row
 
     Parameters
     ----------
-    directions : (n, 3) float64, camera rays with z = 1 (lens distortion already undone), camera frame.
+    directions : (n, 3) float64, camera rays with z = 1 (lens distortion already undone), camera coordinates.
     column, row : (n,) float, projector pixel coordinates, pixel centres at integer + 0.5; None where not
         coded.
 
@@ -154,7 +154,7 @@ def range_image_from_coordinates(
 
 
 def _point(a: np.ndarray, b: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """(3, n) a + w b, times depth the points in the projector frame."""
+    """(3, n) a + w b, times depth the points in projector coordinates."""
     return a + w * b[:, None]
 
 
@@ -174,7 +174,7 @@ def _inverse_depth(
 def _complete(
     point: np.ndarray, projector: Intrinsics, u: np.ndarray, v: np.ndarray, columns_missing: bool
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """(u, v) with the undecoded one replaced by where `point` (3, n), projector frame, projects to; largest change."""
+    """(u, v), the undecoded one from projecting `point` (3, n), projector coordinates; and its largest change."""
     old = u if columns_missing else v
     new = projector.project(point.T)[:, 0 if columns_missing else 1]
     new = np.where(np.isfinite(new), new, old)

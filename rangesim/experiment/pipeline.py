@@ -179,7 +179,7 @@ def _in_time(instrument: Instrument) -> PhotoDetector | None:
 
 
 def segment(cloud: PointCloud, path: Path) -> None:
-    """Write supervoxels, objects and the tree of an organised cloud in the camera frame to a .npz file."""
+    """Write supervoxels, objects and the tree of an organised cloud in camera coordinates to a .npz file."""
     import pcgraph
 
     result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))

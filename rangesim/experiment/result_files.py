@@ -9,7 +9,7 @@ DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.outp
     NAME/capture/        of each instrument: frames and sidecar
          range.npz       range image
          causes.npz      cause of every failed pixel
-         cloud.ply       points, metres, camera frame
+         cloud.ply       points, metres, camera coordinates
          comparison.json, measurement.json, segmentation.npz
 """
 

@@ -20,7 +20,7 @@ def displacement(truth: GroundTruth, rig: Rig, start: Poses, end: Poses) -> np.n
     ----------
     truth : what the pixels of the camera see at `start`.
     rig : Rig, where it stands without motion, with the camera that `truth` is of.
-    start, end : where everything is, before and after; both distances are taken in the camera's frame.
+    start, end : where everything is, before and after; both distances are taken in camera coordinates.
     """
     points = rig.camera.directions(rig.camera.pixel_centres()) * truth.z[..., None]
     result = np.zeros(truth.z.shape, dtype=np.float32)

@@ -54,7 +54,7 @@ def transport_moving(
     dict
         sensor -> Signals for `expose`. `truth`, `energy` and `rig` (hence the pose that takes a point cloud to the
         world) are those at the middle of the sensor's acquisition, `Timing.reference_s`. `motion_m` says how far
-        what a pixel sees moves: the largest distance, in the camera's frame, between a surface point at an exposure of
+        what a pixel sees moves: the largest distance, in camera coordinates, between a surface point at an exposure of
         the pixel and the same point at that middle; of the point the pixel sees at the middle, and of those it sees
         when it is exposed (something passing by). Where a shadow
         passes, the distance is that of the fastest thing. None for a sensor whose one exposure holds everything.

@@ -2,8 +2,8 @@
 """Organised point clouds, and their files."""
 
 from rangesim.point_cloud.point_cloud import (
+    COORDINATES,
     FAR_M,
-    FRAMES,
     MAX_SLOPE,
     NORMAL_RADIUS,
     STEP_FLOOR,
@@ -13,8 +13,8 @@ from rangesim.point_cloud.point_cloud import (
 )
 
 __all__ = [
+    "COORDINATES",
     "FAR_M",
-    "FRAMES",
     "MAX_SLOPE",
     "NORMAL_RADIUS",
     "STEP_FLOOR",

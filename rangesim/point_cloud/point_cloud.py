@@ -14,7 +14,7 @@ from pcgraph.parallel import SMALLEST_ROWS, in_blocks
 from rangesim.decoding.range_image import RangeImage
 from rangesim.settings.config import ShortRepr
 
-FRAMES = ("camera", "world")
+COORDINATES = ("camera", "world")
 FAR_M = 100.0
 """Coordinates of a camera, in metres, beyond which points in the world are double precision."""
 NORMAL_RADIUS = 2
@@ -31,17 +31,17 @@ class PointCloud(ShortRepr):
 
     Parameters
     ----------
-    points : (h, w, 3) or (n, 3) float32, metres, in `frame`; NaN where there is none. float64 in a world whose
+    points : (h, w, 3) or (n, 3) float32, metres, in `coordinates`; NaN where there is none. float64 in a world whose
         origin is more than `FAR_M` from the camera.
-    frame : "camera" (OpenCV: x right, y down, z forward) or "world".
-    normals : (..., 3) float32, unit, towards the camera, in `frame`; NaN where unknown (0 of `finite`). Or None.
+    coordinates : "camera" (OpenCV: x right, y down, z forward) or "world".
+    normals : (..., 3) float32, unit, towards the camera, in `coordinates`; NaN where unknown (0 of `finite`). Or None.
     intensity : (...) float32, the capture's units. Or None.
     colors : (..., 3) uint8, RGB. Or None.
     confidence : (...) float32 in 0..1, see `RangeImage`. Or None.
     """
 
     points: np.ndarray
-    frame: str = "camera"
+    coordinates: str = "camera"
     normals: np.ndarray | None = None
     intensity: np.ndarray | None = None
     colors: np.ndarray | None = None
@@ -51,8 +51,8 @@ class PointCloud(ShortRepr):
         shape = self.points.shape
         if len(shape) not in (2, 3) or shape[-1] != 3:
             raise ValueError(f"expected points of shape (n, 3) or (h, w, 3), got {shape}.")
-        if self.frame not in FRAMES:
-            raise ValueError(f"expected frame to be one of {', '.join(FRAMES)}, got {self.frame!r}.")
+        if self.coordinates not in COORDINATES:
+            raise ValueError(f"expected coordinates to be one of {', '.join(COORDINATES)}, got {self.coordinates!r}.")
         for name, value in self.attributes().items():
             if value.shape not in (shape[:-1], shape):
                 raise ValueError(f"expected {name} of shape {shape[:-1]} or {shape}, got {value.shape}.")
@@ -98,33 +98,33 @@ class PointCloud(ShortRepr):
         return cloud
 
 
-def from_range_image(image: RangeImage, frame: str = "camera") -> PointCloud:
+def from_range_image(image: RangeImage, coordinates: str = "camera") -> PointCloud:
     """Organised point cloud of a range image, with normals.
 
     Parameters
     ----------
-    frame : "camera" or "world".
+    coordinates : "camera" or "world".
 
     Raises
     ------
     ValueError
-        The range image has no camera (uncalibrated capture), or the frame is unknown.
+        The range image has no camera (uncalibrated capture), or these coordinates are unknown.
     """
-    if frame not in FRAMES:
-        raise ValueError(f"expected frame to be one of {', '.join(FRAMES)}, got {frame!r}.")
+    if coordinates not in COORDINATES:
+        raise ValueError(f"expected coordinates to be one of {', '.join(COORDINATES)}, got {coordinates!r}.")
     if image.camera is None or image.T_world_camera is None:
         raise ValueError("expected a calibrated range image: without a rig there are no points.")
     rays = image.camera.directions(image.camera.pixel_centres())
     z = image.z.astype(np.float64)
     points, normals = rays * z[..., None], lattice_normals(z, rays)
     kind: type[np.floating] = np.float32
-    if frame == "world":
+    if coordinates == "world":
         rotation, origin = image.T_world_camera[:3, :3], image.T_world_camera[:3, 3]
         points, normals = points @ rotation.T + origin, normals @ rotation.T
         kind = np.float64 if np.abs(origin).max() > FAR_M else kind
     return PointCloud(
         points=points.astype(kind),
-        frame=frame,
+        coordinates=coordinates,
         normals=normals.astype(np.float32),
         intensity=image.intensity,
         colors=_grey_colors(image.intensity, image.valid),
@@ -142,7 +142,7 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
 
     Parameters
     ----------
-    z : (h, w) float, metres, NaN where invalid. rays : (h, w, 3) float, directions with z = 1, camera frame.
+    z : (h, w) float, metres, NaN where invalid. rays : (h, w, 3) float, directions with z = 1, camera coordinates.
     """
     steps = np.arange(-radius, radius + 1)
     limits = np.maximum(MAX_SLOPE * np.hypot(*np.meshgrid(steps, steps)) * _pixel_size(rays), STEP_FLOOR)

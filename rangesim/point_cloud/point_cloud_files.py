@@ -2,7 +2,7 @@
 """Point clouds written as binary PLY and PCD files.
 
 Fields: x y z, and where present normals, intensity, colour and confidence, under the names that Open3D, PCL
-and MeshLab know; in single precision, but points in double precision stay so. The frame goes into a comment line.
+and MeshLab know; in single precision, but points in double precision stay so. The coordinates go into a comment line.
 `pcgraph.read_cloud` reads them back.
 """
 
@@ -69,7 +69,7 @@ def _table(cloud: PointCloud, pcd: bool) -> np.ndarray:
 def _ply_bytes(cloud: PointCloud) -> bytes:
     table = _table(cloud, pcd=False)
     assert table.dtype.fields is not None
-    lines = ["ply", "format binary_little_endian 1.0", f"comment frame {cloud.frame}, metres"]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment coordinates {cloud.coordinates}, metres"]
     lines.append(f"element vertex {len(table)}")
     lines += [f"property {_PLY_TYPES[kind.str[1:]]} {name}" for name, (kind, *_) in table.dtype.fields.items()]
     return "\n".join([*lines, "end_header\n"]).encode() + table.tobytes()
@@ -81,7 +81,7 @@ def _pcd_bytes(cloud: PointCloud) -> bytes:
     height, width = shape if len(shape) == 2 else (1, shape[0])
     names, sizes = zip(*((name, table.dtype[name].itemsize) for name in table.dtype.names or ()), strict=True)
     lines = [
-        f"# .PCD v0.7 - frame {cloud.frame}, metres",
+        f"# .PCD v0.7 - coordinates {cloud.coordinates}, metres",
         "VERSION 0.7",
         "FIELDS " + " ".join(names),
         "SIZE " + " ".join(map(str, sizes)),

@@ -40,7 +40,7 @@ Coefficient = Annotated[float, Bounds("a coefficient", -1e6, 1e6)]
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole with Brown-Conrady distortion, OpenCV's model and frame: x right, y down, z forward.
+    """Pinhole with Brown-Conrady distortion, OpenCV's model and axes: x right, y down, z forward.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class Intrinsics:
         return np.where(inverse[..., None], np.stack([x, y], axis=-1), np.nan)
 
     def project(self, points: ArrayLike) -> Array:
-        """(..., 2) pixel coordinates of points (..., 3) in this device's frame; NaN behind it and beyond the
+        """(..., 2) pixel coordinates of points (..., 3) in coordinates of this device; NaN behind it and beyond the
         radius at which the distortion turns round."""
         points = np.asarray(points, dtype=np.float64)
         z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
@@ -159,7 +159,7 @@ def is_same_pose(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """(4, 4) T_world_device of a device at `origin` that looks at `target`, metres, OpenCV frame."""
+    """(4, 4) T_world_device of a device at `origin` that looks at `target`, metres, OpenCV axes."""
     o, t, u = (np.asarray(a, dtype=np.float64) for a in (origin, target, up))
     for name, value in (("origin", o), ("target", t), ("up", u)):
         if value.shape != (3,) or not (np.abs(value) <= MAX_COORDINATE_M).all():

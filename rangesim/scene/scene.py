@@ -30,7 +30,7 @@ class Scene:
     """Geometry and materials to measure.
 
     name : str
-    mitsuba : mitsuba.Scene of the active variant, in the renderer's frame: the world less `origin_m`.
+    mitsuba : mitsuba.Scene of the active variant, in the renderer's coordinates: the world less `origin_m`.
     instances : one per shape, in the order of `mitsuba.shapes()`.
     camera, T_world_camera : the scene's own sensor.
     working_distance_m : float, median depth the camera sees; sets default baseline and vergence.
@@ -69,11 +69,11 @@ class Scene:
         return any(emitter.class_name() != "ConstantBackgroundEmitter" for emitter in self.mitsuba.emitters())
 
     def in_renderer(self, rig: Rig) -> Rig:
-        """The rig in the renderer's frame."""
+        """The rig in the renderer's coordinates."""
         return replace(rig, T_world_camera=translation(*-self.origin_m) @ rig.T_world_camera)
 
     def motion_in_renderer(self, T: np.ndarray) -> np.ndarray:
-        """(4, 4) in the renderer's frame of a world transform (4, 4) that moves a shape."""
+        """(4, 4) in the renderer's coordinates of a world transform (4, 4) that moves a shape."""
         return np.asarray(translation(*-self.origin_m) @ T @ translation(*self.origin_m))
 
     def rig(
