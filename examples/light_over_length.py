@@ -32,7 +32,7 @@ def main() -> None:
     for axis, (name, (row, column)) in zip(axes, PIXELS.items(), strict=True):
         scene, sensor = load_scene(SCENES / f"{name}.xml"), AmcwToF((20e6,))
         split = LengthSplit(start_m=0.0, width_m=0.04, bins=250)
-        signals = transport(scene, scene.rig(0.03, width=40, height=30), [sensor, split], spp=8192, max_depth=8)
+        signals = transport(scene, scene.rig(0.03, width=40, height=30), [sensor, split], spp=4096, max_depth=8)
         light = signals.channels[split][:, row, column].reshape(len(KINDS), split.bins)
         first = np.flatnonzero(light.sum(axis=0))[0]
         shown = slice(max(0, first - 5), first + 45)
