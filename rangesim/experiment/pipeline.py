@@ -99,7 +99,12 @@ def run(
         with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
             compile_kernels()
         for number, (rig, instruments) in enumerate(passes, 1):
-            signals = _trace(experiment, scene, rig, instruments, tell, number, len(passes), times)
+            stage = f"Tracing light, pass {number} of {len(passes)} ({', '.join(i.name for i in instruments)})"
+            begin, end = (_fraction(number, len(passes), of_pass) for of_pass in (0.0, 1.0))
+            tell(stage, begin)
+            told = None if progress is None else partial(_tell_part, tell, stage, begin, end - begin)
+            with timed(times, f"transport_{number}"):
+                signals = _trace(experiment, scene, rig, instruments, told)
             write_pass(signals, folder / f"pass_{number}.npz")
             for instrument in instruments:
                 tell(f"Measuring with {instrument.name}", _fraction(number, len(passes), 1.0))
@@ -250,21 +255,19 @@ def _trace(
     scene: Scene,
     rig: Rig,
     instruments: list[Instrument],
-    tell: Progress,
-    number: int,
-    passes: int,
-    times: dict[str, float],
+    progress: Callable[[float], None] | None,
 ) -> Signals:
-    stage = f"Tracing light, pass {number} of {passes} ({', '.join(i.name for i in instruments)})"
-    tell(stage, _fraction(number, passes, 0.0))
-    progress = None if tell is _unwatched else lambda fraction: tell(stage, _fraction(number, passes, fraction))
+    """The light of a pass; `progress` is called with the fraction of it that is done."""
     settings = experiment.transport_settings(instruments)
-    with timed(times, f"transport_{number}"):
-        if experiment.motion is None:
-            return rangesim.transport(scene, rig, [i.sensor for i in instruments], settings, progress=progress)
-        (instrument,) = instruments
-        timings = {instrument.sensor: instrument.timing}
-        return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[instrument.sensor]
+    if experiment.motion is None:
+        return rangesim.transport(scene, rig, [i.sensor for i in instruments], settings, progress=progress)
+    (instrument,) = instruments
+    timings = {instrument.sensor: instrument.timing}
+    return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[instrument.sensor]
+
+
+def _tell_part(tell: Progress, stage: str, begin: float, part: float, fraction: float) -> None:
+    tell(stage, begin + part * fraction)
 
 
 def _fraction(number: int, passes: int, of_pass: float) -> float:

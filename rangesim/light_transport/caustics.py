@@ -61,6 +61,15 @@ def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None =
     return GatheringRadius(float(of_projector / rig.projector.fx), (low, high), *places, fixed_m)
 
 
+class CausticLight(NamedTuple):
+    """Light of the photons around a vertex: the photon that stands for all, their irradiance in W/m2, and whether it was
+    found in a wide circle, and is smooth therefore."""
+
+    photon: Any
+    irradiance: Any
+    is_wide: Any
+
+
 class Vertex(NamedTuple):
     """A vertex of a camera path: surface, throughput, optical length from the camera, and whether light that reaches it
     is the first to do so."""
@@ -73,10 +82,8 @@ class Vertex(NamedTuple):
 
 
 @dr.syntax
-def gather(
-    maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance: Any, active: Any
-) -> tuple[Any, Any, Any]:
-    """The photon that stands for all around a vertex, their irradiance, and whether it was found in a wide circle.
+def gather(maps: PhotonMaps, vertex: Vertex, sample: Any, xi: list[Any], chance: Any, active: Any) -> CausticLight:
+    """The light of the photons around a vertex.
 
     `chance` decides which levels are gathered. Neighbouring lanes share it, so that they skip a level together.
     """
@@ -93,7 +100,7 @@ def gather(
             photon = dr.select(taken, found.photon, photon)
             is_wide = dr.select(taken, maps.is_wide[level], is_wide)
             pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))
-    return photon, irradiance, is_wide
+    return CausticLight(photon, irradiance, is_wide)
 
 
 @dr.syntax
@@ -102,16 +109,14 @@ def caustic_light(
     accumulators: Accumulators,
     channels: list[list[Any]],
     vertex: Vertex,
-    photon: Any,
-    irradiance: Any,
-    is_wide: Any,
+    brought: CausticLight,
     place: Any,
 ) -> tuple[list[list[Any]], Any]:
     """Channels with the light of the photons at a vertex added, and the radiance they bring to the camera."""
     radiance = dr.zeros(mi.Float, dr.width(place))
-    found = irradiance > 0
+    found = brought.irradiance > 0
     if found:
-        flight = maps.flight(photon, found)
+        flight = maps.flight(brought.photon, found)
         wi, wo = vertex.si.wi, vertex.si.to_local(-flight.direction)
         value = vertex.bsdf.eval(mi.BSDFContext(), vertex.si, wo, found)
         # Photons count flux per area, so the geometric cosine is in them already; the BSDF counts that to the shading
@@ -119,9 +124,9 @@ def caustic_light(
         seen, lit = dr.dot(vertex.si.to_world(wi), vertex.si.n), -dr.dot(flight.direction, vertex.si.n)
         cosine = dr.maximum(flight.cosine, dr.abs(lit) / MAX_BENT)
         on_one_side = seen * lit * wi.z * wo.z > 0  # for both normals, or for neither
-        radiance = vertex.throughput * irradiance * mono(value) / cosine
+        radiance = vertex.throughput * brought.irradiance * mono(value) / cosine
         radiance = dr.select(found & on_one_side, radiance, 0)
         length = vertex.length + flight.length
         path = LightPath(flight.u, flight.v, length, vertex.is_first, mi.UInt32(CAUSTIC))
-        channels = accumulators.add(channels, path, radiance, place, found, is_wide)
+        channels = accumulators.add(channels, path, radiance, place, found, brought.is_wide)
     return channels, radiance

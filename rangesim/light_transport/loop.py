@@ -402,10 +402,10 @@ def walk(
             choice = chosen.state
             rotation += 2654435769  # 2^32 over the golden ratio
             chance, gathers = mi.Float(rotation >> 8) * 2**-24, may_connect & ~scatters
-            photon, brought, is_wide = gather(maps, vertex, number, xi, chance, gathers)
-            channels, radiance = caustic_light(maps, accumulators, channels, vertex, photon, brought, is_wide, at.place)
-            caustic += dr.select(is_wide, 0, radiance)
-            smooth_caustic += dr.select(is_wide, radiance, 0)
+            brought = gather(maps, vertex, number, xi, chance, gathers)
+            channels, radiance = caustic_light(maps, accumulators, channels, vertex, brought, at.place)
+            caustic += dr.select(brought.is_wide, 0, radiance)
+            smooth_caustic += dr.select(brought.is_wide, radiance, 0)
             indirect += dr.select(is_later, radiance, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
