@@ -62,8 +62,8 @@ def gathering_radius(rig: Rig, photons_per_pixel: float, fixed_m: float | None =
 
 
 class CausticLight(NamedTuple):
-    """Light of the photons around a vertex: the photon that stands for all, their irradiance in W/m2, and whether it was
-    found in a wide circle, and is smooth therefore."""
+    """Light of the photons around a vertex: the photon that stands for all, their irradiance in W/m2, and whether it
+    was found in a wide circle, and is smooth therefore."""
 
     photon: Any
     irradiance: Any
