@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compactness of supervoxels: how close they are to discs."""
+"""Metrics of supervoxels that need no truth: compactness of their shape, variation of values that they explain."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.metrics.neighbours import NeighbourGraph
-from pcgraph.metrics.table import ranked, whole_numbers
+from pcgraph.metrics.boundary_metrics import NeighbourGraph
+from pcgraph.metrics.labellings import as_floats, as_labels, relabel_sequential
 
 
 def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int = 24) -> float:
@@ -33,8 +33,8 @@ def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int
     ValueError
         The shapes differ, labels are not whole numbers, a point that takes part is not finite, or none takes part.
     """
-    graph = points if isinstance(points, NeighbourGraph) else NeighbourGraph.of(points, whole_numbers(labels) >= 0, k)
-    segment, n = ranked(graph.of_members(labels))
+    graph = points if isinstance(points, NeighbourGraph) else NeighbourGraph.of(points, as_labels(labels) >= 0, k)
+    segment, n = relabel_sequential(graph.of_members(labels))
     counts = np.bincount(segment, minlength=n)
     return float(counts @ _circularity(graph.points, graph.areas(), segment, n) / counts.sum())
 
@@ -52,3 +52,40 @@ def _circularity(
     moment = np.bincount(segment, weights * (squares + areas / (2 * np.pi)), n) / whole
     somewhere = moment > 0
     return np.where(somewhere, np.minimum(1.0, area / (2 * np.pi * np.where(somewhere, moment, 1.0))), 1.0)
+
+
+def explained_variation(labels: ArrayLike, values: ArrayLike) -> float:
+    """EV, 0..1: fraction of the variance of the values that lies between segments (Moore et al. 2008).
+
+    Parameters
+    ----------
+    labels : (n,) or (h, w) int
+        Points negative are left out.
+    values : (n,), (n, c), (h, w) or (h, w, c) float
+        Colours, normals or positions; the unit drops out if all channels share it.
+
+    Returns
+    -------
+    float
+        1 if the values do not vary.
+
+    Raises
+    ------
+    ValueError
+        Shapes do not fit, labels are not whole numbers, no point has one, or a labelled point's value is not finite.
+    """
+    segments, given = as_labels(labels), as_floats(values)
+    if given.shape[: segments.ndim] != segments.shape or given.ndim > segments.ndim + 1:
+        raise ValueError(f"expected values for labels {segments.shape}, got {given.shape}")
+    inside = segments >= 0
+    if not inside.any():
+        raise ValueError("expected at least one point with a label, got none")
+    chosen = given[inside].reshape(np.count_nonzero(inside), -1)
+    if not np.isfinite(chosen).all():
+        raise ValueError("expected finite values, got NaN or infinity at a labelled point; give it the label -1")
+    chosen = chosen - chosen.mean(axis=0)
+    segment, n = relabel_sequential(segments[inside])
+    counts = np.bincount(segment, minlength=n)
+    sums = np.stack([np.bincount(segment, channel, n) for channel in chosen.T])
+    total = float((chosen**2).sum())
+    return min(1.0, float((sums**2 / counts).sum()) / total) if total > 0 else 1.0
