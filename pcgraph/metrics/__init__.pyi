@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from .boundary_metrics import BoundaryCurve as BoundaryCurve
 from .boundary_metrics import NeighbourGraph as NeighbourGraph
-from .boundary_metrics import boundary_curve as boundary_curve
 from .boundary_metrics import boundary_precision as boundary_precision
 from .boundary_metrics import boundary_recall as boundary_recall
 from .labellings import PanopticQuality as PanopticQuality
@@ -18,8 +16,10 @@ from .labellings import undersegmentation_rate as undersegmentation_rate
 from .labellings import variation_of_information as variation_of_information
 from .labellings import weighted_overlap as weighted_overlap
 from .level_curves import BestScales as BestScales
+from .level_curves import BoundaryCurve as BoundaryCurve
 from .level_curves import LevelCurve as LevelCurve
 from .level_curves import best_scales as best_scales
+from .level_curves import boundary_curve as boundary_curve
 from .level_curves import level_curve as level_curve
 from .level_curves import level_score as level_score
 from .tree_metrics import FragmentationCurve as FragmentationCurve

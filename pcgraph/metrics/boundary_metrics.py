@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boundary recall and precision on the k-nearest-neighbour graph of the points, of a labelling and of all cuts."""
+"""Boundary recall and precision, on the k-nearest-neighbour graph of the points."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.hierarchy import lowest_common_ancestors, num_leaves
 from pcgraph.metrics.labellings import as_floats, as_labels
-from pcgraph.metrics.level_curves import HorizontalCuts, LevelCurve
-from pcgraph.metrics.node_table import TreeLike, parents_and_altitudes
 
 
 def boundary_recall(
@@ -211,93 +208,6 @@ class NeighbourGraph:
         bound = np.nextafter(tolerance, np.inf)  # the k-d tree finds what is nearer than the bound, not at it
         distances, _ = cKDTree(self.points[to]).query(self.points[of], distance_upper_bound=bound, workers=2)
         return np.isfinite(distances)
-
-
-@dataclass(frozen=True, eq=False)
-class BoundaryCurve:
-    """Boundary recall and precision of every distinct cut of a tree, from the leaves to the root.
-
-    Attributes
-    ----------
-    altitudes : (l,) float64, ascending
-        As in `LevelCurve`.
-    regions : (l,) int64
-        Number of segments.
-    recall, precision : (l,) float64
-        0..1; as `boundary_recall` and `boundary_precision` of the cut.
-    """
-
-    altitudes: NDArray[np.float64]
-    regions: NDArray[np.int64]
-    recall: NDArray[np.float64]
-    precision: NDArray[np.float64]
-
-    @property
-    def f_measure(self) -> LevelCurve:
-        """Harmonic mean of both, 0..1, as a curve for `best_scales`: the classical ODS and OIS."""
-        sums = self.recall + self.precision
-        values = 2 * self.recall * self.precision / np.where(sums > 0, sums, 1.0)
-        return LevelCurve("boundary_f_measure", True, self.altitudes, self.regions, values)
-
-
-def boundary_curve(
-    graph: NeighbourGraph, tree: TreeLike, leaves: ArrayLike, truth: ArrayLike, *, hops: int = 1
-) -> BoundaryCurve:
-    """Boundary recall and precision of every distinct horizontal cut.
-
-    A point is a boundary point of all cuts below its saliency, the altitude at which the last of its neighbours merges
-    with it; so one number per point answers for all cuts.
-
-    Parameters
-    ----------
-    graph : NeighbourGraph
-        Of the points that have a leaf and a true label.
-    tree : SegmentationTree, or pair (parents, altitudes)
-        As for `level_curve`.
-    leaves, truth : (n,) or (h, w) int
-        Leaf and true label of each point, >= 0 for those in the graph.
-    hops : int, >= 0
-        Near is within as many steps from neighbour to neighbour.
-
-    Raises
-    ------
-    ValueError
-        As `level_curve` and `NeighbourGraph.boundary`; or hops is not a whole number of at least 0.
-    """
-    check_nearness(hops)
-    cuts = HorizontalCuts.of(tree)
-    parents, altitudes = parents_and_altitudes(tree)
-    leaf = graph.of_members(leaves)
-    if leaf.max() >= num_leaves(parents):
-        raise ValueError(f"expected leaves 0..{num_leaves(parents) - 1} of the tree, got {leaf.max()}")
-    saliency = _saliency(graph.neighbours, leaf, parents, np.asarray(altitudes, np.float64))
-    true = graph.boundary_of_members(truth)
-    near_saliency = saliency
-    for _ in range(hops):
-        near_saliency = np.maximum(near_saliency, near_saliency[graph.neighbours].max(axis=1, initial=-np.inf))
-    found = _count_above(saliency, cuts.altitudes)
-    right = _count_above(saliency[graph.within_hops(true, hops)], cuts.altitudes)
-    hit = _count_above(near_saliency[true], cuts.altitudes)
-    recall = hit / true.sum() if true.any() else np.ones(len(hit))
-    return BoundaryCurve(cuts.altitudes, cuts.regions, recall, np.where(found > 0, right / np.maximum(found, 1), 1.0))
-
-
-def _saliency(
-    neighbours: NDArray[np.int32], leaf: NDArray[np.int64], parents: NDArray[np.int32], altitudes: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Altitude at which the last neighbour of each point merges with it, (m,); -inf if all are of its leaf."""
-    n_leaves = num_leaves(parents)
-    saliency = np.full(len(leaf), -np.inf)
-    point, side = np.nonzero(leaf[neighbours] != leaf[:, None])
-    pairs, pair = np.unique(leaf[point] * n_leaves + leaf[neighbours[point, side]], return_inverse=True)
-    ancestors = lowest_common_ancestors(parents, *np.divmod(pairs, n_leaves))
-    np.maximum.at(saliency, point, altitudes[ancestors][pair])
-    return saliency
-
-
-def _count_above(values: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number of values that exceed each level, (l,)."""
-    return len(values) - np.searchsorted(np.sort(values), levels, side="right")
 
 
 def check_nearness(hops: int, tolerance: float | None = None) -> None:

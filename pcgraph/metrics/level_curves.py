@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores of all horizontal cuts of a tree at once, and the best scale of several clouds: ODS and OIS."""
+"""Scores and boundaries of all horizontal cuts of a tree at once; the best scales of several clouds, ODS and OIS."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.hierarchy import ChildLists, num_leaves
+from pcgraph.hierarchy import ChildLists, lowest_common_ancestors, num_leaves
+from pcgraph.metrics.boundary_metrics import NeighbourGraph, check_nearness
 from pcgraph.metrics.labellings import adjusted_rand_from_pairs, count_point_pairs
 from pcgraph.metrics.node_table import Cells, NodeTable, TreeLike, parents_and_altitudes
 
@@ -264,6 +265,98 @@ def _update(trees: SegmentTrees, segment: int, place: int, value: float) -> floa
         at //= 2
         trees.maxima[base + at] = max(trees.maxima[base + 2 * at], trees.maxima[base + 2 * at + 1])
     return trees.maxima[base + 1] - before
+
+
+# Boundaries of levels -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryCurve:
+    """Boundary recall and precision of every distinct cut of a tree, from the leaves to the root.
+
+    Attributes
+    ----------
+    altitudes : (l,) float64, ascending
+        As in `LevelCurve`.
+    regions : (l,) int64
+        Number of segments.
+    recall, precision : (l,) float64
+        0..1; as `boundary_recall` and `boundary_precision` of the cut.
+    """
+
+    altitudes: NDArray[np.float64]
+    regions: NDArray[np.int64]
+    recall: NDArray[np.float64]
+    precision: NDArray[np.float64]
+
+    @property
+    def f_measure(self) -> LevelCurve:
+        """Harmonic mean of both, 0..1, as a curve for `best_scales`: the classical ODS and OIS."""
+        sums = self.recall + self.precision
+        values = 2 * self.recall * self.precision / np.where(sums > 0, sums, 1.0)
+        return LevelCurve(
+            "boundary_f_measure", larger_is_better=True, altitudes=self.altitudes, regions=self.regions, values=values
+        )
+
+
+def boundary_curve(
+    graph: NeighbourGraph, tree: TreeLike, leaves: ArrayLike, truth: ArrayLike, *, hops: int = 1
+) -> BoundaryCurve:
+    """Boundary recall and precision of every distinct horizontal cut.
+
+    A point is a boundary point of all cuts below its saliency, the altitude at which the last of its neighbours merges
+    with it; so one number per point answers for all cuts.
+
+    Parameters
+    ----------
+    graph : NeighbourGraph
+        Of the points that have a leaf and a true label.
+    tree : SegmentationTree, or pair (parents, altitudes)
+        As for `level_curve`.
+    leaves, truth : (n,) or (h, w) int
+        Leaf and true label of each point, >= 0 for those in the graph.
+    hops : int, >= 0
+        Near is within as many steps from neighbour to neighbour.
+
+    Raises
+    ------
+    ValueError
+        As `level_curve` and `NeighbourGraph.boundary`; or hops is not a whole number of at least 0.
+    """
+    check_nearness(hops)
+    cuts = HorizontalCuts.of(tree)
+    parents, altitudes = parents_and_altitudes(tree)
+    leaf = graph.of_members(leaves)
+    if leaf.max() >= num_leaves(parents):
+        raise ValueError(f"expected leaves 0..{num_leaves(parents) - 1} of the tree, got {leaf.max()}")
+    saliency = _saliency(graph.neighbours, leaf, parents, np.asarray(altitudes, np.float64))
+    true = graph.boundary_of_members(truth)
+    near_saliency = saliency
+    for _ in range(hops):
+        near_saliency = np.maximum(near_saliency, near_saliency[graph.neighbours].max(axis=1, initial=-np.inf))
+    found = _count_above(saliency, cuts.altitudes)
+    right = _count_above(saliency[graph.within_hops(true, hops)], cuts.altitudes)
+    hit = _count_above(near_saliency[true], cuts.altitudes)
+    recall = hit / true.sum() if true.any() else np.ones(len(hit))
+    return BoundaryCurve(cuts.altitudes, cuts.regions, recall, np.where(found > 0, right / np.maximum(found, 1), 1.0))
+
+
+def _saliency(
+    neighbours: NDArray[np.int32], leaf: NDArray[np.int64], parents: NDArray[np.int32], altitudes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Altitude at which the last neighbour of each point merges with it, (m,); -inf if all are of its leaf."""
+    n_leaves = num_leaves(parents)
+    saliency = np.full(len(leaf), -np.inf)
+    point, side = np.nonzero(leaf[neighbours] != leaf[:, None])
+    pairs, pair = np.unique(leaf[point] * n_leaves + leaf[neighbours[point, side]], return_inverse=True)
+    ancestors = lowest_common_ancestors(parents, *np.divmod(pairs, n_leaves))
+    np.maximum.at(saliency, point, altitudes[ancestors][pair])
+    return saliency
+
+
+def _count_above(values: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Number of values that exceed each level, (l,)."""
+    return len(values) - np.searchsorted(np.sort(values), levels, side="right")
 
 
 # Best scales ----------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics of whole trees: the best nodes, the best cuts of any kind, and the purity of the nodes.
 
-Those of horizontal cuts are in `level_curves` and, of boundaries, in `boundary_metrics`.
+Those of horizontal cuts are in `level_curves`.
 """
 
 from __future__ import annotations

@@ -11,12 +11,12 @@ from pcgraph.metrics.labellings import as_floats, as_labels, relabel_sequential
 
 
 def compactness(points: ArrayLike | NeighbourGraph, labels: ArrayLike, *, k: int = 24) -> float:
-    """CO, 0..1: mean over the points of how close their segment is to a disc of the same area.
+    """Compactness CO, 0..1: mean over the points of how close their segment is to a disc of the same area.
 
     Schick et al. 2012 take 4 pi area / perimeter^2, but the perimeter of a patch of points, some of it at depth
     edges, depends on the sampling. This takes the circularity of Zunic et al. 2010 from second moments instead:
     area / (2 pi mean square distance from the centroid), 1 for a disc, 3 / pi for a square, less for anything
-    stretched, ragged, with holes or in pieces; every point counts with the area it stands for. Where bending
+    stretched, ragged, with holes or in pieces; every point counts with the area that it represents. Where bending
     gives more than 1 (4 / 3 for a hemisphere), 1 is taken.
 
     Parameters
@@ -55,7 +55,7 @@ def _circularity(
 
 
 def explained_variation(labels: ArrayLike, values: ArrayLike) -> float:
-    """EV, 0..1: fraction of the variance of the values that lies between segments (Moore et al. 2008).
+    """Explained variation EV, 0..1 (Moore et al. 2008): fraction of the values' variance that lies between segments.
 
     Parameters
     ----------
