@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two labellings of the same points: their contingency table and the metrics computed from it.
 
-Of a found labelling and a true one; S is a segment, G a true segment, N the number of points. The checks of labels at
-the end serve all metrics.
+In the formulas S is a segment, G a true segment, N the number of points. The checks of labels at the end serve all
+metrics.
 """
 
 from __future__ import annotations
@@ -93,6 +93,7 @@ def segmentation_covering(
 
 
 weighted_overlap = segmentation_covering
+"""Another name."""
 
 
 def _best_assignment(table: coo_array, gains: NDArray[np.float64]) -> float:
@@ -122,6 +123,7 @@ def achievable_segmentation_accuracy(labels: ArrayLike, truth: ArrayLike) -> flo
 
 
 achievable_accuracy = achievable_segmentation_accuracy
+"""Another name."""
 
 
 def oversegmentation_rate(labels: ArrayLike, truth: ArrayLike) -> float:
