@@ -36,7 +36,6 @@ OF_LABELS = (
     "undersegmentation_error",
 )
 OF_TREES = ("tree_oracle", "dendrogram_purity", "fragmentation_curve")
-OF_LEVELS = ("weighted_overlap", "rand", "information")
 
 
 def parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -114,16 +113,15 @@ def of_metrics(name: str, result: Segmentation, cloud: LabelledCloud) -> Iterato
         for of, found in (("objects", labels), ("supervoxels", leaves)):
             yield from parts(f"{name}/{metric}/{of}", getattr(metrics, metric)(found, truth))
     for metric in OF_TREES:
-        yield from parts(f"{name}/{metric}", getattr(metrics, metric)(tree.parents, leaves, truth))
-    curve = metrics.level_curve(tree.parents, tree.altitudes, leaves, truth)
-    yield from parts(f"{name}/level curve", curve)
+        yield from parts(f"{name}/{metric}", getattr(metrics, metric)(tree, leaves, truth))
+    curve = metrics.level_curve(tree, leaves, truth)
+    fields_of_curve = {"altitudes": curve.altitudes, "regions": curve.regions, "values": curve.values}
+    yield from parts(f"{name}/level curve", {"score": "weighted_overlap", **fields_of_curve})
     yield from parts(f"{name}/best scales", metrics.best_scales([curve]))
     graph = metrics.NeighbourGraph.of(points)
     yield from parts(f"{name}/boundary recall", graph.recall(leaves, truth))
     yield from parts(f"{name}/boundary precision", graph.precision(leaves, truth))
-    yield from parts(
-        f"{name}/boundary curve", metrics.boundary_curve(graph, tree.parents, tree.altitudes, leaves, truth)
-    )
+    yield from parts(f"{name}/boundary curve", metrics.boundary_curve(graph, tree, leaves, truth))
     yield from parts(f"{name}/compactness", metrics.compactness(graph, leaves))
     yield from parts(
         f"{name}/explained variation", metrics.explained_variation(leaves, cloud.colors[inside].astype(float))

@@ -199,9 +199,9 @@ def _tree_figures(clouds: list[LabelledCloud]) -> dict[str, float]:
         truths = [getattr(cloud, kind) for cloud in clouds]
         pairs = list(zip(found, truths, strict=True))
         overlaps = [weighted_overlap(one.labels, truth) for one, truth in pairs]
-        curves = [level_curve(one.tree.parents, one.tree.altitudes, one.supervoxels, truth) for one, truth in pairs]
+        curves = [level_curve(one.tree, one.supervoxels, truth) for one, truth in pairs]
         scales = best_scales(curves)
-        oracle = float(np.mean([tree_oracle(one.tree.parents, one.supervoxels, truth) for one, truth in pairs]))
+        oracle = float(np.mean([tree_oracle(one.tree, one.supervoxels, truth) for one, truth in pairs]))
         result |= {f"wov_{kind}": float(np.mean(overlaps)), f"ois_{kind}": scales.ois, f"ods_{kind}": scales.ods}
         result |= {f"ods_{kind}_altitude": scales.ods_altitude, f"oracle_{kind}": oracle}
         if kind == "objects":

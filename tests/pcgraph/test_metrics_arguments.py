@@ -4,27 +4,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from time import process_time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
-from test_metrics_trees import ALTITUDES, LEAVES, PARENTS, members, random_tree
+from test_metrics_trees import ALTITUDES, LEAVES, PARENTS, TREE
 
 from pcgraph import metrics
-from pcgraph.metrics.hierarchy import count_leaves
-from pcgraph.metrics.meeting import lowest_common
 
 TRUTH = np.array([0, 0, 0, 1, 1, 1, 2, 2])
 POINTS = np.random.default_rng(0).random((8, 3))
 
 OF_TWO: dict[str, Callable[[ArrayLike, ArrayLike], object]] = {
     "contingency": lambda labels, truth: metrics.contingency(labels, truth).toarray().tolist(),
-    "weighted_overlap": metrics.weighted_overlap,
+    "segmentation_covering": metrics.segmentation_covering,
     "undersegmentation_error": metrics.undersegmentation_error,
-    "achievable_accuracy": metrics.achievable_accuracy,
+    "achievable_segmentation_accuracy": metrics.achievable_segmentation_accuracy,
     "adjusted_rand_index": metrics.adjusted_rand_index,
     "variation_of_information": lambda labels, truth: metrics.variation_of_information(labels, truth).total,
     "panoptic_quality": lambda labels, truth: metrics.panoptic_quality(labels, truth, labels, truth).pq,
@@ -32,9 +27,9 @@ OF_TWO: dict[str, Callable[[ArrayLike, ArrayLike], object]] = {
     "boundary_precision": lambda labels, truth: metrics.boundary_precision(POINTS, labels, truth, k=2),
     "explained_variation": lambda labels, _: metrics.explained_variation(labels, POINTS),
     "compactness": lambda labels, _: metrics.compactness(POINTS, labels, k=2),
-    "tree_oracle": lambda labels, truth: metrics.tree_oracle(PARENTS, labels, truth),
-    "level_curve": lambda labels, truth: metrics.level_curve(PARENTS, ALTITUDES, labels, truth).values.tolist(),
-    "fragmentation_curve": lambda labels, truth: metrics.fragmentation_curve(PARENTS, labels, truth).errors.tolist(),
+    "tree_oracle": lambda labels, truth: metrics.tree_oracle(TREE, labels, truth),
+    "level_curve": lambda labels, truth: metrics.level_curve(TREE, labels, truth).values.tolist(),
+    "fragmentation_curve": lambda labels, truth: metrics.fragmentation_curve(TREE, labels, truth).errors.tolist(),
 }
 
 
@@ -71,8 +66,8 @@ def test_masked_points_and_values_take_no_part():
 
 def test_labels_without_end_are_refused():
     with pytest.raises(ValueError, match=r"below 2\*\*63"):
-        metrics.weighted_overlap(TRUTH.astype(np.uint64) + 2**63, TRUTH)
-    assert metrics.weighted_overlap(TRUTH + 2**62, TRUTH) == 1.0
+        metrics.segmentation_covering(TRUTH.astype(np.uint64) + 2**63, TRUTH)
+    assert metrics.segmentation_covering(TRUTH + 2**62, TRUTH) == 1.0
 
 
 @pytest.mark.parametrize("truth", [TRUTH, np.zeros(8, int)], ids=["a boundary", "no boundary"])
@@ -86,39 +81,17 @@ def test_reach_is_checked_before_anything_is_found(truth: NDArray[np.int64], wro
     if "hops" in wrong:
         graph = metrics.NeighbourGraph.of(POINTS, k=2)
         with pytest.raises(ValueError, match="at least"):
-            metrics.boundary_curve(graph, PARENTS, ALTITUDES, LEAVES, truth, **wrong)
+            metrics.boundary_curve(graph, TREE, LEAVES, truth, **wrong)
 
 
 @pytest.mark.parametrize("wrong", [PARENTS * 1.0, "a", [3.5]])
 def test_parents_are_whole_numbers(wrong: object):
     with pytest.raises(ValueError, match="parents that are whole numbers"):
-        metrics.tree_oracle(wrong, LEAVES, TRUTH)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(2, 5))
-@settings(max_examples=50, deadline=None)
-def test_where_leaves_meet(seed: int, arity: int):
-    parents, _ = random_tree(seed, arity)
-    left, right = np.divmod(np.arange(count_leaves(parents) ** 2), count_leaves(parents))
-    paths = [members(parents, leaf) for leaf in range(count_leaves(parents))]
-    expected = [min(set(paths[i]) & set(paths[j])) for i, j in zip(left, right, strict=True)]
-    assert lowest_common(parents, count_leaves(parents), left, right).tolist() == expected
-
-
-def test_depth_does_not_matter():
-    n = 200_000  # all merges in one chain: leaf i + 1 joins what is there as node n + i
-    parents = np.concatenate([[n], np.arange(n, 2 * n - 1), np.arange(n + 1, 2 * n - 1), [2 * n - 2]])
-    left, right = np.random.default_rng(0).integers(0, n, (2, n))
-    lowest_common(PARENTS, 3, LEAVES, LEAVES)
-    start = process_time()
-    meeting = lowest_common(parents, n, left, right)
-    assert process_time() - start < 2.0  # climbing node by node takes minutes
-    apart = left != right
-    assert np.array_equal(meeting[apart], n - 1 + np.maximum(left, right)[apart])
+        metrics.tree_oracle((wrong, ALTITUDES), LEAVES, TRUTH)
 
 
 def test_curves_compare_and_hash_as_objects():
-    curve = metrics.level_curve(PARENTS, ALTITUDES, LEAVES, TRUTH)
+    curve = metrics.level_curve(TREE, LEAVES, TRUTH)
     graph = metrics.NeighbourGraph.of(POINTS, k=2)
     quality = metrics.panoptic_quality(LEAVES, TRUTH)
     for thing in (curve, graph, quality, metrics.best_scales([curve])):

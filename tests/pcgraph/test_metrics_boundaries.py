@@ -29,13 +29,13 @@ def test_a_boundary_point_has_another_label_among_its_nearest():
 
 
 @pytest.mark.parametrize(
-    ("shift", "hops", "share"), [(0, 0, 1), (1, 0, 0.5), (1, 1, 1), (2, 0, 0), (2, 1, 0.5), (3, 2, 0.5)]
+    ("shift", "hops", "fraction"), [(0, 0, 1), (1, 0, 0.5), (1, 1, 1), (2, 0, 0), (2, 1, 0.5), (3, 2, 0.5)]
 )
-def test_recall_counts_hops(shift: int, hops: int, share: float):
+def test_recall_counts_hops(shift: int, hops: int, fraction: float):
     # Boundary points of the truth: 5, 6; of the labels: 5 + shift, 6 + shift.
     found = cut_at(6 + shift)
-    assert boundary_recall(ROW, found, TRUTH, hops=hops, k=2) == share
-    assert boundary_precision(ROW, TRUTH, found, hops=hops, k=2) == share
+    assert boundary_recall(ROW, found, TRUTH, hops=hops, k=2) == fraction
+    assert boundary_precision(ROW, TRUTH, found, hops=hops, k=2) == fraction
 
 
 def test_tolerance_is_a_distance_and_includes_its_end():

@@ -32,10 +32,10 @@ def test_scikit_learn_agrees(seed: int):
     table = cluster.cluster.contingency_matrix(found, true)
     assert metrics.contingency(found, true).toarray().tolist() == table.tolist()
     halves = metrics.variation_of_information(found, true)
-    shared = cluster.mutual_info_score(true, found)
+    mutual = cluster.mutual_info_score(true, found)
     entropy = {name: float(_entropy(labels)) for name, labels in (("found", found), ("true", true))}
-    assert halves.split == pytest.approx(entropy["found"] - shared / np.log(2), abs=1e-9)
-    assert halves.merge == pytest.approx(entropy["true"] - shared / np.log(2), abs=1e-9)
+    assert halves.split == pytest.approx(entropy["found"] - mutual / np.log(2), abs=1e-9)
+    assert halves.merge == pytest.approx(entropy["true"] - mutual / np.log(2), abs=1e-9)
     homogeneity, completeness, _ = cluster.homogeneity_completeness_v_measure(true, found)
     assert halves.merge == pytest.approx((1 - homogeneity) * entropy["true"], abs=1e-9)
     assert halves.split == pytest.approx((1 - completeness) * entropy["found"], abs=1e-9)
@@ -54,8 +54,8 @@ def test_scikit_image_agrees(seed: int):
     if together > 0:
         precision = together / ((table.sum(axis=1) ** 2).sum() - len(true))
         recall = together / ((table.sum(axis=0) ** 2).sum() - len(true))
-        error, *shares = image.adapted_rand_error(true, found, ignore_labels=())
-        assert sorted(shares) == pytest.approx(sorted([precision, recall]))
+        error, *fractions = image.adapted_rand_error(true, found, ignore_labels=())
+        assert sorted(fractions) == pytest.approx(sorted([precision, recall]))
         assert error == pytest.approx(1 - 2 * precision * recall / (precision + recall))
 
 
@@ -66,9 +66,9 @@ def test_dense_definitions_agree(seed: int):
     table = metrics.contingency(found, true).toarray()
     rows, columns, n = table.sum(axis=1), table.sum(axis=0), table.sum()
     overlap = table / (rows[:, None] + columns - table)
-    assert metrics.weighted_overlap(found, true) == pytest.approx((overlap.max(axis=0) * columns).sum() / n)
+    assert metrics.segmentation_covering(found, true) == pytest.approx((overlap.max(axis=0) * columns).sum() / n)
     matched = linear_sum_assignment(overlap * columns, maximize=True)
-    assert metrics.weighted_overlap(found, true, matching="one_to_one") == pytest.approx(
+    assert metrics.segmentation_covering(found, true, matching="one_to_one") == pytest.approx(
         (overlap * columns)[matched].sum() / n
     )
     leak = np.minimum(table, rows[:, None] - table)
@@ -89,7 +89,8 @@ def test_dense_definitions_agree(seed: int):
 def test_refining_never_loses_what_segments_can_achieve(seed: int):
     coarse, true = labelling(seed)
     fine = coarse * 3 + np.random.default_rng(seed + 1).integers(0, 3, len(coarse))
-    assert metrics.achievable_accuracy(fine, true) >= metrics.achievable_accuracy(coarse, true)
+    accuracies = [metrics.achievable_segmentation_accuracy(found, true) for found in (fine, coarse)]
+    assert accuracies[0] >= accuracies[1]
     for definition in ("papon", "levinshtein"):
         errors = [metrics.undersegmentation_error(found, true, definition=definition) for found in (fine, coarse)]
         assert errors[0] <= errors[1] + 1e-12
@@ -121,9 +122,9 @@ def test_the_truth_itself_scores_best(seed: int):
 def scores(found: Labels, true: Labels) -> list[float]:
     halves, quality = metrics.variation_of_information(found, true), metrics.panoptic_quality(found, true)
     return [
-        metrics.weighted_overlap(found, true),
-        metrics.weighted_overlap(found, true, matching="one_to_one"),
-        metrics.achievable_accuracy(found, true),
+        metrics.segmentation_covering(found, true),
+        metrics.segmentation_covering(found, true, matching="one_to_one"),
+        metrics.achievable_segmentation_accuracy(found, true),
         metrics.adjusted_rand_index(found, true),
         quality.pq,
         quality.rq,
@@ -139,5 +140,5 @@ def scores(found: Labels, true: Labels) -> list[float]:
 
 
 def _entropy(labels: Labels) -> float:
-    share = np.unique(labels, return_counts=True)[1] / len(labels)
-    return -(share * np.log2(share)).sum()
+    fraction = np.unique(labels, return_counts=True)[1] / len(labels)
+    return -(fraction * np.log2(fraction)).sum()

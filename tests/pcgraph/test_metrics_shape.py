@@ -20,8 +20,8 @@ def only(inside: NDArray[np.bool_], points: NDArray[np.float64] = GRID) -> float
     whole = NeighbourGraph.of(points, k=24)
     # Outside, each point is a segment of its own, and perfect.
     scattered = np.where(inside, 0, 1 + np.arange(len(points)))
-    share = inside.mean()
-    return (compactness(whole, scattered) - (1 - share)) / share
+    fraction = inside.mean()
+    return (compactness(whole, scattered) - (1 - fraction)) / fraction
 
 
 @pytest.mark.parametrize("k", [8, 24])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The k-nearest-neighbour graph of a cloud, on which boundaries and areas are measured."""
+"""Boundary recall and precision, on the k-nearest-neighbour graph of the points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,72 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.metrics.table import decimals, whole_numbers
+from pcgraph.metrics.labellings import as_floats, as_labels
+
+
+def boundary_recall(
+    points: ArrayLike,
+    labels: ArrayLike,
+    truth: ArrayLike,
+    *,
+    hops: int = 1,
+    k: int = 8,
+    tolerance: float | None = None,
+) -> float:
+    """Boundary recall BR, 0..1: fraction of true boundary points with a boundary point of the labels near.
+
+    A boundary point is one with another label among its k nearest neighbours. For many labellings of one cloud
+    build the graph once: ``NeighbourGraph.of(points, truth >= 0).recall(labels, truth)``.
+
+    Parameters
+    ----------
+    points : (n, 3) or (h, w, 3) float
+        Any frame; metres if `tolerance` is.
+    labels, truth : (n,) or (h, w) int
+        Points negative in either are left out, of the graph too.
+    hops : int, >= 0
+        Near is within as many steps from neighbour to neighbour, away from the true boundary point.
+    k : int, >= 1
+        Neighbours per point, the nearest ones, itself not counted.
+    tolerance : float, the points' unit, optional
+        Near is within this distance instead.
+
+    Returns
+    -------
+    float
+        1 if the truth has no boundary.
+
+    Raises
+    ------
+    ValueError
+        Shapes differ, labels are not whole numbers, nothing is labelled in both, a labelled point is not finite, or a
+        number is out of range.
+    """
+    return _graph_of_labelled(points, labels, truth, k).recall(labels, truth, hops=hops, tolerance=tolerance)
+
+
+def boundary_precision(
+    points: ArrayLike,
+    labels: ArrayLike,
+    truth: ArrayLike,
+    *,
+    hops: int = 1,
+    k: int = 8,
+    tolerance: float | None = None,
+) -> float:
+    """Boundary precision BP, 0..1: fraction of the labels' boundary points with a true boundary point near.
+
+    Parameters and errors as for `boundary_recall`; 1 if the labels have no boundary. Supervoxels cut where nothing
+    true ends, so theirs is low by design.
+    """
+    return _graph_of_labelled(points, labels, truth, k).precision(labels, truth, hops=hops, tolerance=tolerance)
+
+
+def _graph_of_labelled(points: ArrayLike, labels: ArrayLike, truth: ArrayLike, k: int) -> NeighbourGraph:
+    found, true = as_labels(labels), as_labels(truth)
+    if found.shape != true.shape:
+        raise ValueError(f"expected labels and truth of one shape, got {found.shape} and {true.shape}")
+    return NeighbourGraph.of(points, (found >= 0) & (true >= 0), k)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +118,7 @@ class NeighbourGraph:
         ValueError
             The shapes differ, k is below 1, no point is valid, or a valid point is not finite.
         """
-        positions = decimals(points)
+        positions = as_floats(points)
         if positions.ndim not in (2, 3) or positions.shape[-1] != 3:
             raise ValueError(f"expected points (n, 3) or (h, w, 3), got {positions.shape}")
         if not _is_whole(k) or k < 1:
@@ -70,7 +135,9 @@ class NeighbourGraph:
         return cls(finite.shape, np.flatnonzero(chosen), inside, _nearest(inside, min(k, len(inside) - 1)))
 
     def boundary(self, labels: ArrayLike) -> NDArray[np.bool_]:
-        """Points with a neighbour of another label, bool in the shape of the labels; False outside the graph.
+        """Boundary points: those with a neighbour of another label, bool in the shape of the labels.
+
+        False outside the graph.
 
         Raises
         ------
@@ -78,19 +145,19 @@ class NeighbourGraph:
             The shape is not the graph's, labels are not whole numbers, or a point of the graph has a negative label.
         """
         marked = np.zeros(self.shape, bool)
-        marked.flat[self.members] = self.rim(labels)
+        marked.flat[self.members] = self.boundary_of_members(labels)
         return marked
 
     def recall(self, labels: ArrayLike, truth: ArrayLike, *, hops: int = 1, tolerance: float | None = None) -> float:
         """Boundary recall BR, 0..1; parameters as for `boundary_recall`."""
-        return self._share_near(self.rim(truth), self.rim(labels), hops, tolerance)
+        return self._fraction_near(self.boundary_of_members(truth), self.boundary_of_members(labels), hops, tolerance)
 
     def precision(self, labels: ArrayLike, truth: ArrayLike, *, hops: int = 1, tolerance: float | None = None) -> float:
         """Boundary precision BP, 0..1; parameters as for `boundary_precision`."""
-        return self._share_near(self.rim(labels), self.rim(truth), hops, tolerance)
+        return self._fraction_near(self.boundary_of_members(labels), self.boundary_of_members(truth), hops, tolerance)
 
     def areas(self) -> NDArray[np.float64]:
-        """Area of surface that each point of the graph stands for, (m,), the points' unit squared.
+        """Area of surface that each point of the graph represents, (m,), the points' unit squared.
 
         12 sqrt(l1 l2) / (k (k + 1)), with l1, l2 the two larger eigenvalues of the sum of d d^T over the steps d to
         the neighbours: noise across the surface drops out, and a slanted view changes nothing. Exact on a square
@@ -107,7 +174,7 @@ class NeighbourGraph:
 
     def of_members(self, labels: ArrayLike) -> NDArray[np.int64]:
         """Labels of the points in the graph, (m,) int64; raises as `boundary` does."""
-        given = whole_numbers(labels)
+        given = as_labels(labels)
         if given.shape != self.shape:
             raise ValueError(f"expected labels of the points' shape {self.shape}, got {given.shape}")
         own = given.reshape(-1)[self.members]
@@ -115,36 +182,36 @@ class NeighbourGraph:
             raise ValueError("expected labels >= 0 for all points of the graph; build it with valid=labels >= 0")
         return own
 
-    def rim(self, labels: ArrayLike) -> NDArray[np.bool_]:
-        """As `boundary`, but (m,) and of the points in the graph only."""
+    def boundary_of_members(self, labels: ArrayLike) -> NDArray[np.bool_]:
+        """Boundary points among the points in the graph, (m,) bool; raises as `boundary`."""
         own = self.of_members(labels)
         return (own[self.neighbours] != own[:, None]).any(axis=1)
 
     def within_hops(self, marked: NDArray[np.bool_], hops: int) -> NDArray[np.bool_]:
-        """Points of the graph that reach a marked one, (m,) bool both, in so many steps to a neighbour."""
-        check_reach(hops)
+        """Points of the graph from which a marked one is at most so many steps to a neighbour away, (m,) bool both."""
+        check_nearness(hops)
         for _ in range(hops):
             marked = marked | marked[self.neighbours].any(axis=1)
         return marked
 
-    def _share_near(self, of: NDArray[np.bool_], to: NDArray[np.bool_], hops: int, tolerance: float | None) -> float:
-        """Share of the points `of` near a point of `to`; 1 if there are none, as then none is missed."""
-        check_reach(hops, tolerance)
+    def _fraction_near(self, of: NDArray[np.bool_], to: NDArray[np.bool_], hops: int, tolerance: float | None) -> float:
+        """Fraction of the points `of` near a point of `to`; 1 if there are none, as then none is missed."""
+        check_nearness(hops, tolerance)
         if not of.any():
             return 1.0
-        near = self.within_hops(to, hops)[of] if tolerance is None else self._within_reach(of, to, tolerance)
+        near = self.within_hops(to, hops)[of] if tolerance is None else self._within_distance(of, to, tolerance)
         return float(near.mean())
 
-    def _within_reach(self, of: NDArray[np.bool_], to: NDArray[np.bool_], tolerance: float) -> NDArray[np.bool_]:
+    def _within_distance(self, of: NDArray[np.bool_], to: NDArray[np.bool_], tolerance: float) -> NDArray[np.bool_]:
         if not to.any():
             return np.zeros(np.count_nonzero(of), bool)
-        reach = np.nextafter(tolerance, np.inf)  # the tree finds what is nearer than the bound, not at it
-        distances, _ = cKDTree(self.points[to]).query(self.points[of], distance_upper_bound=reach, workers=2)
+        bound = np.nextafter(tolerance, np.inf)  # the k-d tree finds what is nearer than the bound, not at it
+        distances, _ = cKDTree(self.points[to]).query(self.points[of], distance_upper_bound=bound, workers=2)
         return np.isfinite(distances)
 
 
-def check_reach(hops: int, tolerance: float | None = None) -> None:
-    """Nothing; raises ValueError unless hops is a whole number, and tolerance a number if any, of at least 0."""
+def check_nearness(hops: int, tolerance: float | None = None) -> None:
+    """Raise ValueError unless hops is a whole number and tolerance, if given, a number, both at least 0."""
     if not _is_whole(hops) or hops < 0:
         raise ValueError(f"expected hops as a whole number of at least 0, got {hops!r}")
     if tolerance is not None and not (isinstance(tolerance, (float, int, np.number)) and tolerance >= 0):
@@ -156,7 +223,7 @@ def _is_whole(number: object) -> bool:
 
 
 def _nearest(points: NDArray[np.float64], k: int) -> NDArray[np.int32]:
-    """Rows of the k nearest other points of each point, (m, k)."""
+    """Rows of the k nearest other points of each point, (m, k) int32."""
     rows = np.arange(len(points))
     if k == 0:
         return np.empty((len(points), 0), np.int32)

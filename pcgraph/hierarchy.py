@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hierarchies as arrays of parents: children, common ancestors, sums up the tree and values down it.
+
+A hierarchy of k nodes is one array `parents`, (k,) int32: leaves first, every parent after its children, the last
+node the root and its own parent. So one pass in ascending order meets children before parents, and one in
+descending order parents before children. Trees, metrics and learning rest on these functions, which bear the
+names that they have in Higra. Nothing here checks its input; `checked_parents` does that once, at the door.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+Operation = Literal["sum", "max", "min"]
+_OPERATIONS: tuple[Operation, ...] = ("sum", "max", "min")
+
+
+def checked_parents(parents: ArrayLike) -> NDArray[np.int32]:
+    """Parents as (k,) int32, if they are those of a hierarchy with any number of children per node.
+
+    Raises
+    ------
+    ValueError
+        Parents are not whole numbers, a parent does not come after its node, the root is not last, or a leaf comes
+        after another node.
+    """
+    up = np.asarray(parents)
+    if up.dtype.kind not in "iu":
+        raise ValueError(f"expected parents that are whole numbers, got {up.dtype}; convert them first")
+    k = len(up) if up.ndim == 1 else 0
+    if k == 0 or up[-1] != k - 1 or (up[:-1] <= np.arange(k - 1)).any() or (up >= k).any():
+        raise ValueError("expected parents (k,) each larger than its node, the last node its own parent")
+    up = np.ascontiguousarray(up, np.int32)
+    inner = np.bincount(up[:-1], minlength=k) > 0
+    if not inner[num_leaves(up) :].all():
+        raise ValueError("expected leaves before all other nodes, got a leaf among those; renumber the nodes")
+    return up
+
+
+def num_leaves(parents: NDArray[np.int32]) -> int:
+    """Number of nodes without children: all before the first that is a parent."""
+    return int(parents.min()) if len(parents) > 1 else 1
+
+
+@njit(cache=True)
+def children(parents: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The two children of each node of a binary hierarchy, (k, 2) int32, the smaller first; -1 for leaves."""
+    pairs = np.full((len(parents), 2), -1, np.int32)
+    for node in range(len(parents)):
+        up = parents[node]
+        if up != node:
+            pairs[up, 1 if pairs[up, 0] >= 0 else 0] = node
+    return pairs
+
+
+class ChildLists(NamedTuple):
+    """Children of nodes that may have any number of them: those of node i are ``nodes[starts[i] : starts[i + 1]]``.
+
+    Attributes
+    ----------
+    starts : (k + 1,) int64
+    nodes : (k - 1,) int64
+        Ascending for each node.
+    """
+
+    starts: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+
+
+def child_lists(parents: NDArray[np.int32]) -> ChildLists:
+    """Children of each node of any hierarchy."""
+    starts = np.zeros(len(parents) + 1, np.int64)
+    np.cumsum(np.bincount(parents[:-1], minlength=len(parents)), out=starts[1:])
+    return ChildLists(starts, np.argsort(parents[:-1], kind="stable"))
+
+
+def accumulate_sequential(
+    parents: NDArray[np.int32], values: NDArray[Any], operation: Operation = "sum"
+) -> NDArray[Any]:
+    """Values of all nodes from those of the leaves: the sum, largest or smallest of everything at and below a node.
+
+    Parameters
+    ----------
+    parents : (k,) int32
+    values : (n_leaves, ...) or (k, ...) bool, int or float, without NaN
+        Given for all nodes, those of inner nodes count too.
+    operation : "sum", "max" or "min"
+
+    Returns
+    -------
+    (k, ...) int64 or float64
+        Sums add the children in ascending order to the node's own value.
+    """
+    dtype = np.dtype(np.float64 if values.dtype.kind == "f" else np.int64)
+    totals = np.full((len(parents), *values.shape[1:]), _neutral(operation, dtype), dtype)
+    totals[: len(values)] = values
+    _accumulate(parents, totals.reshape(len(parents), -1), _OPERATIONS.index(operation))
+    return totals
+
+
+def _neutral(operation: Operation, dtype: np.dtype[Any]) -> float:
+    """Value that changes nothing."""
+    if operation == "sum":
+        return 0
+    if dtype.kind == "f":
+        return -np.inf if operation == "max" else np.inf
+    return np.iinfo(dtype).min if operation == "max" else np.iinfo(dtype).max
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(parents: NDArray[np.int32], values: NDArray[Any], operation: int) -> None:
+    for node in range(len(parents)):
+        up = parents[node]
+        if up == node:
+            continue
+        for column in range(values.shape[1]):
+            if operation == 0:
+                values[up, column] += values[node, column]
+            elif operation == 1:
+                values[up, column] = max(values[up, column], values[node, column])
+            else:
+                values[up, column] = min(values[up, column], values[node, column])
+
+
+def propagate_sequential(
+    parents: NDArray[np.int32], node_values: NDArray[Any], condition: NDArray[np.bool_]
+) -> NDArray[Any]:
+    """Values of all nodes, from the root down: a node takes its parent's new value where the condition holds.
+
+    Parameters
+    ----------
+    parents : (k,) int32
+    node_values : (k, ...) any dtype
+    condition : (k,) bool
+        A root keeps its value in any case.
+    """
+    return node_values[_sources(parents, condition)]
+
+
+@njit(cache=True)
+def _sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Node whose value each node has after the propagation, (k,)."""
+    sources = np.arange(len(parents)).astype(np.int32)
+    for node in range(len(parents) - 1, -1, -1):
+        if condition[node]:
+            sources[node] = sources[parents[node]]
+    return sources
+
+
+class AncestorIndex(NamedTuple):
+    """What finds lowest common ancestors in a time that does not depend on the hierarchy's depth.
+
+    Where parts merge, the representative leaf of the smaller one is linked to that of the largest. A leaf's part at
+    least doubles with each link, so no chain of links is longer than log2 of the number of leaves.
+
+    Attributes
+    ----------
+    links : (n_leaves,) int32
+        Representative to which a leaf's representative was linked; its own for the last one.
+    merges : (n_leaves,) int32
+        Node at which that happened; k, larger than any node, for the last one.
+    """
+
+    links: NDArray[np.int32]
+    merges: NDArray[np.int32]
+
+
+def ancestor_index(parents: NDArray[np.int32]) -> AncestorIndex:
+    """Index of a hierarchy, for many calls of `lowest_common_ancestor`."""
+    return AncestorIndex(*_linked(parents, num_leaves(parents)))
+
+
+def lowest_common_ancestors(
+    parents: NDArray[np.int32], first: NDArray[np.integer], second: NDArray[np.integer]
+) -> NDArray[np.int32]:
+    """Lowest common ancestor of each pair of leaves, (m,) int32; the leaf itself where the two are one.
+
+    Parameters
+    ----------
+    parents : (k,) int32
+    first, second : (m,) int, 0..n_leaves - 1
+    """
+    ends = np.ascontiguousarray(first, np.int32), np.ascontiguousarray(second, np.int32)
+    return _ancestors_of_pairs(ancestor_index(parents), *ends)
+
+
+@njit(cache=True)
+def lowest_common_ancestor(index: AncestorIndex, a: int, b: int) -> int:
+    """Lowest common ancestor of two leaves: the one whose part was linked first climbs until both meet."""
+    node = a
+    while a != b:
+        if index.merges[a] < index.merges[b]:
+            node, a = index.merges[a], index.links[a]
+        else:
+            node, b = index.merges[b], index.links[b]
+    return node
+
+
+@njit(cache=True)
+def _ancestors_of_pairs(index: AncestorIndex, first: NDArray[np.int32], second: NDArray[np.int32]) -> NDArray[np.int32]:
+    nodes = np.empty(len(first), np.int32)
+    for i in range(len(first)):
+        nodes[i] = lowest_common_ancestor(index, first[i], second[i])
+    return nodes
+
+
+@njit(cache=True)
+def _linked(parents: NDArray[np.int32], n_leaves: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    k = len(parents)
+    links, merges = np.arange(n_leaves).astype(np.int32), np.full(n_leaves, k, np.int32)
+    representative, leaves = np.arange(k).astype(np.int32), np.zeros(k, np.int64)
+    leaves[:n_leaves] = 1
+    for node in range(k - 1):
+        up = parents[node]
+        if leaves[up] == 0:
+            representative[up] = representative[node]
+        else:
+            large, small = representative[up], representative[node]
+            if leaves[node] > leaves[up]:
+                large, small = small, large
+            links[small], merges[small] = large, up
+            representative[up] = large
+        leaves[up] += leaves[node]
+    return links, merges
