@@ -141,6 +141,11 @@ def propagate_sequential(
     return node_values[_sources(parents, condition)]
 
 
+def roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Root above each node, (k,) int32, of a forest: several hierarchies in one array, each root its own parent."""
+    return _sources(parents, np.ones(len(parents), np.bool_))
+
+
 @njit(cache=True)
 def _sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Node whose value each node has after the propagation, (k,)."""
