@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
-from pcgraph.tree.contraction import contract_cheapest, heap_update, uncontracted_graph
+from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.linkage import Linkage, Merges, check_cost
 
 
@@ -73,19 +73,17 @@ def average_linkage(
     A mean of two costs is never below the smaller one, so merging in ascending order yields ascending
     altitudes.
     """
-    pairs, altitudes = _merge(n_nodes, edges, np.stack((costs * weights, weights)))
-    return Merges(pairs, np.maximum.accumulate(altitudes))  # a mean may still round down by one unit in the last place
+    sums = np.stack((costs * weights, weights))
+    graph = ContractedGraph.of(n_nodes, edges, sums[0] / sums[1], sums)
+    _merge(graph)
+    merges = graph.merges()
+    return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))  # a mean may round down by one last place
 
 
 @njit(cache=True)
-def _merge(
-    n_nodes: int, edges: NDArray[np.int32], sums: NDArray[np.float64]
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    graph = uncontracted_graph(n_nodes, edges, sums[0] / sums[1], sums)
-    heap = graph.heap
-    while heap.size[0] > 0:
+def _merge(graph: ContractedGraph) -> None:
+    sums = graph.sums
+    while graph.heap.size[0] > 0:
         _, _, n_parallel = contract_cheapest(graph)
         for edge in graph.parallel[:n_parallel]:
-            heap.costs[edge] = sums[0, edge] / sums[1, edge]
-            heap_update(heap, edge)
-    return graph.pairs[: graph.done[0]].copy(), graph.altitudes[: graph.done[0]].copy()
+            heap_update(graph.heap, edge, sums[0, edge] / sums[1, edge])

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.hierarchy import children, num_leaves, propagate_sequential
+from pcgraph.hierarchy import children, num_leaves, propagate_sequential, propagation_sources
 
 
 def horizontal_cut(
@@ -38,18 +38,13 @@ def horizontal_cut(
     n_leaves = num_leaves(parents)
     if _whole("min_size", min_size) == 1:
         last = n_leaves + _merges(altitudes[n_leaves:], n, altitude, n_leaves)
-        return _highest_before(parents, last)[:n_leaves].copy()
+        return propagation_sources(parents, parents < last)[:n_leaves].copy()
     cores = size_cores(parents, counts, min_size)
     merges = _merges(altitudes[n_leaves:], n, altitude, len(cores.joins) + 1)
     last = n_leaves + merges
     if n is not None:  # so many of the merges that join cores
         last = int(cores.joins[merges - 1]) + 1 if merges > 0 else 0
-    return _highest_before(parents, last)[cores.of_leaf]
-
-
-def _highest_before(parents: NDArray[np.int32], last: int) -> NDArray[np.int32]:
-    """Highest node at or above each node, (k,) int32, with a number below `last`; the node itself from `last` on."""
-    return propagate_sequential(parents, np.arange(len(parents), dtype=np.int32), parents < last)
+    return propagation_sources(parents, parents < last)[cores.of_leaf]
 
 
 def _merges(merge_altitudes: NDArray[np.float64], n: int | None, altitude: float | None, most: int) -> int:

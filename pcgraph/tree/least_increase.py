@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.tree.contraction import NONE, contract_cheapest, heap_update, uncontracted_graph
+from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.linkage import Linkage, Merges, check_numbers
 from pcgraph.voxels.eigen import symmetric_eigen
 
@@ -153,65 +153,73 @@ def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: 
     `plane` is 0. After a merge all edges of the merged region get new costs, so the time is the sum of degrees of
     the merged regions times a logarithm: n log n on graphs of bounded degree, n^2 log n around a hub.
     """
-    rows = np.empty((0, len(edges))) if lengths is None else lengths[None].astype(np.float64)
-    masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
-    pairs, altitudes = _merge(edges, rows, Regions(masses, values, centroids, scatters, float(regions.plane)))
-    return Merges(pairs, np.maximum.accumulate(np.maximum(altitudes, 0.0)))
+    sums = np.empty((0, len(edges))) if lengths is None else lengths[None].astype(np.float64)
+    columns = (np.array(column, np.float64, order="C") for column in regions[:4])
+    state = _State(*columns, np.zeros(len(regions.masses)), float(regions.plane))
+    graph = ContractedGraph.of(len(regions.masses), edges, _first_costs(state, edges, sums), sums)
+    _merge(state, graph)
+    merges = graph.merges()
+    return Merges(merges.pairs, np.maximum.accumulate(np.maximum(merges.altitudes, 0.0)))
+
+
+class _State(NamedTuple):
+    """Regions while they merge, with their residuals (n,): sums of squared distances to their planes."""
+
+    masses: NDArray[np.float64]
+    values: NDArray[np.float64]
+    centroids: NDArray[np.float64]
+    scatters: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    plane: float
 
 
 @njit(cache=True)
-def _merge(
-    edges: NDArray[np.int32], lengths: NDArray[np.float64], regions: Regions
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    n, m = len(regions.masses), len(edges)
-    residuals = np.zeros(n)
-    if regions.plane > 0.0:
-        for a in range(n):
-            residuals[a] = _least_eigenvalue(regions.scatters[a].copy())
-    costs = np.empty(m)
-    for e in range(m):
-        costs[e] = _increase(regions, residuals, edges[e, 0], edges[e, 1])
-        if len(lengths) > 0:
-            costs[e] /= lengths[0, e]
-    graph = uncontracted_graph(n, edges, costs, lengths)
-    heap, lists = graph.heap, graph.lists
+def _first_costs(state: _State, edges: NDArray[np.int32], lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cost of each edge, (m,), and the residuals that it needs."""
+    if state.plane > 0.0:
+        for a in range(len(state.masses)):
+            state.residuals[a] = _least_eigenvalue(state.scatters[a].copy())
+    costs = np.empty(len(edges))
+    for edge in range(len(edges)):
+        costs[edge] = _cost(state, lengths, edge, edges[edge, 0], edges[edge, 1])
+    return costs
+
+
+@njit(cache=True)
+def _merge(state: _State, graph: ContractedGraph) -> None:
+    heap, halves, lengths = graph.heap, graph.halves, graph.sums
     while heap.size[0] > 0:
         kept, gone, _ = contract_cheapest(graph)
-        _unite(regions, residuals, kept, gone)
-        half = lists.first[kept]
+        _unite(state, kept, gone)
+        half = graph.clusters[kept].first
         while half != NONE:
-            e = half >> 1
-            costs[e] = _increase(regions, residuals, kept, lists.ends[half ^ 1])
-            if len(lengths) > 0:
-                costs[e] /= lengths[0, e]
-            heap_update(heap, e)
-            half = lists.after[half]
-    return graph.pairs[: graph.done[0]].copy(), graph.altitudes[: graph.done[0]].copy()
+            edge = half >> 1
+            heap_update(heap, edge, _cost(state, lengths, edge, kept, halves[half ^ 1].end))
+            half = halves[half].after
 
 
 @njit(cache=True)
-def _increase(regions: Regions, residuals: NDArray[np.float64], a: int, b: int) -> float:
-    """Energy of the union of two regions less the sum of theirs."""
-    masses, values = regions.masses, regions.values
-    reduced = masses[a] * masses[b] / (masses[a] + masses[b])
+def _cost(state: _State, lengths: NDArray[np.float64], edge: int, a: int, b: int) -> float:
+    """Energy of the union of the two regions at an edge less the sum of theirs, per length where there are lengths."""
+    reduced = state.masses[a] * state.masses[b] / (state.masses[a] + state.masses[b])
     increase = 0.0
-    for i in range(values.shape[1]):
-        gap = values[a, i] - values[b, i]
+    for i in range(state.values.shape[1]):
+        gap = state.values[a, i] - state.values[b, i]
         increase += reduced * gap * gap
-    if regions.plane > 0.0:
-        union = _scatter_of_union(regions, a, b, reduced)
-        increase += regions.plane * (_least_eigenvalue(union) - residuals[a] - residuals[b])
-    return increase
+    if state.plane > 0.0:
+        union = _scatter_of_union(state.centroids, state.scatters, a, b, reduced)
+        increase += state.plane * (_least_eigenvalue(union) - state.residuals[a] - state.residuals[b])
+    return increase / lengths[0, edge] if len(lengths) > 0 else increase
 
 
 @njit(cache=True)
-def _unite(regions: Regions, residuals: NDArray[np.float64], kept: int, gone: int) -> None:
+def _unite(state: _State, kept: int, gone: int) -> None:
     """Give the first of two regions the moments of both."""
-    masses, values, centroids, scatters, plane = regions
+    masses, values, centroids, scatters, residuals, plane = state
     total = masses[kept] + masses[gone]
     fraction = masses[gone] / total
     if plane > 0.0:
-        scatters[kept] = _scatter_of_union(regions, kept, gone, masses[kept] * fraction)
+        scatters[kept] = _scatter_of_union(centroids, scatters, kept, gone, masses[kept] * fraction)
         residuals[kept] = _least_eigenvalue(scatters[kept].copy())
     for i in range(values.shape[1]):
         values[kept, i] += fraction * (values[gone, i] - values[kept, i])
@@ -221,8 +229,9 @@ def _unite(regions: Regions, residuals: NDArray[np.float64], kept: int, gone: in
 
 
 @njit(cache=True)
-def _scatter_of_union(regions: Regions, a: int, b: int, reduced: float) -> NDArray[np.float64]:
-    centroids, scatters = regions.centroids, regions.scatters
+def _scatter_of_union(
+    centroids: NDArray[np.float64], scatters: NDArray[np.float64], a: int, b: int, reduced: float
+) -> NDArray[np.float64]:
     union = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
