@@ -148,7 +148,7 @@ def roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @njit(cache=True)
 def propagation_sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Node whose value each node has after `propagate_sequential`, (k,) int32: itself or the first above to keep its own."""
+    """Node whose value each node has after `propagate_sequential`, (k,) int32: it or one above it."""
     sources = np.arange(len(parents)).astype(np.int32)
     for node in range(len(parents) - 1, -1, -1):
         if condition[node]:

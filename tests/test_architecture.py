@@ -50,6 +50,7 @@ STOREYS = [
     "output",
     "cloud",
     "parallel",
+    "hierarchy",
     "voxels",
     "inputs",
     "features",
@@ -60,7 +61,7 @@ STOREYS = [
     "scan",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = {"pipeline", "warmup", "detection", "learning", "io", "cli"}
+ON_TOP = {"warmup", "detection", "learning", "io", "cli"}
 """What stands on these and may import all of them."""
 
 
@@ -73,7 +74,7 @@ def test_nobody_in_pcgraph_imports_from_above(path: Path) -> None:
     own = storey(".".join(path.relative_to(ROOT).with_suffix("").parts))
     above = {storey(name) for name in imports(path, top_level_only=True) if name.startswith("pcgraph.")} - {own}
     if own == "metrics":
-        assert not above  # plain arrays in, numbers out
+        assert above <= {"hierarchy"}  # plain arrays in, numbers out
     elif own in STOREYS:
         assert above <= set(STOREYS[: STOREYS.index(own)])
     else:

@@ -154,9 +154,10 @@ def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: 
     the merged regions times a logarithm: n log n on graphs of bounded degree, n^2 log n around a hub.
     """
     sums = np.empty((0, len(edges))) if lengths is None else lengths[None].astype(np.float64)
-    columns = (np.array(column, np.float64, order="C") for column in regions[:4])
-    state = _State(*columns, np.zeros(len(regions.masses)), float(regions.plane))
-    graph = ContractedGraph.of(len(regions.masses), edges, _first_costs(state, edges, sums), sums)
+    n = len(regions.masses)
+    masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
+    state = _State(masses, values, centroids, scatters, np.zeros(n), float(regions.plane))
+    graph = ContractedGraph.of(n, edges, _first_costs(state, edges, sums), sums)
     _merge(state, graph)
     merges = graph.merges()
     return Merges(merges.pairs, np.maximum.accumulate(np.maximum(merges.altitudes, 0.0)))

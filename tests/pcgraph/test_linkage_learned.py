@@ -102,12 +102,21 @@ def good():
         json.dumps(good() | {"intercept": None}).encode(),
         json.dumps(good() | {"intercept": float("nan")}).encode(),
         json.dumps(good() | {"more": 1}).encode(),
+        json.dumps(good() | {"intercept": True}).encode(),
+        json.dumps(good() | {"object_altitude": "0.4"}).encode(),
+        json.dumps(good() | {"intercept": 10**400}).encode(),
+        json.dumps(good() | {"scales": [1e300, 1]}).encode().replace(b"1e+300", b"1e400"),
+        json.dumps(good() | {"names": ["concavity", None]}).encode(),
+        json.dumps({name: value for name, value in good().items() if name != "means"}).encode(),
+        json.dumps(good()).encode()[:-9],
+        json.dumps(good()).encode().replace(b"concavity", b"\xff\xfe"),
+        json.dumps(good()).encode().replace(b"[", b"[" * 100_000),
     ],
 )
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "model.json"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(ValueError, match=r"^expected JSON that EdgeModel.save wrote, got .*model.json"):
         EdgeModel.load(path)
 
 
