@@ -20,17 +20,19 @@ if TYPE_CHECKING:
     from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
     from pcgraph.graph.occlusion import Continuations, Occlusions
     from pcgraph.io import read_cloud, write_segmentation
-    from pcgraph.pipeline import segment, update
+    from pcgraph.scan import segment, update
     from pcgraph.segmentation import Segmentation
     from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth, Vccs
-    from pcgraph.tree.energy import Energy, plane_energy, variance_energy
+    from pcgraph.tree.average_linkage import ConvexityLinkage
+    from pcgraph.tree.energies import plane_energy, variance_energy
     from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
     from pcgraph.tree.lccp import LccpLinkage
     from pcgraph.tree.learned import LearnedLinkage
-    from pcgraph.tree.linkage import ConvexityLinkage, Linkage, Merges
-    from pcgraph.tree.quasi_flat import QuasiFlatLinkage
+    from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
+    from pcgraph.tree.linkage import Linkage, Merges
+    from pcgraph.tree.optimal_cut import Energy
+    from pcgraph.tree.single_linkage import QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree
-    from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
     from pcgraph.voxels.surface import Surface
 
 __all__ = [
@@ -85,34 +87,34 @@ _HOMES = {
     "CloudReadError": "errors",
     "CloudWriteError": "errors",
     "Continuations": "graph.occlusion",
-    "ConvexityLinkage": "tree.linkage",
+    "ConvexityLinkage": "tree.average_linkage",
     "EdgeFeatures": "graph.adjacency",
-    "Energy": "tree.energy",
+    "Energy": "tree.optimal_cut",
     "FelzenszwalbLinkage": "tree.felzenszwalb",
     "LccpLinkage": "tree.lccp",
     "LearnedLinkage": "tree.learned",
     "Linkage": "tree.linkage",
     "Merges": "tree.linkage",
     "Moments": "features.moments",
-    "MumfordShahLinkage": "tree.ward",
+    "MumfordShahLinkage": "tree.least_increase",
     "NodeFeatures": "features.nodes",
     "Occlusions": "graph.occlusion",
     "PcgraphError": "errors",
     "Primitive": "features.primitives",
     "Primitives": "features.primitives",
-    "QuasiFlatLinkage": "tree.quasi_flat",
+    "QuasiFlatLinkage": "tree.single_linkage",
     "Segmentation": "segmentation",
     "SegmentationTree": "tree.tree",
     "SupervoxelMethod": "supervoxels.method",
     "Surface": "voxels.surface",
     "SurfaceGrowth": "supervoxels.method",
     "Vccs": "supervoxels.method",
-    "WardLinkage": "tree.ward",
-    "plane_energy": "tree.energy",
+    "WardLinkage": "tree.least_increase",
+    "plane_energy": "tree.energies",
     "read_cloud": "io",
-    "segment": "pipeline",
-    "update": "pipeline",
-    "variance_energy": "tree.energy",
+    "segment": "scan",
+    "update": "scan",
+    "variance_energy": "tree.energies",
     "write_segmentation": "io",
 }
 

@@ -129,7 +129,7 @@ def _segmentation(
     path: Path, method: Method, color: bool, viewpoint: tuple[float, ...] | None, sizes: dict[str, float | None]
 ) -> tuple[Cloud, Segmentation]:
     from pcgraph.io import read_cloud
-    from pcgraph.pipeline import segment as segment_points
+    from pcgraph.scan import segment as segment_points
     from pcgraph.supervoxels.method import SurfaceGrowth, Vccs
 
     cloud = read_cloud(path)

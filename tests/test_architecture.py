@@ -61,7 +61,7 @@ STOREYS = [
     "scan",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = {"pipeline", "warmup", "detection", "learning", "io", "cli"}
+ON_TOP = {"warmup", "detection", "learning", "io", "cli"}
 """What stands on these and may import all of them."""
 
 
