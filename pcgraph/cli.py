@@ -130,7 +130,8 @@ def _segmentation(
 ) -> tuple[Cloud, Segmentation]:
     from pcgraph.io import read_cloud
     from pcgraph.pipeline import segment as segment_points
-    from pcgraph.supervoxels.method import SurfaceGrowth, Vccs
+    from pcgraph.supervoxels.surface_growth import SurfaceGrowth
+    from pcgraph.supervoxels.vccs import Vccs
 
     cloud = read_cloud(path)
     stored = cloud.viewpoint

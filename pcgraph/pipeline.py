@@ -9,12 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, fraction, positive
 from pcgraph.scan import Scan, Settings, segmentation
 from pcgraph.segmentation import Segmentation
-from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth
+from pcgraph.supervoxels.method import SupervoxelMethod
+from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import ConvexityLinkage, Linkage
-from pcgraph.voxels.bounds import bounding_box
-from pcgraph.voxels.grid import VoxelGrid, voxel_grid, voxel_means
-from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.union import grid_union
+from pcgraph.voxels.grid import VoxelGrid, grid_union, voxel_grid, voxel_means
+from pcgraph.voxels.spacing import bounding_box, median_spacing
 from pcgraph.voxels.warp import choose_warp
 
 VOXELS_PER_SPACING = 3.5
@@ -92,7 +91,9 @@ def segment(
         cloud.points, position, _is_camera(cloud, position, growth) if camera is None else camera, growth
     )
     grid = voxel_grid(cloud.points, cloud.colors, voxel_size, warp)
-    scan = Scan(cloud, position, grid, _outside(grid, position), np.full(grid.n_voxels, -1, np.int32), seed_size)
+    scan = Scan(
+        cloud, position, grid, _orientation_points(grid, position), np.full(grid.n_voxels, -1, np.int32), seed_size
+    )
     return segmentation(scan, None, settings)
 
 
@@ -150,16 +151,16 @@ def update(
     before.grid.warp.check(cloud.points)
     seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp)
     union = grid_union(before.grid, seen)
-    known = np.full(union.grid.n_voxels, -1, np.int32)
-    known[union.first] = before.supervoxels
-    outside = np.empty((union.grid.n_voxels, 3))
-    outside[union.second] = _outside(seen, position)
-    outside[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
-    scan = Scan(cloud, position, union.grid, outside, known, earlier.seed_size)
+    initial = np.full(union.grid.n_voxels, -1, np.int32)
+    initial[union.first] = before.supervoxels
+    towards = np.empty((union.grid.n_voxels, 3))
+    towards[union.second] = _orientation_points(seen, position)
+    towards[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
+    scan = Scan(cloud, position, union.grid, towards, initial, earlier.seed_size)
     return segmentation(scan, earlier, settings)
 
 
-def _outside(grid: VoxelGrid, position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _orientation_points(grid: VoxelGrid, position: NDArray[np.float64]) -> NDArray[np.float64]:
     """From where the voxels were seen: one place, (3,), or the mean of those of each voxel's points, (v, 3)."""
     if position.ndim == 1:
         return position

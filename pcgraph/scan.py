@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.contacts import contacts
-from pcgraph.graph.relations import edge_features
+from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.inputs import CleanCloud, non_negative
 from pcgraph.parallel import side_by_side
 from pcgraph.segmentation import Segmentation
@@ -51,9 +50,9 @@ class Scan:
     viewpoint : (3,) or (n, 3) float64, metres
     grid : VoxelGrid of v voxels
         All that has been seen; its `voxel_of_point` speaks of these points.
-    outside : (3,) or (v, 3) float64, metres
+    orientation_points : (3,) or (v, 3) float64, metres
         A place on the outer side of each voxel's surface.
-    known : (v,) int32
+    initial_labels : (v,) int32
         Supervoxels of earlier scans, -1 elsewhere.
     seed_size : float, metres
     """
@@ -61,20 +60,20 @@ class Scan:
     cloud: CleanCloud
     viewpoint: NDArray[np.float64]
     grid: VoxelGrid
-    outside: NDArray[np.float64]
-    known: NDArray[np.int32]
+    orientation_points: NDArray[np.float64]
+    initial_labels: NDArray[np.int32]
     seed_size: float
 
 
 def segmentation(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
     """The algorithm from voxels on."""
     cloud, grid, method, linkage = scan.cloud, scan.grid, settings.method, settings.linkage
-    planes = method.planes(grid, scan.outside)
+    planes = method.planes(grid, scan.orientation_points)
     normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
-        normals[scan.known >= 0] = earlier.surface.normals
-    supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.known)
+        normals[scan.initial_labels >= 0] = earlier.surface.normals
+    supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.initial_labels)
     leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
     surface = Surface(grid, normals, supervoxels)
     leaves, touching = side_by_side(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.relations import angle_between
+from pcgraph.graph.contacts import angle_between
 from pcgraph.plain_files import read_file, write_file
 
 _FORMAT = "pcgraph edge model 1"

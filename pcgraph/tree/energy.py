@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.pooling import pool_sums
+from pcgraph.features.moments import accumulate_sums
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.tree.ancestors import ancestor_index
 
@@ -113,7 +113,7 @@ def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[n
     # An edge is inside from the lowest common ancestor of its ends upwards: there both its sides leave the outline.
     meeting = ancestor_index(tree.parents).of_pairs(graph.edges)
     outlines -= 2.0 * np.bincount(meeting, lengths, k)
-    pool_sums(tree.parents, outlines[:, None])
+    accumulate_sums(tree.parents, outlines[:, None])
     return np.maximum(outlines, 0.0)
 
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.columns import rows
 from pcgraph.features.moments import Moments
-from pcgraph.features.nodes import NodeFeatures, node_features
+from pcgraph.features.nodes import NodeFeatures, node_features, rows
 from pcgraph.inputs import non_negative
 from pcgraph.tree.ancestors import ancestor_index
 from pcgraph.tree.cuts import horizontal_cut, stable_cut

@@ -6,10 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks
+from pcgraph.parallel import in_blocks, kernel
 
 _LEAST_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
 
@@ -66,7 +65,7 @@ class CameraWarp(Warp):
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64; points must lie in front of the viewpoint."""
         warped = np.empty((len(points), 3))
-        in_blocks(_see, len(points), points, self.viewpoint, self.reference_depth, warped)
+        in_blocks(_project, len(points), points, self.viewpoint, self.reference_depth, warped)
         return warped
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,8 +120,8 @@ def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), _LEAST_LENGTH)
 
 
-@njit(cache=True, nogil=True)
-def _see(
+@kernel
+def _project(
     start: int,
     stop: int,
     points: NDArray[np.float64],
@@ -130,7 +129,7 @@ def _see(
     reference_depth: float,
     warped: NDArray[np.float64],
 ) -> None:
-    """Points as a camera sees them, in metres at the reference depth."""
+    """Set places of points as a camera sees them, in metres at the reference depth."""
     for p in range(start, stop):
         depth = points[p, 2] - viewpoint[2]
         scale = reference_depth / depth

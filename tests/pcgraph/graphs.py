@@ -10,7 +10,7 @@ import numpy as np
 from pcgraph.features.moments import Moments, moments_of_groups
 from pcgraph.features.nodes import NodeFeatures, node_features
 from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
-from pcgraph.graph.relations import angle_between, signed_convexity
+from pcgraph.graph.contacts import angle_between, signed_convexity
 from pcgraph.tree.growth import segmentation_tree
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.tree import SegmentationTree

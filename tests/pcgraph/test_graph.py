@@ -8,7 +8,7 @@ import pytest
 from clouds import SPACING, patch
 
 import pcgraph
-from pcgraph.graph.relations import angle_between, signed_convexity
+from pcgraph.graph.contacts import angle_between, signed_convexity
 
 
 def wedge(convex: bool):

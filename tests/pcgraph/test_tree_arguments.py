@@ -8,7 +8,7 @@ import pytest
 from graphs import hand_graph, hand_tree, random_graph, tree_of
 
 import pcgraph
-from pcgraph.features.pooling import pool_sums
+from pcgraph.features.moments import accumulate_sums
 from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
 from pcgraph.tree.ancestors import ancestor_index
 from pcgraph.tree.edge_model import EdgeModel
@@ -169,5 +169,5 @@ def test_results_compare_and_hash_as_objects(boxes):
 def test_sums_of_everything_below():
     parents = hand_tree([[0, 1], [2, 3]], [1.0, 2.0]).parents
     values = np.array([[1, 10], [2, 20], [4, 40], [8, 80], [16, 160]])
-    pool_sums(parents, values)
+    accumulate_sums(parents, values)
     assert values.tolist() == [[1, 10], [2, 20], [4, 40], [11, 110], [31, 310]]
