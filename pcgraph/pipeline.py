@@ -15,6 +15,7 @@ from pcgraph.tree.linkage import ConvexityLinkage, Linkage
 from pcgraph.voxels.grid import VoxelGrid, grid_union, voxel_grid, voxel_means
 from pcgraph.voxels.spacing import bounding_box, median_spacing
 from pcgraph.voxels.warp import choose_warp
+from pcgraph.warmup import compile_in_two_processes
 
 VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0
@@ -85,6 +86,7 @@ def segment(
     settings = Settings.of(method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
+    compile_in_two_processes()
     voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
     growth = fraction("range_growth", range_growth)
     warp = choose_warp(

@@ -74,12 +74,12 @@ def _hashes(points: NDArray[np.float64]) -> NDArray[np.uint64]:
 
 def _some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """All points, or of large clouds those in some blocks of space."""
-    while len(points) > 2 * _CROWD and len(smaller := _some_blocks(points)) < len(points):
+    while len(points) > 2 * _CROWD and len(smaller := some_blocks(points)) < len(points):
         points = smaller
     return points
 
 
-def _some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points of as many blocks of space as it takes for a crowd, the blocks by their hashes."""
     low, high = bounding_box(points)
     edge = float((high - low).max()) / _BLOCKS
