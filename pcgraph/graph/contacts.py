@@ -56,12 +56,25 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
     edge_of_pair = np.empty(len(keys), np.int64)
     edge_of_pair[order] = np.arange(len(keys))
     edges = np.stack((keys[order] >> 32, keys[order] & 0xFFFFFFFF), axis=1).astype(np.int32)
-    side = (supervoxels[voxel] > other).view(np.uint8)
-    m = len(keys)
-    found = Contacts(edges, np.zeros((m, 2), np.int64), np.zeros((m, 2, 3)), np.zeros((m, 2, 3)), np.zeros(m))
-    _average(voxel, edge_of_pair[pair], side, grid.centroids, normals, found.voxels, found.positions, found.normals)
-    np.add.at(found.lengths, edge_of_pair[pair], 0.5 * grid.edge_lengths[voxel])
-    return found
+    edge = edge_of_pair[pair]
+    side = 2 * edge + (supervoxels[voxel] > other)
+    n_sides = 2 * len(keys)
+    voxels = np.bincount(side, minlength=n_sides)
+
+    def sums(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        rows = vectors[voxel]
+        return np.stack([np.bincount(side, rows[:, axis], n_sides) for axis in range(3)], axis=1)
+
+    directions = sums(normals)
+    x, y, z = directions.T
+    norms = np.sqrt(x * x + y * y + z * z)
+    return Contacts(
+        edges=edges,
+        voxels=voxels.reshape(-1, 2),
+        positions=(sums(grid.centroids) / voxels[:, None]).reshape(-1, 2, 3),
+        normals=(directions / np.maximum(norms, 1e-12)[:, None]).reshape(-1, 2, 3),
+        lengths=np.bincount(edge, 0.5 * grid.edge_lengths[voxel], len(keys)).astype(np.float64),  # int64 if m is 0
+    )
 
 
 @kernel
@@ -121,23 +134,6 @@ def _grown(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32
     return wide, slots
 
 
-@kernel
-def _average(voxel, edge, side, centroids, normals, voxels, positions, directions):  # type: ignore[no-untyped-def]
-    """Set, of both sides of m edges, the number of voxels (m, 2), mean positions and unit mean normals (m, 2, 3)."""
-    for row in range(len(voxel)):
-        i, e, s = voxel[row], edge[row], side[row]
-        voxels[e, s] += 1
-        for axis in range(3):
-            positions[e, s, axis] += centroids[i, axis]
-            directions[e, s, axis] += normals[i, axis]
-    for e in range(len(voxels)):
-        for s in range(2):
-            squares = directions[e, s, 0] ** 2 + directions[e, s, 1] ** 2 + directions[e, s, 2] ** 2
-            for axis in range(3):
-                positions[e, s, axis] /= voxels[e, s]
-                directions[e, s, axis] /= max(math.sqrt(squares), 1e-12)
-
-
 # --- features of edges ---
 
 
@@ -162,26 +158,6 @@ def edge_features(nodes: NodeFeatures, contacts: Contacts) -> EdgeFeatures:
         contact_length=contacts.lengths,
         step=step,
     )
-
-
-@kernel
-def signed_convexity(
-    normal_i: NDArray[np.float64], normal_j: NDArray[np.float64], offset: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Angle between normals, radians, (m,): positive if convex, negative if concave.
-
-    Parameters
-    ----------
-    normal_i, normal_j : (m, 3) float64
-        Unit normals that point out of the surface.
-    offset : (m, 3) float64, metres
-        From the place of i to the place of j.
-    """
-    signs = np.empty(len(offset))
-    origin = np.zeros(3)
-    for row in range(len(offset)):
-        signs[row] = _turn(normal_i[row], normal_j[row], origin, offset[row])
-    return angle_between(normal_i, normal_j) * signs
 
 
 @kernel

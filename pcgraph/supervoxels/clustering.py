@@ -157,7 +157,7 @@ def _seeds_of_cells(
         members = order[starts[cell] : starts[cell + 1]]
         if len(members) < enough:
             continue
-        seed = _nearest_to_mean(places, members, len(members))
+        seed = _nearest_to_mean(places, members)
         seeds[used] = seed
         used += 1
         if two_sided:
@@ -172,14 +172,15 @@ def _seeds_of_cells(
                 members[turned], members[at] = i, members[turned]
                 turned += 1
         if turned > 0 and turned >= enough:
-            seeds[used] = _nearest_to_mean(places, members, turned)
+            seeds[used] = _nearest_to_mean(places, members[:turned])
             used += 1
     return seeds[:used]
 
 
 @routine
-def _nearest_to_mean(places: NDArray[np.float64], members: NDArray[np.int64], n: int) -> int:
-    """Of the first n members the one nearest to their mean, of equals the smallest."""
+def _nearest_to_mean(places: NDArray[np.float64], members: NDArray[np.int64]) -> int:
+    """Member nearest to the mean of all, of equals the smallest."""
+    n = len(members)
     x = y = z = 0.0
     for at in range(n):
         i = members[at]

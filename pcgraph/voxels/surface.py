@@ -255,9 +255,10 @@ def local_planes(grid: VoxelGrid, viewpoints: NDArray[np.float64], reach: int) -
         held, better = windows.residuals[best], np.empty_like(best)
         in_blocks(_take_best, n, neighbourhood, grid.centroids, windows, held, best, costs, better)
         best = better
-    facing, origins = np.empty((n, 3)), np.empty((n, 3))
-    in_blocks(_read_off, n, best, windows, towards, facing, origins)
-    return LocalPlanes(facing, origins)
+    normals = windows.normals[best]
+    x, y, z = (normals * towards).T
+    normals[x + y + z < 0.0] *= -1.0
+    return LocalPlanes(normals, windows.moments[best, 1:4])
 
 
 @kernel
@@ -294,23 +295,3 @@ def _take_best(
             if cost < least:
                 chosen, least = w, cost
         better[i], costs[i] = chosen, least
-
-
-@kernel
-def _read_off(
-    start: int,
-    stop: int,
-    best: NDArray[np.int32],
-    windows: Windows,
-    towards: NDArray[np.float64],
-    facing: NDArray[np.float64],
-    origins: NDArray[np.float64],
-) -> None:
-    """Set each voxel's plane, its normal on the viewpoint's side."""
-    moments, normals, _ = windows
-    for i in range(start, stop):
-        x, y, z = normals[best[i], 0], normals[best[i], 1], normals[best[i], 2]
-        sign = -1.0 if x * towards[i, 0] + y * towards[i, 1] + z * towards[i, 2] < 0.0 else 1.0
-        facing[i, 0], facing[i, 1], facing[i, 2] = sign * x, sign * y, sign * z
-        for axis in range(3):
-            origins[i, axis] = moments[best[i], 1 + axis]
