@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiling kernels ahead of their first use, in two processes.
 
-Compiled kernels are kept in numba's cache, so this is done once per installation. What numba does to compile holds the
-interpreter's lock; so a second process compiles what graph and tree need while this one compiles what voxels need.
+Compiled kernels are kept in numba's cache, so this is done once per installation. Compiling holds the interpreter's
+lock, so threads are no help; a second process compiles what graph and tree need, this one what voxels need.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numba import config
@@ -126,12 +127,15 @@ def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.stack((x, y, depth), axis=-1), np.broadcast_to(np.array([0.0, 0.0, -1.0]), (_EDGE, _EDGE, 3))
 
 
-def _is_cached(kernel: object) -> bool:
+def _is_cached(kernel: Any) -> bool:
     """Whether numba's cache has an index of this kernel that is not older than its source."""
-    source = kernel.py_func.__code__  # type: ignore[attr-defined]
-    written = Path(source.co_filename).stat().st_mtime
-    names = Path(kernel.stats.cache_path).glob(f"*.{source.co_name}-{source.co_firstlineno}.*.nbi")  # type: ignore[attr-defined]
-    return any(name.stat().st_mtime >= written for name in names)
+    source = kernel.py_func.__code__
+    try:
+        written = Path(source.co_filename).stat().st_mtime
+        names = Path(kernel.stats.cache_path).glob(f"*.{source.co_name}-{source.co_firstlineno}.*.nbi")
+        return any(name.stat().st_mtime >= written for name in names)
+    except OSError:  # the source is no plain file, or another process clears the cache: nothing can be said
+        return True
 
 
 def _second_process() -> subprocess.Popen[bytes] | None:
@@ -143,7 +147,7 @@ def _second_process() -> subprocess.Popen[bytes] | None:
     quiet = subprocess.DEVNULL
     try:
         return subprocess.Popen(
-            [sys.executable, "-c", code],
+            [sys.executable, "-P", "-c", code],
             stdin=quiet,
             stdout=quiet,
             stderr=quiet,

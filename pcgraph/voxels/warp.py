@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel
 
-_LEAST_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
+_MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ class RangeWarp(Warp):
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths of rows, (n,) float64; at least `_LEAST_LENGTH`."""
-    return np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), _LEAST_LENGTH)
+    """Lengths of rows, (n,) float64; at least `_MIN_LENGTH`."""
+    return np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), _MIN_LENGTH)
 
 
 @kernel
@@ -166,7 +166,7 @@ def choose_warp(
         raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
     if range_growth:
         distance = float(np.median(_lengths(points - viewpoint)))
-        return RangeWarp(viewpoint, distance, range_growth) if distance > _LEAST_LENGTH else Warp()
+        return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
     if not camera:
         return Warp()
     warp = CameraWarp(viewpoint, float(np.median(points[:, 2])) - float(viewpoint[2]))
