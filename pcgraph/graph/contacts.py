@@ -98,8 +98,8 @@ def _boundary_voxels(  # type: ignore[no-untyped-def]
             n_seen += (seen[n_seen] != own) & (seen[n_seen] != last)
             last = supervoxels[neighbours[a]]
         for b in range(n_seen):
-            for known in range(b):
-                if seen[known] == seen[b]:
+            for earlier in range(b):
+                if seen[earlier] == seen[b]:
                     break
             else:
                 if n_keys == len(keys):

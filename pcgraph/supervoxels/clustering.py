@@ -113,7 +113,7 @@ def set_means(sums: NDArray[np.float64], means: NDArray[np.float64]) -> None:
 
 
 def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, two_sided: bool) -> NDArray[np.int32]:
-    """Voxels from which supervoxels grow, (k,) int32, ascending; perhaps none.
+    """Voxels from which supervoxels expand, (k,) int32, ascending; perhaps none.
 
     In each seed cell with enough voxels for a surface, it is the voxel nearest to the mean of the cell's voxels,
     of equals the first. Unless `two_sided`, voxels of the cell that face away from it count as another surface,
