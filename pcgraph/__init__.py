@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from pcgraph.io import read_cloud, write_segmentation
     from pcgraph.scan import segment, update
     from pcgraph.segmentation import Segmentation
-    from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth, Vccs
+    from pcgraph.supervoxels.method import SupervoxelMethod
+    from pcgraph.supervoxels.surface_growth import SurfaceGrowth
+    from pcgraph.supervoxels.vccs import Vccs
     from pcgraph.tree.average_linkage import ConvexityLinkage
     from pcgraph.tree.energies import plane_energy, variance_energy
     from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
@@ -107,8 +109,8 @@ _HOMES = {
     "SegmentationTree": "tree.tree",
     "SupervoxelMethod": "supervoxels.method",
     "Surface": "voxels.surface",
-    "SurfaceGrowth": "supervoxels.method",
-    "Vccs": "supervoxels.method",
+    "SurfaceGrowth": "supervoxels.surface_growth",
+    "Vccs": "supervoxels.vccs",
     "WardLinkage": "tree.least_increase",
     "plane_energy": "tree.energies",
     "read_cloud": "io",

@@ -130,7 +130,9 @@ def _segmentation(
 ) -> tuple[Cloud, Segmentation]:
     from pcgraph.io import read_cloud
     from pcgraph.scan import segment as segment_points
-    from pcgraph.supervoxels.method import SurfaceGrowth, Vccs
+    from pcgraph.supervoxels.surface_growth import SurfaceGrowth
+    from pcgraph.supervoxels.vccs import Vccs
+    from pcgraph.warmup import must_compile
 
     cloud = read_cloud(path)
     stored = cloud.viewpoint
@@ -139,6 +141,8 @@ def _segmentation(
     position = stored if viewpoint is None else viewpoint
     colors = cloud.colors if color else None
     chosen = SurfaceGrowth() if method is Method.SURFACE else Vccs()
+    if must_compile():
+        typer.echo("pcgraph: compiling its kernels, which takes ten seconds or so; done once.", err=True)
     try:
         result = segment_points(
             cloud.points,

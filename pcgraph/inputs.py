@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.voxels.bounds import bounding_box
+from pcgraph.voxels.spacing import bounding_box
 
 _SMALLEST = 1e-250
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow

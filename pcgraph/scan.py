@@ -14,21 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.contacts import contacts
-from pcgraph.graph.relations import edge_features
+from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, fraction, non_negative, positive
 from pcgraph.parallel import side_by_side
 from pcgraph.segmentation import Segmentation
-from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth
+from pcgraph.supervoxels.method import SupervoxelMethod
+from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.average_linkage import ConvexityLinkage
 from pcgraph.tree.linkage import Linkage
 from pcgraph.tree.tree import segmentation_tree
-from pcgraph.voxels.bounds import bounding_box
-from pcgraph.voxels.grid import VoxelGrid, voxel_grid, voxel_means
-from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.grid import VoxelGrid, grid_union, voxel_grid, voxel_means
+from pcgraph.voxels.spacing import bounding_box, median_spacing
 from pcgraph.voxels.surface import Surface
-from pcgraph.voxels.union import grid_union
 from pcgraph.voxels.warp import choose_warp
+from pcgraph.warmup import compile_in_two_processes
 
 VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0
@@ -101,6 +100,7 @@ def segment(
     position = clean_viewpoint(viewpoint, cloud)
     voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
     growth = fraction("range_growth", range_growth)
+    compile_in_two_processes()
     warp = choose_warp(
         cloud.points, position, _is_camera(cloud, position, growth) if camera is None else camera, growth
     )

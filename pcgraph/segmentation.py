@@ -155,8 +155,7 @@ class Segmentation:
         ValueError
             The shape is another, or the segmentation holds points of earlier scans, which are not among these.
         """
-        from pcgraph.features.primitive_moments import pool_up_tree, primitive_moments
-        from pcgraph.features.primitives import fit_primitives
+        from pcgraph.features.primitives import fit_primitives, primitive_moments, primitive_moments_up_tree
 
         surface = self.surface
         places, normals, groups = surface.grid.centroids, surface.normals, surface.supervoxels
@@ -169,7 +168,7 @@ class Segmentation:
             places, groups = given[inside].astype(np.float64), self.supervoxels[inside]
             normals = normals[surface.grid.voxel_of_point]
         leaves = primitive_moments(places, normals, groups, self.tree.n_leaves)
-        return fit_primitives(pool_up_tree(leaves, self.tree.parents))
+        return fit_primitives(primitive_moments_up_tree(leaves, self.tree.parents))
 
     def _spread(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
         """Values of the finite points in the input's shape."""

@@ -1,14 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiling ahead of a measurement of time."""
+"""Compiling kernels ahead of their first use, in two processes.
+
+Compiled kernels are kept in numba's cache, so this is done once per installation. Compiling holds the interpreter's
+lock, so threads are no help; a second process compiles what graph and tree need, this one what voxels need.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+import gc
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+from typing import Any
 
-from pcgraph.scan import segment
+import numpy as np
+from numba import config
+from numpy.typing import NDArray
+
+from pcgraph.features.moments import moments_of_groups
+from pcgraph.features.nodes import node_features
+from pcgraph.graph import contacts
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.supervoxels import clustering
+from pcgraph.supervoxels.surface_growth import SurfaceGrowth
+from pcgraph.tree.average_linkage import ConvexityLinkage
+from pcgraph.tree.tree import segmentation_tree
+from pcgraph.voxels.grid import VoxelGrid, voxel_grid
+from pcgraph.voxels.spacing import some_blocks
+from pcgraph.voxels.warp import CameraWarp, Warp
 
 _EDGE = 24  # points along the cloud's edges
 _SPACING = 0.01  # metres between neighbouring points
+_PATIENCE_S = 120.0  # after which the second process is given up
+
+_lock = Lock()
+_done = False
 
 
 def compile_kernels() -> None:
@@ -17,11 +48,126 @@ def compile_kernels() -> None:
     It segments two small clouds, one as a list and one as a camera's image. Needed only where times are measured:
     results are the same without it.
     """
+    from pcgraph.scan import segment
+
+    image, normals = _step()
+    segment(image, np.full(image.shape, 0.5), normals, (0.0, 0.0, 0.0))
+    segment(image.reshape(-1, 3))
+    some_blocks(image.reshape(-1, 3))
+
+
+def must_compile() -> bool:
+    """Whether the kernels that `pcgraph.segment` needs by default are still missing in numba's cache."""
+    if _done or config.DISABLE_JIT:
+        return False
+    return not (_is_cached(clustering._expand) and _is_cached(contacts._relate))
+
+
+def compile_in_two_processes() -> None:
+    """Fill numba's cache with what `pcgraph.segment` needs by default, if it is missing; once per process."""
+    global _done
+    with _lock:
+        if not must_compile():
+            _done = True
+            return
+        _done = True
+        other = _second_process()
+        if other is None:
+            return  # kernels are compiled one by one as they are used
+        try:
+            with _no_garbage_collection():
+                compile_voxels()
+            other.wait(_PATIENCE_S)
+        finally:
+            if other.poll() is None:
+                other.kill()
+                other.wait()
+
+
+def compile_voxels() -> None:
+    """Compile what it takes from points to supervoxels."""
+    image, _ = _step()
+    points = image.reshape(-1, 3)
+    method, warp = SurfaceGrowth(), CameraWarp(np.zeros(3), 1.0)
+    some_blocks(points)
+    grid = voxel_grid(points, np.full(points.shape, 0.5), 3.5 * _SPACING, warp)
+    planes = method.planes(grid, np.zeros(3))
+    supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
+    method.supervoxel_of_point(points, grid, planes, supervoxels)
+
+
+def compile_graph_and_tree() -> None:
+    """Compile what it takes from supervoxels to objects."""
+    places = np.array([[0.0, 0, 1], [0.1, 0, 1], [0.2, 0, 1], [0.2, 0.1, 1.1]])
+    n = len(places)
+    labels, each = np.arange(n, dtype=np.int32), np.arange(n)
+    grid = VoxelGrid(
+        size=0.1,
+        warp=Warp(),
+        cells=np.rint(places / 0.1),
+        voxel_of_point=labels,
+        order=each,
+        starts=np.arange(n + 1),
+        counts=np.ones(n, np.int64),
+        warped=places,
+        centroids=places,
+        edge_lengths=np.full(n, 0.1),
+        colors=None,
+        indptr=np.array([0, 1, 3, 5, 6]),
+        neighbours=np.array([1, 0, 2, 1, 3, 2], np.int32),
+    )
+    normals = np.tile([0.0, 0, -1], (n, 1))
+    leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
+    nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
+    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes)
+    segmentation_tree(ConvexityLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
+
+
+def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """An image of a plane with a step in depth, so that there are edges, and its normals."""
     steps = _SPACING * np.arange(_EDGE)
     x, y = np.meshgrid(steps, steps)
-    depth = np.where((x > steps[8]) & (y > steps[8]), 0.9, 1.0)  # metres; a step, so that there are edges
-    image = np.stack((x, y, depth), axis=-1)
-    colors = np.full(image.shape, 0.5)
-    normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), image.shape)
-    segment(image, colors, normals, (0.0, 0.0, 0.0))
-    segment(image.reshape(-1, 3))
+    depth = np.where((x > steps[8]) & (y > steps[8]), 0.9, 1.0)  # metres
+    return np.stack((x, y, depth), axis=-1), np.broadcast_to(np.array([0.0, 0.0, -1.0]), (_EDGE, _EDGE, 3))
+
+
+@contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Put the collection of cyclic garbage off: numba's many small objects make it an eighth of all compiling."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _is_cached(kernel: Any) -> bool:
+    """Whether numba's cache has an index of this kernel that is not older than its source."""
+    source = kernel.py_func.__code__
+    try:
+        written = Path(source.co_filename).stat().st_mtime
+        names = Path(kernel.stats.cache_path).glob(f"*.{source.co_name}-{source.co_firstlineno}.*.nbi")
+        return any(name.stat().st_mtime >= written for name in names)
+    except OSError:  # the source is no plain file, or another process clears the cache: nothing can be said
+        return True
+
+
+def _second_process() -> subprocess.Popen[bytes] | None:
+    """The process that compiles graph and tree; None where there is but one thread or no interpreter to start."""
+    if config.NUMBA_NUM_THREADS < 2 or not Path(sys.executable or "").name.startswith("python"):
+        return None
+    code = "import gc; gc.disable(); from pcgraph.warmup import compile_graph_and_tree; compile_graph_and_tree()"
+    paths = os.pathsep.join(path for path in sys.path if path)
+    quiet = subprocess.DEVNULL
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", code],
+            stdin=quiet,
+            stdout=quiet,
+            stderr=quiet,
+            env={**os.environ, "PYTHONPATH": paths},
+        )
+    except OSError:
+        return None

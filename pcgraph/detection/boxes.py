@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from pcgraph.detection.hulls import FLAT, smallest_rectangle
 from pcgraph.features.nodes import unit_vector
-from pcgraph.features.primitive_moments import finite_vectors
+from pcgraph.features.primitives import finite_vectors
 
 _SAME_NORMAL = 1e6  # steps per unit in which normals of facets are told apart
 _MOST_FACETS = 64  # the largest ones; noise makes hundreds of small ones

@@ -116,7 +116,7 @@ def grow_planes(
 def take_in(count, mean, scatter, more, its_mean, its_scatter):  # type: ignore[no-untyped-def]
     """Number of points of two groups together; `mean` and `scatter` of the first become those of both.
 
-    Source: Chan, Golub and LeVeque 1979. `pcgraph.features.pooling` has it written out, as rows handed on as views cost
+    Source: Chan, Golub and LeVeque 1979. `pcgraph.features.moments` has it written out, as rows handed on as views cost
     it six times the time.
     """
     total = count + more

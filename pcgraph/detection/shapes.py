@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.detection.boxes import OrientedBox, plane_basis, some_points, standing_box, tight_box
 from pcgraph.features.nodes import unit_vector
-from pcgraph.features.primitive_moments import finite_vectors, primitive_moments
-from pcgraph.features.primitives import fit_primitives
+from pcgraph.features.primitives import finite_vectors, fit_primitives, primitive_moments
 
 Kind = Literal["plane", "box", "sphere", "cylinder"]
 

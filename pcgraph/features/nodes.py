@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features of nodes: what a group of points looks like, read off its moments."""
+"""Features of nodes: what a group of points looks like, read off its moments; and tables of features."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments
+from pcgraph.parallel import kernel, routine
 from pcgraph.voxels.eigen import symmetric_eigen
 
 _NO_PLANE = 1e-5  # second over first standard deviation below which points lie on a line
@@ -37,6 +37,8 @@ class NodeFeatures:
         Mean colour; NaN if the cloud has none.
     color_covariance : (k, 3, 3) float64
         Covariance of the points' colours; NaN if the cloud has none.
+    deviations : (k, 3) float64, metres
+        s3, s2 and s1: square roots of the covariance's eigenvalues, ascending. No column of its own.
     """
 
     size: NDArray[np.int64]
@@ -49,10 +51,11 @@ class NodeFeatures:
     residual: NDArray[np.float64]
     color: NDArray[np.float64]
     color_covariance: NDArray[np.float64]
+    deviations: NDArray[np.float64]
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """All features by name, in the order of the attributes."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "deviations"}
 
     def verticality(self, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
         """How steep each node's plane stands, (k,) float64: 0 a floor, 1 a wall, 1 - |normal . up|.
@@ -96,9 +99,11 @@ def node_features(moments: Moments) -> NodeFeatures:
     """
     covariance = moments.covariances
     towards = np.zeros_like(moments.centroids) if moments.normals is None else moments.normals
-    low, middle, high, normals = _principal(covariance, towards)
-    scale = np.where(high > 0.0, high, 1.0)
     k = len(moments)
+    deviations, normals = np.empty((k, 3)), np.empty((k, 3))
+    _principal(covariance, towards, deviations, normals)
+    low, middle, high = np.ascontiguousarray(deviations.T)
+    scale = np.where(high > 0.0, high, 1.0)
     colors, spreads = moments.colors, moments.color_covariances
     return NodeFeatures(
         size=moments.counts,
@@ -111,18 +116,20 @@ def node_features(moments: Moments) -> NodeFeatures:
         residual=low,
         color=np.full((k, 3), np.nan) if colors is None else colors,
         color_covariance=np.full((k, 3, 3), np.nan) if spreads is None else spreads,
+        deviations=deviations,
     )
 
 
-@njit(cache=True, nogil=True)
-def _principal(  # type: ignore[no-untyped-def]
-    covariances: NDArray[np.float64], towards: NDArray[np.float64]
-):
-    """Standard deviations, ascending, (k,) each, and plane normals, (k, 3)."""
-    k = len(covariances)
-    deviations, normals = np.empty((3, k)), np.empty((k, 3))
+@kernel
+def _principal(
+    covariances: NDArray[np.float64],
+    towards: NDArray[np.float64],
+    deviations: NDArray[np.float64],
+    normals: NDArray[np.float64],
+) -> None:
+    """Set standard deviations, ascending, (k, 3), and plane normals, (k, 3)."""
     matrix, vectors, axes = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for s in range(k):
+    for s in range(len(covariances)):
         for i in range(3):
             for j in range(3):
                 matrix[i, j] = covariances[s, i, j]
@@ -132,14 +139,13 @@ def _principal(  # type: ignore[no-untyped-def]
             for other in range(3):  # ties go by number, so that ranks differ
                 below = matrix[other, other] - matrix[axis, axis]
                 rank += below < 0.0 or (below == 0.0 and other < axis)
-            deviations[rank, s] = np.sqrt(max(matrix[axis, axis], 0.0))
+            deviations[s, rank] = np.sqrt(max(matrix[axis, axis], 0.0))
             for i in range(3):
                 axes[rank, i] = vectors[i, axis]
-        _plane_normal(deviations[1, s], deviations[2, s], axes, towards[s], normals[s])
-    return deviations[0], deviations[1], deviations[2], normals
+        _plane_normal(deviations[s, 1], deviations[s, 2], axes, towards[s], normals[s])
 
 
-@njit(cache=True, nogil=True)
+@routine
 def _plane_normal(
     middle: float,
     high: float,
@@ -147,7 +153,7 @@ def _plane_normal(
     towards: NDArray[np.float64],
     normal: NDArray[np.float64],
 ) -> None:
-    """Nothing; `normal` becomes the axis of least spread on the outer side, or, of a line, one across it."""
+    """Set `normal` to the axis of least spread on the outer side, or, of a line, one across it."""
     for i in range(3):
         normal[i] = axes[0, i]
     if middle <= _NO_PLANE * high:
@@ -168,3 +174,34 @@ def _plane_normal(
     if facing < 0.0:
         for i in range(3):
             normal[i] = -normal[i]
+
+
+# --- tables of features: one array per column ---
+
+
+def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]], n: int) -> list[dict[str, object]]:
+    """One dict per row from one array per column; scalars become Python numbers, vectors stay arrays."""
+    names = list(columns)
+    lists = [column.tolist() if column.ndim == 1 else list(column) for column in columns.values()]
+    return [dict(zip(names, (values[i] for values in lists), strict=True)) for i in range(n)]
+
+
+def scalar_columns(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
+    """The same table with one column per number: vectors split into x, y, z, colours into r, g, b, matrices too.
+
+    Symmetric matrices keep their upper triangle. Columns of NaN, which the cloud knows nothing of, are left out.
+    """
+    split: dict[str, NDArray[np.generic]] = {}
+    for name, column in columns.items():
+        axes = "rgb" if name.startswith("color") else "xyz"
+        if column.ndim == 1:
+            split[name] = column
+        elif column.ndim == 2:
+            split |= {f"{name}_{axes[i]}": column[:, i] for i in range(3)}
+        else:
+            split |= {f"{name}_{axes[i]}{axes[j]}": column[:, i, j] for i in range(3) for j in range(i, 3)}
+    return {name: column for name, column in split.items() if not len(column) or not _unknown(column)}
+
+
+def _unknown(column: NDArray[np.generic]) -> bool:
+    return column.dtype.kind == "f" and bool(np.isnan(column.astype(np.float64)).all())

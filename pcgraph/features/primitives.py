@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planes, spheres and cylinders that fit groups of points best, from the groups' moments alone."""
+"""Planes, spheres and cylinders that fit groups of points best, from the groups' moments alone.
+
+The moments, sums of powers up to the fourth order, are additive; so every node of a tree has its best shapes.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,10 @@ from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.powers import tensor
-from pcgraph.features.primitive_moments import PrimitiveMoments
+from pcgraph.features.moments import accumulate_moments, moments_of_groups
+from pcgraph.parallel import kernel, routine
 
 _STRAIGHT = 1e7  # radius over size above which a round shape is a plane
 _EXACT = 1e-6  # residual over size below which a fit counts as perfect: powers resolve no less
@@ -197,3 +200,229 @@ def _simplest(
     flat = plane <= gain * np.minimum(sphere, cylinder)
     ball = sphere <= gain * cylinder
     return np.where(flat, Primitive.PLANE, np.where(ball, Primitive.SPHERE, Primitive.CYLINDER)).astype(np.int8)
+
+
+# --- moments of groups up to the fourth order ---
+
+
+@dataclass(frozen=True)
+class PrimitiveMoments:
+    """Moments of k groups of points up to the fourth order, and second moments of their normals.
+
+    Attributes
+    ----------
+    counts : (k,) int64
+        Points per group, >= 1.
+    centers : (k, 3) float64, metres
+        The group's centroid as rounded to float64: origin of its powers.
+    scales : (k,) float64, metres
+        Unit of its powers: a power of two near the group's root mean square radius, 1 if that is 0.
+    powers : (k, 35) float64, dimensionless
+        Sums over the points of x^a y^b z^c, with (x, y, z) = (point - center) / scale, for a + b + c <= 4, rows in the
+        order of `EXPONENTS`.
+    normal_sums : (k, 3) float64
+        Sum of the points' normals.
+    normal_scatters : (k, 3, 3) float64
+        Sum of n n^T.
+
+    Notes
+    -----
+    Groups only ever get larger up a tree, so nothing cancels. Do not subtract a small group from one far larger or
+    far away: fourth powers lose four times as many digits as distances do.
+    """
+
+    counts: NDArray[np.int64]
+    centers: NDArray[np.float64]
+    scales: NDArray[np.float64]
+    powers: NDArray[np.float64]
+    normal_sums: NDArray[np.float64]
+    normal_scatters: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Number of groups."""
+        return len(self.counts)
+
+
+def primitive_moments(
+    points: ArrayLike, normals: ArrayLike, groups: NDArray[np.int32], n_groups: int
+) -> PrimitiveMoments:
+    """Moments of points by group.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+    normals : (n, 3) float64
+        Unit normals; those of the points' voxels will do: ``surface.normals[surface.grid.voxel_of_point]``.
+    groups : (n,) int32, 0..n_groups - 1
+        Every group has a point at least.
+    n_groups : int
+
+    Raises
+    ------
+    ValueError
+        A shape is not as above, a number is not finite, or a group is out of range or has no point.
+    """
+    places, directions = finite_vectors("points", points), finite_vectors("normals", normals)
+    if not len(places) == len(directions) == len(groups):
+        raise ValueError(
+            f"expected one normal and one group per point, got {len(places)} points, {len(directions)} normals, "
+            f"{len(groups)} groups"
+        )
+    if groups.min(initial=0) < 0 or groups.max(initial=-1) != n_groups - 1 or not np.bincount(groups).all():
+        raise ValueError(f"expected all of the groups 0..{n_groups - 1}, with a point each, and no others")
+    low = moments_of_groups(places, None, groups, n_groups)
+    scales = _scales(low.counts, low.scatters)
+    powers = sums_of_powers(places, groups, low.centroids, scales)
+    sums, scatters = _normal_moments(directions, groups, n_groups)
+    return PrimitiveMoments(low.counts, low.centroids, scales, powers, sums, scatters)
+
+
+def finite_vectors(name: str, vectors: ArrayLike) -> NDArray[np.float64]:
+    """The vectors as (n, 3) float64; ValueError if they have another shape or are not all finite numbers."""
+    array = np.asarray(vectors)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        raise ValueError(f"expected {name} as numbers of shape (n, 3), got {array.shape} {array.dtype}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"expected {name} as finite numbers; leave out points that have NaN or infinite ones")
+    return array.astype(np.float64, copy=False)
+
+
+def primitive_moments_up_tree(leaves: PrimitiveMoments, parents: NDArray[np.int32]) -> PrimitiveMoments:
+    """Moments of every node of a tree, from those of its leaves.
+
+    Parameters
+    ----------
+    leaves : PrimitiveMoments
+        Of the first nodes, in order.
+    parents : (k,) int32
+        Parent of each node; larger than the node's own number, except for the root, which is its own parent.
+    """
+    k, n = len(parents), len(leaves)
+    counts, centers, scatters = np.zeros(k, np.int64), np.zeros((k, 3)), np.zeros((k, 3, 3))
+    counts[:n], centers[:n] = leaves.counts, leaves.centers
+    scatters[:n] = tensor(leaves.powers, 2) * (leaves.scales**2)[:, None, None]
+    # Where inner nodes are, and how large, before their powers are summed:
+    accumulate_moments(parents, counts, centers, scatters)
+    scales = np.concatenate((leaves.scales, _scales(counts[n:], scatters[n:])))
+    powers = np.zeros((k, N_POWERS))
+    normal_sums, normal_scatters = np.zeros((k, 3)), np.zeros((k, 3, 3))
+    powers[:n], normal_sums[:n], normal_scatters[:n] = leaves.powers, leaves.normal_sums, leaves.normal_scatters
+    _accumulate(parents, centers, scales, powers, normal_sums, normal_scatters)
+    return PrimitiveMoments(counts, centers, scales, powers, normal_sums, normal_scatters)
+
+
+def _scales(counts: NDArray[np.int64], scatters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Powers of two, by which a product is exact, next above the root mean square radius."""
+    radius = np.sqrt(np.trace(scatters, axis1=1, axis2=2) / counts)
+    return np.where(radius > 0.0, np.ldexp(1.0, np.frexp(radius)[1]), 1.0)
+
+
+@kernel
+def _normal_moments(  # type: ignore[no-untyped-def]
+    normals: NDArray[np.float64], groups: NDArray[np.int32], n_groups: int
+):
+    """Sum of n and sum of n n^T by group."""
+    sums, scatters = np.zeros((n_groups, 3)), np.zeros((n_groups, 3, 3))
+    for i in range(len(groups)):
+        for a in range(3):
+            sums[groups[i], a] += normals[i, a]
+            for b in range(3):
+                scatters[groups[i], a, b] += normals[i, a] * normals[i, b]
+    return sums, scatters
+
+
+@kernel
+def _accumulate(parents, centers, scales, powers, normal_sums, normal_scatters):  # type: ignore[no-untyped-def]
+    """Add every node's sums to its parent's, children first."""
+    for node in range(len(parents)):
+        up = parents[node]
+        if up == node:
+            continue
+        add_moved(powers[up], powers[node], (centers[node] - centers[up]) / scales[up], scales[node] / scales[up])
+        for a in range(3):
+            normal_sums[up, a] += normal_sums[node, a]
+            for b in range(3):
+                normal_scatters[up, a, b] += normal_scatters[node, a, b]
+
+
+# --- sums of powers, and how they move to another origin and unit ---
+
+# Row t stands for x^a y^b z^c; ascending in order a + b + c: 1, 3, 6, 10 and 15 rows of order 0, 1, 2, 3 and 4.
+EXPONENTS = np.array(
+    [(a, b, order - a - b) for order in range(5) for a in range(order, -1, -1) for b in range(order - a, -1, -1)],
+    dtype=np.int64,
+)
+N_POWERS = len(EXPONENTS)
+_ROW = np.full((5, 5, 5), -1, np.int64)
+_ROW[EXPONENTS[:, 0], EXPONENTS[:, 1], EXPONENTS[:, 2]] = np.arange(N_POWERS)
+_CHOOSE = np.array([[1, 0, 0, 0, 0], [1, 1, 0, 0, 0], [1, 2, 1, 0, 0], [1, 3, 3, 1, 0], [1, 4, 6, 4, 1]], np.float64)
+
+
+def tensor(powers: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+    """Sums of all products of `order` coordinates, (k, 3, ..., 3), from their (k, 35) sums of powers."""
+    axes = np.indices((3,) * order).reshape(order, -1)
+    exponents = np.stack([(axes == axis).sum(axis=0) for axis in range(3)])
+    return powers[:, _ROW[tuple(exponents)]].reshape(len(powers), *(3,) * order)
+
+
+@kernel
+def sums_of_powers(
+    points: NDArray[np.float64], groups: NDArray[np.int32], centers: NDArray[np.float64], scales: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sums of x^a y^b z^c over the points of each of k groups, (k, 35), dimensionless.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+    groups : (n,) int32, 0..k - 1
+    centers : (k, 3) float64, metres
+        Origin of each group's coordinates.
+    scales : (k,) float64, metres
+        Unit of each group's coordinates.
+    """
+    sums = np.zeros((len(centers), N_POWERS))
+    ladder = np.ones((3, 5))
+    for i in range(len(points)):
+        s = groups[i]
+        for axis in range(3):
+            x = (points[i, axis] - centers[s, axis]) / scales[s]
+            for order in range(1, 5):
+                ladder[axis, order] = ladder[axis, order - 1] * x
+        for t in range(N_POWERS):
+            sums[s, t] += ladder[0, EXPONENTS[t, 0]] * ladder[1, EXPONENTS[t, 1]] * ladder[2, EXPONENTS[t, 2]]
+    return sums
+
+
+@routine
+def add_moved(
+    target: NDArray[np.float64], source: NDArray[np.float64], offset: NDArray[np.float64], ratio: float
+) -> None:
+    """Add the points that `source` sums to `target`, in the target's coordinates.
+
+    Parameters
+    ----------
+    target, source : (35,) float64
+        Sums of powers; the target's are changed.
+    offset : (3,) float64
+        The source's origin in the target's coordinates.
+    ratio : float
+        The source's unit in the target's.
+
+    Notes
+    -----
+    By the binomial theorem, hence exact but for rounding.
+    """
+    ladder = np.ones((3, 5))
+    units = np.ones(5)
+    for order in range(1, 5):
+        units[order] = units[order - 1] * ratio
+        for axis in range(3):
+            ladder[axis, order] = ladder[axis, order - 1] * offset[axis]
+    for t in range(N_POWERS):
+        a, b, c = EXPONENTS[t]
+        for i in range(a + 1):
+            for j in range(b + 1):
+                for k in range(c + 1):
+                    ways = _CHOOSE[a, i] * _CHOOSE[b, j] * _CHOOSE[c, k]
+                    shift = ladder[0, a - i] * ladder[1, b - j] * ladder[2, c - k]
+                    target[t] += ways * shift * units[i + j + k] * source[_ROW[i, j, k]]

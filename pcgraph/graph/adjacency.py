@@ -32,7 +32,7 @@ class EdgeFeatures:
         where they form a valley (concave): the sign of (n_j - n_i) . (x_j - x_i). Source: LCCP, Stein et al.
         2014.
     contact_convexity : (m,) float64, radians
-        The same from the normals and positions of the two rims of voxels that touch.
+        The same from the normals and positions of the voxels on either side that touch.
     normal_angle : (m,) float64, radians, 0..pi
         Angle between the nodes' normals.
     color_contrast : (m,) float64, 0..sqrt(3)
@@ -40,9 +40,9 @@ class EdgeFeatures:
     contact_voxels : (m,) int64
         Voxels of either side that touch the other side.
     contact_length : (m,) float64, metres
-        Mean over both rims of the number of touching voxels times their edge length.
+        Mean over both sides of the number of touching voxels times their edge length.
     step : (m,) float64, metres
-        Offset between the surfaces at the contact: distance of each rim to the other node's plane, the
+        Offset between the surfaces at the contact: distance of each side's boundary to the other node's plane, the
         smaller of the two. Near 0 where surfaces meet in a crease, the height of the step where one lies
         before the other.
     """
@@ -161,7 +161,7 @@ class AdjacencyGraph:
         return pyg(self, up, occlusions)
 
     def write_graphml(self, path: str | PathLike[str], occlusions: Occlusions | None = None) -> None:
-        """Nothing; writes the graph with all features, vectors as scalars (``normal_x``), whole or not at all.
+        """Write the graph with all features, vectors as scalars (``normal_x``), whole or not at all.
 
         ``networkx.read_graphml(path, node_type=int)`` reads it back.
 

@@ -27,7 +27,7 @@ class BoundaryCost:
     Attributes
     ----------
     contact : float, 0..1
-        Share of the convexity at the contact; the rest is that of the whole supervoxels.
+        Fraction that the convexity at the contact counts; the rest is that of the whole supervoxels.
     convex : float, >= 0
         Cost of a convex radian: small, so that faces of a box merge late but before the box and its table.
     step : float, radians per voxel, >= 0
@@ -54,7 +54,7 @@ class BoundaryCost:
     def __post_init__(self) -> None:
         _check_fields(self)
         if self.contact > 1.0:
-            raise ValueError(f"expected contact as a share of 0..1, got {self.contact!r}")
+            raise ValueError(f"expected contact as a fraction of 0..1, got {self.contact!r}")
 
     def __call__(self, features: EdgeFeatures) -> NDArray[np.float64]:
         """Costs, (m,) float64, radians, in whole multiples of 2**-20 so that sums of them are exact.
@@ -77,8 +77,8 @@ class BoundaryStrength:
     """How probably an edge is an object's boundary, 0..1, read off everything its features know.
 
     strength = 1 - 2^-(z^3) with z = concavity v + step s + normal a + color c, where v is the mean of the concavities
-    of nodes and of rims, max(0, -convexity) and max(0, -contact_convexity), s the step in voxels, a the angle between
-    normals and c the contrast of colours. It rises with each of them, is 0 where all are 0, and 1/2 at z = 1.
+    of nodes and at contacts, max(0, -convexity) and max(0, -contact_convexity), s the step in voxels, a the angle
+    between normals and c the contrast of colours. It rises with each of them, is 0 where all are 0, and 1/2 at z = 1.
 
     Attributes
     ----------

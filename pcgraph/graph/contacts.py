@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contacts: where two supervoxels touch."""
+"""Contacts: where two supervoxels touch, and how they lie to each other there (features of edges)."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.voxels.grid import VoxelGrid
-
-_MOST_OWNERS = 26
+from pcgraph.features.nodes import NodeFeatures
+from pcgraph.graph.adjacency import EdgeFeatures
+from pcgraph.parallel import kernel, routine
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Pairs of touching supervoxels and what their rims look like; m pairs, side 0 is the smaller number.
+    """Pairs of touching supervoxels and what their boundaries look like; m pairs, side 0 is the smaller number.
 
     Attributes
     ----------
@@ -50,30 +51,44 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
     supervoxels : (v,) int32
         Supervoxel of each voxel.
     """
-    voxel, other, pair, keys = _rims(grid.indptr, grid.neighbours, supervoxels)
+    voxel, other, pair, keys = _boundary_voxels(grid.indptr, grid.neighbours, supervoxels)
     order = np.argsort(keys)
     edge_of_pair = np.empty(len(keys), np.int64)
     edge_of_pair[order] = np.arange(len(keys))
     edges = np.stack((keys[order] >> 32, keys[order] & 0xFFFFFFFF), axis=1).astype(np.int32)
-    side = supervoxels[voxel] > other
-    voxels, positions, directions, lengths = _rim_means(
-        voxel, edge_of_pair[pair], side.view(np.uint8), grid.centroids, normals, grid.edge_lengths, len(keys)
+    edge = edge_of_pair[pair]
+    side = 2 * edge + (supervoxels[voxel] > other)
+    n_sides = 2 * len(keys)
+    voxels = np.bincount(side, minlength=n_sides)
+
+    def sums(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        rows = vectors[voxel]
+        return np.stack([np.bincount(side, rows[:, axis], n_sides) for axis in range(3)], axis=1)
+
+    directions = sums(normals)
+    x, y, z = directions.T
+    norms = np.sqrt(x * x + y * y + z * z)
+    return Contacts(
+        edges=edges,
+        voxels=voxels.reshape(-1, 2),
+        positions=(sums(grid.centroids) / voxels[:, None]).reshape(-1, 2, 3),
+        normals=(directions / np.maximum(norms, 1e-12)[:, None]).reshape(-1, 2, 3),
+        lengths=np.bincount(edge, 0.5 * grid.edge_lengths[voxel], len(keys)).astype(np.float64),  # int64 if m is 0
     )
-    return Contacts(edges, voxels, positions, directions, lengths)
 
 
-@njit(cache=True, nogil=True)
-def _rims(  # type: ignore[no-untyped-def]
+@kernel
+def _boundary_voxels(  # type: ignore[no-untyped-def]
     indptr: NDArray[np.int64], neighbours: NDArray[np.int32], supervoxels: NDArray[np.int32]
 ):
-    """Each voxel on a rim, once per other supervoxel that it touches: voxel, other, pair; and the pairs' keys.
+    """Each voxel on a boundary, once per other supervoxel it touches: voxel, other, pair; and the pairs' keys.
 
     Pairs are numbered as they come up; their key is (smaller << 32) + larger.
     """
     voxel, other = np.empty(len(neighbours), np.int32), np.empty(len(neighbours), np.int32)
     pair = np.empty(len(neighbours), np.int32)
     keys, slots = np.empty(512, np.int64), np.full(2048, -1, np.int32)
-    seen = np.empty(_MOST_OWNERS + 1, np.int32)
+    seen = np.empty(MAX_NEIGHBOURS + 1, np.int32)
     used = n_keys = 0
     for i in range(len(supervoxels)):
         own = last = supervoxels[i]
@@ -83,8 +98,8 @@ def _rims(  # type: ignore[no-untyped-def]
             n_seen += (seen[n_seen] != own) & (seen[n_seen] != last)
             last = supervoxels[neighbours[a]]
         for b in range(n_seen):
-            for known in range(b):
-                if seen[known] == seen[b]:
+            for earlier in range(b):
+                if seen[earlier] == seen[b]:
                     break
             else:
                 if n_keys == len(keys):
@@ -96,10 +111,10 @@ def _rims(  # type: ignore[no-untyped-def]
                     n_keys += 1
                 voxel[used], other[used], pair[used] = i, seen[b], slots[slot]
                 used += 1
-    return voxel[:used].copy(), other[:used].copy(), pair[:used].copy(), keys[:n_keys].copy()
+    return voxel[:used], other[:used], pair[:used], keys[:n_keys]
 
 
-@njit(cache=True, nogil=True)
+@routine
 def _slot(key: int, keys: NDArray[np.int64], slots: NDArray[np.int32]) -> int:
     """Place of a key in the hash table, or the empty place where it belongs."""
     mask = len(slots) - 1
@@ -109,7 +124,7 @@ def _slot(key: int, keys: NDArray[np.int64], slots: NDArray[np.int32]) -> int:
     return at
 
 
-@njit(cache=True, nogil=True)
+@routine
 def _grown(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """The same keys with room for as many again, and their hash table, a quarter full."""
     wide, slots = np.empty(2 * len(keys), np.int64), np.full(8 * len(keys), -1, np.int32)
@@ -119,22 +134,78 @@ def _grown(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32
     return wide, slots
 
 
-@njit(cache=True, nogil=True)
-def _rim_means(voxel, edge, side, centroids, normals, edge_lengths, m):  # type: ignore[no-untyped-def]
-    """Voxels (m, 2), mean positions and unit mean normals (m, 2, 3), and lengths (m,) of both rims of m edges."""
-    voxels, lengths = np.zeros((m, 2), np.int64), np.zeros(m)
-    positions, directions = np.zeros((m, 2, 3)), np.zeros((m, 2, 3))
-    for row in range(len(voxel)):
-        i, e, s = voxel[row], edge[row], side[row]
-        voxels[e, s] += 1
-        lengths[e] += 0.5 * edge_lengths[i]
-        for axis in range(3):
-            positions[e, s, axis] += centroids[i, axis]
-            directions[e, s, axis] += normals[i, axis]
-    for e in range(m):
-        for s in range(2):
-            squares = directions[e, s, 0] ** 2 + directions[e, s, 1] ** 2 + directions[e, s, 2] ** 2
-            for axis in range(3):
-                positions[e, s, axis] /= voxels[e, s]
-                directions[e, s, axis] /= max(np.sqrt(squares), 1e-12)
-    return voxels, positions, directions, lengths
+# --- features of edges ---
+
+
+def edge_features(nodes: NodeFeatures, contacts: Contacts) -> EdgeFeatures:
+    """Features of every contact.
+
+    Parameters
+    ----------
+    nodes : NodeFeatures of k supervoxels
+    contacts : Contacts, m of them, between these
+    """
+    i, j = contacts.edges.T
+    convexity, contact_convexity, normal_angle, step = np.empty((4, len(i)))
+    relations = convexity, contact_convexity, normal_angle, step
+    _relate(contacts.edges, nodes.centroid, nodes.normal, contacts.positions, contacts.normals, relations)
+    return EdgeFeatures(
+        convexity=convexity,
+        contact_convexity=contact_convexity,
+        normal_angle=normal_angle,
+        color_contrast=np.nan_to_num(np.linalg.norm(nodes.color[j] - nodes.color[i], axis=1)),
+        contact_voxels=contacts.voxels.sum(axis=1),
+        contact_length=contacts.lengths,
+        step=step,
+    )
+
+
+@kernel
+def angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angle, radians, 0..pi, (m,), between rows; by the tangent, which stays exact for small angles."""
+    angles = np.empty(len(a))
+    for row in range(len(a)):
+        angles[row] = _angle(a[row], b[row])
+    return angles
+
+
+@kernel
+def _relate(edges, centroids, normals, places, contact_normals, relations):  # type: ignore[no-untyped-def]
+    """Set convexity of nodes and at contacts, angle between nodes' normals, and step, (m,) each."""
+    convexity, contact_convexity, angle, step = relations
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        angle[e] = _angle(normals[i], normals[j])
+        convexity[e] = angle[e] * _turn(normals[i], normals[j], centroids[i], centroids[j])
+        contact_convexity[e] = _angle(contact_normals[e, 0], contact_normals[e, 1])
+        contact_convexity[e] *= _turn(contact_normals[e, 0], contact_normals[e, 1], places[e, 0], places[e, 1])
+        step[e] = min(_height(places[e, 1], centroids[i], normals[i]), _height(places[e, 0], centroids[j], normals[j]))
+
+
+@routine
+def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Angle between two vectors, radians, 0..pi."""
+    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return math.atan2(math.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+@routine
+def _turn(
+    normal_i: NDArray[np.float64], normal_j: NDArray[np.float64], at_i: NDArray[np.float64], at_j: NDArray[np.float64]
+) -> float:
+    """1 where the surface bends away from its outside on the way from i to j, -1 where towards it, 0 where neither."""
+    opening = 0.0
+    for axis in range(3):
+        opening += (normal_j[axis] - normal_i[axis]) * (at_j[axis] - at_i[axis])
+    if opening > 0.0:
+        return 1.0
+    return -1.0 if opening < 0.0 else 0.0
+
+
+@routine
+def _height(point: NDArray[np.float64], origin: NDArray[np.float64], normal: NDArray[np.float64]) -> float:
+    """Distance of a point to a plane."""
+    height = 0.0
+    for axis in range(3):
+        height += (point[axis] - origin[axis]) * normal[axis]
+    return abs(height)

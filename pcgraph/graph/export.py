@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.columns import rows, scalar_columns
+from pcgraph.features.nodes import rows, scalar_columns
 
 if TYPE_CHECKING:
     import networkx

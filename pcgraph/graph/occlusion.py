@@ -1,21 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where one supervoxel hides another from the sensor without touching it."""
+"""Where one supervoxel hides another from the sensor without touching it, and what may go on behind.
+
+The voxels are seen in an image of directions; depth edges are sought along its rows and columns, and gathered by pairs
+of supervoxels.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.nodes import NodeFeatures
-from pcgraph.graph.bearings import BearingImage, bearing_image
-from pcgraph.graph.relations import angle_between
-from pcgraph.graph.scanlines import scan
+from pcgraph.graph.contacts import angle_between
+from pcgraph.parallel import kernel, routine
 from pcgraph.voxels.surface import Surface
 
-_FLUSH_RAD = 0.2
-_FLUSH_VOXELS = 2.0
+_SMOOTH_RAD = 0.2  # surfaces at most this far apart in angle
+_SMOOTH_VOXELS = 2.0  # and in height may be one
+_MAX_CELLS = 4e6
+_MAX_CELLS_PER_VOXEL = 16  # to either side; only voxels that nearly touch the sensor are wider
+_MAX_DEPTH = 32  # things one behind the other along a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +40,7 @@ class Continuations:
     angle : (r,) float64, radians, 0..pi
         Angle between the supervoxels' normals.
     offset : (r,) float64, metres
-        Mean distance of either's rim from the other's plane, the larger of the two.
+        Mean distance of either's boundary from the other's plane, the larger of the two.
     color_contrast : (r,) float64, 0..sqrt(3)
         Distance of mean colours; 0 if the cloud has none.
     coplanar : (r,) bool
@@ -127,13 +134,11 @@ def occlusions(
     rays = grid.centroids - position
     ranges = np.maximum(np.sqrt(np.einsum("ij,ij->i", rays, rays)), 1e-300)
     bearings = rays / ranges[:, None]
+    view = View(bearings, ranges, surface.normals, grid.edge_lengths, surface.supervoxels, *grid.neighbourhood)
     found = [
-        scan(
-            np.ascontiguousarray(lines), wraps, bearings, ranges, surface.normals, grid.edge_lengths,
-            surface.supervoxels, grid.indptr, grid.neighbours, reach, least_gap,
-        )
+        _scan(np.ascontiguousarray(lines), wraps, view, reach, least_gap)
         for lines, wraps in ((seen.voxels, seen.wraps), (seen.voxels.T, False))
-    ]  # fmt: skip
+    ]
     depth_edges, hidings = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return _collected(surface, bearings, ranges, depth_edges, _continuations(surface, nodes, hidings))
 
@@ -159,9 +164,10 @@ def _collected(
     pairs, pair = _pairs(surface.supervoxels[front], surface.supervoxels[behind])
     q = len(pairs)
     gap = np.bincount(pair, ranges[behind] - ranges[front], q) / np.bincount(pair, minlength=q)
-    rims = np.unique(pair * np.int64(surface.grid.n_voxels) + front)
-    rim_pair, rim_voxel = np.divmod(rims, surface.grid.n_voxels)
-    length = np.bincount(rim_pair, surface.grid.edge_lengths[rim_voxel], q).astype(np.float64)  # int64 if q is 0
+    boundary = np.unique(pair * np.int64(surface.grid.n_voxels) + front)
+    boundary_pair, boundary_voxel = np.divmod(boundary, surface.grid.n_voxels)
+    edge_lengths = surface.grid.edge_lengths[boundary_voxel]
+    length = np.bincount(boundary_pair, edge_lengths, q).astype(np.float64)  # int64 if q is 0
     across = bearings[behind] - bearings[front]
     sums = np.stack([np.bincount(pair, across[:, axis], q) for axis in range(3)], axis=1)
     norms = np.linalg.norm(sums, axis=1, keepdims=True)
@@ -184,7 +190,7 @@ def _continuations(surface: Surface, nodes: NodeFeatures, hidings: NDArray[np.in
     edge = np.bincount(pair, surface.grid.edge_lengths[hidings].mean(axis=1), r) / crossings
     angle, offset = angle_between(nodes.normal[i], nodes.normal[j]), np.maximum(*heights)
     contrast = np.nan_to_num(np.linalg.norm(nodes.color[j] - nodes.color[i], axis=1))
-    coplanar = (angle <= _FLUSH_RAD) & (offset <= np.maximum(_FLUSH_VOXELS * edge, 0.1 * width))
+    coplanar = (angle <= _SMOOTH_RAD) & (offset <= np.maximum(_SMOOTH_VOXELS * edge, 0.1 * width))
     return Continuations(pairs, crossings, width, angle, offset, contrast, coplanar)
 
 
@@ -196,3 +202,194 @@ def _pairs(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple[NDArray
     """Distinct pairs in ascending order, (q, 2) int32, and the pair of each row."""
     keys, inverse = np.unique((first.astype(np.int64) << 32) + second, return_inverse=True)
     return np.stack((keys >> 32, keys & 0xFFFFFFFF), axis=1).astype(np.int32), inverse
+
+
+# --- what the sensor sees where: the nearest voxel in every direction ---
+
+
+@dataclass(frozen=True, eq=False)
+class BearingImage:
+    """A lattice of directions with the voxel seen in each.
+
+    Attributes
+    ----------
+    voxels : (h, w) int32
+        Voxel seen, -1 where none. Cells that touch are neighbouring directions.
+    wraps : bool
+        Whether what lies between the last column and the first is a gap like any other, as in a panorama.
+    """
+
+    voxels: NDArray[np.int32]
+    wraps: bool = False
+
+
+def bearing_image(surface: Surface, viewpoint: NDArray[np.float64]) -> BearingImage:
+    """Spherical image around the viewpoint in which a voxel at median distance fills about one cell.
+
+    Parameters
+    ----------
+    surface : Surface of v voxels
+    viewpoint : (3,) float64, metres, the points' frame
+
+    Notes
+    -----
+    The poles lie in the direction and counter-direction in which there is least to see, the seam behind the middle of
+    the view, so that a camera's image has neither. Nearer voxels hide farther ones and fill as many cells as their
+    width needs.
+    """
+    grid = surface.grid
+    rays = grid.centroids - viewpoint
+    ranges = np.sqrt(np.einsum("ij,ij->i", rays, rays))
+    seen = np.flatnonzero(ranges > 0.5 * grid.edge_lengths)  # the sensor's own voxel lies in no direction
+    if not len(seen):
+        return BearingImage(np.full((1, 1), -1, np.int32))
+    bearings = rays[seen] / ranges[seen, None]
+    width = grid.edge_lengths[seen] / ranges[seen]
+    cell = max(float(np.median(width)), np.sqrt(4.0 * np.pi / _MAX_CELLS))
+    frame = _frame(bearings)
+    azimuth = np.arctan2(bearings @ frame[1], bearings @ frame[0])
+    height = bearings @ frame[2]
+    elevation = np.arcsin(np.clip(height, -1.0, 1.0))
+    row = ((elevation - elevation.min()) / cell).astype(np.int64)
+    column = ((azimuth - azimuth.min()) / cell).astype(np.int64)
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    half = np.ceil(0.5 * width / cell - 0.5)
+    stretched = np.ceil(0.5 * width / (cell * np.sqrt(np.maximum(1.0 - height * height, 1e-6))) - 0.5)
+    halves = np.minimum(np.stack((half, stretched), axis=1), _MAX_CELLS_PER_VOXEL).astype(np.int64)
+    voxels = _nearest(row, column, halves, seen.astype(np.int32), ranges, *shape)
+    return BearingImage(voxels, bool(np.ptp(azimuth) > np.pi))
+
+
+def _frame(bearings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Forward, sideways and polar direction, rows of (3, 3)."""
+    pole = np.linalg.eigh(bearings.T @ bearings)[1][:, 0]
+    mean = bearings.mean(axis=0)
+    forward = mean - pole * (pole @ mean)
+    if np.linalg.norm(forward) < 1e-6:  # as much on one side as on the other: any forward will do
+        forward = np.cross(pole, np.eye(3)[np.abs(pole).argmin()])
+    forward /= np.linalg.norm(forward)
+    return np.stack((forward, np.cross(pole, forward), pole))
+
+
+@kernel
+def _nearest(row, column, halves, voxel, ranges, height, width):  # type: ignore[no-untyped-def]
+    """The nearest voxel of each cell, -1 where there is none."""
+    image = np.full((height, width), -1, np.int32)
+    for i in range(len(voxel)):
+        for r in range(max(row[i] - halves[i, 0], 0), min(row[i] + halves[i, 0] + 1, height)):
+            for c in range(max(column[i] - halves[i, 1], 0), min(column[i] + halves[i, 1] + 1, width)):
+                if image[r, c] < 0 or ranges[voxel[i]] < ranges[image[r, c]]:
+                    image[r, c] = voxel[i]
+    return image
+
+
+# --- depth edges along the lines of that image ---
+
+
+class View(NamedTuple):
+    """Voxels as the sensor sees them, unit bearings (v, 3) and ranges (v,) in metres, and their surface."""
+
+    bearings: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    edge_lengths: NDArray[np.float64]
+    supervoxels: NDArray[np.int32]
+    indptr: NDArray[np.int64]
+    neighbours: NDArray[np.int32]
+
+
+@kernel
+def _scan(  # type: ignore[no-untyped-def]
+    image: NDArray[np.int32], wraps: bool, view: View, reach: float, least_gap: float
+):
+    """Depth edges (e, 2), front and behind, and continuations (c, 2), both int32 voxels, along the image's rows.
+
+    Where a line passes from far to near, the far surface goes into hiding; where it passes from near to far, what
+    comes out is paired with what went in last. A hole in the data ends all hiding.
+    """
+    ranges, edge_lengths, supervoxels = view.ranges, view.edge_lengths, view.supervoxels
+    neighbours, indptr = view.neighbours, view.indptr
+    depth_edges = np.empty((image.size, 2), np.int32)
+    continuations = np.empty((image.size, 2), np.int32)
+    hidden, line = np.empty(_MAX_DEPTH, np.int32), np.empty(image.shape[1] + 4, np.int32)
+    n_edges = n_continuations = 0
+    for row in range(image.shape[0]):
+        first, last = _voxels_of(image[row], wraps, line)
+        depth = 0
+        for at in range(first, last):
+            before, voxel = line[at], line[at + 1]
+            if supervoxels[before] == supervoxels[voxel]:
+                continue
+            comes_out = ranges[before] < ranges[voxel]
+            front, behind, beyond = (before, voxel, line[at + 2]) if comes_out else (voxel, before, line[at - 1])
+            if _apart(front, behind, view, reach):
+                depth = 0
+                continue
+            if beyond >= 0 and _apart(behind, beyond, view, reach):
+                beyond = -1
+            edge = max(edge_lengths[front], edge_lengths[behind])
+            if not _stands_off(front, behind, beyond, view, least_gap * edge) or np.any(
+                neighbours[indptr[front] : indptr[front + 1]] == behind
+            ):
+                continue
+            depth_edges[n_edges, 0], depth_edges[n_edges, 1] = front, behind
+            n_edges += 1
+            if not comes_out:
+                hidden[depth % _MAX_DEPTH] = behind
+                depth += 1
+            elif depth > 0:
+                depth -= 1
+                entered = hidden[depth % _MAX_DEPTH]
+                if ranges[entered] > ranges[front] and supervoxels[entered] != supervoxels[behind]:
+                    continuations[n_continuations, 0], continuations[n_continuations, 1] = entered, behind
+                    n_continuations += 1
+    return depth_edges[:n_edges].copy(), continuations[:n_continuations].copy()
+
+
+@routine
+def _voxels_of(cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32]) -> tuple[int, int]:
+    """First and last place in `line` of the voxels in these cells, each once in a row; -1 is before and after them."""
+    n = 1
+    line[0] = line[1] = -1
+    for cell in cells:
+        if cell >= 0 and cell != line[n]:
+            n += line[n] >= 0
+            line[n] = cell
+    if wraps and n > 1:  # go on to the first voxel again
+        line[n + 1] = line[1]
+        n += 1
+    line[n + 1] = -1
+    return 1, n
+
+
+@routine
+def _apart(front, behind, view, reach):  # type: ignore[no-untyped-def]
+    """Whether two bearings lie further apart than `reach` voxels."""
+    bearings, ranges, edge_lengths = view.bearings, view.ranges, view.edge_lengths
+    squares = 0.0
+    for axis in range(3):
+        squares += (bearings[front, axis] - bearings[behind, axis]) ** 2
+    return squares > (reach * max(edge_lengths[front] / ranges[front], edge_lengths[behind] / ranges[behind])) ** 2
+
+
+@routine
+def _stands_off(front, behind, beyond, view, gap):  # type: ignore[no-untyped-def]
+    """Whether `front` is nearer than `behind` by the gap, and half as far off the surface to which that belongs.
+
+    A surface seen at a slant gets deeper, too, but stays in its plane (the normal's), and in its line (to the voxel
+    beyond): the latter holds where lines are too far apart for normals, as the rings of a spinning scanner.
+    """
+    bearings, ranges, normals = view.bearings, view.ranges, view.normals
+    if ranges[behind] - ranges[front] < gap:
+        return False
+    height = offsets = along = lengths = 0.0
+    for axis in range(3):
+        at = ranges[behind] * bearings[behind, axis]
+        offset = ranges[front] * bearings[front, axis] - at
+        height += offset * normals[behind, axis]
+        if beyond >= 0:
+            further = ranges[beyond] * bearings[beyond, axis] - at
+            offsets, along, lengths = offsets + offset * offset, along + offset * further, lengths + further * further
+    if height < 0.5 * gap:
+        return False
+    return lengths == 0.0 or offsets - along * along / lengths > (0.5 * gap) ** 2

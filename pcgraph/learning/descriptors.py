@@ -10,8 +10,7 @@ from scipy.sparse import csr_array
 
 from pcgraph.detection.planes import find_planes
 from pcgraph.features.nodes import NodeFeatures
-from pcgraph.features.primitive_moments import pool_up_tree, primitive_moments
-from pcgraph.features.primitives import Primitives, fit_primitives
+from pcgraph.features.primitives import Primitives, fit_primitives, primitive_moments, primitive_moments_up_tree
 from pcgraph.segmentation import Segmentation
 
 GROWTH = 4.0  # each ancestor that is asked has so many times the points of the one before
@@ -131,7 +130,9 @@ def _primitives(segmentation: Segmentation) -> Primitives:
     places = np.concatenate((surface.grid.centroids, own.centroid))
     normals = np.concatenate((surface.normals, own.normal))
     leaf = np.concatenate((surface.supervoxels, np.arange(tree.n_leaves, dtype=np.int32)))
-    return fit_primitives(pool_up_tree(primitive_moments(places, normals, leaf, tree.n_leaves), tree.parents))
+    return fit_primitives(
+        primitive_moments_up_tree(primitive_moments(places, normals, leaf, tree.n_leaves), tree.parents)
+    )
 
 
 def _curved(fits: Primitives, length: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.pooling import pool_sums
+from pcgraph.features.moments import accumulate_sums
 from pcgraph.segmentation import Segmentation
 from pcgraph.tree.tree import SegmentationTree
 
@@ -152,7 +152,7 @@ def _sum_up(tree: SegmentationTree, table: NDArray[Any]) -> NDArray[Any]:
     values = _summable(np.where(np.isnan(table), 0, table))
     sums = np.zeros((len(tree.parents), table.shape[1]), values.dtype)
     sums[: tree.n_leaves] = values
-    pool_sums(tree.parents, sums)
+    accumulate_sums(tree.parents, sums)
     return sums
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.graph.relations import angle_between
+from pcgraph.graph.contacts import angle_between
 from pcgraph.hierarchy import roots
 from pcgraph.inputs import positive
 from pcgraph.tree.average_linkage import average_linkage

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.features.columns import rows
 from pcgraph.features.moments import Moments, moments_up_tree
-from pcgraph.features.nodes import NodeFeatures, node_features
+from pcgraph.features.nodes import NodeFeatures, node_features, rows
 from pcgraph.hierarchy import lowest_common_ancestors, roots
 from pcgraph.inputs import non_negative
 from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences, stable_cut

@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pcgraph.parallel import kernel
 
 _MAX_ROTATIONS = 30
 _WIDE_GAP = 1e-4  # of the trace: the least eigenvalue stands this far apart, so the closed form is exact
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def symmetric_eigen(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -> None:
-    """Nothing; `matrix` becomes diagonal (unsorted eigenvalues), `vectors` its eigenvectors as columns.
+    """Diagonalise `matrix` in place (unsorted eigenvalues); `vectors` receives its eigenvectors as columns.
 
     Parameters
     ----------
@@ -59,9 +60,9 @@ def symmetric_eigen(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -
             vectors[i, q] = s * ip + c * iq
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def plane_normal(scatter: NDArray[np.float64], normal: NDArray[np.float64]) -> float:
-    """Least eigenvalue, if it stands well apart from the others, else -1; `normal` becomes its unit eigenvector.
+    """Least eigenvalue, if it stands well apart from the others, else -1; `normal` receives its unit eigenvector.
 
     Parameters
     ----------

@@ -1,23 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sparse voxel grid: which points share a voxel, and which voxels touch (26-neighbourhood)."""
+"""The sparse voxel grid: which points share a voxel, which voxels touch, and what two grids occupy together."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks
-from pcgraph.voxels.cells import cell_keys, sorted_keys
-from pcgraph.voxels.touching import touching
+from pcgraph.parallel import in_blocks, kernel
+from pcgraph.voxels.spacing import bounding_box
 from pcgraph.voxels.warp import Warp
 
-# Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points'
-# order.
+# Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
 _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
+_MAX_KEY = float(1 << 62)
+MAX_NEIGHBOURS = 26
+"""Voxels around a voxel."""
+
+
+class Neighbourhood(NamedTuple):
+    """The 26-neighbourhood of occupied voxels as CSR lists.
+
+    Attributes
+    ----------
+    indptr : (v + 1,) int64
+    neighbours : (e,) int32
+        ``neighbours[indptr[i]:indptr[i + 1]]`` are the occupied among the 26 voxels around voxel i, ascending.
+    """
+
+    indptr: NDArray[np.int64]
+    neighbours: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +65,7 @@ class VoxelGrid:
         Mean colour of the voxel's points.
     indptr : (v + 1,) int64
     neighbours : (e,) int32
-        ``neighbours[indptr[i]:indptr[i + 1]]`` are the occupied among the 26 voxels around voxel i,
-        ascending.
+        Which voxels touch; see `Neighbourhood`.
     """
 
     size: float
@@ -72,6 +86,11 @@ class VoxelGrid:
     def n_voxels(self) -> int:
         """Number of occupied voxels."""
         return len(self.counts)
+
+    @property
+    def neighbourhood(self) -> Neighbourhood:
+        """Which voxels touch, as kernels take it."""
+        return Neighbourhood(self.indptr, self.neighbours)
 
 
 def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, size: float, warp: Warp) -> VoxelGrid:
@@ -104,12 +123,22 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
     centroids = warp.backward(warped)
     if colors is not None:
         colors = _sorted_means(colors, starts, order, _COLOR_STEPS)
-    indptr, neighbours = touching(ordered[starts[:-1]], *pitch)
-    lengths = size * warp.scale(centroids)
-    counts = np.diff(starts)
-    cells = np.floor(scaled[order[starts[:-1]]])
-    members = voxel_of_point, order, starts, counts
-    return VoxelGrid(size, warp, cells, *members, warped, centroids, lengths, colors, indptr, neighbours)
+    indptr, neighbours = touching_voxels(ordered[starts[:-1]], *pitch)
+    return VoxelGrid(
+        size=size,
+        warp=warp,
+        cells=np.floor(scaled[order[starts[:-1]]]),
+        voxel_of_point=voxel_of_point,
+        order=order,
+        starts=starts,
+        counts=np.diff(starts),
+        warped=warped,
+        centroids=centroids,
+        edge_lengths=size * warp.scale(centroids),
+        colors=colors,
+        indptr=indptr,
+        neighbours=neighbours,
+    )
 
 
 def voxel_means(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
@@ -125,7 +154,7 @@ def _sorted_means(
     return means
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(
     start: int,
     stop: int,
@@ -135,7 +164,7 @@ def _gather(
     voxel_of_point: NDArray[np.int32],
     warped: NDArray[np.float64],
 ) -> None:
-    """Each point learns its voxel, each voxel the mean of its points in units of a voxel."""
+    """Set the voxel of each point, and the mean of each voxel's points in units of a voxel."""
     for v in range(start, stop):
         x = y = z = np.int64(0)
         first = order[starts[v]]
@@ -150,7 +179,7 @@ def _gather(
         warped[v, 0], warped[v, 1], warped[v, 2] = cell_x + x / total, cell_y + y / total, cell_z + z / total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _average(
     start: int,
     stop: int,
@@ -170,3 +199,221 @@ def _average(
             z += np.int64(np.rint(values[p, 2] * steps))
         total = max(starts[v + 1] - starts[v], 1) * steps
         means[v, 0], means[v, 1], means[v, 2] = x / total, y / total, z / total
+
+
+# --- cells as whole numbers that sort ---
+
+
+def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
+    """One whole number per place that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
+
+    Parameters
+    ----------
+    scaled : (n, 3) float64
+        Places in units of a cell; cells are the unit cubes.
+    size : float, metres
+        Edge length of a cell, for the message.
+
+    Raises
+    ------
+    ValueError
+        The places span so many cells that the numbers do not fit.
+    """
+    cells = scaled
+    low, high = np.floor(bounding_box(scaled))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
+    if not _fits(high - low):
+        cells = np.stack([_without_gaps(np.floor(scaled[:, axis])) for axis in range(3)], axis=1)
+        low, high = bounding_box(cells)
+        if not _fits(high - low):
+            raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
+    # Two spare cells per axis keep a row's end from touching the next row's start.
+    extent = (high - low).astype(np.int64) + 3
+    pitch = (int(extent[1] * extent[2]), int(extent[2]))
+    keys = np.empty(len(cells), np.int64)
+    in_blocks(_number_cells, len(cells), cells, low, *pitch, keys)
+    return keys, pitch
+
+
+def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys, none negative, in ascending order, and where each was; equal ones stay in their order.
+
+    Key and place go into one number where they fit, as numbers sort three times faster than their places do.
+    """
+    bits = int(len(keys) - 1).bit_length()
+    if int(keys.max()) >= 1 << (62 - bits):
+        order = np.argsort(keys, kind="stable")
+        return keys[order], order
+    both = (keys << bits) | np.arange(len(keys))
+    both.sort()
+    return both >> bits, both & ((1 << bits) - 1)
+
+
+@kernel
+def _number_cells(
+    start: int,
+    stop: int,
+    cells: NDArray[np.float64],
+    low: NDArray[np.float64],
+    pitch_x: int,
+    pitch_y: int,
+    keys: NDArray[np.int64],
+) -> None:
+    """Keys of cells, given by their coordinates or by places in them."""
+    for p in range(start, stop):
+        x, y = np.int64(np.floor(cells[p, 0]) - low[0]), np.int64(np.floor(cells[p, 1]) - low[1])
+        keys[p] = x * pitch_x + y * pitch_y + np.int64(np.floor(cells[p, 2]) - low[2])
+
+
+def _fits(span: NDArray[np.float64]) -> bool:
+    return bool(span.max() < _MAX_KEY) and bool(np.prod(span + 3.0) < _MAX_KEY)
+
+
+def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Same order and same touching pairs, but no gap wider than one empty cell."""
+    values, inverse = np.unique(cells, return_inverse=True)
+    return np.concatenate(([0.0], np.cumsum(np.minimum(np.diff(values), 2.0))))[inverse]
+
+
+# --- which occupied voxels touch ---
+
+
+def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Neighbourhood:
+    """The 26-neighbourhood of occupied voxels.
+
+    Parameters
+    ----------
+    keys : (v,) int64
+        Ascending, x pitch_x + y pitch_y + z of each voxel, with two cells to spare at the end of every row.
+    pitch_x, pitch_y : int
+        What a step in x and in y adds to a key.
+    """
+    counts = np.empty(len(keys), np.int64)
+    room = np.empty((len(keys), MAX_NEIGHBOURS), np.int32)
+    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, room)
+    indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
+    neighbours = np.empty(indptr[-1], np.int32)
+    in_blocks(_pack, len(keys), indptr, room, neighbours)
+    return Neighbourhood(indptr, neighbours)
+
+
+@kernel
+def _walk(
+    start: int,
+    stop: int,
+    keys: NDArray[np.int64],
+    pitch_x: int,
+    pitch_y: int,
+    counts: NDArray[np.int64],
+    room: NDArray[np.int32],
+) -> None:
+    """The lists, one row each: nine pointers walk the sorted keys, each along one row of three voxels around."""
+    n = len(keys)
+    pointers = np.empty(9, np.int64)
+    shifts = np.empty(9, np.int64)
+    for row in range(9):
+        shifts[row] = (row // 3 - 1) * pitch_x + (row % 3 - 1) * pitch_y - 1
+        low, high = 0, n if start < stop else 0  # np.searchsorted takes seconds to compile
+        while low < high:
+            middle = (low + high) // 2
+            if keys[middle] < keys[start] + shifts[row]:
+                low = middle + 1
+            else:
+                high = middle
+        pointers[row] = low
+    for i in range(start, stop):
+        count = 0
+        for row in range(9):
+            target = keys[i] + shifts[row]
+            at = pointers[row]
+            while at < n and keys[at] < target:
+                at += 1
+            pointers[row] = at
+            while at < n and keys[at] <= target + 2:
+                if at != i:
+                    room[i, count] = at
+                    count += 1
+                at += 1
+        counts[i] = count
+
+
+@kernel
+def _pack(
+    start: int, stop: int, indptr: NDArray[np.int64], room: NDArray[np.int32], neighbours: NDArray[np.int32]
+) -> None:
+    """The lists one after the other."""
+    for i in range(start, stop):
+        first = indptr[i]
+        for q in range(indptr[i + 1] - first):
+            neighbours[first + q] = room[i, q]
+
+
+# --- two scans of one scene in one grid ---
+
+
+@dataclass(frozen=True, eq=False)
+class GridUnion:
+    """What two grids occupy together.
+
+    Attributes
+    ----------
+    grid : VoxelGrid of v voxels
+        Means weighted by points. Its `voxel_of_point`, `order` and `starts` speak of the second grid's points, its
+        `counts` of those of both.
+    first, second : (v1,), (v2,) int64
+        Where the voxels of either grid went.
+    """
+
+    grid: VoxelGrid
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+
+
+def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
+    """Union of two grids of the same size and warp.
+
+    Raises
+    ------
+    ValueError
+        One grid has colours and the other has none.
+    """
+    if (a.colors is None) != (b.colors is None):
+        raise ValueError("expected colours with both scans or with neither, got them with one")
+    cells = np.vstack((a.cells, b.cells))
+    keys, pitch = cell_keys(cells, a.size)
+    unique_keys, at, voxel = np.unique(keys, return_index=True, return_inverse=True)
+    first, second = voxel[: a.n_voxels], voxel[a.n_voxels :]
+    counts = np.zeros(len(unique_keys), np.int64)
+    counts[first] += a.counts
+    counts[second] += b.counts
+
+    def blend(of_a: NDArray[np.float64], of_b: NDArray[np.float64]) -> NDArray[np.float64]:
+        mean = np.zeros((len(counts), 3))
+        mean[first] = of_a
+        fraction = (b.counts / counts[second])[:, None]
+        mean[second] += fraction * (of_b - mean[second])
+        return mean
+
+    warped = blend(a.warped, b.warped)
+    colors = None if a.colors is None or b.colors is None else blend(a.colors, b.colors)
+    centroids = a.warp.backward(warped)
+    points_of_b = np.zeros(len(counts) + 1, np.int64)
+    points_of_b[second + 1] = b.counts
+    indptr, neighbours = touching_voxels(unique_keys, *pitch)
+    grid = VoxelGrid(
+        size=a.size,
+        warp=a.warp,
+        cells=cells[at],
+        voxel_of_point=second[b.voxel_of_point].astype(np.int32),
+        order=b.order,
+        starts=np.cumsum(points_of_b),
+        counts=counts,
+        warped=warped,
+        centroids=centroids,
+        edge_lengths=a.size * a.warp.scale(centroids),
+        colors=colors,
+        indptr=indptr,
+        neighbours=neighbours,
+    )
+    return GridUnion(grid, first, second)

@@ -6,12 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks
+from pcgraph.parallel import in_blocks, kernel
 
-_LEAST_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
+_MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class CameraWarp(Warp):
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64; points must lie in front of the viewpoint."""
         warped = np.empty((len(points), 3))
-        in_blocks(_see, len(points), points, self.viewpoint, self.reference_depth, warped)
+        in_blocks(_project, len(points), points, self.viewpoint, self.reference_depth, warped)
         return warped
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -117,12 +116,12 @@ class RangeWarp(Warp):
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths of rows, (n,) float64; at least `_LEAST_LENGTH`."""
-    return np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), _LEAST_LENGTH)
+    """Lengths of rows, (n,) float64; at least `_MIN_LENGTH`."""
+    return np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), _MIN_LENGTH)
 
 
-@njit(cache=True, nogil=True)
-def _see(
+@kernel
+def _project(
     start: int,
     stop: int,
     points: NDArray[np.float64],
@@ -130,7 +129,7 @@ def _see(
     reference_depth: float,
     warped: NDArray[np.float64],
 ) -> None:
-    """Points as a camera sees them, in metres at the reference depth."""
+    """Set places of points as a camera sees them, in metres at the reference depth."""
     for p in range(start, stop):
         depth = points[p, 2] - viewpoint[2]
         scale = reference_depth / depth
@@ -167,7 +166,7 @@ def choose_warp(
         raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
     if range_growth:
         distance = float(np.median(_lengths(points - viewpoint)))
-        return RangeWarp(viewpoint, distance, range_growth) if distance > _LEAST_LENGTH else Warp()
+        return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
     if not camera:
         return Warp()
     warp = CameraWarp(viewpoint, float(np.median(points[:, 2])) - float(viewpoint[2]))

@@ -10,11 +10,16 @@ import numpy as np
 from pcgraph.features.moments import Moments, moments_of_groups
 from pcgraph.features.nodes import NodeFeatures, node_features
 from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
-from pcgraph.graph.relations import angle_between, signed_convexity
+from pcgraph.graph.contacts import angle_between
 from pcgraph.tree.linkage import Linkage, Merges
 from pcgraph.tree.tree import SegmentationTree, segmentation_tree
 
 SHAPES = ("random", "chain", "star", "complete", "parts", "no edges")
+
+
+def signed_convexity(normal_i: np.ndarray, normal_j: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Angle between normals, positive where they open on the way from i to j."""
+    return angle_between(normal_i, normal_j) * np.sign(((normal_j - normal_i) * offset).sum(axis=1))
 
 
 def edges_of(shape: str, n: int, rng: np.random.Generator) -> np.ndarray:

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from pcgraph.features.moments import moments_of_groups, moments_up_tree
 from pcgraph.features.nodes import node_features
-from pcgraph.features.powers import EXPONENTS
-from pcgraph.features.primitive_moments import pool_up_tree, primitive_moments
+from pcgraph.features.primitives import EXPONENTS, primitive_moments, primitive_moments_up_tree
 
 
 def clustered_points(rng, n_groups, origin):
@@ -70,7 +69,7 @@ def test_fourth_powers_of_every_node_equal_those_of_its_points(seed, n_leaves, o
     rng = np.random.default_rng(seed)
     points, _, normals, groups = clustered_points(rng, n_leaves, origin)
     parents, below = random_tree(rng, n_leaves)
-    pooled = pool_up_tree(primitive_moments(points, normals, groups, n_leaves), parents)
+    pooled = primitive_moments_up_tree(primitive_moments(points, normals, groups, n_leaves), parents)
     for node, leaves in enumerate(below):
         inside = np.isin(groups, leaves)
         local = (points[inside] - pooled.centers[node]) / pooled.scales[node]

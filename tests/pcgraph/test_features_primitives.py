@@ -8,9 +8,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pcgraph.features.powers import sums_of_powers
-from pcgraph.features.primitive_moments import PrimitiveMoments, pool_up_tree, primitive_moments
-from pcgraph.features.primitives import Primitive, fit_primitives
+from pcgraph.features.primitives import (
+    Primitive,
+    PrimitiveMoments,
+    fit_primitives,
+    primitive_moments,
+    primitive_moments_up_tree,
+    sums_of_powers,
+)
 
 N = 2000
 PLACES = [np.zeros(3), np.array([1.0, -2.0, 3.0]), np.full(3, 1e6)]
@@ -126,7 +131,7 @@ def test_two_halves_are_the_whole():
     points, normals = sphere(rng, np.pi / 3.0)
     points = 0.1 * points + [5.0, 6.0, 7.0]
     halves = (points[:, 0] > points[:, 0].mean()).astype(np.int32)
-    pooled = pool_up_tree(primitive_moments(points, normals, halves, 2), np.array([2, 2, 2], np.int32))
+    pooled = primitive_moments_up_tree(primitive_moments(points, normals, halves, 2), np.array([2, 2, 2], np.int32))
     whole = moments(points, normals)
     root = PrimitiveMoments(*(getattr(pooled, field.name)[2:] for field in fields(pooled)))
     united, direct = fit_primitives(root).columns(), fit_primitives(whole).columns()

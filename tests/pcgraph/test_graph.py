@@ -8,7 +8,9 @@ import pytest
 from clouds import SPACING, patch
 
 import pcgraph
-from pcgraph.graph.relations import angle_between, signed_convexity
+from pcgraph.features.moments import moments_of_groups
+from pcgraph.features.nodes import node_features
+from pcgraph.graph.contacts import Contacts, angle_between, edge_features
 
 
 def wedge(convex: bool):
@@ -39,8 +41,21 @@ def test_sign_of_convexity(convex):
 
 def test_convexity_does_not_depend_on_which_side_comes_first():
     rng = np.random.default_rng(0)
-    a, b, offset = rng.normal(size=(3, 20, 3))
-    assert np.array_equal(signed_convexity(a, b, offset), signed_convexity(b, a, -offset))
+    m = 20
+    normals, places = rng.normal(size=(2, m, 2, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    nodes = node_features(moments_of_groups(rng.normal(size=(8 * m, 3)), None, np.arange(8 * m) % (2 * m), 2 * m))
+    edges = np.arange(2 * m, dtype=np.int32).reshape(m, 2)
+    voxels = np.ones((m, 2), np.int64)
+    there = edge_features(nodes, Contacts(edges, voxels, places, normals, np.ones(m)))
+    back = edge_features(
+        nodes,
+        Contacts(*(np.ascontiguousarray(both[:, ::-1]) for both in (edges, voxels, places, normals)), np.ones(m)),
+    )
+    for name, column in there.columns().items():
+        assert np.array_equal(column, back.columns()[name]), name
+    assert (there.convexity > 0.0).any()
+    assert (there.contact_convexity < 0.0).any()
 
 
 def test_small_angles_are_exact():

@@ -15,8 +15,7 @@ from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
-from pcgraph.graph.contacts import Contacts, contacts
-from pcgraph.graph.relations import edge_features
+from pcgraph.graph.contacts import Contacts, contacts, edge_features
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.floats(0.02, 0.9))

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 import pcgraph
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
-from pcgraph.graph.bearings import bearing_image
-from pcgraph.graph.occlusion import occlusions
+from pcgraph.graph.occlusion import bearing_image, occlusions
 from pcgraph.voxels.surface import Surface
 
 HEIGHT, WIDTH, FOCAL = 120, 160, 130.0

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from pcgraph.parallel import in_blocks
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid
-from pcgraph.voxels.planes import local_planes
 from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.surface import local_planes
 from pcgraph.voxels.warp import Warp
 
 

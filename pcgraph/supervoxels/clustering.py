@@ -1,0 +1,522 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps of clustering voxels around seeds: distance, seeds, expansion, refinement, connectivity.
+
+A clustering is `labels`, (v,) int32, the supervoxel of each voxel, -1 where it has none yet. Initial labels are those
+of an earlier scan: they stay.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.voxels.grid import VoxelGrid, cell_keys, sorted_keys
+
+EARLY_SWEEPS = 1.8
+"""Times seed size over voxel size: sweeps in which PCL's supervoxels take voxels from each other."""
+_REFINEMENTS = 2
+
+
+# --- the distance of a voxel to a supervoxel ---
+
+
+class Metric(NamedTuple):
+    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'|, with |n . n'| where `two_sided`.
+
+    Attributes
+    ----------
+    spatial : float, 1 / metres
+    normal, color : float
+    two_sided : bool
+        Whether opposite normals are the same.
+    """
+
+    spatial: float
+    normal: float
+    color: float
+    two_sided: bool
+
+
+class VoxelGraph(NamedTuple):
+    """Voxels, which of them touch, and how their distances are measured: what all steps read and none writes.
+
+    Attributes
+    ----------
+    features : (v, 9) float64
+        Rows (place in the warped space, unit normal, colour).
+    indptr : (v + 1,) int64
+    neighbours : (e,) int32
+        The voxels around each; see `pcgraph.voxels.grid.Neighbourhood`.
+    metric : Metric
+    """
+
+    features: NDArray[np.float64]
+    indptr: NDArray[np.int64]
+    neighbours: NDArray[np.int32]
+    metric: Metric
+
+
+def voxel_graph(grid: VoxelGrid, normals: NDArray[np.float64], metric: Metric) -> VoxelGraph:
+    """The voxels of a grid as the steps take them, given their unit normals, (v, 3) float64."""
+    features = np.zeros((grid.n_voxels, 9))
+    features[:, :3], features[:, 3:6] = grid.warped, normals
+    if grid.colors is not None:
+        features[:, 6:] = grid.colors
+    return VoxelGraph(features, grid.indptr, grid.neighbours, metric)
+
+
+@routine
+def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], s: int, metric: Metric) -> float:
+    """Distance D of voxel i to supervoxel s, given rows of `VoxelGraph.features`."""
+    x, y, z = features[i, 0] - means[s, 0], features[i, 1] - means[s, 1], features[i, 2] - means[s, 2]
+    cosine = features[i, 3] * means[s, 3] + features[i, 4] * means[s, 4] + features[i, 5] * means[s, 5]
+    r, g, b = features[i, 6] - means[s, 6], features[i, 7] - means[s, 7], features[i, 8] - means[s, 8]
+    if metric.two_sided:
+        cosine = abs(cosine)
+    away, tint = np.sqrt(x * x + y * y + z * z), np.sqrt(r * r + g * g + b * b)
+    return metric.spatial * away + metric.normal * (1.0 - cosine) + metric.color * tint
+
+
+@routine
+def sum_features(features: NDArray[np.float64], labels: NDArray[np.int32], n_labels: int) -> NDArray[np.float64]:
+    """Sums of the features of each supervoxel's voxels, and their number, (n_labels, 10) float64, in voxel order."""
+    sums = np.zeros((n_labels, 10))
+    for i in range(len(labels)):
+        if labels[i] >= 0:
+            add_features(features, i, sums, labels[i], 1.0)
+    return sums
+
+
+@njit(cache=True, nogil=True, inline="always")
+def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64], s: int, sign: float) -> None:
+    """Update the sums: voxel i joins supervoxel s (sign 1) or leaves it (sign -1)."""
+    for column in range(9):
+        sums[s, column] += sign * features[i, column]
+    sums[s, 9] += sign
+
+
+@routine
+def set_means(sums: NDArray[np.float64], means: NDArray[np.float64]) -> None:
+    """Set `means`, (k, 9), to the supervoxels' mean rows, normals at unit length; rows of empty ones stay."""
+    for s in range(len(sums)):
+        if sums[s, 9] > 0.0:
+            length = max(np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2), 1e-12)
+            for column in range(9):
+                means[s, column] = sums[s, column] / (length if 3 <= column < 6 else sums[s, 9])
+
+
+# --- where supervoxels start ---
+
+
+def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, two_sided: bool) -> NDArray[np.int32]:
+    """Voxels from which supervoxels expand, (k,) int32, ascending; perhaps none.
+
+    In each seed cell with enough voxels for a surface, it is the voxel nearest to the mean of the cell's voxels,
+    of equals the first. Unless `two_sided`, voxels of the cell that face away from it count as another surface,
+    with a seed of its own if they are enough.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    normals : (v, 3) float64
+        Unit normals.
+    seed_size : float, metres
+        Their R_seed: edge length of the seed cells.
+    two_sided : bool
+        Whether opposite normals are the same.
+
+    Notes
+    -----
+    Source: Papon et al. 2013, section 3.2. Parts of the surface that hold no seed are left to `expand`.
+    """
+    keys, _ = cell_keys(grid.warped / seed_size, seed_size)
+    ordered, order = sorted_keys(keys)
+    starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
+    ratio = seed_size / grid.size  # a cell counts if it holds a tenth of a plane, or half of a line
+    enough = min(0.1 * ratio * ratio, 0.5 * ratio)
+    return np.sort(_seeds_of_cells(grid.warped, normals, order, starts, enough, two_sided))
+
+
+@kernel
+def _seeds_of_cells(
+    places: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    order: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    enough: float,
+    two_sided: bool,
+) -> NDArray[np.int32]:
+    """One seed per cell, or two where surfaces face away from each other."""
+    seeds = np.empty(2 * (len(starts) - 1), np.int32)
+    used = 0
+    for cell in range(len(starts) - 1):
+        members = order[starts[cell] : starts[cell + 1]]
+        if len(members) < enough:
+            continue
+        seed = _nearest_to_mean(places, members)
+        seeds[used] = seed
+        used += 1
+        if two_sided:
+            continue
+        turned = 0
+        for at in range(len(members)):  # those that face away come to the front of the list
+            i = members[at]
+            facing = 0.0
+            for axis in range(3):
+                facing += normals[i, axis] * normals[seed, axis]
+            if facing < 0.0:
+                members[turned], members[at] = i, members[turned]
+                turned += 1
+        if turned > 0 and turned >= enough:
+            seeds[used] = _nearest_to_mean(places, members[:turned])
+            used += 1
+    return seeds[:used]
+
+
+@routine
+def _nearest_to_mean(places: NDArray[np.float64], members: NDArray[np.int64]) -> int:
+    """Member nearest to the mean of all, of equals the smallest."""
+    n = len(members)
+    x = y = z = 0.0
+    for at in range(n):
+        i = members[at]
+        x, y, z = x + places[i, 0], y + places[i, 1], z + places[i, 2]
+    x, y, z = x / n, y / n, z / n
+    nearest, least = -1, np.inf
+    for at in range(n):
+        i = members[at]
+        away = (places[i, 0] - x) ** 2 + (places[i, 1] - y) ** 2 + (places[i, 2] - z) ** 2
+        if away < least or (away == least and i < nearest):
+            nearest, least = i, away
+    return nearest
+
+
+# --- expansion from seeds over touching voxels ---
+
+
+def expand(
+    voxels: VoxelGraph, seeds: NDArray[np.int32], sweeps: float, initial: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """Label of each voxel, (v,) int32: of the seed that reached it first or, in early sweeps, is nearer to it.
+
+    A connected part of the grid without a seed becomes one supervoxel.
+
+    Parameters
+    ----------
+    voxels : VoxelGraph of v voxels
+    seeds : (k,) int32
+        Distinct voxels; those that have an initial label are no seeds.
+    sweeps : float
+        Early sweeps, during which a voxel may go over to a nearer supervoxel.
+    initial : (v,) int32
+        Supervoxels that exist already and keep their voxels, but may expand; -1 elsewhere.
+    """
+    early_sweeps = max(1, int(min(sweeps, 1e9)) - 1)
+    seeds = seeds[initial[seeds] < 0]
+    labels, n_initial = initial.copy(), int(initial.max()) + 1
+    labels[seeds] = np.arange(n_initial, n_initial + len(seeds), dtype=np.int32)
+    _expand(voxels, initial >= 0, labels, n_initial + len(seeds), early_sweeps)
+    return labels
+
+
+@kernel
+def _expand(
+    voxels: VoxelGraph,
+    fixed: NDArray[np.bool_],
+    labels: NDArray[np.int32],
+    n_labels: int,
+    early_sweeps: int,
+) -> None:
+    """Spread labels as far as there are voxels; each part of the voxels that none reaches gets one of its own.
+
+    Early sweeps may also take a voxel from a supervoxel that is farther from it.
+    """
+    features, indptr, neighbours, metric = voxels
+    n = len(features)
+    claim, best = np.full(n, -1, np.int32), np.full(n, np.inf)
+    sums, means = sum_features(features, labels, n_labels), np.zeros((n_labels, 9))
+    frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
+    n_frontier, sweep = 0, 0
+    for i in range(n):
+        if labels[i] >= 0:
+            best[i] = -1.0 if fixed[i] else 0.0  # no distance is below -1
+            frontier[n_frontier] = i
+            n_frontier += 1
+    while n_frontier > 0:
+        set_means(sums, means)
+        n_touched = 0
+        for f in range(n_frontier):
+            i = frontier[f]
+            s = labels[i]
+            for a in range(indptr[i], indptr[i + 1]):
+                j = neighbours[a]
+                if labels[j] == s or (labels[j] >= 0 and sweep >= early_sweeps):
+                    continue
+                d = distance(features, j, means, s, metric)
+                if d < best[j] or (d == best[j] and claim[j] > s):
+                    if claim[j] < 0:
+                        touched[n_touched] = j
+                        n_touched += 1
+                    best[j], claim[j] = d, s
+        for t in range(n_touched):
+            j = touched[t]
+            if labels[j] >= 0:
+                add_features(features, j, sums, labels[j], -1.0)
+            add_features(features, j, sums, claim[j], 1.0)
+            labels[j], claim[j] = claim[j], -1
+        frontier, touched = touched, frontier
+        n_frontier, sweep = n_touched, sweep + 1
+    _label_the_rest(indptr, neighbours, labels, n_labels, frontier)
+
+
+@routine
+def _label_the_rest(indptr, neighbours, labels, n_supervoxels, stack):  # type: ignore[no-untyped-def]
+    """Make each connected part of the voxels without a label a supervoxel of its own."""
+    for start in range(len(labels)):
+        if labels[start] >= 0:
+            continue
+        labels[start], stack[0], depth = n_supervoxels, start, 1
+        while depth > 0:
+            depth -= 1
+            i = stack[depth]
+            for a in range(indptr[i], indptr[i + 1]):
+                j = neighbours[a]
+                if labels[j] < 0:
+                    labels[j], stack[depth] = n_supervoxels, j
+                    depth += 1
+        n_supervoxels += 1
+
+
+# --- refinement: supervoxels compete for the voxels on their boundaries ---
+
+
+def refine(voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool_]) -> None:
+    """Move voxels on a boundary, in a few sweeps, to the nearest supervoxel that touches them.
+
+    First all voxels on a boundary are looked at, later those next to one that moved. All voxels of a sweep choose
+    at once, by the means before it.
+
+    Parameters
+    ----------
+    voxels : VoxelGraph of v voxels
+    labels : (v,) int32, >= 0
+        Supervoxel of each voxel; overwritten. Pieces may come off.
+    fixed : (v,) bool
+        Voxels that stay.
+    """
+    queued = fixed.copy()
+    active, sums, means = _boundary(voxels, labels, fixed, int(labels.max()) + 1)
+    for _ in range(_REFINEMENTS):
+        chosen = np.empty_like(active)
+        in_blocks(_choose, len(active), active, voxels, labels, means, chosen)
+        active = _move(active, chosen, voxels, labels, sums, means, queued)
+        if not len(active):
+            return
+
+
+@kernel
+def _boundary(  # type: ignore[no-untyped-def]
+    voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool_], n_labels: int
+):
+    """Voxels that are not fixed and touch another supervoxel, ascending; and sums and means of all supervoxels."""
+    features, indptr, neighbours, _ = voxels
+    found = np.empty(len(labels), np.int32)
+    used = 0
+    for i in range(len(labels)):
+        if fixed[i]:
+            continue
+        for a in range(indptr[i], indptr[i + 1]):
+            if labels[neighbours[a]] != labels[i]:
+                found[used] = i
+                used += 1
+                break
+    sums, means = sum_features(features, labels, n_labels), np.empty((n_labels, 9))
+    set_means(sums, means)
+    return found[:used], sums, means
+
+
+@kernel
+def _choose(
+    start: int,
+    stop: int,
+    active: NDArray[np.int32],
+    voxels: VoxelGraph,
+    labels: NDArray[np.int32],
+    means: NDArray[np.float64],
+    chosen: NDArray[np.int32],
+) -> None:
+    """Set the nearest of the supervoxels around each active voxel; of equals its own, else the smaller number."""
+    features, indptr, neighbours, metric = voxels
+    for q in range(start, stop):
+        i = active[q]
+        own = nearest = labels[i]
+        least, last = -1.0, own
+        for a in range(indptr[i], indptr[i + 1]):
+            s = labels[neighbours[a]]
+            if s in (own, last, nearest):
+                continue
+            last = s
+            if least < 0.0:
+                least = distance(features, i, means, own, metric)
+            d = distance(features, i, means, s, metric)
+            if d < least or (d == least and nearest != own and s < nearest):
+                nearest, least = s, d
+        chosen[q] = nearest
+
+
+@kernel
+def _move(
+    active: NDArray[np.int32],
+    chosen: NDArray[np.int32],
+    voxels: VoxelGraph,
+    labels: NDArray[np.int32],
+    sums: NDArray[np.float64],
+    means: NDArray[np.float64],
+    queued: NDArray[np.bool_],
+) -> NDArray[np.int32]:
+    """Move each active voxel to what it chose; the voxels to look at next: these and those around, not the queued.
+
+    Fixed voxels count as queued.
+    """
+    features, indptr, neighbours, _ = voxels
+    following = np.empty(len(labels), np.int32)
+    used = 0
+    for q in range(len(active)):
+        i = active[q]
+        if labels[i] != chosen[q]:
+            add_features(features, i, sums, labels[i], -1.0)
+            add_features(features, i, sums, chosen[q], 1.0)
+            labels[i] = chosen[q]
+            for a in range(indptr[i] - 1, indptr[i + 1]):
+                j = i if a < indptr[i] else neighbours[a]
+                if not queued[j]:
+                    queued[j] = True
+                    following[used] = j
+                    used += 1
+    for q in range(used):
+        queued[following[q]] = False
+    set_means(sums, means)
+    return following[:used]
+
+
+# --- connectivity: every supervoxel in one piece ---
+
+
+def enforce_connectivity(
+    voxels: VoxelGraph, labels: NDArray[np.int32], initial: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """Labels such that each one's voxels are connected, (v,) int32, renumbered in the order of their first voxel.
+
+    The initial piece of each supervoxel, else its largest, keeps it; voxels of other pieces go, ring by ring, to the
+    nearest supervoxel that touches them.
+
+    Parameters
+    ----------
+    voxels : VoxelGraph of v voxels
+    labels : (v,) int32, >= 0
+        Supervoxels, perhaps in pieces.
+    initial : (v,) int32
+        Supervoxels that exist already, each in one piece, and keep their numbers and voxels; -1 elsewhere.
+    """
+    n_supervoxels = int(labels.max()) + 1
+    kept = _largest_pieces(voxels, labels, n_supervoxels, initial >= 0)
+    _adopt(voxels, kept, n_supervoxels)
+    names = np.full(n_supervoxels, -1, np.int32)
+    n_initial = int(initial.max()) + 1
+    names[:n_initial] = np.arange(n_initial)
+    return _renumber(kept, names, n_initial)
+
+
+@kernel
+def _renumber(labels: NDArray[np.int32], names: NDArray[np.int32], used: int) -> NDArray[np.int32]:
+    """Labels by their names, (n_supervoxels,) int32; those still without one, -1, get the next in order of voxels."""
+    numbered = np.empty(len(labels), np.int32)
+    for i in range(len(labels)):
+        if names[labels[i]] < 0:
+            names[labels[i]] = used
+            used += 1
+        numbered[i] = names[labels[i]]
+    return numbered
+
+
+@kernel
+def _largest_pieces(
+    voxels: VoxelGraph, labels: NDArray[np.int32], n_supervoxels: int, fixed: NDArray[np.bool_]
+) -> NDArray[np.int32]:
+    """Labels of the voxels in their supervoxel's fixed piece, else in its largest (the first of equals), else -1."""
+    indptr, neighbours = voxels.indptr, voxels.neighbours
+    n = len(labels)
+    piece = np.full(n, -1, np.int32)
+    stack = np.empty(n, np.int32)
+    sizes = np.zeros(n, np.int64)
+    largest = np.full(n_supervoxels, -1, np.int64)
+    n_pieces = 0
+    for start in range(n):
+        if piece[start] >= 0:
+            continue
+        piece[start] = n_pieces
+        stack[0] = start
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            i = stack[depth]
+            sizes[n_pieces] += n if fixed[i] else 1  # a fixed voxel outweighs all others
+            for a in range(indptr[i], indptr[i + 1]):
+                j = neighbours[a]
+                if piece[j] < 0 and labels[j] == labels[i]:
+                    piece[j] = n_pieces
+                    stack[depth] = j
+                    depth += 1
+        s = labels[start]
+        if largest[s] < 0 or sizes[n_pieces] > sizes[largest[s]]:
+            largest[s] = n_pieces
+        n_pieces += 1
+    for i in range(n):
+        piece[i] = labels[i] if piece[i] == largest[labels[i]] else -1
+    return piece
+
+
+@kernel
+def _adopt(
+    voxels: VoxelGraph,
+    labels: NDArray[np.int32],
+    n_supervoxels: int,
+) -> None:
+    """Give every voxel without a label, ring by ring, the nearest label around it."""
+    features, indptr, neighbours, metric = voxels
+    means = np.zeros((n_supervoxels, 9))
+    set_means(sum_features(features, labels, n_supervoxels), means)
+    waiting, adopted = np.empty(len(labels), np.int32), np.empty(len(labels), np.int32)
+    n_waiting = 0
+    for i in range(len(labels)):
+        if labels[i] < 0:
+            waiting[n_waiting] = i
+            n_waiting += 1
+    while n_waiting > 0:
+        for w in range(n_waiting):
+            adopted[w] = _nearest_label(waiting[w], features, metric, indptr, neighbours, labels, means)
+        left = 0
+        for w in range(n_waiting):
+            if adopted[w] >= 0:
+                labels[waiting[w]] = adopted[w]
+            else:
+                waiting[left] = waiting[w]
+                left += 1
+        n_waiting = left
+
+
+@routine
+def _nearest_label(i, features, metric, indptr, neighbours, labels, means):  # type: ignore[no-untyped-def]
+    """Label of a neighbour of voxel i with the least distance to it, the smaller of equals; -1 if there is none."""
+    nearest, least = -1, np.inf
+    for a in range(indptr[i], indptr[i + 1]):
+        s = labels[neighbours[a]]
+        if s >= 0:
+            d = distance(features, i, means, s, metric)
+            if d < least or (d == least and s < nearest):
+                nearest, least = s, d
+    return nearest
