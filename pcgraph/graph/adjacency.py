@@ -96,6 +96,9 @@ class AdjacencyGraph:
     def to_networkx(self, occlusions: Occlusions | None = None) -> networkx.Graph:
         """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names.
 
+        Vectors are split (``normal_x``) and all numbers are Python's, so that JSON, GEXF and GraphML take the graph;
+        features that the cloud knows nothing of are left out.
+
         Parameters
         ----------
         occlusions : Occlusions, optional
@@ -109,7 +112,7 @@ class AdjacencyGraph:
         """
         from pcgraph.graph.export import network
 
-        return network(self, occlusions, split=False)
+        return network(self, occlusions)
 
     def to_csr(self, weights: str | ArrayLike | None = None) -> csr_array:
         """The graph as a symmetric SciPy matrix, (k, k) float64, 2 m stored entries, columns ascending.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.columns import rows
+from pcgraph.features.columns import rows, scalar_columns
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import NodeFeatures, node_features
 from pcgraph.inputs import non_negative
@@ -219,12 +219,12 @@ class SegmentationTree:
         return node_features(self.moments)
 
     def to_networkx(self) -> networkx.DiGraph:
-        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features."""
+        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features as numbers."""
         from networkx import DiGraph
 
         columns = {"altitude": self.altitudes, **self.features().columns()}
         tree = DiGraph()
-        tree.add_nodes_from(enumerate(rows(columns, len(self.parents))))
+        tree.add_nodes_from(enumerate(rows(scalar_columns(columns), len(self.parents))))
         tree.add_edges_from((up, node) for node, up in enumerate(self.parents.tolist()) if up != node)
         return tree
 
