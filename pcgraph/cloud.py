@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.errors import CloudReadError
+from pcgraph.short_repr import ShortRepr
 
 Columns = Mapping[str, NDArray[np.generic]]
 """One array per field of a file."""
@@ -19,7 +20,7 @@ _LABEL_NAMES = ("label", "labels")
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(ShortRepr):
     """Points with what a file says about each of them.
 
     Attributes

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.cloud import Cloud
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.bounds import bounding_box
 
 _SMALLEST = 1e-250
@@ -49,7 +50,7 @@ def as_arrays(
 
 
 @dataclass(frozen=True, eq=False)
-class CleanCloud:
+class CleanCloud(ShortRepr):
     """The finite points of a cloud.
 
     Attributes

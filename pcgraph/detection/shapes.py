@@ -13,6 +13,7 @@ from pcgraph.detection.boxes import OrientedBox, plane_basis, some_points, stand
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitive_moments import finite_vectors, primitive_moments
 from pcgraph.features.primitives import fit_primitives
+from pcgraph.short_repr import ShortRepr
 
 Kind = Literal["plane", "box", "sphere", "cylinder"]
 
@@ -24,7 +25,7 @@ GAIN = 0.7  # a plane has to be beaten by this factor: boxes, spheres and cylind
 
 
 @dataclass(frozen=True)
-class Shape:
+class Shape(ShortRepr):
     """What fits points best.
 
     Attributes

@@ -11,10 +11,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.features.pooling import pool_means, pool_moments
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class Moments(ShortRepr):
     """Number, means and scatter of k groups of points.
 
     Scatter is kept about each group's own centroid, not about the origin, so nothing cancels when a cloud

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.pooling import pool_moments
 from pcgraph.features.powers import N_POWERS, add_moved, sums_of_powers, tensor
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True)
-class PrimitiveMoments:
+class PrimitiveMoments(ShortRepr):
     """Moments of k groups of points up to the fourth order, and second moments of their normals.
 
     Attributes

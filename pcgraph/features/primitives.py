@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pcgraph.features.powers import tensor
 from pcgraph.features.primitive_moments import PrimitiveMoments
+from pcgraph.short_repr import ShortRepr
 
 _STRAIGHT = 1e7  # radius over size above which a round shape is a plane
 _EXACT = 1e-6  # residual over size below which a fit counts as perfect: powers resolve no less
@@ -25,7 +26,7 @@ class Primitive(IntEnum):
 
 
 @dataclass(frozen=True)
-class Primitives:
+class Primitives(ShortRepr):
     """The best plane, sphere and cylinder of every one of k groups of points.
 
     Where a group is flat, so that no sphere or cylinder is better than its plane, the radius is infinite and centre

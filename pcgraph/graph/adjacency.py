@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
+from pcgraph.short_repr import ShortRepr
 
 if TYPE_CHECKING:
     import networkx
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeFeatures:
+class EdgeFeatures(ShortRepr):
     """One row per edge (i, j), i < j.
 
     Attributes
@@ -71,7 +72,7 @@ class EdgeFeatures:
 
 
 @dataclass(frozen=True, eq=False)
-class AdjacencyGraph:
+class AdjacencyGraph(ShortRepr):
     """Supervoxels as nodes and their contacts as edges.
 
     Attributes

@@ -12,6 +12,7 @@ from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.bearings import BearingImage, bearing_image
 from pcgraph.graph.relations import angle_between
 from pcgraph.graph.scanlines import scan
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
 
 _FLUSH_RAD = 0.2
@@ -19,7 +20,7 @@ _FLUSH_VOXELS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Continuations:
+class Continuations(ShortRepr):
     """Pairs of supervoxels that vanish behind something on one side and appear from behind it on the other.
 
     Attributes
@@ -51,7 +52,7 @@ class Continuations:
 
 
 @dataclass(frozen=True, eq=False)
-class Occlusions:
+class Occlusions(ShortRepr):
     """Pairs of supervoxels next to each other as the sensor sees them, but apart in depth.
 
     A pair may touch elsewhere, and then has a contact edge as well; each may hide the other, in different places.

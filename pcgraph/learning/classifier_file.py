@@ -10,12 +10,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.short_repr import ShortRepr
+
 _FORMAT = "pcgraph node classifier 1"
 _WRITE = "write it with NodeClassifier.save"
 
 
 @dataclass(frozen=True, eq=False)
-class StoredForest:
+class StoredForest(ShortRepr):
     """Decision trees whose mean says how probable each class is; predicts as the scikit-learn estimator did.
 
     Attributes

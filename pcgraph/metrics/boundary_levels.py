@@ -12,10 +12,11 @@ from pcgraph.metrics.hierarchy import Cuts, checked_parents, count_leaves
 from pcgraph.metrics.levels import LevelCurve
 from pcgraph.metrics.meeting import lowest_common
 from pcgraph.metrics.neighbours import NeighbourGraph, check_reach
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class BoundaryCurve:
+class BoundaryCurve(ShortRepr):
     """Boundary recall and precision of every distinct cut of a tree, from the leaves to the root.
 
     Attributes

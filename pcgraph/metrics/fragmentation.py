@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.metrics.hierarchy import children
 from pcgraph.metrics.node_table import NodeTable
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class FragmentationCurve:
+class FragmentationCurve(ShortRepr):
     """Least error against the number of regions of optimal cuts.
 
     Attributes

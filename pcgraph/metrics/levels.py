@@ -13,6 +13,7 @@ from pcgraph.metrics.hierarchy import Cuts
 from pcgraph.metrics.node_table import NodeTable
 from pcgraph.metrics.rand_index import rand_from_pairs
 from pcgraph.metrics.tournament import overlap_of_cuts
+from pcgraph.short_repr import ShortRepr
 
 Score = Literal[
     "weighted_overlap",
@@ -24,7 +25,7 @@ Score = Literal[
 
 
 @dataclass(frozen=True, eq=False)
-class LevelCurve:
+class LevelCurve(ShortRepr):
     """One score of every distinct cut of a tree, from the leaves to the root.
 
     Attributes

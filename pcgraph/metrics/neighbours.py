@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.metrics.table import decimals, whole_numbers
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class NeighbourGraph:
+class NeighbourGraph(ShortRepr):
     """The k nearest neighbours of each point of a cloud: computed once, good for any number of labellings.
 
     The graph is directed: each point looks at its own k nearest neighbours, so that a boundary is equally thick

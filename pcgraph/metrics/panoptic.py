@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.metrics.table import count_pairs, labelled, overlaps, ranked, whole_numbers
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class PanopticQuality:
+class PanopticQuality(ShortRepr):
     """Matches of segments and true segments, per class; the numbers for all are means over the classes.
 
     Attributes

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.metrics.levels import LevelCurve
+from pcgraph.short_repr import ShortRepr
 
 _LOWER_IS_BETTER = ("undersegmentation_error", "variation_of_information")
 
 
 @dataclass(frozen=True, eq=False)
-class BestScales:
+class BestScales(ShortRepr):
     """The best score with one altitude for all clouds (ODS) and with the best altitude for each (OIS).
 
     Attributes

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.pooling import pool_sums
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.short_repr import ShortRepr
 from pcgraph.tree.ancestors import ancestor_index
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Energy:
+class Energy(ShortRepr):
     """Energy of a segmentation at a scale: sum over its segments of data + scale x complexity.
 
     Attributes

@@ -13,6 +13,7 @@ from pcgraph.features.columns import rows, scalar_columns
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import NodeFeatures, node_features
 from pcgraph.inputs import non_negative
+from pcgraph.short_repr import ShortRepr
 from pcgraph.tree.ancestors import ancestor_index
 from pcgraph.tree.cuts import horizontal_cut, stable_cut
 from pcgraph.tree.energy import Energy
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentationTree:
+class SegmentationTree(ShortRepr):
     """Binary merge tree; every cut of it is a segmentation, and all cuts at altitudes nest.
 
     Attributes

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import cell_keys, sorted_keys
 from pcgraph.voxels.touching import touching
 from pcgraph.voxels.warp import Warp
@@ -21,7 +22,7 @@ _COLOR_STEPS = 65535.0
 
 
 @dataclass(frozen=True, eq=False)
-class VoxelGrid:
+class VoxelGrid(ShortRepr):
     """Occupied voxels of a cloud in ascending order of grid coordinates, whatever the points' order.
 
     Attributes

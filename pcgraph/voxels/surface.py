@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.grid import VoxelGrid
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class Surface(ShortRepr):
     """Occupied voxels with their normals and supervoxels.
 
     Attributes
