@@ -135,4 +135,4 @@ def _binary_columns(element: PlyElement, code: str, body: bytes) -> dict[str, ND
             f"the PLY header promises {element.count} vertices ({needed} bytes), but only {len(body)} bytes follow"
         )
     rows = np.frombuffer(body, record, count=element.count)
-    return {name: rows[name].astype(kind) for name, kind in element.properties}
+    return {name: rows[name].astype(kind, copy=False) for name, kind in element.properties}
