@@ -24,16 +24,15 @@ from scipy.sparse.csgraph import connected_components
 import pcgraph
 from pcgraph.features.moments import Moments
 from pcgraph.segmentation import Segmentation
-from pcgraph.tree.energy import plane_energy
+from pcgraph.tree.average_linkage import ConvexityLinkage
+from pcgraph.tree.energies import plane_energy
 from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
-from pcgraph.tree.growth import segmentation_tree
 from pcgraph.tree.lccp import LccpLinkage
-from pcgraph.tree.leaf_truth import LeafTruth, leaf_truth
-from pcgraph.tree.learned import LearnedLinkage
-from pcgraph.tree.linkage import ConvexityLinkage, Linkage
-from pcgraph.tree.quasi_flat import QuasiFlatLinkage
-from pcgraph.tree.tree import SegmentationTree
-from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.learned import LeafTruth, LearnedLinkage, leaf_truth
+from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.linkage import Linkage
+from pcgraph.tree.single_linkage import QuasiFlatLinkage
+from pcgraph.tree.tree import SegmentationTree, segmentation_tree
 
 LINKAGES: dict[str, Linkage] = {
     "convexity (default)": ConvexityLinkage(),
@@ -99,14 +98,14 @@ def _measure(cases: list[Case], linkages: list[Linkage] | list[LearnedLinkage]) 
     cases[0].tree(linkages[0])  # compiled
     trees, seconds = zip(*(case.tree(linkage) for case, linkage in zip(cases, linkages, strict=True)), strict=True)
     default = [
-        case.table.overlap(tree.cut(altitude=linkage.object_altitude))
+        case.table.covering(tree.cut(altitude=linkage.default_object_altitude))
         for case, tree, linkage in zip(cases, trees, linkages, strict=True)
     ]
     inner = np.concatenate([tree.altitudes[np.isfinite(tree.altitudes)] for tree in trees])
     levels = np.unique(np.quantile(inner[inner > 0.0], 1.0 - np.geomspace(5e-4, 0.3, LEVELS)))
     curves = np.array(
         [
-            [case.table.overlap(tree.cut(altitude=level)) for level in levels]
+            [case.table.covering(tree.cut(altitude=level)) for level in levels]
             for case, tree in zip(cases, trees, strict=True)
         ]
     )
@@ -129,7 +128,7 @@ def _show(name: str, row: dict[str, float]) -> None:
 def _measure_cuts(cases: list[Case]) -> dict[str, dict[str, float]]:
     """Other cuts of the default tree."""
     linkage = ConvexityLinkage()
-    altitude, rows = linkage.object_altitude, {}
+    altitude, rows = linkage.default_object_altitude, {}
     trees = [case.tree(linkage)[0] for case in cases]
     cuts = {
         f"altitude {altitude:g} rad": lambda tree: tree.cut(altitude=altitude),
@@ -139,10 +138,10 @@ def _measure_cuts(cases: list[Case]) -> dict[str, dict[str, float]]:
         f"optimal, planes, scale {PLANE_SCALE:g}": lambda tree: tree.cut_optimal(plane_energy(tree), PLANE_SCALE),
     }
     for name, cut in cuts.items():
-        overlaps = [case.table.overlap(cut(tree)) for case, tree in zip(cases, trees, strict=True)]
+        overlaps = [case.table.covering(cut(tree)) for case, tree in zip(cases, trees, strict=True)]
         rows[name] = {"wov": float(np.mean(overlaps)), "worst": float(np.min(overlaps))}
     for name, connected in (("bound: true object of each supervoxel", False), ("bound: the same, along edges", True)):
-        overlaps = [case.table.overlap(_best_possible(case, connected)) for case in cases]
+        overlaps = [case.table.covering(_best_possible(case, connected)) for case in cases]
         rows[name] = {"wov": float(np.mean(overlaps)), "worst": float(np.min(overlaps))}
     return rows
 

@@ -74,7 +74,7 @@ def of_tree(name: str, result: Segmentation) -> Iterator[tuple[str, Any]]:
     yield f"{name}/altitudes", tree.altitudes
     yield f"{name}/cut into 20", tree.cut(n=20)
     yield f"{name}/cut into 20 of 100", tree.cut(n=20, min_size=100)
-    yield f"{name}/part cut", tree.cut(altitude=result.linkage.part_altitude)
+    yield f"{name}/part cut", tree.cut(altitude=result.linkage.default_part_altitude)
     yield f"{name}/persistence", tree.persistence
 
 

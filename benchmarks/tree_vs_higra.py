@@ -24,14 +24,13 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from pcgraph.features.moments import Moments
-from pcgraph.tree.ancestors import ancestor_index
-from pcgraph.tree.average import average_linkage
-from pcgraph.tree.energy import Energy
+from pcgraph.hierarchy import lowest_common_ancestors
+from pcgraph.tree.average_linkage import average_linkage
 from pcgraph.tree.least_increase import Regions, least_increase_linkage
-from pcgraph.tree.single import single_linkage
+from pcgraph.tree.linkage import Merges
+from pcgraph.tree.optimal_cut import Energy
+from pcgraph.tree.single_linkage import single_linkage
 from pcgraph.tree.tree import SegmentationTree
-
-Arrays = tuple[NDArray[np.int32], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ def problem(n: int) -> tuple[Problem, float]:
     return Problem(n, edges, rng.random(len(edges)), weights, rng.normal(size=(n, 3)), graph), built
 
 
-def ours(kind: str, p: Problem) -> Arrays:
+def ours(kind: str, p: Problem) -> Merges:
     if kind == "single":
-        return single_linkage(p.n, p.edges, p.costs)[:2]
+        return single_linkage(p.n, p.edges, p.costs)
     if kind == "average":
         return average_linkage(p.n, p.edges, p.costs, p.weights)
     regions = Regions(np.ones(p.n), p.values, np.zeros((p.n, 3)), np.zeros((p.n, 3, 3)), 0.0)
@@ -85,7 +84,7 @@ def parents_of(pairs: NDArray[np.int32], n: int) -> NDArray[np.int32]:
 
 def same_hierarchy(p: Problem, pairs: NDArray[np.int32], altitudes: NDArray[np.float64], tree, levels) -> bool:  # type: ignore[no-untyped-def]
     """Whether the ends of every edge meet at the same altitude in both trees (to 1e-9)."""
-    meeting = ancestor_index(parents_of(pairs, p.n)).of_pairs(p.edges)
+    meeting = lowest_common_ancestors(parents_of(pairs, p.n), *p.edges.T)
     mine = np.concatenate((np.zeros(p.n), altitudes))[meeting]
     return bool(np.allclose(mine, higra.saliency(tree, levels), rtol=1e-9))
 
@@ -146,7 +145,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 10_000, 100_000])
     results: dict[str, object] = {
         "import_higra_ms": import_ms("import higra"),
-        "import_pcgraph_tree_ms": import_ms("import pcgraph.tree.tree, pcgraph.tree.average"),
+        "import_pcgraph_tree_ms": import_ms("import pcgraph.tree.tree, pcgraph.tree.average_linkage"),
     }
     print(f"import: Higra {results['import_higra_ms']:.0f} ms, pcgraph.tree {results['import_pcgraph_tree_ms']:.0f} ms")
     for n in parser.parse_args().nodes:
@@ -154,16 +153,16 @@ def main() -> None:
         repeats = max(3, 30_000 // n)
         row: dict[str, object] = {"edges": len(p.edges), "higra_graph_ms": 1e3 * built}
         for kind in ("single", "average", "ward"):
-            pairs, altitudes = ours(kind, p)
+            merges = ours(kind, p)
             tree, levels = theirs(kind, p)
             row[kind] = {
-                "same": same_hierarchy(p, pairs, altitudes, tree, levels),
+                "same": same_hierarchy(p, merges.pairs, merges.altitudes, tree, levels),
                 "ms": median_ms(lambda kind=kind, p=p: ours(kind, p), repeats),  # type: ignore[misc]
                 "higra_ms": median_ms(lambda kind=kind, p=p: theirs(kind, p), repeats),  # type: ignore[misc]
             }
             print(f"{n:7d} nodes, {len(p.edges)} edges, {kind:8s}", row[kind])
-        pairs, altitudes = ours("average", p)
-        row["cuts"] = cut_times(p, pairs, altitudes, repeats)
+        merges = ours("average", p)
+        row["cuts"] = cut_times(p, merges.pairs, merges.altitudes, repeats)
         print(f"{n:7d} nodes", {name: round(ms, 3) for name, ms in row["cuts"].items()})
         results[str(n)] = row
     print(json.dumps(results))

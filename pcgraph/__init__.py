@@ -29,25 +29,25 @@ if TYPE_CHECKING:
     from pcgraph.graph.occlusion import Occlusions as Occlusions
     from pcgraph.io import read_cloud as read_cloud
     from pcgraph.io import write_segmentation as write_segmentation
-    from pcgraph.pipeline import segment as segment
-    from pcgraph.pipeline import update as update
+    from pcgraph.scan import segment as segment
+    from pcgraph.scan import update as update
     from pcgraph.segmentation import Segmentation as Segmentation
     from pcgraph.supervoxels.method import SupervoxelMethod as SupervoxelMethod
     from pcgraph.supervoxels.method import SurfaceGrowth as SurfaceGrowth
     from pcgraph.supervoxels.method import Vccs as Vccs
-    from pcgraph.tree.energy import Energy as Energy
-    from pcgraph.tree.energy import plane_energy as plane_energy
-    from pcgraph.tree.energy import variance_energy as variance_energy
+    from pcgraph.tree.average_linkage import ConvexityLinkage as ConvexityLinkage
+    from pcgraph.tree.energies import plane_energy as plane_energy
+    from pcgraph.tree.energies import variance_energy as variance_energy
     from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage as FelzenszwalbLinkage
     from pcgraph.tree.lccp import LccpLinkage as LccpLinkage
     from pcgraph.tree.learned import LearnedLinkage as LearnedLinkage
-    from pcgraph.tree.linkage import ConvexityLinkage as ConvexityLinkage
+    from pcgraph.tree.least_increase import MumfordShahLinkage as MumfordShahLinkage
+    from pcgraph.tree.least_increase import WardLinkage as WardLinkage
     from pcgraph.tree.linkage import Linkage as Linkage
     from pcgraph.tree.linkage import Merges as Merges
-    from pcgraph.tree.quasi_flat import QuasiFlatLinkage as QuasiFlatLinkage
+    from pcgraph.tree.optimal_cut import Energy as Energy
+    from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
-    from pcgraph.tree.ward import MumfordShahLinkage as MumfordShahLinkage
-    from pcgraph.tree.ward import WardLinkage as WardLinkage
     from pcgraph.voxels.surface import Surface as Surface
 else:
     import lazy_loader
@@ -65,17 +65,19 @@ else:
             "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
             "graph.occlusion": ["Continuations", "Occlusions"],
             "io": ["read_cloud", "write_segmentation"],
-            "pipeline": ["segment", "update"],
+            "scan": ["segment", "update"],
             "segmentation": ["Segmentation"],
             "supervoxels.method": ["SupervoxelMethod", "SurfaceGrowth", "Vccs"],
-            "tree.energy": ["Energy", "plane_energy", "variance_energy"],
+            "tree.average_linkage": ["ConvexityLinkage"],
+            "tree.energies": ["plane_energy", "variance_energy"],
             "tree.felzenszwalb": ["FelzenszwalbLinkage"],
             "tree.lccp": ["LccpLinkage"],
             "tree.learned": ["LearnedLinkage"],
-            "tree.linkage": ["ConvexityLinkage", "Linkage", "Merges"],
-            "tree.quasi_flat": ["QuasiFlatLinkage"],
+            "tree.least_increase": ["MumfordShahLinkage", "WardLinkage"],
+            "tree.linkage": ["Linkage", "Merges"],
+            "tree.optimal_cut": ["Energy"],
+            "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
-            "tree.ward": ["MumfordShahLinkage", "WardLinkage"],
             "voxels.surface": ["Surface"],
         },
     )

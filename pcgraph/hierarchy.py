@@ -138,12 +138,17 @@ def propagate_sequential(
     condition : (k,) bool
         A root keeps its value in any case.
     """
-    return node_values[_sources(parents, condition)]
+    return node_values[propagation_sources(parents, condition)]
+
+
+def roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Root above each node, (k,) int32, of a forest: several hierarchies in one array, each root its own parent."""
+    return propagation_sources(parents, np.ones(len(parents), np.bool_))
 
 
 @njit(cache=True)
-def _sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Node whose value each node has after the propagation, (k,)."""
+def propagation_sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Node whose value each node has after `propagate_sequential`, (k,) int32: it or one above it."""
     sources = np.arange(len(parents)).astype(np.int32)
     for node in range(len(parents) - 1, -1, -1):
         if condition[node]:

@@ -1,44 +1,182 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a scan: the whole algorithm, from voxels to objects, on one page."""
+"""Segmentation of a scan: the whole algorithm, from points to voxels, supervoxels, graph, tree and objects.
+
+`segment` and `update` say what a first scan, and one that follows, is put into; `segment_scan` is the algorithm.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import contacts
 from pcgraph.graph.relations import edge_features
-from pcgraph.inputs import CleanCloud, non_negative
+from pcgraph.inputs import CleanCloud, Points, as_arrays, clean_cloud, clean_viewpoint, fraction, non_negative, positive
 from pcgraph.parallel import side_by_side
 from pcgraph.segmentation import Segmentation
-from pcgraph.supervoxels.method import SupervoxelMethod
-from pcgraph.tree.growth import segmentation_tree
+from pcgraph.supervoxels.method import SupervoxelMethod, SurfaceGrowth
+from pcgraph.tree.average_linkage import ConvexityLinkage
 from pcgraph.tree.linkage import Linkage
-from pcgraph.voxels.grid import VoxelGrid, voxel_means
+from pcgraph.tree.tree import segmentation_tree
+from pcgraph.voxels.bounds import bounding_box
+from pcgraph.voxels.grid import VoxelGrid, voxel_grid, voxel_means
+from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.surface import Surface
+from pcgraph.voxels.union import grid_union
+from pcgraph.voxels.warp import choose_warp
+
+VOXELS_PER_SPACING = 3.5
+SEEDS_PER_VOXEL = 6.0
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How the scan is segmented, checked."""
+def segment(
+    points: Points,
+    colors: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    *,
+    voxel_size: float | None = None,
+    seed_size: float | None = None,
+    camera: bool | None = None,
+    range_growth: float = 0.0,
+    method: SupervoxelMethod | None = None,
+    linkage: Linkage | None = None,
+    object_altitude: float | None = None,
+) -> Segmentation:
+    """Segmentation of a point cloud: supervoxels, their adjacency graph, and the tree on it.
 
-    method: SupervoxelMethod
-    linkage: Linkage
-    object_altitude: float
+    Parameters
+    ----------
+    points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
+        Of a `Cloud`, and of a file that `read_cloud` reads, colours, normals and viewpoint are used too where none
+        are given (not a viewpoint of zeros, which PCD files hold where none is known).
+        NaN and infinite points are left out and labelled -1. Organised points (h, w, 3) are taken for a
+        camera's image in the camera's frame (z forward) unless `viewpoint` or `camera` say otherwise.
+    colors : same shape, uint8 0..255 or float 0..1, optional
+    normals : same shape, float, optional
+        Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
+    viewpoint : (3,) or points' shape float, metres, the points' frame, optional
+        Where the sensor stood, for all points or for each; estimated normals point to its side, and convexity
+        depends on that. Default: the origin for organised clouds and for clouds whose bounding box leaves the
+        origin out; otherwise a place high above (+z) the box.
+    voxel_size : float, metres, optional
+        Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
+    seed_size : float, metres, optional
+        Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 6 times `voxel_size`.
+    camera : bool, optional
+        Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
+        depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, unless
+        voxels grow with range. (A missing point stored as (0, 0, 0) lies at the viewpoint: make it NaN.)
+    range_growth : float, 0..1, without 1
+        Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
+        scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece.
+    method : SupervoxelMethod, optional
+        How voxels become supervoxels; default `SurfaceGrowth()`.
+    linkage : Linkage, optional
+        How the graph becomes a tree; default `ConvexityLinkage()`, whose altitudes are radians of concavity.
+    object_altitude : float, the linkage's unit, optional
+        Altitude above which two parts are two objects: the cut that gives `labels`. Default: the linkage's.
 
-    @classmethod
-    def of(cls, method: SupervoxelMethod, linkage: Linkage, object_altitude: float | None) -> Settings:
-        if not isinstance(method, SupervoxelMethod):
-            raise ValueError(f"expected a method such as pcgraph.SurfaceGrowth() or pcgraph.Vccs(), got {method!r}")
-        if not isinstance(linkage, Linkage):
-            raise ValueError(f"expected a linkage such as pcgraph.ConvexityLinkage(), got {linkage!r}")
-        altitude = linkage.object_altitude if object_altitude is None else object_altitude
-        return cls(method, linkage, non_negative("object_altitude", altitude))
+    Returns
+    -------
+    Segmentation
+        Every finite point has a supervoxel; the voxels that hold points of a supervoxel are connected
+        (26-neighbourhood). The same points give the same supervoxels in any order, and node features up to the
+        rounding of sums; the number of threads changes nothing.
+
+    Raises
+    ------
+    ValueError
+        A shape, dtype or value is not as above, or no point is finite.
+    CloudReadError
+        `points` names a file that cannot be read.
+
+    Notes
+    -----
+    Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
+    """
+    points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
+    settings = Settings.of(method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
+    cloud = clean_cloud(points, colors, normals)
+    position = clean_viewpoint(viewpoint, cloud)
+    voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
+    growth = fraction("range_growth", range_growth)
+    warp = choose_warp(
+        cloud.points, position, _is_camera(cloud, position, growth) if camera is None else camera, growth
+    )
+    grid = voxel_grid(cloud.points, cloud.colors, voxel_size, warp)
+    initial_labels = np.full(grid.n_voxels, -1, np.int32)
+    scan = Scan(cloud, position, grid, _orientation_points(grid, position), initial_labels, seed_size)
+    return segment_scan(scan, None, settings)
+
+
+def update(
+    earlier: Segmentation,
+    points: Points,
+    colors: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    *,
+    method: SupervoxelMethod | None = None,
+    linkage: Linkage | None = None,
+    object_altitude: float | None = None,
+) -> Segmentation:
+    """Segmentation of a scene after one more scan of it.
+
+    Supervoxels keep their numbers and what they hold: the new points join those whose voxels they fall into, or
+    beside which they lie on the same surface, or found new ones. Graph and tree are made anew, over all that has
+    been seen. The points of earlier scans are not needed, and a scan costs time for its own points and for the
+    voxels of the scene, not for the points seen before.
+
+    Parameters
+    ----------
+    earlier : Segmentation
+        Of the scans so far; its voxel size, seed size and grid are used again.
+    points, colors, normals, viewpoint
+        The new scan in the same frame; as for `pcgraph.segment`.
+    method, linkage, object_altitude
+        As for `pcgraph.segment`; default: those of the earlier scan.
+
+    Returns
+    -------
+    Segmentation
+        `labels` and `supervoxels` are those of the new points; `graph`, `tree` and `surface` those of the whole
+        scene. Points of an earlier scan keep their supervoxels, so their objects are now
+        ``result.objects[earlier.supervoxels]``.
+
+    Raises
+    ------
+    ValueError
+        As for `pcgraph.segment`; or the earlier scan's voxels grow with a camera's depth and a new point does not
+        lie in front of that camera (segment the first scan with ``camera=False``); or one scan has colours and
+        the other none.
+
+    Notes
+    -----
+    Nothing is ever taken away: what has moved between the scans is there twice.
+    """
+    points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
+    if object_altitude is None and linkage is None:
+        object_altitude = earlier.object_altitude
+    settings = Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
+    cloud = clean_cloud(points, colors, normals)
+    position = clean_viewpoint(viewpoint, cloud)
+    before = earlier.surface
+    before.grid.warp.check(cloud.points)
+    seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp)
+    union = grid_union(before.grid, seen)
+    labels = np.full(union.grid.n_voxels, -1, np.int32)
+    labels[union.first] = before.supervoxels
+    orientation = np.empty((union.grid.n_voxels, 3))
+    orientation[union.second] = _orientation_points(seen, position)
+    orientation[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
+    scan = Scan(cloud, position, union.grid, orientation, labels, earlier.seed_size)
+    return segment_scan(scan, earlier, settings)
 
 
 @dataclass(frozen=True)
@@ -51,9 +189,9 @@ class Scan:
     viewpoint : (3,) or (n, 3) float64, metres
     grid : VoxelGrid of v voxels
         All that has been seen; its `voxel_of_point` speaks of these points.
-    outside : (3,) or (v, 3) float64, metres
+    orientation_points : (3,) or (v, 3) float64, metres
         A place on the outer side of each voxel's surface.
-    known : (v,) int32
+    initial_labels : (v,) int32
         Supervoxels of earlier scans, -1 elsewhere.
     seed_size : float, metres
     """
@@ -61,20 +199,39 @@ class Scan:
     cloud: CleanCloud
     viewpoint: NDArray[np.float64]
     grid: VoxelGrid
-    outside: NDArray[np.float64]
-    known: NDArray[np.int32]
+    orientation_points: NDArray[np.float64]
+    initial_labels: NDArray[np.int32]
     seed_size: float
 
 
-def segmentation(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
-    """The algorithm from voxels on."""
+@dataclass(frozen=True)
+class Settings:
+    """Method, linkage and cut of a segmentation, checked."""
+
+    method: SupervoxelMethod
+    linkage: Linkage
+    object_altitude: float
+
+    @classmethod
+    def of(cls, method: SupervoxelMethod, linkage: Linkage, object_altitude: float | None) -> Settings:
+        """Settings; without an altitude the linkage's default."""
+        if not isinstance(method, SupervoxelMethod):
+            raise ValueError(f"expected a method such as pcgraph.SurfaceGrowth() or pcgraph.Vccs(), got {method!r}")
+        if not isinstance(linkage, Linkage):
+            raise ValueError(f"expected a linkage such as pcgraph.ConvexityLinkage(), got {linkage!r}")
+        altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
+        return cls(method, linkage, non_negative("object_altitude", altitude))
+
+
+def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
+    """Segmentation of a scan: the algorithm from voxels on."""
     cloud, grid, method, linkage = scan.cloud, scan.grid, settings.method, settings.linkage
-    planes = method.planes(grid, scan.outside)
+    planes = method.planes(grid, scan.orientation_points)
     normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
-        normals[scan.known >= 0] = earlier.surface.normals
-    supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.known)
+        normals[scan.initial_labels >= 0] = earlier.surface.normals
+    supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.initial_labels)
     leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
     surface = Surface(grid, normals, supervoxels)
     leaves, touching = side_by_side(
@@ -117,3 +274,30 @@ def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArr
     length = np.linalg.norm(means, axis=1, keepdims=True)
     usable = length > 1e-6
     return np.where(usable, means / np.where(usable, length, 1.0), estimated)
+
+
+def _orientation_points(grid: VoxelGrid, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From where the voxels were seen: one place, (3,), or the mean of those of each voxel's points, (v, 3)."""
+    if position.ndim == 1:
+        return position
+    low, high = bounding_box(position)
+    middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
+    return middle + reach * voxel_means((position - middle) / reach, grid)
+
+
+def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> tuple[float, float]:
+    if voxel_size is None:
+        spacing = VOXELS_PER_SPACING * median_spacing(cloud.points)
+        voxel_size = spacing if seed_size is None else min(spacing, positive("seed_size", seed_size))
+    voxel = positive("voxel_size", voxel_size)
+    seed = SEEDS_PER_VOXEL * voxel if seed_size is None else positive("seed_size", seed_size)
+    if seed < voxel:
+        raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
+    return voxel, seed
+
+
+def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float) -> bool:
+    """Whether a camera at the viewpoint may have taken this as one image."""
+    if len(cloud.shape) != 2 or viewpoint.ndim != 1 or range_growth:
+        return False
+    return bool(cloud.points[:, 2].min() > viewpoint[2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pcgraph.pipeline import segment
+from pcgraph.scan import segment
 
 _EDGE = 24  # points along the cloud's edges
 _SPACING = 0.01  # metres between neighbouring points

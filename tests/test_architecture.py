@@ -47,11 +47,11 @@ STOREYS = [
     "errors",
     "interrupts",
     "short_repr",
-    "hierarchy",
     "plain_files",
     "output",
     "cloud",
     "parallel",
+    "hierarchy",
     "voxels",
     "inputs",
     "features",
@@ -62,7 +62,7 @@ STOREYS = [
     "scan",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = {"pipeline", "warmup", "detection", "learning", "io", "cli"}
+ON_TOP = {"warmup", "detection", "learning", "io", "cli"}
 """What stands on these and may import all of them."""
 
 

@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cuts: the node of the tree that each leaf ends up in."""
+"""Cuts of a tree: the node that each leaf ends up in, by altitude, number, size or stability.
+
+A cut chooses nodes, none above another. A leaf goes to the chosen node above it; where it has none, because what is
+above it is too small or does not last, it goes to the core that the tree would have merged it with.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.tree.cores import core_of_leaf, size_cores
-from pcgraph.tree.segments import children_of, tops_below
-from pcgraph.tree.stability import stable_nodes
+from pcgraph.hierarchy import children, num_leaves, propagate_sequential, propagation_sources
 
 
 def horizontal_cut(
@@ -30,27 +35,16 @@ def horizontal_cut(
     n, altitude, min_size
         As for `SegmentationTree.cut`, with its errors.
     """
-    n_leaves = (len(parents) + 1) // 2
+    n_leaves = num_leaves(parents)
     if _whole("min_size", min_size) == 1:
         last = n_leaves + _merges(altitudes[n_leaves:], n, altitude, n_leaves)
-        return tops_below(parents, last)[:n_leaves].copy()
+        return propagation_sources(parents, parents < last)[:n_leaves].copy()
     cores = size_cores(parents, counts, min_size)
     merges = _merges(altitudes[n_leaves:], n, altitude, len(cores.joins) + 1)
     last = n_leaves + merges
     if n is not None:  # so many of the merges that join cores
         last = int(cores.joins[merges - 1]) + 1 if merges > 0 else 0
-    return tops_below(parents, last)[cores.of_leaf]
-
-
-def stable_cut(
-    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
-) -> NDArray[np.int32]:
-    """Node of each leaf, (n_leaves,) int32, in the most stable segmentation; see `SegmentationTree.cut_stable`."""
-    least = min(_whole("min_size", min_size), int(counts[-1]))
-    chosen = stable_nodes(parents, altitudes, counts, least)
-    if not chosen.any():  # only parts that do not touch, each too small
-        chosen[-1] = True
-    return core_of_leaf(parents, children_of(parents), counts, chosen)
+    return propagation_sources(parents, parents < last)[cores.of_leaf]
 
 
 def _merges(merge_altitudes: NDArray[np.float64], n: int | None, altitude: float | None, most: int) -> int:
@@ -71,3 +65,189 @@ def _whole(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"expected {name} as a whole number of at least 1, got {value!r}")
     return int(value)
+
+
+@njit(cache=True)
+def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int32]:
+    """Segment of each leaf, (n_leaves,) int32, numbered from 0 in the order of their first leaf.
+
+    Parameters
+    ----------
+    nodes : (n_leaves,) int32, 0..n_nodes - 1
+        Leaves with the same node share a segment.
+    n_nodes : int
+    """
+    number = np.full(n_nodes, -1, np.int32)
+    segments = np.empty(len(nodes), np.int32)
+    used = 0
+    for leaf in range(len(nodes)):
+        if number[nodes[leaf]] < 0:
+            number[nodes[leaf]] = used
+            used += 1
+        segments[leaf] = number[nodes[leaf]]
+    return segments
+
+
+# --- cores: segments of a least size ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SizeCores:
+    """What remains of a tree when no segment may have fewer than some number of points.
+
+    Attributes
+    ----------
+    of_leaf : (n_leaves,) int32
+        Core of each leaf, a node of the tree.
+    joins : (n_cores - 1,) int32
+        Nodes that join two groups of cores, ascending. All other merges only make a core larger.
+    """
+
+    of_leaf: NDArray[np.int32]
+    joins: NDArray[np.int32]
+
+
+def size_cores(parents: NDArray[np.int32], counts: NDArray[np.int64], min_size: int) -> SizeCores:
+    """Cores of a tree for a least number of points: nodes that have it, while neither child has.
+
+    Which segment a small leaf joins at one cut contains the one that it joins at a finer cut.
+
+    Parameters
+    ----------
+    parents : (k,) int32
+        As in `SegmentationTree`.
+    counts : (k,) int64
+        Points of each node.
+    min_size : int
+        If the whole tree has fewer points, its root is the only core.
+    """
+    enough = counts >= min(min_size, int(counts[-1]))
+    pairs = children(parents)
+    inner = pairs[:, 0] >= 0
+    enough_below = enough[pairs] & inner[:, None]
+    chosen = enough & ~enough_below.any(axis=1)
+    joins = np.flatnonzero(enough_below.all(axis=1)).astype(np.int32)
+    return SizeCores(core_of_leaf(parents, counts, chosen), joins)
+
+
+def core_of_leaf(parents: NDArray[np.int32], counts: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Chosen node of each leaf, (n_leaves,) int32.
+
+    A leaf below no chosen node climbs to the first node with a chosen node below, and from there descends into
+    the larger child that has one. So it goes where the tree would have merged it.
+
+    Parameters
+    ----------
+    parents, counts : (k,)
+    chosen : (k,) bool
+        At least one, none above another.
+    """
+    core = _cores_below(children(parents), counts, chosen)
+    return propagate_sequential(parents, core, core < 0)[: num_leaves(parents)].copy()
+
+
+@njit(cache=True)
+def _cores_below(
+    children: NDArray[np.int32], counts: NDArray[np.int64], chosen: NDArray[np.bool_]
+) -> NDArray[np.int32]:
+    """Chosen node at or below each node, that of the larger child where both have one; -1 without."""
+    core = np.full(len(children), -1, np.int32)
+    for node in range(len(children)):
+        a, b = children[node]
+        if chosen[node]:
+            core[node] = node
+        elif a >= 0 and core[a] >= 0 and core[b] >= 0:
+            core[node] = core[a] if counts[a] >= counts[b] else core[b]
+        elif a >= 0:
+            core[node] = max(core[a], core[b])
+    return core
+
+
+# --- stability: what lasts longest ------------------------------------------------------------------------------------
+
+
+def persistences(parents: NDArray[np.int32], altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Range of altitudes over which each node is a segment of the horizontal cuts, (k,) float64.
+
+    Parent's altitude less the node's own; infinite for what never merges below infinity, 0 for nodes that are
+    born at infinity.
+    """
+    above = altitudes[parents]
+    above[-1] = np.inf
+    born = np.isfinite(altitudes)
+    return np.subtract(above, altitudes, out=np.zeros(len(parents)), where=born)
+
+
+def stable_cut(
+    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
+) -> NDArray[np.int32]:
+    """Node of each leaf, (n_leaves,) int32, in the most stable segmentation; see `SegmentationTree.cut_stable`."""
+    least = min(_whole("min_size", min_size), int(counts[-1]))
+    chosen = stable_nodes(parents, altitudes, counts, least)
+    if not chosen.any():  # only parts that do not touch, each too small
+        chosen[-1] = True
+    return core_of_leaf(parents, counts, chosen)
+
+
+def stable_nodes(
+    parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
+) -> NDArray[np.bool_]:
+    """Whether each node is chosen, (k,) bool: nodes of the largest total stability, none above another.
+
+    A branch is a segment from where it first has `min_size` points; a merge with something smaller does not end
+    it. Its stability is the sum of points x persistence over its nodes. Persistence ends at the largest finite
+    altitude at which two parts of `min_size` points merge: what is smaller may come in at any altitude (a voxel far off
+    at pi), and would make the whole scene last. The nodes chosen are the tops of branches; of equal stability the
+    coarser one is taken. Leaves below no chosen node are left to the caller.
+
+    Parameters
+    ----------
+    parents, altitudes : (k,)
+        As in `SegmentationTree`.
+    counts : (k,) int64
+        Points of each node.
+    min_size : int
+
+    Notes
+    -----
+    Source: Campello et al. 2015 (excess of mass, HDBSCAN), with altitude in place of 1 / density, so what lasts long
+    at high altitude counts as much as what lasts long at low altitude.
+    """
+    across_gap, pairs = np.isinf(altitudes), children(parents)
+    smaller = np.where(pairs[:, 0] >= 0, counts[pairs].min(axis=1), 0)
+    levels = np.minimum(altitudes, altitudes[~across_gap & (smaller >= min_size)].max(initial=0.0))
+    persistence = levels[parents] - levels
+    taken = _more_stable(pairs, persistence, counts, (counts >= min_size) & ~across_gap, min_size)
+    taken = propagate_sequential(parents, taken, ~taken)
+    below = taken[parents]
+    below[-1] = False
+    return taken & ~below  # the highest of each chain of taken nodes
+
+
+@njit(cache=True)
+def _more_stable(
+    children: NDArray[np.int32],
+    persistence: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    eligible: NDArray[np.bool_],
+    min_size: int,
+) -> NDArray[np.bool_]:
+    """Whether each eligible node's branch has at least the stability of the best choice below it."""
+    k = len(children)
+    own, best = np.zeros(k), np.zeros(k)
+    taken = np.zeros(k, np.bool_)
+    for node in range(k):
+        a, b = children[node]
+        below = 0.0
+        if a >= 0:
+            below = best[a] + best[b]
+        if not eligible[node]:
+            best[node] = below
+            continue
+        if a >= 0 and (counts[a] < min_size) != (counts[b] < min_size):
+            own[node] = own[a] if counts[a] >= min_size else own[b]  # the branch goes on
+        own[node] += counts[node] * persistence[node]
+        # Where a branch goes on, the node above has all of this and more, so it takes over by itself.
+        taken[node] = own[node] >= below
+        best[node] = max(own[node], below)
+    return taken

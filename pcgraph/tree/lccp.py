@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.relations import angle_between
+from pcgraph.hierarchy import roots
 from pcgraph.inputs import positive
-from pcgraph.tree.average import average_linkage
+from pcgraph.tree.average_linkage import average_linkage
 from pcgraph.tree.linkage import Linkage, Merges, check_numbers
-from pcgraph.tree.segments import tops_below
-from pcgraph.tree.single import single_linkage
+from pcgraph.tree.single_linkage import single_linkage
 
 _SMOOTHNESS = 0.1  # voxels
 
@@ -41,10 +41,6 @@ class LccpLinkage(Linkage):
         Their k: number of common neighbours with convex edges to both that an edge needs.
     seed_size : float, metres, > 0, optional
         Spacing of the supervoxels; default: the median distance between the centroids of those that touch.
-    object_altitude : float
-        1 for their segmentation.
-    part_altitude : float
-        Angle over pi up to which convex edges join parts; 20 degrees.
 
     Notes
     -----
@@ -56,8 +52,9 @@ class LccpLinkage(Linkage):
     sanity: bool = False
     common_neighbours: int = 0
     seed_size: float | None = None
-    object_altitude: float = 1.0
-    part_altitude: float = 1.0 / 9.0
+
+    default_object_altitude = 1.0  # their segmentation
+    default_part_altitude = 1.0 / 9.0  # convex edges of up to 20 degrees join parts
 
     def __post_init__(self) -> None:
         check_numbers(self, "concavity_tolerance", "common_neighbours")
@@ -68,9 +65,10 @@ class LccpLinkage(Linkage):
         """Merges inside objects, then merges of objects."""
         convex = self.convex(graph)
         angles = graph.edge_features.normal_angle[convex] / np.pi
-        pairs, altitudes, _ = single_linkage(graph.n_nodes, graph.edges[convex], angles)
-        between, above = _merges_between(graph, pairs)
-        return Merges(np.concatenate((pairs, between)), np.concatenate((altitudes, 1.0 + above)))
+        inside = single_linkage(graph.n_nodes, graph.edges[convex], angles)
+        between = _merges_between(graph, inside.pairs)
+        altitudes = np.concatenate((inside.altitudes, 1.0 + between.altitudes))
+        return Merges(np.concatenate((inside.pairs, between.pairs)), altitudes)
 
     def convex(self, graph: AdjacencyGraph) -> NDArray[np.bool_]:
         """Whether LCCP takes each edge for convex, (m,) bool."""
@@ -113,12 +111,12 @@ def _common_neighbours(graph: AdjacencyGraph, convex: NDArray[np.bool_]) -> NDAr
     return np.asarray(common.sum(axis=1)).astype(np.int64)
 
 
-def _merges_between(graph: AdjacencyGraph, pairs: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def _merges_between(graph: AdjacencyGraph, pairs: NDArray[np.int32]) -> Merges:
     """Average linkage, by angle between normals over pi, of what earlier merges made."""
     n, done = graph.n_nodes, graph.n_nodes + len(pairs)
     parents = np.arange(done, dtype=np.int32)
     parents[pairs] = np.arange(n, done, dtype=np.int32)[:, None]
-    top, part = np.unique(tops_below(parents, done)[:n], return_inverse=True)
+    top, part = np.unique(roots(parents)[:n], return_inverse=True)
     ends = np.sort(part[graph.edges], axis=1)
     across = ends[:, 0] != ends[:, 1]
     lengths = graph.edge_features.contact_voxels[across].astype(np.float64)
@@ -126,9 +124,9 @@ def _merges_between(graph: AdjacencyGraph, pairs: NDArray[np.int32]) -> tuple[ND
     weights = np.bincount(edge, lengths, len(keys)).astype(np.float64)
     means = np.bincount(edge, lengths * graph.edge_features.normal_angle[across] / np.pi, len(keys)) / weights
     quotient = np.stack((keys // len(top), keys % len(top)), axis=1).astype(np.int32)
-    between, altitudes = average_linkage(len(top), quotient, means, weights)
-    named = np.concatenate((top, np.arange(done, done + len(between)))).astype(np.int32)
-    return np.sort(named[between], axis=1), altitudes
+    between = average_linkage(len(top), quotient, means, weights)
+    named = np.concatenate((top, np.arange(done, done + len(between.pairs)))).astype(np.int32)
+    return Merges(np.sort(named[between.pairs], axis=1), between.altitudes)
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

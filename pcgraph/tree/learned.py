@@ -1,30 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learned linkage: the probability of a boundary, fitted on labelled clouds."""
+"""Learned linkage: the probability that an edge is a boundary, fitted on labelled clouds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.errors import CloudReadError, CloudWriteError
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.tree.average import average_linkage
-from pcgraph.tree.edge_model import EdgeModel, edge_evidence
-from pcgraph.tree.growth import segmentation_tree
-from pcgraph.tree.leaf_truth import LeafTruth, leaf_truth
+from pcgraph.graph.relations import angle_between
+from pcgraph.plain_files import read_file, write_file
+from pcgraph.tree.average_linkage import average_linkage
 from pcgraph.tree.linkage import Linkage, Merges
+from pcgraph.tree.tree import segmentation_tree
 
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
 
 _STEPS = float(1 << 20)
-_PURE = 0.8  # share of a supervoxel's points that must agree before an edge at it teaches anything
-_PLATEAU = 0.002  # overlap below the best that still counts as best
+_PURE = 0.8  # fraction of a supervoxel's points that must agree before an edge at it teaches anything
+_PLATEAU = 0.002  # covering below the best that still counts as best
 _ALTITUDES = np.linspace(0.05, 0.95, 37)
 
 
@@ -35,7 +38,7 @@ class LearnedLinkage(Linkage):
     Attributes
     ----------
     model : EdgeModel
-        Logistic regression on `edge_evidence`; its `object_altitude` is the linkage's.
+        Logistic regression on `edge_evidence`; its `object_altitude`, fitted with it, is the linkage's default.
 
     Notes
     -----
@@ -50,12 +53,12 @@ class LearnedLinkage(Linkage):
             raise ValueError(f"expected an EdgeModel, got {type(self.model).__name__}; fit one or load it")
 
     @property
-    def object_altitude(self) -> float:  # type: ignore[override]
+    def default_object_altitude(self) -> float:
         """Probability of a boundary above which two parts are two objects: the model's."""
         return self.model.object_altitude
 
     @property
-    def part_altitude(self) -> float:  # type: ignore[override]
+    def default_part_altitude(self) -> float:
         """Half of that: what is learned from are objects, so nothing was learned about parts."""
         return 0.5 * self.model.object_altitude
 
@@ -63,11 +66,11 @@ class LearnedLinkage(Linkage):
         """Merges, the least likely boundary first."""
         costs = np.rint(self.model(graph) * _STEPS) / _STEPS  # whole multiples, so that sums of them are exact
         weights = graph.edge_features.contact_voxels.astype(np.float64)
-        return Merges(*average_linkage(graph.n_nodes, graph.edges, costs, weights))
+        return average_linkage(graph.n_nodes, graph.edges, costs, weights)
 
     @classmethod
     def fit(cls, segmentations: Sequence[Segmentation], truths: Sequence[ArrayLike]) -> LearnedLinkage:
-        """Linkage fitted on labelled clouds; its `object_altitude` is amid those with the best mean overlap on these.
+        """Linkage fitted on labelled clouds; its altitude for objects is amid those with the best mean covering there.
 
         Parameters
         ----------
@@ -93,21 +96,128 @@ class LearnedLinkage(Linkage):
         model = _fit_edges([result.graph for result in segmentations], tables)
         linkage = cls(model)
         trees = [segmentation_tree(linkage.merges(r.graph, r.leaves), r.leaves) for r in segmentations]
-        overlaps = [
-            [t.overlap(tree.cut(altitude=a)) for a in _ALTITUDES] for tree, t in zip(trees, tables, strict=True)
+        coverings = [
+            [t.covering(tree.cut(altitude=a)) for a in _ALTITUDES] for tree, t in zip(trees, tables, strict=True)
         ]
-        mean = np.mean(overlaps, axis=0)
+        mean = np.mean(coverings, axis=0)
         best = float(np.median(_ALTITUDES[mean >= mean.max() - _PLATEAU]))  # not the peak: the peak is luck
-        return cls(replace(model, object_altitude=best))
+        return cls(msgspec.structs.replace(model, object_altitude=best))
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Nothing; writes the model as JSON (`EdgeModel.save`)."""
+        """Write the model as JSON (`EdgeModel.save`)."""
         self.model.save(path)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> LearnedLinkage:
         """Linkage from a file that `save` wrote; needs no scikit-learn (`EdgeModel.load`)."""
         return cls(EdgeModel.load(path))
+
+
+# --- the model of an edge ---------------------------------------------------------------------------------------------
+
+
+def edge_evidence(graph: AdjacencyGraph) -> dict[str, NDArray[np.float64]]:
+    """What a model sees of each edge: columns (m,) float64 by name, free of the scene's scale.
+
+    Angles are in radians, steps in voxel edges, and nothing depends on which end of an edge comes first.
+    """
+    features, nodes = graph.edge_features, graph.node_features
+    i, j = graph.edges.T
+    apart = nodes.centroid[i] - nodes.centroid[j]
+    crease = angle_between(np.cross(nodes.normal[i], nodes.normal[j]), apart)
+    apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    rise_i = np.einsum("ij,ij->i", apart, nodes.normal[i])
+    rise_j = -np.einsum("ij,ij->i", apart, nodes.normal[j])
+    return {
+        "concavity": np.maximum(-features.convexity, 0.0),
+        "convexity": np.maximum(features.convexity, 0.0),
+        "contact_concavity": np.maximum(-features.contact_convexity, 0.0),
+        "contact_convexity": np.maximum(features.contact_convexity, 0.0),
+        "normal_angle": features.normal_angle,
+        "crease_angle": np.minimum(crease, np.pi - crease),  # between the planes' crease and the way across
+        "color_contrast": features.color_contrast,
+        "step_voxels": features.step / features.voxel_edge,
+        "lower_rise": np.minimum(rise_i, rise_j),  # sines of the angles at which each sees the other
+        "upper_rise": np.maximum(rise_i, rise_j),
+    }
+
+
+class EdgeModel(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="format", tag="pcgraph edge model 1"
+):
+    """Logistic regression on standardised evidence; plain numbers, so that a file of it cannot run code.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Columns of `edge_evidence` that are used.
+    means, scales, coefficients : tuple of float
+        One per name; evidence enters as coefficient x (value - mean) / scale.
+    intercept : float
+    object_altitude : float, 0..1
+        Probability of a boundary above which two parts are two objects.
+    """
+
+    names: tuple[str, ...]
+    means: tuple[float, ...]
+    scales: tuple[float, ...]
+    coefficients: tuple[float, ...]
+    intercept: float
+    object_altitude: float
+
+    def __post_init__(self) -> None:
+        columns = (self.means, self.scales, self.coefficients)
+        numbers = [*self.means, *self.scales, *self.coefficients, self.intercept, self.object_altitude]
+        if any(len(column) != len(self.names) for column in columns) or not np.isfinite(numbers).all():
+            raise ValueError(f"expected one finite mean, scale and coefficient for each of {len(self.names)} names")
+        if not all(scale > 0.0 for scale in self.scales):
+            raise ValueError("expected scales above 0; fit the model again")
+
+    def __call__(self, graph: AdjacencyGraph) -> NDArray[np.float64]:
+        """Probability of a boundary at each edge, (m,) float64, 0..1.
+
+        Raises
+        ------
+        ValueError
+            The model was fitted on evidence that this version does not know.
+        """
+        evidence = edge_evidence(graph)
+        unknown = sorted(set(self.names) - set(evidence))
+        if unknown:
+            raise ValueError(f"expected evidence of {sorted(evidence)}, got {unknown}; fit the model again")
+        logit = np.full(len(graph.edges), self.intercept)
+        for name, mean, scale, weight in zip(self.names, self.means, self.scales, self.coefficients, strict=True):
+            logit += weight * (evidence[name] - mean) / scale
+        return 0.5 * (1.0 + np.tanh(0.5 * logit))  # the logistic function without overflow
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the model as JSON, the whole file or none.
+
+        Raises
+        ------
+        CloudWriteError
+            The place cannot be written.
+        """
+        write_file(Path(path), msgspec.json.format(msgspec.json.encode(self), indent=1), CloudWriteError)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> EdgeModel:
+        """Model from a file that `save` wrote.
+
+        Raises
+        ------
+        CloudReadError
+            The file cannot be read.
+        ValueError
+            The file holds no such model.
+        """
+        text = read_file(Path(path), CloudReadError)
+        try:
+            return msgspec.json.decode(text, type=cls)
+        except RecursionError:
+            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}, which is nested too deep") from None
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}: {error}") from None
 
 
 def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeModel:
@@ -130,3 +240,80 @@ def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeMod
     regression = LogisticRegression(class_weight="balanced", max_iter=1000).fit((rows - means) / scales, boundary)
     weights, intercept = regression.coef_[0].tolist(), float(regression.intercept_[0])
     return EdgeModel(tuple(columns), tuple(means.tolist()), tuple(scales.tolist()), tuple(weights), intercept, 0.5)
+
+
+# --- what is learned from ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LeafTruth:
+    """Points per pair of leaf and true segment; r pairs.
+
+    Attributes
+    ----------
+    leaf, truth : (r,) int64
+        Leaf, and true segment numbered from 0 in ascending order of the true labels.
+    points : (r,) int64
+        Points that lie in both.
+    n_leaves : int
+    """
+
+    leaf: NDArray[np.int64]
+    truth: NDArray[np.int64]
+    points: NDArray[np.int64]
+    n_leaves: int
+
+    def majority(self, fraction: float) -> NDArray[np.int64]:
+        """True segment of each leaf, (n_leaves,) int64; -1 where none holds this fraction of its points."""
+        order = np.argsort(self.points, kind="stable")
+        best, most = np.full(self.n_leaves, -1, np.int64), np.zeros(self.n_leaves)
+        best[self.leaf[order]] = self.truth[order]
+        most[self.leaf[order]] = self.points[order]
+        total = np.bincount(self.leaf, self.points, self.n_leaves)
+        return np.where(most >= fraction * np.maximum(total, 1), best, -1)
+
+    def covering(self, segments: NDArray[np.int32]) -> float:
+        """Segmentation covering, 0..1, of the true segments by the leaves' segments.
+
+        It is `pcgraph.metrics.weighted_overlap` of the points, without a pass over them.
+
+        Parameters
+        ----------
+        segments : (n_leaves,) int32
+        """
+        segment, n_true = segments[self.leaf].astype(np.int64), int(self.truth.max()) + 1
+        keys, pair = np.unique(segment * n_true + self.truth, return_inverse=True)
+        common = np.bincount(pair, self.points)
+        found, true = keys // n_true, keys % n_true
+        size, extent = np.bincount(segment, self.points), np.bincount(self.truth, self.points)
+        best = np.zeros(n_true)
+        np.maximum.at(best, true, common / (size[found] + extent[true] - common))
+        return float(best @ extent / extent.sum())
+
+
+def leaf_truth(supervoxels: NDArray[np.int32], truth: ArrayLike, n_leaves: int) -> LeafTruth:
+    """Points per pair of leaf and true segment.
+
+    Parameters
+    ----------
+    supervoxels : (n,) or (h, w) int32
+        Leaf of each point, negative where it has none.
+    truth : same shape, int
+        True segment of each point, negative where unknown.
+    n_leaves : int
+
+    Raises
+    ------
+    ValueError
+        The shapes differ, or the truth is not whole numbers.
+    """
+    true = np.asarray(truth)
+    if true.shape != supervoxels.shape:
+        raise ValueError(f"expected a truth of shape {supervoxels.shape}, got {true.shape}")
+    if true.dtype.kind not in "iub":
+        raise ValueError(f"expected a truth of whole numbers, got {true.dtype}; convert it first")
+    both = (true >= 0) & (supervoxels >= 0)
+    names, column = np.unique(true[both], return_inverse=True)
+    n_true = np.int64(max(len(names), 1))
+    keys, points = np.unique(supervoxels[both] * n_true + column, return_counts=True)
+    return LeafTruth(keys // n_true, keys % n_true, points, n_leaves)

@@ -1,21 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Region merging along a graph by energy: what raises the energy least, per boundary removed, merges first."""
+"""Least-increase linkage: what raises an energy least, per boundary removed, merges first (Ward, Mumford and Shah)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.tree.edge_queue import queued_edges, requeue, unqueue
-from pcgraph.tree.half_edges import NONE, drop, hand_over, hung_edges
+from pcgraph.features.moments import Moments
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
+from pcgraph.tree.linkage import Linkage, Merges, check_numbers
 from pcgraph.voxels.eigen import symmetric_eigen
 
 
-@dataclass(frozen=True, eq=False)
-class Regions:
+@dataclass(frozen=True)
+class WardLinkage(Linkage):
+    """Ward's linkage along the graph: the merge that adds least to the sum of squares comes first.
+
+    Attributes
+    ----------
+    position : float, per voxel, >= 0
+        Weight of places, in voxel edges.
+    normal : float, >= 0
+        Weight of unit normals.
+    color : float, >= 0
+        Weight of colours, 0..1.
+
+    Notes
+    -----
+    A merge of A and B costs |A| |B| / (|A| + |B|) ||f_A - f_B||^2 (Ward 1963), where f are weighted means and
+    |A| is the number of points over the mean number of points of a supervoxel, so that altitudes do not depend
+    on the units of length or the density of points.
+    """
+
+    position: float = 0.0
+    normal: float = 1.0
+    color: float = 0.0
+
+    default_object_altitude = 6.0  # increase of the sum of squares
+    default_part_altitude = 0.5
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "position", "normal", "color")
+
+    def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
+        """Merges, the smallest increase first."""
+        regions = _regions(graph, leaves, self.position, self.normal, self.color, 0.0)
+        return least_increase_linkage(regions, graph.edges, None)
+
+
+@dataclass(frozen=True)
+class MumfordShahLinkage(Linkage):
+    """Merging by Mumford and Shah's energy; altitudes are its scale lambda.
+
+    Attributes
+    ----------
+    plane : float, per voxel, >= 0
+        Weight of distances to a region's least-squares plane, in voxel edges.
+    normal, color : float, >= 0
+        Weights of unit normals and of colours, 0..1, as piecewise constant data.
+
+    Notes
+    -----
+    Energy: sum over the regions of |A| (plane^2 mean d^2 + normal^2 var n + color^2 var c) + lambda x length of
+    boundaries, in voxel edges. Two regions merge at lambda = increase of the first / length of their contact, the
+    smallest first (Koepfler et al. 1994). |A| as for `WardLinkage`.
+    """
+
+    plane: float = 1.0
+    normal: float = 0.0
+    color: float = 0.0
+
+    default_object_altitude = 10.0  # lambda
+    default_part_altitude = 0.1
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "plane", "normal", "color")
+
+    def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
+        """Merges, the smallest scale first."""
+        regions = _regions(graph, leaves, 0.0, self.normal, self.color, self.plane**2)
+        lengths = graph.edge_features.contact_voxels / 2.0  # boundary voxels of both sides
+        return least_increase_linkage(regions, graph.edges, lengths)
+
+
+def _regions(
+    graph: AdjacencyGraph, leaves: Moments, position: float, normal: float, color: float, plane: float
+) -> Regions:
+    """Supervoxels as regions, in lengths of a voxel edge and masses of a mean supervoxel."""
+    unit = float(np.median(graph.edge_features.voxel_edge)) if len(graph.edges) else 1.0
+    mean_count = leaves.counts.mean()
+    centroids = leaves.centroids / unit
+    columns: list[NDArray[np.float64]] = []
+    if position > 0.0:
+        columns.append(position * centroids)
+    if normal > 0.0:
+        columns.append(normal * graph.node_features.normal)
+    if color > 0.0 and leaves.colors is not None:
+        columns.append(color * leaves.colors)
+    values = np.hstack(columns) if columns else np.zeros((len(leaves), 0))
+    return Regions(leaves.counts / mean_count, values, centroids, leaves.scatters / (unit**2 * mean_count), plane)
+
+
+class Regions(NamedTuple):
     """What the energy of n regions is made of.
 
     The energy of a region is the sum over its mass of the squared distance of `values` to their mean, plus
@@ -39,10 +130,8 @@ class Regions:
     plane: float
 
 
-def least_increase_linkage(
-    regions: Regions, edges: NDArray[np.int32], lengths: NDArray[np.float64] | None
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Binary merges of regions along edges until every connected component is one.
+def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: NDArray[np.float64] | None) -> Merges:
+    """Merges of regions along edges, the least increase of energy per length of boundary removed first.
 
     Parameters
     ----------
@@ -54,11 +143,9 @@ def least_increase_linkage(
 
     Returns
     -------
-    pairs : (t, 2) int32
-        Merge i joins these two into the new node n + i.
-    altitudes : (t,) float64
-        Increase of energy per length, made not to decrease: a merge below the altitude of an earlier one, which
-        a graph allows, takes that altitude. Of equal increases the first edge merges first.
+    Merges
+        Altitudes are increases per length, made not to decrease: a merge below the altitude of an earlier one,
+        which a graph allows, takes that altitude. Of equal increases the first edge merges first.
 
     Notes
     -----
@@ -66,93 +153,86 @@ def least_increase_linkage(
     `plane` is 0. After a merge all edges of the merged region get new costs, so the time is the sum of degrees of
     the merged regions times a logarithm: n log n on graphs of bounded degree, n^2 log n around a hub.
     """
-    per_length = lengths is not None
-    boundary = np.ones(len(edges)) if lengths is None else lengths.astype(np.float64)
-    pairs, altitudes = _merge(
-        edges,
-        boundary,
-        per_length,
-        regions.masses.copy(),
-        np.ascontiguousarray(regions.values, np.float64).copy(),
-        regions.centroids.copy(),
-        regions.scatters.copy(),
-        float(regions.plane),
-    )
-    return pairs, np.maximum.accumulate(np.maximum(altitudes, 0.0))
+    sums = np.empty((0, len(edges))) if lengths is None else lengths[None].astype(np.float64)
+    n = len(regions.masses)
+    masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
+    state = _State(masses, values, centroids, scatters, np.zeros(n), float(regions.plane))
+    graph = ContractedGraph.of(n, edges, _first_costs(state, edges, sums), sums)
+    _merge(state, graph)
+    merges = graph.merges()
+    return Merges(merges.pairs, np.maximum.accumulate(np.maximum(merges.altitudes, 0.0)))
+
+
+class _State(NamedTuple):
+    """Regions while they merge, with their residuals (n,): sums of squared distances to their planes."""
+
+    masses: NDArray[np.float64]
+    values: NDArray[np.float64]
+    centroids: NDArray[np.float64]
+    scatters: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    plane: float
 
 
 @njit(cache=True)
-def _merge(edges, lengths, per_length, masses, values, centroids, scatters, plane):  # type: ignore[no-untyped-def]
-    n = len(masses)
-    ends, after, before, first, degree = hung_edges(n, edges)
-    residuals = np.zeros(n)
-    for a in range(n):
-        if plane > 0.0:
-            residuals[a] = _least_eigenvalue(scatters[a].copy())
+def _first_costs(state: _State, edges: NDArray[np.int32], lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cost of each edge, (m,), and the residuals that it needs."""
+    if state.plane > 0.0:
+        for a in range(len(state.masses)):
+            state.residuals[a] = _least_eigenvalue(state.scatters[a].copy())
     costs = np.empty(len(edges))
-    sums = lengths.reshape(1, -1) if per_length else np.empty((0, len(edges)))  # the same memory
-    twins, moved = np.empty(len(edges), np.int64), np.empty(len(edges), np.int64)
-    for e in range(len(edges)):
-        increase = _increase(edges[e, 0], edges[e, 1], masses, values, centroids, scatters, residuals, plane)
-        costs[e] = increase / lengths[e]
-    order, place, size = queued_edges(costs)
-    name = np.arange(n)  # a region lives on under the slot of one of its leaves; this is its tree node
-    pairs, altitudes = np.empty((max(n - 1, 0), 2), np.int32), np.empty(max(n - 1, 0))
-    t = 0
-    while size[0] > 0:
-        e = order[0]
-        kept, gone = ends[2 * e], ends[2 * e + 1]
-        pairs[t, 0], pairs[t, 1] = min(name[kept], name[gone]), max(name[kept], name[gone])
-        altitudes[t] = costs[e]
-        if degree[gone] > degree[kept]:
-            kept, gone = gone, kept
-        name[kept] = n + t
-        t += 1
-        drop(e, ends, after, before, first, degree)
-        unqueue(e, costs, order, place, size)
-        for pair in range(hand_over(kept, gone, ends, after, before, first, degree, sums, twins, moved)):
-            unqueue(moved[pair], costs, order, place, size)
-        _unite(kept, gone, masses, values, centroids, scatters, residuals, plane)
-        half = first[kept]
+    for edge in range(len(edges)):
+        costs[edge] = _cost(state, lengths, edge, edges[edge, 0], edges[edge, 1])
+    return costs
+
+
+@njit(cache=True)
+def _merge(state: _State, graph: ContractedGraph) -> None:
+    heap, halves, lengths = graph.heap, graph.halves, graph.sums
+    while heap.size[0] > 0:
+        kept, gone, _ = contract_cheapest(graph)
+        _unite(state, kept, gone)
+        half = graph.clusters[kept].first
         while half != NONE:
-            e = half >> 1
-            increase = _increase(kept, ends[half ^ 1], masses, values, centroids, scatters, residuals, plane)
-            costs[e] = increase / lengths[e]
-            requeue(e, costs, order, place, size)
-            half = after[half]
-    return pairs[:t].copy(), altitudes[:t].copy()
+            edge = half >> 1
+            heap_update(heap, edge, _cost(state, lengths, edge, kept, halves[half ^ 1].end))
+            half = halves[half].after
 
 
 @njit(cache=True)
-def _increase(a, b, masses, values, centroids, scatters, residuals, plane):  # type: ignore[no-untyped-def]
-    """Energy of the union of two regions less the sum of theirs."""
-    reduced = masses[a] * masses[b] / (masses[a] + masses[b])
+def _cost(state: _State, lengths: NDArray[np.float64], edge: int, a: int, b: int) -> float:
+    """Energy of the union of the two regions at an edge less the sum of theirs, per length where there are lengths."""
+    reduced = state.masses[a] * state.masses[b] / (state.masses[a] + state.masses[b])
     increase = 0.0
-    for i in range(values.shape[1]):
-        gap = values[a, i] - values[b, i]
+    for i in range(state.values.shape[1]):
+        gap = state.values[a, i] - state.values[b, i]
         increase += reduced * gap * gap
-    if plane > 0.0:
-        union = _scatter_of_union(a, b, reduced, centroids, scatters)
-        increase += plane * (_least_eigenvalue(union) - residuals[a] - residuals[b])
-    return increase
+    if state.plane > 0.0:
+        union = _scatter_of_union(state.centroids, state.scatters, a, b, reduced)
+        increase += state.plane * (_least_eigenvalue(union) - state.residuals[a] - state.residuals[b])
+    return increase / lengths[0, edge] if len(lengths) > 0 else increase
 
 
 @njit(cache=True)
-def _unite(kept, gone, masses, values, centroids, scatters, residuals, plane):  # type: ignore[no-untyped-def]
+def _unite(state: _State, kept: int, gone: int) -> None:
+    """Give the first of two regions the moments of both."""
+    masses, values, centroids, scatters, residuals, plane = state
     total = masses[kept] + masses[gone]
-    share = masses[gone] / total
+    fraction = masses[gone] / total
     if plane > 0.0:
-        scatters[kept] = _scatter_of_union(kept, gone, masses[kept] * share, centroids, scatters)
+        scatters[kept] = _scatter_of_union(centroids, scatters, kept, gone, masses[kept] * fraction)
         residuals[kept] = _least_eigenvalue(scatters[kept].copy())
     for i in range(values.shape[1]):
-        values[kept, i] += share * (values[gone, i] - values[kept, i])
+        values[kept, i] += fraction * (values[gone, i] - values[kept, i])
     for i in range(3):
-        centroids[kept, i] += share * (centroids[gone, i] - centroids[kept, i])
+        centroids[kept, i] += fraction * (centroids[gone, i] - centroids[kept, i])
     masses[kept] = total
 
 
 @njit(cache=True)
-def _scatter_of_union(a, b, reduced, centroids, scatters):  # type: ignore[no-untyped-def]
+def _scatter_of_union(
+    centroids: NDArray[np.float64], scatters: NDArray[np.float64], a: int, b: int, reduced: float
+) -> NDArray[np.float64]:
     union = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -163,6 +243,6 @@ def _scatter_of_union(a, b, reduced, centroids, scatters):  # type: ignore[no-un
 
 @njit(cache=True)
 def _least_eigenvalue(matrix: NDArray[np.float64]) -> float:
-    """Of a symmetric positive semi-definite matrix, which is overwritten."""
+    """Least eigenvalue of a symmetric positive semi-definite matrix, which is overwritten."""
     symmetric_eigen(matrix, np.empty((3, 3)))
     return max(min(matrix[0, 0], matrix[1, 1], matrix[2, 2]), 0.0)

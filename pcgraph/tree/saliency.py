@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.tree.ancestors import ancestor_index, common_ancestor
+from pcgraph.hierarchy import AncestorIndex, ancestor_index, lowest_common_ancestor
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.surface import Surface
 
@@ -38,9 +38,7 @@ def voxel_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float
     if last >= tree.n_leaves:
         raise ValueError(f"expected a surface of the tree's {tree.n_leaves} leaves, got one with supervoxel {last}")
     index = ancestor_index(tree.parents)
-    return _strongest_contacts(
-        index.links, index.merges, tree.altitudes, grid.indptr, grid.neighbours, surface.supervoxels
-    )
+    return _strongest_contacts(index, tree.altitudes, grid.indptr, grid.neighbours, surface.supervoxels)
 
 
 def point_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float64]:
@@ -52,7 +50,13 @@ def point_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float
 
 
 @njit(cache=True)
-def _strongest_contacts(links, merges, altitudes, indptr, neighbours, supervoxels):  # type: ignore[no-untyped-def]
+def _strongest_contacts(
+    index: AncestorIndex,
+    altitudes: NDArray[np.float64],
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    supervoxels: NDArray[np.int32],
+) -> NDArray[np.float64]:
     strength = np.zeros(len(supervoxels))
     for voxel in range(len(supervoxels)):
         own = supervoxels[voxel]
@@ -62,6 +66,6 @@ def _strongest_contacts(links, merges, altitudes, indptr, neighbours, supervoxel
             if other in (own, seen):
                 continue
             seen = other
-            level = altitudes[common_ancestor(links, merges, own, other)]
+            level = altitudes[lowest_common_ancestor(index, own, other)]
             strength[voxel] = max(strength[voxel], level)
     return strength

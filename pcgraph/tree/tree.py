@@ -8,21 +8,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from pcgraph.features.columns import rows, scalar_columns
-from pcgraph.features.moments import Moments
+from pcgraph.features.moments import Moments, moments_up_tree
 from pcgraph.features.nodes import NodeFeatures, node_features
+from pcgraph.hierarchy import lowest_common_ancestors, roots
 from pcgraph.inputs import non_negative
 from pcgraph.short_repr import ShortRepr
-from pcgraph.tree.ancestors import ancestor_index
-from pcgraph.tree.cuts import horizontal_cut, stable_cut
-from pcgraph.tree.energy import Energy
-from pcgraph.tree.optimal import appearance_scales
-from pcgraph.tree.segments import numbered_segments
-from pcgraph.tree.stability import persistences
+from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences, stable_cut
+from pcgraph.tree.linkage import Merges
+from pcgraph.tree.optimal_cut import Energy, appearance_scales
 
 if TYPE_CHECKING:
     import networkx
+
+_GAP_CANDIDATES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,7 @@ class SegmentationTree(ShortRepr):
         Parameters
         ----------
         altitudes : (l,) float, the linkage's unit
-            For example ``[0.0, linkage.part_altitude, linkage.object_altitude, np.inf]``.
+            For example ``[0.0, 0.06, 0.5, np.inf]``.
 
         Raises
         ------
@@ -112,7 +113,8 @@ class SegmentationTree(ShortRepr):
 
         Of all ways to choose nodes, none above another, the one with the largest sum of points x persistence
         (excess of mass, Campello et al. 2015). Segments may come from different altitudes. Persistence ends at
-        the largest finite altitude, so a scene that is one piece is never one segment for that alone.
+        the largest finite altitude at which two parts of `min_size` points merge, so a scene that is one piece is never
+        one segment for that alone.
 
         Parameters
         ----------
@@ -213,7 +215,28 @@ class SegmentationTree(ShortRepr):
         ValueError
             Pairs are not (m, 2) whole numbers, or not leaves.
         """
-        return self.altitudes[ancestor_index(self.parents).of_pairs(pairs)]
+        return self.altitudes[self.lowest_common_ancestors(pairs)]
+
+    def lowest_common_ancestors(self, pairs: ArrayLike) -> NDArray[np.int32]:
+        """Lowest common ancestor of each pair of leaves, (m,) int32; the leaf itself where the two are one.
+
+        Parameters
+        ----------
+        pairs : (m, 2) int, 0..n_leaves - 1
+
+        Raises
+        ------
+        ValueError
+            Pairs are not (m, 2) whole numbers, or not leaves of the tree.
+        """
+        leaves, last = np.asarray(pairs), self.n_leaves - 1
+        if leaves.ndim != 2 or leaves.shape[1] != 2 or (leaves.size and leaves.dtype.kind not in "iu"):
+            raise ValueError(
+                f"expected pairs (m, 2) of leaves, whole numbers, got {leaves.dtype} of shape {leaves.shape}"
+            )
+        if leaves.size and not 0 <= leaves.min() <= leaves.max() <= last:
+            raise ValueError(f"expected pairs of this tree's leaves 0..{last}, got {leaves.min()}..{leaves.max()}")
+        return lowest_common_ancestors(self.parents, *leaves.T)
 
     def features(self) -> NodeFeatures:
         """Features of all k nodes, from their moments."""
@@ -231,3 +254,66 @@ class SegmentationTree(ShortRepr):
 
     def _segments(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
         return numbered_segments(nodes, len(self.parents))
+
+
+# --- from merges to a tree --------------------------------------------------------------------------------------------
+
+
+def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
+    """Tree over k leaves: a linkage's merges, then those across the gaps.
+
+    Parameters
+    ----------
+    merges : Merges of k leaves
+        Along the edges of their graph.
+    leaves : Moments of k leaves
+
+    Notes
+    -----
+    Parts that do not touch are joined at infinite altitude, the smallest (in points) first, each to the
+    nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large
+    parts apart.
+    """
+    n_leaves, n_merges = len(leaves), len(merges.pairs)
+    parents = np.arange(2 * n_leaves - 1, dtype=np.int32)
+    parents[merges.pairs] = np.arange(n_leaves, n_leaves + n_merges, dtype=np.int32)[:, None]
+    parts = roots(parents[: n_leaves + n_merges])[:n_leaves]
+    gaps = _join_parts(parts, leaves, n_leaves + n_merges)
+    parents[gaps] = np.arange(n_leaves + n_merges, 2 * n_leaves - 1, dtype=np.int32)[:, None]
+    levels = np.concatenate((np.zeros(n_leaves), merges.altitudes, np.full(len(gaps), np.inf)))
+    return SegmentationTree(parents, levels, moments_up_tree(leaves, parents))
+
+
+def _join_parts(parts: NDArray[np.int32], leaves: Moments, next_node: int) -> NDArray[np.int32]:
+    """Merges, (p - 1, 2) int32, of p parts, given by the root node of each leaf."""
+    tops, part = np.unique(parts, return_inverse=True)
+    if len(tops) == 1:
+        return np.empty((0, 2), np.int32)
+    sizes = np.bincount(part, leaves.counts)
+    order = np.lexsort((-tops, sizes))  # ascending size; of equal parts the later one is absorbed first
+    rank = np.empty(len(tops), np.int64)
+    rank[order] = np.arange(len(tops))
+    target = _nearest_larger(part, rank, leaves.centroids)
+    name = tops.copy()
+    merges = np.empty((len(tops) - 1, 2), np.int32)
+    for step, small in enumerate(order[:-1].tolist()):
+        merges[step] = sorted((name[small], name[target[small]]))
+        name[target[small]] = next_node + step
+    return merges
+
+
+def _nearest_larger(
+    part: NDArray[np.int64], rank: NDArray[np.int64], centroids: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """For each part the larger one with a leaf nearest to its own; the largest part if none is near."""
+    n_near = min(_GAP_CANDIDATES + 1, len(centroids))
+    seeking = np.flatnonzero(rank[part] < len(rank) - 1)  # the largest part looks for none
+    distance, leaf = cKDTree(centroids).query(centroids[seeking], k=n_near)
+    row, column = np.nonzero(rank[part[leaf]] > rank[part[seeking]][:, None])
+    source, candidate = part[seeking[row]], part[leaf[row, column]]
+    best = np.lexsort((candidate, distance[row, column], source))
+    source_part = source[best]
+    first = np.flatnonzero(np.diff(source_part, prepend=-1))
+    target = np.full(len(rank), int(np.argmax(rank)), np.int64)
+    target[source_part[first]] = candidate[best][first]
+    return target

@@ -124,7 +124,7 @@ def _cloud(path: Path, _: Arguments) -> Any:
 
 
 def _edge_model(path: Path, _: Arguments) -> Any:
-    from pcgraph.tree.edge_model import EdgeModel
+    from pcgraph.tree.learned import EdgeModel
 
     return EdgeModel.load(path)
 

@@ -188,7 +188,7 @@ def opencv_files() -> Seeds:
 
 def edge_models() -> Seeds:
     """A model of edges as `EdgeModel.save` writes it."""
-    from pcgraph.tree.edge_model import EdgeModel
+    from pcgraph.tree.learned import EdgeModel
 
     model = EdgeModel(("concavity", "normal_angle"), (0.1, 0.2), (1.0, 0.5), (2.0, 3.0), -1.0, 0.5)
     return {"model": of_file("model.json", written("model.json", model.save))}

@@ -11,9 +11,8 @@ from pcgraph.features.moments import Moments, moments_of_groups
 from pcgraph.features.nodes import NodeFeatures, node_features
 from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
 from pcgraph.graph.relations import angle_between, signed_convexity
-from pcgraph.tree.growth import segmentation_tree
 from pcgraph.tree.linkage import Linkage, Merges
-from pcgraph.tree.tree import SegmentationTree
+from pcgraph.tree.tree import SegmentationTree, segmentation_tree
 
 SHAPES = ("random", "chain", "star", "complete", "parts", "no edges")
 

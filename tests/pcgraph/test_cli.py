@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import pcgraph
 from pcgraph.cli import app, member, members
 from pcgraph.io.ply import encode_ply
-from pcgraph.tree.edge_model import EdgeModel
+from pcgraph.tree.learned import EdgeModel
 
 
 def ply(points) -> bytes:
@@ -151,6 +151,9 @@ def test_every_member_of_a_family_is_named_in_the_help():
 
 def test_a_linkage_from_outside_has_a_name_too():
     class OutermostLinkage(pcgraph.Linkage):
+        default_object_altitude = 1.0
+        default_part_altitude = 0.5
+
         def merges(self, graph, leaves):
             raise NotImplementedError
 
@@ -165,7 +168,7 @@ def test_a_linkage_from_outside_has_a_name_too():
 @pytest.mark.parametrize("linkage", ["convexity", "mumford-shah", "lccp"])
 def test_linkage_and_cut(linkage, scene, tmp_path):
     chosen = members("Linkage")[linkage]()
-    altitude = 0.4 * chosen.object_altitude
+    altitude = 0.4 * chosen.default_object_altitude
     options = ("--linkage", linkage[:5], "--altitude", altitude, "--min-size", 40)
     done = run(scene, "--out", tmp_path / "a.npz", *options, *VIEW)
     assert done.exit_code == 0, done.output

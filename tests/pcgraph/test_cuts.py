@@ -11,15 +11,16 @@ from clouds import refines
 from graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
 
 from pcgraph.features.moments import Moments
-from pcgraph.tree.energy import Energy, boundary_lengths, plane_energy, variance_energy
+from pcgraph.hierarchy import children
+from pcgraph.tree.average_linkage import ConvexityLinkage
+from pcgraph.tree.energies import boundary_lengths, plane_energy, variance_energy
 from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
 from pcgraph.tree.lccp import LccpLinkage
-from pcgraph.tree.linkage import ConvexityLinkage
-from pcgraph.tree.quasi_flat import QuasiFlatLinkage
+from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.optimal_cut import Energy
 from pcgraph.tree.saliency import point_saliency, voxel_saliency
-from pcgraph.tree.segments import children_of
+from pcgraph.tree.single_linkage import QuasiFlatLinkage
 from pcgraph.tree.tree import SegmentationTree
-from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
 
 #            8 (9)               Leaves 0..4; nodes 5..8 at these altitudes. Points of the leaves: 40, 30, 2, 20, 8.
 #           /     \
@@ -87,6 +88,18 @@ def test_a_merge_with_something_small_does_not_end_a_life():
     assert tree.cut_stable(min_size=10).tolist() == [0, 0, 0, 1]
 
 
+def test_trifles_that_come_late_do_not_make_a_scene_last():
+    #  halves of 100 points, of 50 each, become one at 1; three single points join at 2 and 3
+    counts = np.array([50, 50, 50, 50, 1, 1, 1])
+    parents = np.array([7, 7, 8, 8, 10, 11, 12, 9, 9, 10, 11, 12, 12], np.int32)
+    altitudes = np.array([0, 0, 0, 0, 0, 0, 0, 0.1, 0.1, 1.0, 2.0, 3.0, 3.0])
+    sizes = np.concatenate((counts, [100, 100, 200, 201, 202, 203]))
+    moments = Moments(sizes, np.zeros((13, 3)), np.zeros((13, 3, 3)), None)
+    late = SegmentationTree(parents, altitudes, moments)
+    assert late.cut_stable(min_size=10)[:4].tolist() == [0, 0, 1, 1]
+    assert late.cut_stable(min_size=1000).tolist() == [0] * 7
+
+
 def test_the_most_stable_cut_is_the_best_antichain():
     rng = np.random.default_rng(1)
     for _ in range(30):
@@ -109,13 +122,13 @@ def random_tree(n, rng, integers=True):
 
 
 def all_cuts(tree):
-    children = children_of(tree.parents).tolist()
+    pairs = children(tree.parents).tolist()
 
     def below(node):
-        a, b = children[node]
+        a, b = pairs[node]
         return [[node]] + ([left + right for left in below(a) for right in below(b)] if a >= 0 else [])
 
-    return below(len(children) - 1)
+    return below(len(pairs) - 1)
 
 
 def test_the_optimal_cut_of_five_leaves(tree):
@@ -150,7 +163,7 @@ def random_energy(tree, rng):
     """Any data, and complexities of which a parent has at most as much as its children."""
     k = len(tree.parents)
     complexity = rng.integers(1, 6, k).astype(float)
-    for node, (a, b) in enumerate(children_of(tree.parents).tolist()):
+    for node, (a, b) in enumerate(children(tree.parents).tolist()):
         if a >= 0:
             complexity[node] = min(complexity[node], complexity[a] + complexity[b])
     return Energy(rng.integers(0, 40, k).astype(float), complexity)
@@ -254,15 +267,15 @@ def test_saliency_above_a_level_is_the_boundary_of_that_cut(boxes):
 )
 def test_faces_of_boxes_are_the_parts_of_other_linkages_too(boxes, linkage):
     result = boxes[2]
-    expected = result.tree.cut(altitude=ConvexityLinkage().part_altitude)
-    parts = tree_of(linkage, result.graph, result.leaves).cut(altitude=linkage.part_altitude)
+    expected = result.tree.cut(altitude=ConvexityLinkage().default_part_altitude)
+    parts = tree_of(linkage, result.graph, result.leaves).cut(altitude=linkage.default_part_altitude)
     assert np.array_equal(parts, expected)
 
 
 def test_faces_of_boxes_are_parts_and_boxes_are_objects(boxes):
     _, truth, result = boxes
     linkage = ConvexityLinkage()
-    parts, objects = result.tree.levels([linkage.part_altitude, linkage.object_altitude]).T
+    parts, objects = result.tree.levels([linkage.default_part_altitude, linkage.default_object_altitude]).T
     assert parts.max() + 1 == 7  # the plane, and three faces of either box
     assert objects.max() + 1 == 3
     assert refines(parts, objects)

@@ -7,6 +7,7 @@ import json
 import sys
 from dataclasses import fields, replace
 
+import msgspec
 import numpy as np
 import pytest
 from clouds import box, patch
@@ -15,9 +16,7 @@ from sklearn.linear_model import LogisticRegression
 
 import pcgraph
 from pcgraph.graph.adjacency import EdgeFeatures
-from pcgraph.tree.edge_model import EdgeModel, edge_evidence
-from pcgraph.tree.leaf_truth import leaf_truth
-from pcgraph.tree.learned import LearnedLinkage
+from pcgraph.tree.learned import EdgeModel, LearnedLinkage, edge_evidence, leaf_truth
 
 MODEL = EdgeModel(("concavity", "step_voxels"), (0.2, 1.0), (0.5, 2.0), (1.5, 0.25), -0.5, 0.4)
 
@@ -39,7 +38,7 @@ def test_fitted_on_one_scene_it_finds_the_objects_of_another(boxes, stack):
     points, objects, _ = boxes
     found = pcgraph.segment(points, viewpoint=(0.8, -1.0, 3.0), linkage=linkage)
     assert pcgraph.metrics.weighted_overlap(found.labels, objects) > 0.95
-    assert 0.0 < linkage.part_altitude < linkage.object_altitude < 1.0
+    assert 0.0 < linkage.default_part_altitude < linkage.default_object_altitude < 1.0
     assert found.tree.altitudes[np.isfinite(found.tree.altitudes)].max() <= 1.0
 
 
@@ -85,7 +84,7 @@ def test_files_hold_numbers_and_come_back_the_same(tmp_path, stack):
 
 
 def good():
-    return {"format": "pcgraph edge model 1"} | {field.name: getattr(MODEL, field.name) for field in fields(MODEL)}
+    return {"format": "pcgraph edge model 1"} | msgspec.structs.asdict(MODEL)
 
 
 @pytest.mark.parametrize(
@@ -103,12 +102,21 @@ def good():
         json.dumps(good() | {"intercept": None}).encode(),
         json.dumps(good() | {"intercept": float("nan")}).encode(),
         json.dumps(good() | {"more": 1}).encode(),
+        json.dumps(good() | {"intercept": True}).encode(),
+        json.dumps(good() | {"object_altitude": "0.4"}).encode(),
+        json.dumps(good() | {"intercept": 10**400}).encode(),
+        json.dumps(good() | {"scales": [1e300, 1]}).encode().replace(b"1e+300", b"1e400"),
+        json.dumps(good() | {"names": ["concavity", None]}).encode(),
+        json.dumps({name: value for name, value in good().items() if name != "means"}).encode(),
+        json.dumps(good()).encode()[:-9],
+        json.dumps(good()).encode().replace(b"concavity", b"\xff\xfe"),
+        json.dumps(good()).encode().replace(b"[", b"[" * 100_000),
     ],
 )
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "model.json"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(ValueError, match=r"^expected JSON that EdgeModel.save wrote, got .*model.json"):
         EdgeModel.load(path)
 
 
@@ -122,7 +130,7 @@ def test_truth_of_leaves_by_hand():
         cut = np.array(segments, np.int32)
         known = truth >= 0
         labels = np.append(cut, -1)[supervoxels]
-        assert table.overlap(cut) == pytest.approx(pcgraph.metrics.weighted_overlap(labels[known], truth[known]))
+        assert table.covering(cut) == pytest.approx(pcgraph.metrics.weighted_overlap(labels[known], truth[known]))
 
 
 def test_evidence_that_this_version_does_not_know_is_refused():

@@ -13,14 +13,11 @@ from graphs import edges_of, hand_graph, leaf_sets, random_graph, tree_of, unit_
 from scipy.spatial.distance import squareform
 
 from pcgraph.features.moments import moments_of_groups
-from pcgraph.tree.average import average_linkage
-from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage, normal_contrast
+from pcgraph.tree.average_linkage import average_linkage
+from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage, normal_contrast, scale_linkage
 from pcgraph.tree.lccp import LccpLinkage
-from pcgraph.tree.least_increase import Regions, least_increase_linkage
-from pcgraph.tree.quasi_flat import QuasiFlatLinkage
-from pcgraph.tree.scales import scale_linkage
-from pcgraph.tree.single import single_linkage
-from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.least_increase import MumfordShahLinkage, Regions, WardLinkage, least_increase_linkage
+from pcgraph.tree.single_linkage import QuasiFlatLinkage, minimum_spanning_forest, single_linkage
 
 CHAIN = [[0, 1], [1, 2], [2, 3], [3, 4]]
 
@@ -33,10 +30,10 @@ def value_regions(values, masses=None):
     return Regions(weights, rows, np.zeros((n, 3)), np.zeros((n, 3, 3)), 0.0)
 
 
-def partition_at(n, pairs, altitudes, level):
+def partition_at(n, merges, level):
     """Sets of leaves after all merges up to a level."""
     sets = {i: frozenset([i]) for i in range(n)}
-    for step, (pair, altitude) in enumerate(zip(pairs.tolist(), altitudes, strict=True)):
+    for step, (pair, altitude) in enumerate(zip(merges.pairs.tolist(), merges.altitudes, strict=True)):
         if altitude <= level:
             sets[n + step] = sets.pop(pair[0]) | sets.pop(pair[1])
     return set(sets.values())
@@ -53,20 +50,20 @@ def test_quasi_flat_zones_of_five_nodes():
 def test_single_linkage_lets_one_cheap_edge_join_what_a_mean_keeps_apart():
     edges = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], np.int32)
     costs = np.array([0.1, 0.3, 2.0, 2.0, 2.0, 0.1])  # pairs {0, 1} and {2, 3}; one of four contacts is cheap
-    _, single, forest = single_linkage(4, edges, costs)
-    _, average = average_linkage(4, edges, costs, np.ones(6))
-    assert single.tolist() == [0.1, 0.1, 0.3]
+    single, forest = minimum_spanning_forest(4, edges, costs)
+    average = average_linkage(4, edges, costs, np.ones(6))
+    assert single.altitudes.tolist() == [0.1, 0.1, 0.3]
     assert forest.tolist() == [0, 5, 1]
-    assert average.tolist() == [0.1, 0.1, (0.3 + 3 * 2.0) / 4]
+    assert average.altitudes.tolist() == [0.1, 0.1, (0.3 + 3 * 2.0) / 4]
 
 
 def test_felzenszwalb_scales_of_five_nodes():
     # Weights 1, 4, 2, 8 along a chain. {0} and {1}: k = (1 - 0) 1 = 1; {2} and {3}: 2. The edge of weight 4, at
     # k >= 2: {0, 1} has Int 1, so (4 - 1) 2 = 6; {2, 3} has (4 - 2) 2 = 4; k = 6. The edge of weight 8: below k = 6
     # it would need (8 - 2) 2 = 12, from 6 on {0, 1, 2, 3} has Int 4 and needs (8 - 4) 4 = 16.
-    pairs, scales = scale_linkage(5, np.array(CHAIN, np.int32), np.array([1.0, 4.0, 2.0, 8.0]))
-    assert pairs.tolist() == [[0, 1], [2, 3], [5, 6], [4, 7]]
-    assert scales.tolist() == [1.0, 2.0, 6.0, 16.0]
+    merges = scale_linkage(5, np.array(CHAIN, np.int32), np.array([1.0, 4.0, 2.0, 8.0]))
+    assert merges.pairs.tolist() == [[0, 1], [2, 3], [5, 6], [4, 7]]
+    assert merges.altitudes.tolist() == [1.0, 2.0, 6.0, 16.0]
 
 
 def test_scannet_weight_is_squared_where_convex():
@@ -108,16 +105,15 @@ def test_felzenszwalb_scales_agree_with_their_definition(shape):
     for n in (2, 5, 12, 25):
         edges = edges_of(shape, n, rng)
         weights = rng.integers(1, 60, len(edges)) / 4.0  # exact in floating point, so that levels compare exactly
-        _, scales = scale_linkage(n, edges, weights)
-        assert scales.tolist() == brute_force_scales(n, edges, weights)
+        assert scale_linkage(n, edges, weights).altitudes.tolist() == brute_force_scales(n, edges, weights)
 
 
 def test_wards_linkage_of_five_nodes():
     # Values 0, 1, 4, 6, 6.5 along a chain: {3, 4} costs 1/2 0.25 = 0.125; {0, 1} costs 1/2; then 2 to {0, 1} costs
     # 2/3 3.5^2 = 8.17 and to {3, 4} 2/3 2.25^2 = 3.375; last {0, 1} and {2, 3, 4}: 6/5 (5.5 - 0.5)^2 = 30.
-    pairs, altitudes = least_increase_linkage(value_regions([0.0, 1.0, 4.0, 6.0, 6.5]), np.array(CHAIN, np.int32), None)
-    assert pairs.tolist() == [[3, 4], [0, 1], [2, 5], [6, 7]]
-    assert altitudes == pytest.approx([0.125, 0.5, 3.375, 30.0])
+    merges = least_increase_linkage(value_regions([0.0, 1.0, 4.0, 6.0, 6.5]), np.array(CHAIN, np.int32), None)
+    assert merges.pairs.tolist() == [[3, 4], [0, 1], [2, 5], [6, 7]]
+    assert merges.altitudes == pytest.approx([0.125, 0.5, 3.375, 30.0])
 
 
 def test_mumford_shah_counts_the_boundary_that_a_merge_removes():
@@ -125,18 +121,18 @@ def test_mumford_shah_counts_the_boundary_that_a_merge_removes():
     # cost 1 and, once 3 is {2, 3} of mean 5, 2/3 1.5^2 / (1/8) = 12; {0, 1} to {2, 3}: 4/4 4.5^2 / 1 = 20.25.
     regions = value_regions([0.0, 1.0, 4.0, 6.0, 6.5])
     lengths = np.array([1.0, 1.0, 10.0, 0.125])
-    pairs, altitudes = least_increase_linkage(regions, np.array(CHAIN, np.int32), lengths)
-    assert pairs.tolist() == [[2, 3], [0, 1], [4, 5], [6, 7]]
-    assert altitudes == pytest.approx([0.2, 0.5, 12.0, 6 / 5 * (5.5 - 0.5) ** 2])
+    merges = least_increase_linkage(regions, np.array(CHAIN, np.int32), lengths)
+    assert merges.pairs.tolist() == [[2, 3], [0, 1], [4, 5], [6, 7]]
+    assert merges.altitudes == pytest.approx([0.2, 0.5, 12.0, 6 / 5 * (5.5 - 0.5) ** 2])
 
 
 def test_contacts_with_the_same_third_region_add_up():
     # A triangle of values 0, 1, 4 and contacts of 1: {0, 1} costs 1/2, then 2/3 3.5^2 over a contact of 2.
     triangle = np.array([[0, 1], [0, 2], [1, 2]], np.int32)
-    _, altitudes = least_increase_linkage(value_regions([0.0, 1.0, 4.0]), triangle, np.ones(3))
-    assert altitudes == pytest.approx([0.5, 2 / 3 * 3.5**2 / 2])
-    _, without = least_increase_linkage(value_regions([0.0, 1.0, 4.0]), triangle, None)
-    assert without == pytest.approx([0.5, 2 / 3 * 3.5**2])
+    merges = least_increase_linkage(value_regions([0.0, 1.0, 4.0]), triangle, np.ones(3))
+    assert merges.altitudes == pytest.approx([0.5, 2 / 3 * 3.5**2 / 2])
+    without = least_increase_linkage(value_regions([0.0, 1.0, 4.0]), triangle, None)
+    assert without.altitudes == pytest.approx([0.5, 2 / 3 * 3.5**2])
 
 
 def test_mumford_shah_grows_planes_before_it_bends_them():
@@ -210,7 +206,7 @@ def test_lccps_partition_is_a_cut(shape):
 def merges_of(name, graph, values, costs, weights):
     n = len(values)
     if name == "single":
-        return single_linkage(n, graph, costs)[:2]
+        return single_linkage(n, graph, costs)
     if name == "average":
         return average_linkage(n, graph, costs, weights)
     return least_increase_linkage(value_regions(values), graph, None)
@@ -222,10 +218,12 @@ def test_agreement_with_scipy_on_complete_graphs(name):
     for n in (2, 9, 40):
         values, edges = rng.normal(size=(n, 3)), edges_of("complete", n, rng)
         distances = np.linalg.norm(values[edges[:, 0]] - values[edges[:, 1]], axis=1)
-        pairs, altitudes = merges_of(name, edges, values, distances, np.ones(len(edges)))
+        merges = merges_of(name, edges, values, distances, np.ones(len(edges)))
         theirs = scipy_hierarchy.linkage(squareform(squareform(distances)), name)
-        assert pairs.tolist() == np.sort(theirs[:, :2], axis=1).astype(int).tolist()
-        heights = np.sqrt(2.0 * altitudes) if name == "ward" else altitudes  # their height of a pair: its distance
+        assert merges.pairs.tolist() == np.sort(theirs[:, :2], axis=1).astype(int).tolist()
+        heights = (
+            np.sqrt(2.0 * merges.altitudes) if name == "ward" else merges.altitudes
+        )  # their height of a pair: its distance
         assert heights == pytest.approx(theirs[:, 2], rel=1e-9)
 
 
@@ -237,7 +235,7 @@ def test_agreement_with_higra(name, shape):
     n = 60
     edges, values = edges_of(shape, n, rng), rng.normal(size=(n, 2))
     costs, weights = rng.random(len(edges)), rng.integers(1, 9, len(edges)).astype(float)
-    pairs, altitudes = merges_of(name, edges, values, costs, weights)
+    merges = merges_of(name, edges, values, costs, weights)
     graph = hg.UndirectedGraph(n)
     graph.add_edges(edges[:, 0], edges[:, 1])
     if name == "single":
@@ -246,18 +244,18 @@ def test_agreement_with_higra(name, shape):
         theirs, levels = hg.binary_partition_tree_average_linkage(graph, costs, weights)
     else:
         theirs, levels = hg.binary_partition_tree_ward_linkage(graph, values)
-    for level in np.quantile(altitudes, [0.1, 0.5, 0.9]) * (1.0 + 1e-9):
+    for level in np.quantile(merges.altitudes, [0.1, 0.5, 0.9]) * (1.0 + 1e-9):
         labels = hg.labelisation_horizontal_cut_from_threshold(theirs, levels, level)
         expected = {frozenset(np.flatnonzero(labels == label).tolist()) for label in np.unique(labels)}
-        assert partition_at(n, pairs, altitudes, level) == expected
-    assert np.sort(altitudes) == pytest.approx(np.sort(levels[n:]), rel=1e-9)
+        assert partition_at(n, merges, level) == expected
+    assert np.sort(merges.altitudes) == pytest.approx(np.sort(levels[n:]), rel=1e-9)
 
 
 def test_wards_altitudes_do_not_fall_where_the_graph_would_let_them():
     # 0 - 1 - 2 at 0, 5, 0: the first merge costs 12.5, then {0, 1} at 2.5 and 2 at 0 only 2/3 6.25 = 4.2.
-    pairs, altitudes = least_increase_linkage(value_regions([0, 5, 0]), np.array([[0, 1], [1, 2]], np.int32), None)
-    assert altitudes.tolist() == [12.5, 12.5]
-    assert pairs.tolist() == [[0, 1], [2, 3]]
+    merges = least_increase_linkage(value_regions([0, 5, 0]), np.array([[0, 1], [1, 2]], np.int32), None)
+    assert merges.altitudes.tolist() == [12.5, 12.5]
+    assert merges.pairs.tolist() == [[0, 1], [2, 3]]
 
 
 def test_ward_and_mumford_shah_know_no_units_nor_density():
@@ -279,5 +277,5 @@ def test_felzenszwalbs_tree_reads_its_weights_from_the_normals():
     graph = hand_graph(CHAIN, convexity=-np.ones(4), normal_angle=[0.1, 0.4, 0.2, 0.8])
     tree = tree_of(FelzenszwalbLinkage(), graph, unit_leaves(5))
     weights = 1.0 - np.cos([0.1, 0.4, 0.2, 0.8])
-    assert tree.altitudes[5:] == pytest.approx(scale_linkage(5, graph.edges, weights)[1])
+    assert tree.altitudes[5:] == pytest.approx(scale_linkage(5, graph.edges, weights).altitudes)
     assert leaf_sets(tree)[7] == {0, 1, 2, 3}

@@ -195,7 +195,7 @@ def test_any_cloud_in_any_setting_keeps_every_promise(rng, n, shape, data):
     colors, normals = attributes(rng, len(points))
     result = pcgraph.segment(points, colors, normals, **chosen)
     assert_covered_and_connected(points, result)
-    assert np.array_equal(result.labels, result.cut(altitude=chosen["linkage"].object_altitude))
+    assert np.array_equal(result.labels, result.cut(altitude=chosen["linkage"].default_object_altitude))
     assert_edges_are_the_contacts(result)
     assert_moments_are_direct(result.leaves, points, result.supervoxels)
     assert_tree_is_nested(result)

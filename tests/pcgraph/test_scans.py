@@ -172,7 +172,7 @@ def test_an_update_goes_on_with_the_settings(halves):
     assert (second.method, second.linkage, second.object_altitude) == tuple(options.values())
     assert np.array_equal(second.objects, second.tree.cut(altitude=0.01))
     other = pcgraph.update(first, right, viewpoint=viewpoint, linkage=pcgraph.ConvexityLinkage())
-    assert other.object_altitude == pcgraph.ConvexityLinkage().object_altitude
+    assert other.object_altitude == pcgraph.ConvexityLinkage().default_object_altitude
 
 
 def test_an_update_leaves_the_planes_as_they_are_fitted(halves):

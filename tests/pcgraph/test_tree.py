@@ -12,9 +12,8 @@ from clouds import refines
 
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
-from pcgraph.tree.average import average_linkage
-from pcgraph.tree.growth import segmentation_tree
-from pcgraph.tree.linkage import Merges
+from pcgraph.tree.average_linkage import average_linkage
+from pcgraph.tree.tree import segmentation_tree
 
 
 def leaves_on_a_line(n, **moved):
@@ -33,10 +32,10 @@ def test_hand_drawn_graph_of_five_nodes():
     edges = np.array([[0, 1], [0, 4], [1, 2], [2, 3], [2, 4], [3, 4]], np.int32)
     costs = np.array([1.0, 9.0, 4.0, 3.0, 6.0, 2.0])
     weights = np.array([1.0, 3.0, 1.0, 1.0, 2.0, 1.0])
-    pairs, altitudes = average_linkage(5, edges, costs, weights)
-    assert pairs.tolist() == [[0, 1], [3, 4], [2, 5], [6, 7]]
-    assert altitudes.tolist() == [1.0, 2.0, 4.0, 7.0]
-    tree = segmentation_tree(Merges(pairs, altitudes), leaves_on_a_line(5))
+    merges = average_linkage(5, edges, costs, weights)
+    assert merges.pairs.tolist() == [[0, 1], [3, 4], [2, 5], [6, 7]]
+    assert merges.altitudes.tolist() == [1.0, 2.0, 4.0, 7.0]
+    tree = segmentation_tree(merges, leaves_on_a_line(5))
     assert tree.parents.tolist() == [5, 5, 7, 6, 6, 7, 8, 8, 8]
     assert tree.altitudes.tolist() == [0, 0, 0, 0, 0, 1, 2, 4, 7]
     assert tree.cut(n=2).tolist() == [0, 0, 0, 1, 1]
@@ -48,9 +47,9 @@ def test_hand_drawn_graph_of_five_nodes():
 
 def test_of_equal_costs_the_first_edge_merges_first():
     edges = np.array([[0, 1], [1, 2], [2, 3]], np.int32)
-    pairs, altitudes = average_linkage(4, edges, np.full(3, 0.5), np.ones(3))
-    assert pairs.tolist() == [[0, 1], [2, 4], [3, 5]]
-    assert altitudes.tolist() == [0.5, 0.5, 0.5]
+    merges = average_linkage(4, edges, np.full(3, 0.5), np.ones(3))
+    assert merges.pairs.tolist() == [[0, 1], [2, 4], [3, 5]]
+    assert merges.altitudes.tolist() == [0.5, 0.5, 0.5]
 
 
 def test_average_linkage_agrees_with_brute_force():
@@ -60,9 +59,9 @@ def test_average_linkage_agrees_with_brute_force():
         complete.add_edges_from((i, i + 1) for i in range(n - 1))
         edges = np.array(sorted(tuple(sorted(edge)) for edge in complete.edges), np.int32)
         costs, weights = rng.random(len(edges)), rng.integers(1, 9, len(edges)).astype(float)
-        pairs, altitudes = average_linkage(n, edges, costs, weights)
+        merges = average_linkage(n, edges, costs, weights)
         clusters = {i: {i} for i in range(n)}
-        for step, (pair, altitude) in enumerate(zip(pairs.tolist(), altitudes, strict=True)):
+        for step, (pair, altitude) in enumerate(zip(merges.pairs.tolist(), merges.altitudes, strict=True)):
             means = {}
             for (i, j), cost, weight in zip(edges.tolist(), costs, weights, strict=True):
                 a = next(c for c, members in clusters.items() if i in members)
@@ -79,7 +78,7 @@ def test_average_linkage_agrees_with_brute_force():
 
 def test_parts_that_do_not_touch_join_last_smallest_first_each_to_the_nearest_larger_one():
     edges = np.array([[0, 1], [1, 2], [5, 6]], np.int32)  # parts {0, 1, 2}, {3}, {4}, {5, 6}
-    merges = Merges(*average_linkage(7, edges, np.array([0.1, 0.2, 5.0]), np.ones(3)))
+    merges = average_linkage(7, edges, np.array([0.1, 0.2, 5.0]), np.ones(3))
     tree = segmentation_tree(merges, leaves_on_a_line(7, x4=4.4))
     assert np.isinf(tree.altitudes[-3:]).all()
     assert np.isfinite(tree.altitudes[:-3]).all()

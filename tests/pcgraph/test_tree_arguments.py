@@ -8,18 +8,16 @@ import pytest
 from graphs import hand_graph, hand_tree, random_graph, tree_of
 
 import pcgraph
-from pcgraph.features.pooling import pool_sums
 from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
-from pcgraph.tree.ancestors import ancestor_index
-from pcgraph.tree.edge_model import EdgeModel
-from pcgraph.tree.energy import Energy, boundary_lengths, plane_energy, variance_energy
+from pcgraph.tree.average_linkage import ConvexityLinkage
+from pcgraph.tree.energies import boundary_lengths, plane_energy, variance_energy
 from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
 from pcgraph.tree.lccp import LccpLinkage
-from pcgraph.tree.learned import LearnedLinkage
-from pcgraph.tree.linkage import ConvexityLinkage
-from pcgraph.tree.quasi_flat import QuasiFlatLinkage
+from pcgraph.tree.learned import EdgeModel, LearnedLinkage
+from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.optimal_cut import Energy
 from pcgraph.tree.saliency import point_saliency, voxel_saliency
-from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.single_linkage import QuasiFlatLinkage
 
 CHAIN = [[0, 1], [1, 2], [2, 3], [3, 4]]
 
@@ -64,7 +62,7 @@ def test_pairs_are_leaves(tree, pairs, message):
     with pytest.raises(ValueError, match=message):
         tree.edge_saliency(pairs)
     with pytest.raises(ValueError, match=message):
-        ancestor_index(tree.parents).of_pairs(pairs)
+        tree.lowest_common_ancestors(pairs)
 
 
 def test_pairs_come_in_any_form(tree):
@@ -83,13 +81,18 @@ def test_pairs_come_in_any_form(tree):
         *((WardLinkage, name) for name in ("position", "normal", "color")),
         *((MumfordShahLinkage, name) for name in ("plane", "normal", "color")),
         *((LccpLinkage, name) for name in ("concavity_tolerance", "common_neighbours")),
-        *((kind, "object_altitude") for kind in (ConvexityLinkage, QuasiFlatLinkage, LccpLinkage, WardLinkage)),
-        *((kind, "part_altitude") for kind in (FelzenszwalbLinkage, MumfordShahLinkage)),
     ],
 )
 def test_settings_are_finite_and_not_negative(kind, name, wrong):
     with pytest.raises(ValueError, match=name):
         kind(**{name: wrong})
+
+
+@pytest.mark.parametrize("kind", [ConvexityLinkage, FelzenszwalbLinkage, LccpLinkage, QuasiFlatLinkage, WardLinkage])
+def test_where_the_tree_is_cut_is_no_setting_of_a_linkage(kind):
+    assert 0.0 < kind.default_part_altitude < kind.default_object_altitude < np.inf
+    with pytest.raises(TypeError, match="object_altitude"):
+        kind(object_altitude=0.3)
 
 
 def test_other_settings():
@@ -158,16 +161,9 @@ def test_results_compare_and_hash_as_objects(boxes):
     graph, leaves = random_graph("random", 5, np.random.default_rng(0))[:2]
     tree, energy = tree_of(ConvexityLinkage(), graph, leaves), Energy(np.ones(2), np.ones(2))
     hidden = result.occlusions()
-    others = (graph.edge_features, graph.node_features, hidden, hidden.continuations, ancestor_index(tree.parents))
+    others = (graph.edge_features, graph.node_features, hidden, hidden.continuations)
     for thing in (graph, tree, energy, ConvexityLinkage().merges(graph, leaves), *others):
         assert thing == thing
         assert thing != tree_of(ConvexityLinkage(), graph, leaves)
         assert len({thing, thing}) == 1
     assert ConvexityLinkage() == ConvexityLinkage()  # settings are equal where their numbers are
-
-
-def test_sums_of_everything_below():
-    parents = hand_tree([[0, 1], [2, 3]], [1.0, 2.0]).parents
-    values = np.array([[1, 10], [2, 20], [4, 40], [8, 80], [16, 160]])
-    pool_sums(parents, values)
-    assert values.tolist() == [[1, 10], [2, 20], [4, 40], [11, 110], [31, 310]]

@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 from pcgraph.features.moments import Moments
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
-from pcgraph.tree.edge_model import EdgeModel
-from pcgraph.tree.energy import Energy, plane_energy, variance_energy
+from pcgraph.tree.average_linkage import ConvexityLinkage
+from pcgraph.tree.energies import plane_energy, variance_energy
 from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
 from pcgraph.tree.lccp import LccpLinkage
-from pcgraph.tree.learned import LearnedLinkage
-from pcgraph.tree.linkage import ConvexityLinkage
-from pcgraph.tree.quasi_flat import QuasiFlatLinkage
-from pcgraph.tree.ward import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.learned import EdgeModel, LearnedLinkage
+from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
+from pcgraph.tree.optimal_cut import Energy
+from pcgraph.tree.single_linkage import QuasiFlatLinkage
 
 MODEL = EdgeModel(("contact_concavity", "step_voxels"), (0.2, 0.1), (0.5, 0.2), (1.5, 0.7), -0.3, 0.4)
 LINKAGES = [

@@ -9,7 +9,7 @@ import sys
 CODE = """
 import sys
 import numpy as np
-from pcgraph.pipeline import segment
+from pcgraph.scan import segment
 from pcgraph.warmup import compile_kernels
 
 def compiled():

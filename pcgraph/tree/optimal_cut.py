@@ -1,15 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scale sets: the scale from which each node belongs to the cut of least energy."""
+"""Optimal cuts: energies of segmentations, and the scale from which each node belongs to the cut of least energy."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.tree.segments import children_of
+from pcgraph.hierarchy import children
+from pcgraph.short_repr import ShortRepr
 
 _NONE = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Energy(ShortRepr):
+    """Energy of a segmentation at a scale: sum over its segments of data + scale x complexity.
+
+    Attributes
+    ----------
+    data : (k,) float64
+        How badly each node of a tree fits its points as one segment.
+    complexity : (k,) float64
+        What each node costs as a segment; a node's is at most the sum of its children's. Ones count segments.
+
+    Raises
+    ------
+    ValueError
+        The two are not arrays of one dimension and one length, a value is NaN, or a complexity infinite.
+    """
+
+    data: NDArray[np.float64]
+    complexity: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name, values in (("data", self.data), ("complexity", self.complexity)):
+            if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+                raise ValueError(f"expected {name} as an array of numbers, got {_kind(values)}; use np.asarray")
+        if self.data.ndim != 1 or self.data.shape != self.complexity.shape:
+            raise ValueError(
+                f"expected data and complexity (k,) of one length, got {self.data.shape} and {self.complexity.shape}"
+            )
+        if np.isnan(self.data).any() or not np.isfinite(self.complexity).all():
+            raise ValueError("expected data without NaN and finite complexity; check the values given")
+
+
+def _kind(values: object) -> object:
+    return values.dtype if isinstance(values, np.ndarray) else type(values).__name__
 
 
 def appearance_scales(
@@ -36,34 +76,44 @@ def appearance_scales(
     bends of the function wait in a heap with the last one on top; two heaps merge in constant time, and every
     bend leaves once: O(k log k) in any tree, however deep.
     """
-    scales = _appearances(children_of(parents), data, complexity)
-    _not_above_parents(parents, scales)
-    return scales
+    return _appearances(parents, children(parents), data, complexity)
 
 
-@njit(cache=True)
-def _not_above_parents(parents: NDArray[np.int32], scales: NDArray[np.float64]) -> None:
-    for node in range(len(parents) - 2, -1, -1):
-        scales[node] = min(scales[node], scales[parents[node]])
+class _Bends(NamedTuple):
+    """Pairing heaps of bends, those at the largest scales on top; a bend is named by the node at whose scale it is.
+
+    Attributes
+    ----------
+    scales : (k,) float64
+    first, following : (k,) int32
+        First child of a bend in its heap, and next child of the same parent; -1 without.
+    """
+
+    scales: NDArray[np.float64]
+    first: NDArray[np.int32]
+    following: NDArray[np.int32]
 
 
 @njit(cache=True)
 def _appearances(
-    children: NDArray[np.int32], data: NDArray[np.float64], complexity: NDArray[np.float64]
+    parents: NDArray[np.int32],
+    children: NDArray[np.int32],
+    data: NDArray[np.float64],
+    complexity: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    k = len(children)
+    k = len(parents)
     scales = np.zeros(k)
+    bends = _Bends(scales, np.full(k, _NONE, np.int32), np.full(k, _NONE, np.int32))
     # The last piece of each node's function: energy at large scales is last_data + scale x last_complexity.
     last_data, last_complexity = data.copy(), complexity.copy()
     # At its bend each node's function changes from the children's piece to the node's own line.
     data_change, complexity_change = np.zeros(k), np.zeros(k)
-    top = np.full(k, _NONE, np.int32)  # the node's heap of bends, named by the node at whose scale they are
-    first, following = np.full(k, _NONE, np.int32), np.full(k, _NONE, np.int32)
+    top = np.full(k, _NONE, np.int32)  # the node's heap of bends
     for node in range(k):
         a, b = children[node]
         if a < 0:
             continue
-        heap = _meld(top[a], top[b], scales, first, following)
+        heap = _meld(bends, top[a], top[b])
         energy, count = last_data[a] + last_data[b], last_complexity[a] + last_complexity[b]
         if data[node] == np.inf:
             scales[node], top[node] = np.inf, heap
@@ -73,14 +123,16 @@ def _appearances(
         while heap != _NONE and crossing <= scales[heap]:
             energy -= data_change[heap]
             count -= complexity_change[heap]
-            heap = _pop(heap, scales, first, following)
+            heap = _pop(bends, heap)
             crossing = _crossing(data[node], complexity[node], energy, count)
         scales[node] = crossing
         if crossing == np.inf:
             top[node], last_data[node], last_complexity[node] = heap, energy, count
         else:
             data_change[node], complexity_change[node] = data[node] - energy, complexity[node] - count
-            top[node] = _meld(node, heap, scales, first, following)
+            top[node] = _meld(bends, node, heap)
+    for node in range(k - 2, -1, -1):  # what is above replaces a node that would appear later
+        scales[node] = min(scales[node], scales[parents[node]])
     return scales
 
 
@@ -95,22 +147,23 @@ def _crossing(data: float, complexity: float, data_below: float, complexity_belo
 
 
 @njit(cache=True)
-def _meld(a, b, key, first, following):  # type: ignore[no-untyped-def]
-    """Two pairing heaps as one, the larger key on top."""
+def _meld(bends: _Bends, a: int, b: int) -> int:
+    """Two heaps as one."""
     if a == _NONE:
         return b
     if b == _NONE:
         return a
-    if key[b] > key[a]:
+    if bends.scales[b] > bends.scales[a]:
         a, b = b, a
-    following[b] = first[a]
-    first[a] = b
+    bends.following[b] = bends.first[a]
+    bends.first[a] = b
     return a
 
 
 @njit(cache=True)
-def _pop(heap, key, first, following):  # type: ignore[no-untyped-def]
-    """A pairing heap without its top: children melded in pairs, then the pairs from the last to the first."""
+def _pop(bends: _Bends, heap: int) -> int:
+    """A heap without its top: children melded in pairs, then the pairs from the last to the first."""
+    first, following = bends.first, bends.following
     child, pairs = first[heap], _NONE
     first[heap] = _NONE
     while child != _NONE:
@@ -120,7 +173,7 @@ def _pop(heap, key, first, following):  # type: ignore[no-untyped-def]
         if second != _NONE:
             rest = following[second]
             following[second] = _NONE
-        pair = _meld(child, second, key, first, following)
+        pair = _meld(bends, child, second)
         following[pair] = pairs
         pairs = pair
         child = rest
@@ -128,6 +181,6 @@ def _pop(heap, key, first, following):  # type: ignore[no-untyped-def]
     while pairs != _NONE:
         rest = following[pairs]
         following[pairs] = _NONE
-        merged = _meld(merged, pairs, key, first, following)
+        merged = _meld(bends, merged, pairs)
         pairs = rest
     return merged

@@ -1,54 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Energies of segmentations: what a segment costs by its points, and what by its outline."""
+"""Energies of a tree's nodes (Mumford and Shah's): what a segment costs by its points, and what by its outline."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.features.pooling import pool_sums
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.short_repr import ShortRepr
-from pcgraph.tree.ancestors import ancestor_index
-
-if TYPE_CHECKING:
-    from pcgraph.tree.tree import SegmentationTree
-
-
-@dataclass(frozen=True, eq=False)
-class Energy(ShortRepr):
-    """Energy of a segmentation at a scale: sum over its segments of data + scale x complexity.
-
-    Attributes
-    ----------
-    data : (k,) float64
-        How badly each node of a tree fits its points as one segment.
-    complexity : (k,) float64
-        What each node costs as a segment; a node's is at most the sum of its children's. Ones count segments.
-
-    Raises
-    ------
-    ValueError
-        The two are not arrays of one dimension and one length, a value is NaN, or a complexity infinite.
-    """
-
-    data: NDArray[np.float64]
-    complexity: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        for name, values in (("data", self.data), ("complexity", self.complexity)):
-            if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
-                raise ValueError(f"expected {name} as an array of numbers, got {_kind(values)}; use np.asarray")
-        if self.data.ndim != 1 or self.data.shape != self.complexity.shape:
-            raise ValueError(
-                f"expected data and complexity (k,) of one length, got {self.data.shape} and {self.complexity.shape}"
-            )
-        if np.isnan(self.data).any() or not np.isfinite(self.complexity).all():
-            raise ValueError("expected data without NaN and finite complexity; check the values given")
+from pcgraph.hierarchy import accumulate_sequential, lowest_common_ancestors
+from pcgraph.tree.optimal_cut import Energy
+from pcgraph.tree.tree import SegmentationTree
 
 
 def plane_energy(tree: SegmentationTree, graph: AdjacencyGraph | None = None) -> Energy:
@@ -112,14 +74,9 @@ def boundary_lengths(tree: SegmentationTree, graph: AdjacencyGraph) -> NDArray[n
     k, lengths = len(tree.parents), graph.edge_features.contact_length
     outlines = np.bincount(graph.edges.ravel(), np.repeat(lengths, 2), k).astype(np.float64)
     # An edge is inside from the lowest common ancestor of its ends upwards: there both its sides leave the outline.
-    meeting = ancestor_index(tree.parents).of_pairs(graph.edges)
+    meeting = lowest_common_ancestors(tree.parents, *graph.edges.T)
     outlines -= 2.0 * np.bincount(meeting, lengths, k)
-    pool_sums(tree.parents, outlines[:, None])
-    return np.maximum(outlines, 0.0)
-
-
-def _kind(values: object) -> object:
-    return values.dtype if isinstance(values, np.ndarray) else type(values).__name__
+    return np.maximum(accumulate_sequential(tree.parents, outlines), 0.0)
 
 
 def _complexity(tree: SegmentationTree, graph: AdjacencyGraph | None) -> NDArray[np.float64]:

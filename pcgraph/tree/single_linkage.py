@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Single linkage: two parts merge at the cheapest edge between them (minimum spanning forest, quasi-flat zones)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pcgraph.features.moments import Moments
+from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.tree.linkage import Linkage, Merges, check_cost
+
+
+@dataclass(frozen=True)
+class QuasiFlatLinkage(Linkage):
+    """Single linkage on an edge's concavity; altitudes in radians.
+
+    Attributes
+    ----------
+    cost : BoundaryCost
+        Cost of an edge.
+
+    Notes
+    -----
+    The cut at an altitude is what stays connected over edges of at most that cost (Meyer and Maragos 1999), so
+    one cheap edge joins two objects.
+    """
+
+    cost: BoundaryCost = field(default_factory=BoundaryCost)
+
+    default_object_altitude = 0.07  # radians
+    default_part_altitude = 0.04
+
+    def __post_init__(self) -> None:
+        check_cost(self.cost)
+
+    def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
+        """Merges, the cheapest edge first."""
+        return single_linkage(graph.n_nodes, graph.edges, self.cost(graph.edge_features))
+
+
+def single_linkage(n_nodes: int, edges: NDArray[np.int32], costs: NDArray[np.float64]) -> Merges:
+    """Merges of nodes along edges, the cheapest edge between two clusters first.
+
+    Parameters
+    ----------
+    n_nodes : int
+    edges : (m, 2) int32
+    costs : (m,) float64
+
+    Returns
+    -------
+    Merges
+        Altitudes are these costs. Of equal ones the first edge merges first.
+    """
+    return minimum_spanning_forest(n_nodes, edges, costs)[0]
+
+
+def minimum_spanning_forest(
+    n_nodes: int, edges: NDArray[np.int32], costs: NDArray[np.float64]
+) -> tuple[Merges, NDArray[np.int64]]:
+    """Merges by `single_linkage`, and the edge that made each, (t,) int64 (Kruskal 1956)."""
+    order = np.argsort(costs, kind="stable")
+    pairs, taken = _kruskal(n_nodes, edges[order])
+    forest = order[taken]
+    return Merges(pairs, costs[forest]), forest
+
+
+@njit(cache=True)
+def _root_of(roots: NDArray[np.int64], node: int) -> int:
+    """Representative of a node's set; paths are halved on the way."""
+    while roots[node] != node:
+        roots[node] = roots[roots[node]]
+        node = roots[node]
+    return node
+
+
+@njit(cache=True)
+def _kruskal(n_nodes: int, edges: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Merges, and which edges made them; edges come in ascending order of cost."""
+    roots, size = np.arange(n_nodes), np.ones(n_nodes, np.int64)
+    tree_node = np.arange(n_nodes)  # of the set with this root
+    pairs, taken = np.empty((max(n_nodes - 1, 0), 2), np.int32), np.empty(max(n_nodes - 1, 0), np.int64)
+    t = 0
+    for e in range(len(edges)):
+        a, b = _root_of(roots, edges[e, 0]), _root_of(roots, edges[e, 1])
+        if a == b:
+            continue
+        if size[b] > size[a]:
+            a, b = b, a
+        pairs[t, 0], pairs[t, 1] = min(tree_node[a], tree_node[b]), max(tree_node[a], tree_node[b])
+        taken[t] = e
+        roots[b] = a
+        size[a] += size[b]
+        tree_node[a] = n_nodes + t
+        t += 1
+    return pairs[:t].copy(), taken[:t].copy()
