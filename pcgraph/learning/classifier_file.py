@@ -72,7 +72,8 @@ class StoredForest(ShortRepr):
 
     def predict_proba(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
         """Probability of each class for each row of descriptors, (m, c) float64."""
-        rows = table.astype(np.float32)  # as scikit-learn compares
+        with np.errstate(over="ignore"):
+            rows = table.astype(np.float32)  # as scikit-learn compares
         total = np.zeros((len(rows), len(self.classes_)))
         for first, last in zip(self.starts[:-1], self.starts[1:], strict=True):
             nodes = slice(first, last)
@@ -144,7 +145,7 @@ def decode_classifier(content: bytes, name: str) -> tuple[dict[str, Any], list[s
         file = msgspec.json.decode(content, type=_File)
         forest = _forest(file)
     except (msgspec.DecodeError, RecursionError, OverflowError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = ascii(str(error))[1:-1][:200]  # it may quote the file
         raise ValueError(f"expected a classifier of nodes in {name}: {reason}; {_WRITE}") from None
     settings = {field: getattr(file.settings, field) for field in _Settings.__struct_fields__}
     return settings, file.feature_names, forest
