@@ -102,13 +102,23 @@ def imported_modules(path: Path, known: set[str]) -> Iterator[str]:
             yield from known & {".".join(parts[:n]) for n in range(2, len(parts) + 1)}
 
 
-def test_no_imports_go_in_a_circle() -> None:
-    """Between files and between rooms; imports for type checks alone, and inside functions, load nothing."""
-    paths = {module_of(path): path for path in modules("rangesim")}
+def import_graph(package: str) -> nx.DiGraph:
+    """Which module of a package loads which; imports for type checks alone, and inside functions, load nothing."""
+    paths = {module_of(path): path for path in modules(package)}
     files = nx.DiGraph()
     for module, path in paths.items():
         known = {m for m in paths if m != module and not module.startswith(f"{m}.")}
         files.add_edges_from((module, other) for other in imported_modules(path, known))
+    return files
+
+
+def test_no_files_of_pcgraph_import_in_a_circle() -> None:
+    assert [c for c in nx.strongly_connected_components(import_graph("pcgraph")) if len(c) > 1] == []
+
+
+def test_no_imports_go_in_a_circle() -> None:
+    """Between files and between rooms."""
+    files = import_graph("rangesim")
     assert [c for c in nx.strongly_connected_components(files) if len(c) > 1] == []
     room = {module: module.split(".")[1] for module in files}
     rooms = nx.DiGraph([(room[a], room[b]) for a, b in files.edges if room[a] != room[b]])

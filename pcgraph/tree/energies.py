@@ -97,11 +97,11 @@ def _variances(
         if up == node:
             continue
         total = seen[up] + counts[node]
-        share = counts[node] / total
+        fraction = counts[node] / total
         for i in range(d):
             gap = means[node, i] - means[up, i]
-            sums[up] += seen[up] * share * gap * gap
-            means[up, i] += share * gap
+            sums[up] += seen[up] * fraction * gap * gap
+            means[up, i] += fraction * gap
         sums[up] += sums[node]
         seen[up] = total
     return sums

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
@@ -142,9 +142,7 @@ def edge_evidence(graph: AdjacencyGraph) -> dict[str, NDArray[np.float64]]:
     }
 
 
-class EdgeModel(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="format", tag="pcgraph edge model 1"
-):
+class EdgeModel(msgspec.Struct, frozen=True):
     """Logistic regression on standardised evidence; plain numbers, so that a file of it cannot run code.
 
     Attributes
@@ -198,7 +196,8 @@ class EdgeModel(
         CloudWriteError
             The place cannot be written.
         """
-        write_file(Path(path), msgspec.json.format(msgspec.json.encode(self), indent=1), CloudWriteError)
+        file = _EdgeModelFile(**msgspec.structs.asdict(self), format="pcgraph edge model 1")
+        write_file(Path(path), msgspec.json.format(msgspec.json.encode(file), indent=1), CloudWriteError)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> EdgeModel:
@@ -213,11 +212,19 @@ class EdgeModel(
         """
         text = read_file(Path(path), CloudReadError)
         try:
-            return msgspec.json.decode(text, type=cls)
+            file = msgspec.json.decode(text, type=_EdgeModelFile)
         except RecursionError:
             raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}, which is nested too deep") from None
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}: {error}") from None
+            reason = ascii(str(error))[1:-1][:200]  # it may quote the file
+            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}: {reason}") from None
+        return cls(**{name: getattr(file, name) for name in cls.__struct_fields__})
+
+
+class _EdgeModelFile(EdgeModel, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What stands in a file of a model."""
+
+    format: Literal["pcgraph edge model 1"]
 
 
 def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeModel:

@@ -102,6 +102,8 @@ def good():
         json.dumps(good() | {"intercept": None}).encode(),
         json.dumps(good() | {"intercept": float("nan")}).encode(),
         json.dumps(good() | {"more": 1}).encode(),
+        json.dumps(good() | {"\x1b[31m\n" + "m" * 1000: 1}).encode(),
+        json.dumps({name: value for name, value in good().items() if name != "format"}).encode(),
         json.dumps(good() | {"intercept": True}).encode(),
         json.dumps(good() | {"object_altitude": "0.4"}).encode(),
         json.dumps(good() | {"intercept": 10**400}).encode(),
@@ -116,8 +118,10 @@ def good():
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "model.json"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"^expected JSON that EdgeModel.save wrote, got .*model.json"):
+    with pytest.raises(ValueError, match=r"^expected JSON that EdgeModel.save wrote, got .*model.json") as refusal:
         EdgeModel.load(path)
+    assert str(refusal.value).isprintable()
+    assert len(str(refusal.value)) < 300 + len(str(path))
 
 
 def test_truth_of_leaves_by_hand():
