@@ -1,133 +1,85 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point clouds as supervoxels, an adjacency graph and a segmentation tree.
 
-Names load on first use, so that ``import pcgraph`` costs nothing.
+Names load on first use, so that ``import pcgraph`` costs nothing. Type checkers and editors read the first block.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
+__version__ = "0.1.0"
 
 TYPE_CHECKING = False  # the module typing would double the time of this import
 if TYPE_CHECKING:
-    from pcgraph import detection, learning, metrics
-    from pcgraph.cloud import Cloud
-    from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
-    from pcgraph.features.moments import Moments
-    from pcgraph.features.nodes import NodeFeatures
-    from pcgraph.features.primitives import Primitive, Primitives
-    from pcgraph.graph.adjacency import AdjacencyGraph, EdgeFeatures
-    from pcgraph.graph.boundary import BoundaryCost, BoundaryStrength
-    from pcgraph.graph.occlusion import Continuations, Occlusions
-    from pcgraph.io import read_cloud, write_segmentation
-    from pcgraph.scan import segment, update
-    from pcgraph.segmentation import Segmentation
-    from pcgraph.supervoxels.method import SupervoxelMethod
-    from pcgraph.supervoxels.surface_growth import SurfaceGrowth
-    from pcgraph.supervoxels.vccs import Vccs
-    from pcgraph.tree.average_linkage import ConvexityLinkage
-    from pcgraph.tree.energies import plane_energy, variance_energy
-    from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
-    from pcgraph.tree.lccp import LccpLinkage
-    from pcgraph.tree.learned import LearnedLinkage
-    from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
-    from pcgraph.tree.linkage import Linkage, Merges
-    from pcgraph.tree.optimal_cut import Energy
-    from pcgraph.tree.single_linkage import QuasiFlatLinkage
-    from pcgraph.tree.tree import SegmentationTree
-    from pcgraph.voxels.surface import Surface
+    from pcgraph import detection as detection
+    from pcgraph import learning as learning
+    from pcgraph import metrics as metrics
+    from pcgraph.cloud import Cloud as Cloud
+    from pcgraph.errors import CloudReadError as CloudReadError
+    from pcgraph.errors import CloudWriteError as CloudWriteError
+    from pcgraph.errors import PcgraphError as PcgraphError
+    from pcgraph.features.moments import Moments as Moments
+    from pcgraph.features.nodes import NodeFeatures as NodeFeatures
+    from pcgraph.features.primitives import Primitive as Primitive
+    from pcgraph.features.primitives import Primitives as Primitives
+    from pcgraph.graph.adjacency import AdjacencyGraph as AdjacencyGraph
+    from pcgraph.graph.adjacency import EdgeFeatures as EdgeFeatures
+    from pcgraph.graph.boundary import BoundaryCost as BoundaryCost
+    from pcgraph.graph.boundary import BoundaryStrength as BoundaryStrength
+    from pcgraph.graph.occlusion import Continuations as Continuations
+    from pcgraph.graph.occlusion import Occlusions as Occlusions
+    from pcgraph.io import read_cloud as read_cloud
+    from pcgraph.io import write_segmentation as write_segmentation
+    from pcgraph.scan import segment as segment
+    from pcgraph.scan import update as update
+    from pcgraph.segmentation import Segmentation as Segmentation
+    from pcgraph.supervoxels.method import SupervoxelMethod as SupervoxelMethod
+    from pcgraph.supervoxels.surface_growth import SurfaceGrowth as SurfaceGrowth
+    from pcgraph.supervoxels.vccs import Vccs as Vccs
+    from pcgraph.tree.average_linkage import ConvexityLinkage as ConvexityLinkage
+    from pcgraph.tree.energies import plane_energy as plane_energy
+    from pcgraph.tree.energies import variance_energy as variance_energy
+    from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage as FelzenszwalbLinkage
+    from pcgraph.tree.lccp import LccpLinkage as LccpLinkage
+    from pcgraph.tree.learned import LearnedLinkage as LearnedLinkage
+    from pcgraph.tree.least_increase import MumfordShahLinkage as MumfordShahLinkage
+    from pcgraph.tree.least_increase import WardLinkage as WardLinkage
+    from pcgraph.tree.linkage import Linkage as Linkage
+    from pcgraph.tree.linkage import Merges as Merges
+    from pcgraph.tree.optimal_cut import Energy as Energy
+    from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
+    from pcgraph.tree.tree import SegmentationTree as SegmentationTree
+    from pcgraph.voxels.surface import Surface as Surface
+else:
+    import lazy_loader
 
-__all__ = [
-    "AdjacencyGraph",
-    "BoundaryCost",
-    "BoundaryStrength",
-    "Cloud",
-    "CloudReadError",
-    "CloudWriteError",
-    "Continuations",
-    "ConvexityLinkage",
-    "EdgeFeatures",
-    "Energy",
-    "FelzenszwalbLinkage",
-    "LccpLinkage",
-    "LearnedLinkage",
-    "Linkage",
-    "Merges",
-    "Moments",
-    "MumfordShahLinkage",
-    "NodeFeatures",
-    "Occlusions",
-    "PcgraphError",
-    "Primitive",
-    "Primitives",
-    "QuasiFlatLinkage",
-    "Segmentation",
-    "SegmentationTree",
-    "SupervoxelMethod",
-    "Surface",
-    "SurfaceGrowth",
-    "Vccs",
-    "WardLinkage",
-    "detection",
-    "learning",
-    "metrics",
-    "plane_energy",
-    "read_cloud",
-    "segment",
-    "update",
-    "variance_energy",
-    "write_segmentation",
-]
-
-_SUBPACKAGES = ("detection", "learning", "metrics")
-
-_HOMES = {
-    "AdjacencyGraph": "graph.adjacency",
-    "BoundaryCost": "graph.boundary",
-    "BoundaryStrength": "graph.boundary",
-    "Cloud": "cloud",
-    "CloudReadError": "errors",
-    "CloudWriteError": "errors",
-    "Continuations": "graph.occlusion",
-    "ConvexityLinkage": "tree.average_linkage",
-    "EdgeFeatures": "graph.adjacency",
-    "Energy": "tree.optimal_cut",
-    "FelzenszwalbLinkage": "tree.felzenszwalb",
-    "LccpLinkage": "tree.lccp",
-    "LearnedLinkage": "tree.learned",
-    "Linkage": "tree.linkage",
-    "Merges": "tree.linkage",
-    "Moments": "features.moments",
-    "MumfordShahLinkage": "tree.least_increase",
-    "NodeFeatures": "features.nodes",
-    "Occlusions": "graph.occlusion",
-    "PcgraphError": "errors",
-    "Primitive": "features.primitives",
-    "Primitives": "features.primitives",
-    "QuasiFlatLinkage": "tree.single_linkage",
-    "Segmentation": "segmentation",
-    "SegmentationTree": "tree.tree",
-    "SupervoxelMethod": "supervoxels.method",
-    "Surface": "voxels.surface",
-    "SurfaceGrowth": "supervoxels.surface_growth",
-    "Vccs": "supervoxels.vccs",
-    "WardLinkage": "tree.least_increase",
-    "plane_energy": "tree.energies",
-    "read_cloud": "io",
-    "segment": "scan",
-    "update": "scan",
-    "variance_energy": "tree.energies",
-    "write_segmentation": "io",
-}
-
-
-def __getattr__(name: str) -> object:
-    if name in _SUBPACKAGES:
-        return import_module(f"pcgraph.{name}")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'pcgraph' has no attribute {name!r}")
-    return getattr(import_module(f"pcgraph.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+    __getattr__, __dir__, __all__ = lazy_loader.attach(
+        __name__,
+        submodules={"detection", "learning", "metrics"},
+        submod_attrs={
+            "cloud": ["Cloud"],
+            "errors": ["CloudReadError", "CloudWriteError", "PcgraphError"],
+            "features.moments": ["Moments"],
+            "features.nodes": ["NodeFeatures"],
+            "features.primitives": ["Primitive", "Primitives"],
+            "graph.adjacency": ["AdjacencyGraph", "EdgeFeatures"],
+            "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
+            "graph.occlusion": ["Continuations", "Occlusions"],
+            "io": ["read_cloud", "write_segmentation"],
+            "scan": ["segment", "update"],
+            "segmentation": ["Segmentation"],
+            "supervoxels.method": ["SupervoxelMethod"],
+            "supervoxels.surface_growth": ["SurfaceGrowth"],
+            "supervoxels.vccs": ["Vccs"],
+            "tree.average_linkage": ["ConvexityLinkage"],
+            "tree.energies": ["plane_energy", "variance_energy"],
+            "tree.felzenszwalb": ["FelzenszwalbLinkage"],
+            "tree.lccp": ["LccpLinkage"],
+            "tree.learned": ["LearnedLinkage"],
+            "tree.least_increase": ["MumfordShahLinkage", "WardLinkage"],
+            "tree.linkage": ["Linkage", "Merges"],
+            "tree.optimal_cut": ["Energy"],
+            "tree.single_linkage": ["QuasiFlatLinkage"],
+            "tree.tree": ["SegmentationTree"],
+            "voxels.surface": ["Surface"],
+        },
+    )

@@ -3,35 +3,65 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+import re
 import time
-from enum import StrEnum
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pcgraph.cloud import Cloud
+import pcgraph
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from pcgraph.cloud import Cloud
     from pcgraph.segmentation import Segmentation
+    from pcgraph.tree.linkage import Linkage
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
-class Method(StrEnum):
-    """Methods of supervoxels by name."""
+def members(family: str) -> dict[str, type[Any]]:
+    """Classes of a family of pcgraph by name, those that need no argument: MumfordShahLinkage is mumford-shah."""
+    for name in dir(pcgraph):
+        getattr(pcgraph, name)  # a class is known once it is loaded
+    waiting, found = [getattr(pcgraph, family)], {}
+    while waiting:
+        kind = waiting.pop()
+        waiting += kind.__subclasses__()
+        needed = [p for p in inspect.signature(kind).parameters.values() if p.default is p.empty]
+        if not inspect.isabstract(kind) and not needed:
+            found[re.sub("(?<=.)([A-Z])", r"-\1", kind.__name__.removesuffix(family)).lower()] = kind
+    return dict(sorted(found.items()))
 
-    SURFACE = "surface"
-    VCCS = "vccs"
+
+def member(family: str, name: str) -> Any:
+    """A new member of a family by name, or by a beginning of it that fits no other; ValueError if there is none."""
+    known = members(family)
+    fitting = [name] if name in known else [one for one in known if name and one.startswith(name)]
+    if len(fitting) != 1:
+        raise ValueError(f"expected one of {', '.join(known)}, got {ascii(name)[:100]}")
+    return known[fitting[0]]()
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"pcgraph {pcgraph.__version__}")
+        raise typer.Exit
 
 
 @app.callback()
-def _pcgraph() -> None:
+def _pcgraph(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
     """Point clouds as supervoxels, an adjacency graph and a segmentation tree."""
 
 
@@ -49,12 +79,25 @@ def segment(
     seed_size: Annotated[
         float | None, typer.Option(help="Distance of supervoxels in metres. Default: 6 x the voxel edge.")
     ] = None,
-    objects: Annotated[
-        int | None, typer.Option(help="Exact number of segments. Default: as many as concavity calls for.")
-    ] = None,
     method: Annotated[
-        Method, typer.Option(help="How supervoxels form: 'surface' keeps to edges within a point, 'vccs' is PCL's.")
-    ] = Method.SURFACE,
+        str,
+        typer.Option(help="How supervoxels form: surface-growth keeps to edges within a point, vccs is PCL's."),
+    ] = "surface-growth",
+    linkage: Annotated[
+        str,
+        typer.Option(
+            help="How the graph becomes a tree: convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, ward, or the "
+            ".json file of a learned one."
+        ),
+    ] = "convexity",
+    objects: Annotated[
+        int | None, typer.Option(help="Exact number of segments. Default: as many as --altitude leaves.")
+    ] = None,
+    altitude: Annotated[
+        float | None,
+        typer.Option(help="Altitude of the cut, in the linkage's unit (convexity: radians). Default: the linkage's."),
+    ] = None,
+    min_size: Annotated[int, typer.Option(help="Points that every segment has at least.")] = 1,
     range_growth: Annotated[
         float,
         typer.Option(help="Power of the range with which voxels grow, 0 to 1; 0.5 suits scanners. Default: 0."),
@@ -75,9 +118,22 @@ def segment(
     start = time.perf_counter()
     try:
         targets = _targets(cloud, out)
-        sizes = {"voxel_size": voxel_size, "seed_size": seed_size, "range_growth": range_growth}
-        read, result = _segmentation(cloud, method, color, viewpoint, sizes)
-        labels = result.labels if objects is None else result.cut(n=objects)
+        if objects is not None and altitude is not None:
+            raise ValueError("expected --objects or --altitude, got both: choose one")
+        read = _read(cloud, color)
+        result = _segmented(
+            cloud,
+            read,
+            viewpoint=viewpoint,
+            voxel_size=voxel_size,
+            seed_size=seed_size,
+            range_growth=range_growth,
+            method=member("SupervoxelMethod", method),
+            linkage=_linkage(linkage),
+            object_altitude=altitude,
+        )
+        level = result.object_altitude if objects is None else None
+        labels = result.labels if level is not None and min_size == 1 else result.cut(objects, level, min_size)
         _write(targets, read, result, labels)
     except (PcgraphError, ValueError, MemoryError) as error:
         message = " ".join(str(error).split()) or "the cloud does not fit into memory: choose a larger voxel size"
@@ -92,6 +148,8 @@ def main() -> None:
 
 
 def _targets(cloud: Path, out: Path | None) -> list[Path]:
+    if out is not None and str(out) == "-":
+        raise CloudWriteError("nothing is written to a pipe, got --out -: give a .ply or .npz file or a folder")
     if out is not None and out.suffix and not out.is_dir():
         if out.suffix.lower() not in (".ply", ".npz"):
             raise CloudWriteError(f"expected --out as a .ply or .npz file or a folder, got {out.name!r}")
@@ -109,7 +167,7 @@ def _targets(cloud: Path, out: Path | None) -> list[Path]:
 
 def _check_targets(targets: list[Path]) -> None:
     """Refuse to write where a file of the user's is, or where nothing can be written; this writes nothing."""
-    from pcgraph.io.write import is_segmentation
+    from pcgraph.io.segmentation_files import is_segmentation
 
     for target in targets:
         if target.is_symlink() and not target.exists():
@@ -125,40 +183,28 @@ def _check_targets(targets: list[Path]) -> None:
         raise CloudWriteError(f"cannot write to {above}: permission denied; choose another --out")
 
 
-def _segmentation(
-    path: Path, method: Method, color: bool, viewpoint: tuple[float, ...] | None, sizes: dict[str, float | None]
-) -> tuple[Cloud, Segmentation]:
-    from pcgraph.io import read_cloud
-    from pcgraph.scan import segment as segment_points
-    from pcgraph.supervoxels.surface_growth import SurfaceGrowth
-    from pcgraph.supervoxels.vccs import Vccs
+def _read(path: Path, color: bool) -> Cloud:
+    cloud = pcgraph.read_cloud(path)
+    return cloud if color else replace(cloud, colors=None)
+
+
+def _linkage(name: str) -> Linkage:
+    return pcgraph.LearnedLinkage.load(name) if name.lower().endswith(".json") else member("Linkage", name)
+
+
+def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
     from pcgraph.warmup import must_compile
 
-    cloud = read_cloud(path)
-    stored = cloud.viewpoint
-    if stored is not None and not stored.any():
-        stored = None  # PCD writers put zeros where they know nothing
-    position = stored if viewpoint is None else viewpoint
-    colors = cloud.colors if color else None
-    chosen = SurfaceGrowth() if method is Method.SURFACE else Vccs()
     if must_compile():
         typer.echo("pcgraph: compiling its kernels, which takes ten seconds or so; done once.", err=True)
     try:
-        result = segment_points(
-            cloud.points,
-            colors,
-            cloud.normals,
-            position,
-            method=chosen,
-            **sizes,  # type: ignore[arg-type]
-        )
+        return pcgraph.segment(cloud, **settings)
     except ValueError as error:
         raise CloudReadError(f"cannot segment {path}: {error}") from None
-    return cloud, result
 
 
 def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:
-    from pcgraph.io.write import encode_segmentation
+    from pcgraph.io.segmentation_files import encode_segmentation
     from pcgraph.plain_files import write_files
 
     contents = {target: encode_segmentation(target.name, cloud, result, labels) for target in targets}

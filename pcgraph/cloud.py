@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The point cloud as files hold it."""
+"""The point cloud as files hold it, and how their named columns become one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.errors import CloudReadError
+from pcgraph.short_repr import ShortRepr
+
+Columns = Mapping[str, NDArray[np.generic]]
+"""One array per field of a file."""
+
+_NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
+_LABEL_NAMES = ("label", "labels")
+
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(ShortRepr):
     """Points with what a file says about each of them.
 
     Attributes
@@ -37,3 +47,111 @@ class Cloud:
     def organised(self) -> bool:
         """Whether the points lie on an image lattice."""
         return self.points.ndim == 3
+
+
+def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDArray[np.float64] | None = None) -> Cloud:
+    """Cloud built from one array per field.
+
+    Parameters
+    ----------
+    columns : mapping of field name to (n,) array
+        Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``),
+        normals and labels are picked up under the names that PCL, Open3D and MeshLab write. Colours run to
+        65535 in unsigned 16 bits, to 1 in floats none of which is larger, else to 255.
+    shape : (n,) or (h, w)
+        Leading shape of the result.
+    viewpoint : (3,) float64, metres, optional
+
+    Raises
+    ------
+    CloudReadError
+        A coordinate is missing or is not a floating-point or integer number.
+    """
+    missing = [name for name in "xyz" if name not in columns]
+    if missing:
+        raise CloudReadError(
+            f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)[:200]}"
+        )
+    return Cloud(
+        points=_stack(columns, ("x", "y", "z"), shape),
+        colors=_colors(columns, shape),
+        normals=_normals(columns, shape),
+        labels=_labels(columns, shape),
+        viewpoint=viewpoint,
+    )
+
+
+def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.floating]:
+    wide = any(columns[name].dtype.itemsize > 4 for name in names)
+    dtype = np.float64 if wide else np.float32
+    stacked = np.empty((*shape, len(names)), dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis, name in enumerate(names):
+            stacked[..., axis] = columns[name].reshape(shape)
+    return stacked
+
+
+def _colors(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
+    for name in ("rgb", "rgba"):
+        packed = columns.get(name)
+        if packed is not None and packed.dtype.itemsize == 4:
+            bits = np.ascontiguousarray(packed).view(np.uint32)
+            channels = [(bits >> shift) & 0xFF for shift in (16, 8, 0)]
+            return np.stack(channels, axis=-1).astype(np.uint8).reshape(*shape, 3)
+    if not all(name in columns for name in ("red", "green", "blue")):
+        return None
+    stored = [columns[name] for name in ("red", "green", "blue")]
+    if all(channel.dtype == np.uint8 for channel in stored):
+        return np.stack(stored, axis=-1).astype(np.uint8).reshape(*shape, 3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = np.stack(stored, axis=-1).astype(np.float64)
+        scaled = np.rint(values * (255.0 / _white(stored, values)))
+    return np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8).reshape(*shape, 3)
+
+
+def _white(stored: list[NDArray[np.generic]], values: NDArray[np.float64]) -> float:
+    """The number that means white: 65535 in unsigned 16 bits, 1 in floats of at most 1, else 255."""
+    if all(channel.dtype.kind == "u" and channel.dtype.itemsize == 2 for channel in stored):
+        return 65535.0
+    floats = all(channel.dtype.kind == "f" for channel in stored)
+    return 1.0 if floats and values.max(initial=0.0, where=np.isfinite(values)) <= 1.0 else 255.0
+
+
+def _normals(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.floating] | None:
+    for names in _NORMAL_NAMES:
+        if all(name in columns for name in names):
+            return _stack(columns, names, shape)
+    return None
+
+
+def _labels(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.int32] | None:
+    for name in _LABEL_NAMES:
+        if name in columns and columns[name].dtype.kind in "iu":
+            return columns[name].astype(np.int32).reshape(shape)
+    return None
+
+
+def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.float64]:
+    """First `n_rows` x `n_columns` numbers of a text, in reading order.
+
+    Returns
+    -------
+    (n_rows, n_columns) float64
+        ``nan`` and ``inf`` in any case are numbers too.
+
+    Raises
+    ------
+    CloudReadError
+        Too few numbers, or a word that is not a number.
+    """
+    needed = n_rows * n_columns
+    if needed > len(body):  # a number takes a byte at least: refuse before allocating what a header invents
+        raise CloudReadError(f"the header promises {needed} numbers, but only {len(body)} bytes follow")
+    words = body.split(None, needed)[:needed]
+    if len(words) < needed:
+        raise CloudReadError(f"the header promises {n_rows} points ({needed} numbers), but {len(words)} follow")
+    try:
+        # Not through an array of the words: each would take as many bytes as the longest.
+        return np.fromiter(map(float, words), np.float64, needed).reshape(n_rows, n_columns)
+    except ValueError as error:
+        raise CloudReadError(f"expected numbers only in the ascii data: {str(error)[:120]}") from None

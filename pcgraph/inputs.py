@@ -3,19 +3,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from os import PathLike
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.cloud import Cloud
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.spacing import bounding_box
 
 _SMALLEST = 1e-250
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow
 
 
+Points = ArrayLike | Cloud | PathLike[str]
+"""What `pcgraph.segment` takes: an array of points, a cloud, or the name of a file."""
+
+
+def as_arrays(
+    points: Points, colors: ArrayLike | None, normals: ArrayLike | None, viewpoint: ArrayLike | None
+) -> tuple[ArrayLike, ArrayLike | None, ArrayLike | None, ArrayLike | None]:
+    """Points, colours, normals and viewpoint as they are, or those of a cloud or a file where none are given beside it.
+
+    Raises
+    ------
+    CloudReadError
+        `points` names a file that cannot be read as a cloud.
+    """
+    if isinstance(points, (str, PathLike)):
+        from pcgraph.io import read_cloud
+
+        points = read_cloud(points)
+    if not isinstance(points, Cloud):
+        return points, colors, normals, viewpoint
+    stored = points.viewpoint
+    if stored is not None and not stored.any():
+        stored = None  # PCD writers put zeros where they know nothing
+    return (
+        points.points,
+        points.colors if colors is None else colors,
+        points.normals if normals is None else normals,
+        stored if viewpoint is None else viewpoint,
+    )
+
+
 @dataclass(frozen=True, eq=False)
-class CleanCloud:
+class CleanCloud(ShortRepr):
     """The finite points of a cloud.
 
     Attributes
@@ -50,6 +85,9 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     ValueError
         A shape, dtype or range is not the documented one, or no point is finite.
     """
+    if not isinstance(points, (np.ndarray, Sequence)) and np.asarray(points).dtype == object:
+        kinds = "an array (n, 3) or (h, w, 3), a pcgraph.Cloud or the name of a .pcd or .ply file"
+        raise ValueError(f"expected points as {kinds}, got {type(points).__name__}")
     array = _numbers("points", points)
     if array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise ValueError(f"expected points of shape (n, 3) or (h, w, 3), got {array.shape}")

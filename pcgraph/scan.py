@@ -15,7 +15,7 @@ from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import contacts, edge_features
-from pcgraph.inputs import CleanCloud, clean_cloud, clean_viewpoint, fraction, non_negative, positive
+from pcgraph.inputs import CleanCloud, Points, as_arrays, clean_cloud, clean_viewpoint, fraction, non_negative, positive
 from pcgraph.parallel import side_by_side
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod
@@ -34,7 +34,7 @@ SEEDS_PER_VOXEL = 6.0
 
 
 def segment(
-    points: ArrayLike,
+    points: Points,
     colors: ArrayLike | None = None,
     normals: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
@@ -51,7 +51,9 @@ def segment(
 
     Parameters
     ----------
-    points : (n, 3) or (h, w, 3) float or integer, metres, any frame
+    points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
+        Of a `Cloud`, and of a file that `read_cloud` reads, colours, normals and viewpoint are used too where none
+        are given (not a viewpoint of zeros, which PCD files hold where none is known).
         NaN and infinite points are left out and labelled -1. Organised points (h, w, 3) are taken for a
         camera's image in the camera's frame (z forward) unless `viewpoint` or `camera` say otherwise.
     colors : same shape, uint8 0..255 or float 0..1, optional
@@ -90,11 +92,14 @@ def segment(
     ------
     ValueError
         A shape, dtype or value is not as above, or no point is finite.
+    CloudReadError
+        `points` names a file that cannot be read.
 
     Notes
     -----
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
+    points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
     settings = Settings.of(method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
@@ -112,7 +117,7 @@ def segment(
 
 def update(
     earlier: Segmentation,
-    points: ArrayLike,
+    points: Points,
     colors: ArrayLike | None = None,
     normals: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
@@ -155,6 +160,7 @@ def update(
     -----
     Nothing is ever taken away: what has moved between the scans is there twice.
     """
+    points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
     if object_altitude is None and linkage is None:
         object_altitude = earlier.object_altitude
     settings = Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)

@@ -3,47 +3,27 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from pcgraph.detection.boxes import OrientedBox, standing_box, tight_box
-    from pcgraph.detection.objects import DetectedObject, object_labels, objects_on
-    from pcgraph.detection.planes import Planes, find_planes
-    from pcgraph.detection.shapes import Shape, fit_shape
+    from pcgraph.detection.boxes import OrientedBox as OrientedBox
+    from pcgraph.detection.boxes import standing_box as standing_box
+    from pcgraph.detection.boxes import tight_box as tight_box
+    from pcgraph.detection.objects import DetectedObject as DetectedObject
+    from pcgraph.detection.objects import object_labels as object_labels
+    from pcgraph.detection.objects import objects_on as objects_on
+    from pcgraph.detection.planes import Planes as Planes
+    from pcgraph.detection.planes import find_planes as find_planes
+    from pcgraph.detection.shapes import Shape as Shape
+    from pcgraph.detection.shapes import fit_shape as fit_shape
+else:
+    import lazy_loader
 
-__all__ = [
-    "DetectedObject",
-    "OrientedBox",
-    "Planes",
-    "Shape",
-    "find_planes",
-    "fit_shape",
-    "object_labels",
-    "objects_on",
-    "standing_box",
-    "tight_box",
-]
-
-_HOMES = {
-    "DetectedObject": "objects",
-    "OrientedBox": "boxes",
-    "Planes": "planes",
-    "Shape": "shapes",
-    "find_planes": "planes",
-    "fit_shape": "shapes",
-    "object_labels": "objects",
-    "objects_on": "objects",
-    "standing_box": "boxes",
-    "tight_box": "boxes",
-}
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'pcgraph.detection' has no attribute {name!r}")
-    return getattr(import_module(f"pcgraph.detection.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+    __getattr__, __dir__, __all__ = lazy_loader.attach(
+        __name__,
+        submod_attrs={
+            "boxes": ["OrientedBox", "standing_box", "tight_box"],
+            "objects": ["DetectedObject", "object_labels", "objects_on"],
+            "planes": ["Planes", "find_planes"],
+            "shapes": ["Shape", "fit_shape"],
+        },
+    )

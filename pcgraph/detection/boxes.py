@@ -12,13 +12,14 @@ from scipy.spatial import ConvexHull
 from pcgraph.detection.hulls import FLAT, smallest_rectangle
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors
+from pcgraph.short_repr import ShortRepr
 
 _SAME_NORMAL = 1e6  # steps per unit in which normals of facets are told apart
 _MOST_FACETS = 64  # the largest ones; noise makes hundreds of small ones
 
 
 @dataclass(frozen=True)
-class OrientedBox:
+class OrientedBox(ShortRepr):
     """A box in any pose.
 
     Attributes

@@ -14,13 +14,14 @@ from pcgraph.detection.planes import Planes, find_planes
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.inputs import non_negative
 from pcgraph.segmentation import Segmentation
+from pcgraph.short_repr import ShortRepr
 
 LEAST_HEIGHT = 3.0  # voxel edges
 LEAST_SUPERVOXELS = 0.5  # median supervoxels, in points
 
 
 @dataclass(frozen=True)
-class DetectedObject:
+class DetectedObject(ShortRepr):
     """One thing on a support.
 
     Attributes

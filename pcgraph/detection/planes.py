@@ -16,12 +16,13 @@ from pcgraph.detection.plane_search import leaf_areas, plane_regions, region_are
 from pcgraph.detection.regions import moments_of_regions
 from pcgraph.features.nodes import node_features, unit_vector
 from pcgraph.segmentation import Segmentation
+from pcgraph.short_repr import ShortRepr
 
 ROLE_ANGLE = np.radians(20.0)
 
 
 @dataclass(frozen=True)
-class Planes:
+class Planes(ShortRepr):
     """p planes, the one of largest area first.
 
     Attributes

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.detection.boxes import OrientedBox, plane_basis, some_points, standing_box, tight_box
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors, fit_primitives, primitive_moments
+from pcgraph.short_repr import ShortRepr
 
 Kind = Literal["plane", "box", "sphere", "cylinder"]
 
@@ -23,7 +24,7 @@ GAIN = 0.7  # a plane has to be beaten by this factor: boxes, spheres and cylind
 
 
 @dataclass(frozen=True)
-class Shape:
+class Shape(ShortRepr):
     """What fits points best.
 
     Attributes

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import kernel, routine
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class Moments(ShortRepr):
     """Number, means and scatter of k groups of points.
 
     Scatter is kept about each group's own centroid, not about the origin, so nothing cancels when a cloud

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.moments import accumulate_moments, moments_of_groups
 from pcgraph.parallel import kernel, routine
+from pcgraph.short_repr import ShortRepr
 
 _STRAIGHT = 1e7  # radius over size above which a round shape is a plane
 _EXACT = 1e-6  # residual over size below which a fit counts as perfect: powers resolve no less
@@ -28,7 +29,7 @@ class Primitive(IntEnum):
 
 
 @dataclass(frozen=True)
-class Primitives:
+class Primitives(ShortRepr):
     """The best plane, sphere and cylinder of every one of k groups of points.
 
     Where a group is flat, so that no sphere or cylinder is better than its plane, the radius is infinite and centre
@@ -206,7 +207,7 @@ def _simplest(
 
 
 @dataclass(frozen=True)
-class PrimitiveMoments:
+class PrimitiveMoments(ShortRepr):
     """Moments of k groups of points up to the fourth order, and second moments of their normals.
 
     Attributes

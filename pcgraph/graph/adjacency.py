@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
+from pcgraph.short_repr import ShortRepr
 
 if TYPE_CHECKING:
     import networkx
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeFeatures:
+class EdgeFeatures(ShortRepr):
     """One row per edge (i, j), i < j.
 
     Attributes
@@ -71,7 +72,7 @@ class EdgeFeatures:
 
 
 @dataclass(frozen=True, eq=False)
-class AdjacencyGraph:
+class AdjacencyGraph(ShortRepr):
     """Supervoxels as nodes and their contacts as edges.
 
     Attributes
@@ -96,6 +97,9 @@ class AdjacencyGraph:
     def to_networkx(self, occlusions: Occlusions | None = None) -> networkx.Graph:
         """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names.
 
+        Vectors are split (``normal_x``) and all numbers are Python's, so that JSON, GEXF and GraphML take the graph;
+        features that the cloud knows nothing of are left out.
+
         Parameters
         ----------
         occlusions : Occlusions, optional
@@ -109,7 +113,7 @@ class AdjacencyGraph:
         """
         from pcgraph.graph.export import network
 
-        return network(self, occlusions, split=False)
+        return network(self, occlusions)
 
     def to_csr(self, weights: str | ArrayLike | None = None) -> csr_array:
         """The graph as a symmetric SciPy matrix, (k, k) float64, 2 m stored entries, columns ascending.

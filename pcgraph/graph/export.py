@@ -24,19 +24,19 @@ def edge_columns(graph: AdjacencyGraph) -> dict[str, NDArray[np.generic]]:
     return {**graph.edge_features.columns(), "boundary_strength": graph.edge_features.boundary_strength}
 
 
-def network(graph: AdjacencyGraph, occlusions: Occlusions | None, split: bool) -> networkx.Graph:
-    """The graph with columns as attributes, vectors split into scalars or not; see `AdjacencyGraph.to_networkx`."""
+def network(graph: AdjacencyGraph, occlusions: Occlusions | None) -> networkx.Graph:
+    """The graph with scalar columns as attributes; see `AdjacencyGraph.to_networkx`."""
     from networkx import Graph, MultiGraph
 
-    nodes, edges = graph.node_features.columns(), edge_columns(graph)
+    nodes = scalar_columns(graph.node_features.columns())
     result = Graph() if occlusions is None else MultiGraph()
-    result.add_nodes_from(enumerate(rows(scalar_columns(nodes) if split else nodes, graph.n_nodes)))
-    contacts = _joined(graph.edges, scalar_columns(edges) if split else edges)
+    result.add_nodes_from(enumerate(rows(nodes, graph.n_nodes)))
+    contacts = _joined(graph.edges, scalar_columns(edge_columns(graph)))
     if occlusions is None:
         result.add_edges_from(contacts)
         return result
     columns = {"front": _checked(graph, occlusions)[:, 0], **occlusions.columns()}
-    hidden = _joined(occlusions.pairs, scalar_columns(columns) if split else columns)
+    hidden = _joined(occlusions.pairs, scalar_columns(columns))
     both = [("contact", edge) for edge in contacts] + [("occlusion", edge) for edge in hidden]
     # One key per edge: they are the edges' ids in GraphML, where programs take two of one id for one edge.
     result.add_edges_from((i, j, key, {"kind": kind, **row}) for key, (kind, (i, j, row)) in enumerate(both))
@@ -88,7 +88,7 @@ def graphml(graph: AdjacencyGraph, occlusions: Occlusions | None) -> bytes:
     from networkx.readwrite.graphml import write_graphml_xml
 
     stream = io.BytesIO()
-    write_graphml_xml(network(graph, occlusions, split=True), stream)
+    write_graphml_xml(network(graph, occlusions), stream)
     return stream.getvalue()
 
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.contacts import angle_between
 from pcgraph.parallel import kernel, routine
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
 
 _SMOOTH_RAD = 0.2  # surfaces at most this far apart in angle
@@ -26,7 +27,7 @@ _MAX_DEPTH = 32  # things one behind the other along a line
 
 
 @dataclass(frozen=True, eq=False)
-class Continuations:
+class Continuations(ShortRepr):
     """Pairs of supervoxels that vanish behind something on one side and appear from behind it on the other.
 
     Attributes
@@ -58,7 +59,7 @@ class Continuations:
 
 
 @dataclass(frozen=True, eq=False)
-class Occlusions:
+class Occlusions(ShortRepr):
     """Pairs of supervoxels next to each other as the sensor sees them, but apart in depth.
 
     A pair may touch elsewhere, and then has a contact edge as well; each may hide the other, in different places.

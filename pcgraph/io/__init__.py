@@ -1,9 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds and segmentations in files."""
+"""Point clouds and segmentations in files: one function reads all formats, one writes them."""
 
 from __future__ import annotations
 
-from pcgraph.io.read import read_cloud
-from pcgraph.io.write import write_segmentation
+from os import PathLike
+from pathlib import Path
+
+from pcgraph.cloud import Cloud
+from pcgraph.errors import CloudReadError
+from pcgraph.io.pcd import read_pcd
+from pcgraph.io.ply import read_ply
+from pcgraph.io.segmentation_files import write_segmentation
+from pcgraph.plain_files import read_file
 
 __all__ = ["read_cloud", "write_segmentation"]
+
+MAX_REASON = 300
+"""Characters of what is wrong with a file, that a damaged file may make as long as it likes."""
+_READERS = {".pcd": read_pcd, ".ply": read_ply}
+
+
+def read_cloud(path: str | PathLike[str]) -> Cloud:
+    """Cloud held by a PCD or PLY file, in the file's own frame and unit (metres assumed elsewhere).
+
+    Parameters
+    ----------
+    path : str or path
+        ``.pcd`` (ascii, binary, binary_compressed) or ``.ply`` (ascii, binary of either byte order).
+
+    Raises
+    ------
+    CloudReadError
+        No such file, a directory, another extension, or content that is truncated or contradicts its header.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise CloudReadError(f"{path} is a directory: expected a file ending in {' or '.join(_READERS)}")
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise CloudReadError(f"expected a file ending in {' or '.join(_READERS)}, got {path.name!r}: convert it first")
+    content = read_file(path, CloudReadError)
+    try:
+        return reader(content)
+    except CloudReadError as error:
+        said = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))  # names of fields may be anything
+        raise CloudReadError(f"{path}: {said[:MAX_REASON]}") from None

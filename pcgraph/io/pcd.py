@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud
+from pcgraph.cloud import Cloud, cloud_from_columns, numbers_from_text
 from pcgraph.errors import CloudReadError
-from pcgraph.io.columns import cloud_from_columns
-from pcgraph.io.text import numbers_from_text
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -154,8 +154,6 @@ def _binary_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.gene
 
 
 def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
-    from pcgraph.io.lzf import decompress
-
     per_point = sum(dtype.itemsize * count for dtype, count in zip(header.dtypes, header.counts, strict=True))
     if len(body) < 8:
         raise CloudReadError("the compressed PCD data is cut off before its two sizes")
@@ -165,7 +163,7 @@ def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.
     if packed > len(body) - 8 or unpacked > 88 * packed + 264:
         raise CloudReadError(f"the PCD data promises {packed} compressed bytes, but {len(body) - 8} are left")
     target = np.empty(unpacked, np.uint8)
-    if decompress(np.frombuffer(body, np.uint8, count=packed, offset=8), target) != unpacked:
+    if lzf_decompressor()(np.frombuffer(body, np.uint8, count=packed, offset=8), target) != unpacked:
         raise CloudReadError("the compressed PCD data is damaged and cannot be unpacked")
     columns: dict[str, NDArray[np.generic]] = {}
     start = 0
@@ -181,3 +179,60 @@ def _check_length(available: int, needed: int, header: PcdHeader) -> None:
         raise CloudReadError(
             f"the PCD header promises {header.n_points} points ({needed} bytes), but only {available} bytes follow"
         )
+
+
+# ---- LZF, the coding of binary_compressed data ----------------------------------------------------------------------
+
+
+@cache
+def lzf_decompressor() -> Callable[[NDArray[np.uint8], NDArray[np.uint8]], int]:
+    """`decompress_lzf`, compiled; numba is imported only where a file is compressed."""
+    from numba import njit
+
+    return njit(cache=True)(decompress_lzf)
+
+
+def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
+    """Number of bytes written to `target`, or -1 if the stream is broken or does not fit.
+
+    Parameters
+    ----------
+    source : (c,) uint8
+        LZF stream: a control byte below 32 announces that many + 1 literal bytes; any other one a copy of
+        ``(control >> 5) + 2`` bytes (length 7 takes one byte more) from up to 8191 bytes back.
+    target : (u,) uint8
+        Filled from the front.
+
+    Notes
+    -----
+    Every read and write is bounds-checked and every step consumes input, so no stream can crash or hang it.
+    Source: M. Lehmann, liblzf, format as documented there; written anew.
+    """
+    read, wrote = 0, 0
+    n_source, n_target = source.size, target.size
+    while read < n_source:
+        control = int(source[read])
+        read += 1
+        if control < 32:
+            length = control + 1
+            if read + length > n_source or wrote + length > n_target:
+                return -1
+            for offset in range(length):  # as a loop, for slices take the compiler seconds
+                target[wrote + offset] = source[read + offset]
+            read += length
+        else:
+            length = control >> 5
+            if read + (2 if length == 7 else 1) > n_source:
+                return -1
+            if length == 7:
+                length += int(source[read])
+                read += 1
+            start = wrote - ((control & 31) << 8) - int(source[read]) - 1
+            read += 1
+            length += 2
+            if start < 0 or wrote + length > n_target:
+                return -1
+            for offset in range(length):  # copies may overlap themselves, so byte by byte
+                target[wrote + offset] = target[start + offset]
+        wrote += length
+    return wrote

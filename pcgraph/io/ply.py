@@ -8,10 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud
+from pcgraph.cloud import Cloud, cloud_from_columns, numbers_from_text
 from pcgraph.errors import CloudReadError
-from pcgraph.io.columns import cloud_from_columns
-from pcgraph.io.text import numbers_from_text
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -137,4 +135,4 @@ def _binary_columns(element: PlyElement, code: str, body: bytes) -> dict[str, ND
             f"the PLY header promises {element.count} vertices ({needed} bytes), but only {len(body)} bytes follow"
         )
     rows = np.frombuffer(body, record, count=element.count)
-    return {name: rows[name].astype(kind) for name, kind in element.properties}
+    return {name: rows[name].astype(kind, copy=False) for name, kind in element.properties}

@@ -1,50 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pooling over the tree, classes of nodes, labels for new points; names load on first use. See docs/learning.md."""
+"""Values over the tree, classes of nodes, labels for new points; names load on first use. See docs/learning.md.
+
+`NodeClassifier` needs scikit-learn, and nothing else does: it is imported with that name alone.
+"""
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from pcgraph.learning.classifier import NodeClassifier
-    from pcgraph.learning.descriptors import leaf_descriptors
-    from pcgraph.learning.pooling import down, pool_points, pool_up
-    from pcgraph.learning.transfer import supervoxels_at
-    from pcgraph.learning.voting import majority, pure_ancestors, spread_votes, votes
+    from pcgraph.learning.classifier import NodeClassifier as NodeClassifier
+    from pcgraph.learning.descriptors import leaf_descriptors as leaf_descriptors
+    from pcgraph.learning.propagation import accumulate as accumulate
+    from pcgraph.learning.propagation import accumulate_points as accumulate_points
+    from pcgraph.learning.propagation import majority as majority
+    from pcgraph.learning.propagation import propagate_labels as propagate_labels
+    from pcgraph.learning.propagation import pure_ancestors as pure_ancestors
+    from pcgraph.learning.propagation import supervoxels_at as supervoxels_at
+    from pcgraph.learning.propagation import unpool as unpool
+    from pcgraph.learning.propagation import votes as votes
+else:
+    import lazy_loader
 
-__all__ = [
-    "NodeClassifier",
-    "down",
-    "leaf_descriptors",
-    "majority",
-    "pool_points",
-    "pool_up",
-    "pure_ancestors",
-    "spread_votes",
-    "supervoxels_at",
-    "votes",
-]
-
-_HOMES = {
-    "NodeClassifier": "classifier",
-    "down": "pooling",
-    "leaf_descriptors": "descriptors",
-    "majority": "voting",
-    "pool_points": "pooling",
-    "pool_up": "pooling",
-    "pure_ancestors": "voting",
-    "spread_votes": "voting",
-    "supervoxels_at": "transfer",
-    "votes": "voting",
-}
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'pcgraph.learning' has no attribute {name!r}")
-    return getattr(import_module(f"pcgraph.learning.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+    __getattr__, __dir__, __all__ = lazy_loader.attach(
+        __name__,
+        submod_attrs={
+            "classifier": ["NodeClassifier"],
+            "descriptors": ["leaf_descriptors"],
+            "propagation": [
+                "accumulate",
+                "accumulate_points",
+                "majority",
+                "propagate_labels",
+                "pure_ancestors",
+                "supervoxels_at",
+                "unpool",
+                "votes",
+            ],
+        },
+    )

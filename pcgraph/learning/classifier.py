@@ -4,25 +4,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from inspect import signature
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.errors import CloudReadError, CloudWriteError
+from pcgraph.learning.classifier_file import StoredForest, decode_classifier, encode_classifier
 from pcgraph.learning.descriptors import leaf_descriptors
-from pcgraph.learning.pooling import down
-from pcgraph.learning.voting import votes
+from pcgraph.learning.propagation import unpool, votes
+from pcgraph.plain_files import read_file, write_file
 from pcgraph.segmentation import Segmentation
+
+try:
+    from sklearn.base import BaseEstimator, ClassifierMixin, clone
+    from sklearn.utils.validation import check_is_fitted
+except ImportError as missing:
+    raise ImportError("NodeClassifier needs scikit-learn; pip install 'rangesim[learn]'") from missing
 
 _TREES = 100
 
 
-class NodeClassifier:
+class NodeClassifier(ClassifierMixin, BaseEstimator):
     """Classifier of supervoxels, whose classes go to their points.
 
     A supervoxel is described by itself, its neighbours in the graph and its ancestors in the tree; an estimator of
-    scikit-learn does the rest. `get_params`, `set_params` and `sklearn.base.clone` work as for its own.
+    scikit-learn does the rest. A sample, to scikit-learn, is a whole segmented cloud: `clone`, `cross_val_score` and
+    `GridSearchCV` take lists of segmentations and of true labels.
 
     Parameters
     ----------
@@ -36,10 +46,12 @@ class NodeClassifier:
         Ancestors that are told; 0: none. See `pcgraph.learning.descriptors.leaf_descriptors`.
     random_state : int
         Seed of the default estimator.
+    unlabelled : int or str, optional
+        The label that means none. Default: -1, or "" where labels are text.
 
     Attributes
     ----------
-    classes_ : (c,) int64
+    classes_ : (c,) int64 or str
         Labels seen in `fit`, ascending.
     estimator_ : the fitted estimator
     feature_names_ : list of str
@@ -53,12 +65,14 @@ class NodeClassifier:
         neighbours: int = 1,
         ancestors: int = 3,
         random_state: int = 0,
+        unlabelled: int | str | None = None,
     ) -> None:
         self.estimator = estimator
         self.pose = pose
         self.neighbours = neighbours
         self.ancestors = ancestors
         self.random_state = random_state
+        self.unlabelled = unlabelled
 
     def fit(
         self,
@@ -71,27 +85,25 @@ class NodeClassifier:
         Parameters
         ----------
         segmentations : Segmentation, or a list of them
-        truths : the points' leading shape, int, or a list of such
-            True label of each point; negative: unlabelled. A supervoxel learns the label most of its points have,
-            and counts as many points as have it.
+        truths : the points' leading shape, int, bool or str, or a list of such
+            True label of each point; `unlabelled` where there is none. A supervoxel learns the label most of its
+            points have, and counts as many points as have it.
         ups : (3,) float, or a list of such, optional
             Against gravity, in each cloud's frame. Default: the normal of its largest plane.
 
         Raises
         ------
-        ImportError
-            scikit-learn is not installed.
         ValueError
-            The lists differ in length, or no point is labelled.
+            The lists differ in length, labels are neither whole numbers nor text, or no point is labelled.
         """
         clouds, labels, directions = _listed(segmentations, truths, ups)
-        known = [np.unique(truth[truth >= 0]) for truth in labels]
-        classes = np.unique(np.concatenate(known)).astype(np.int64)
+        known = [truth != self._none(truth) for truth in labels]
+        classes = np.unique(np.concatenate([truth[labelled] for truth, labelled in zip(labels, known, strict=True)]))
         if not len(classes):
-            raise ValueError("expected at least one labelled point, got only negative labels")
+            raise ValueError(f"expected at least one labelled point, got {self._none(classes)!r} only")
         rows, targets, weights = [], [], []
-        for cloud, truth, up in zip(clouds, labels, directions, strict=True):
-            number = np.where(truth >= 0, np.searchsorted(classes, truth), -1)
+        for cloud, truth, labelled, up in zip(clouds, labels, known, directions, strict=True):
+            number = np.where(labelled, np.searchsorted(classes, truth), -1)
             counts = votes(cloud, number, len(classes))[: cloud.tree.n_leaves]
             voted = counts.any(axis=1)
             table, names = self._describe(cloud, up)
@@ -109,12 +121,16 @@ class NodeClassifier:
 
         Raises
         ------
+        sklearn.exceptions.NotFittedError
+            A ValueError: `fit` was not called before.
         ValueError
-            `fit` was not called before.
+            The classifier was fitted on descriptors that this version does not know.
         """
-        if not hasattr(self, "estimator_"):
-            raise ValueError("expected a fitted classifier, got a new one; call fit first")
-        return self.estimator_.predict_proba(self._describe(segmentation, up)[0])
+        check_is_fitted(self, msg="expected a fitted %(name)s, got a new one; call fit first")
+        table, names = self._describe(segmentation, up)
+        if names != self.feature_names_:
+            raise ValueError("expected a classifier of this version's descriptors, got another's; fit it again")
+        return self.estimator_.predict_proba(table)
 
     def predict_proba(self, segmentation: Segmentation, up: ArrayLike | None = None) -> NDArray[np.float64]:
         """Probability of each class at each point, the points' leading shape + (c,); NaN where not finite.
@@ -125,12 +141,18 @@ class NodeClassifier:
         up : (3,) float, optional
             As in `fit`.
         """
-        return down(segmentation, self.predict_nodes(segmentation, up))
+        return unpool(segmentation, self.predict_nodes(segmentation, up))
 
-    def predict(self, segmentation: Segmentation, up: ArrayLike | None = None) -> NDArray[np.int64]:
-        """Most probable label of each point, in the points' shape; -1 where not finite; parameters as above."""
-        best = self.predict_nodes(segmentation, up).argmax(axis=1)
-        return down(segmentation, self.classes_[best])
+    def predict(self, segmentation: Segmentation, up: ArrayLike | None = None) -> NDArray[Any]:
+        """Most probable label of each point, in the points' shape; `unlabelled` where it is not finite.
+
+        Parameters
+        ----------
+        segmentation, up : as for `predict_proba`
+        """
+        number = unpool(segmentation, self.predict_nodes(segmentation, up).argmax(axis=1))
+        none = np.asarray([self._none(self.classes_)])  # last, where the -1 of points that are not finite finds it
+        return np.concatenate((self.classes_, none))[number]
 
     def score(
         self,
@@ -138,59 +160,69 @@ class NodeClassifier:
         truths: ArrayLike | Sequence[ArrayLike],
         ups: ArrayLike | Sequence[ArrayLike] | None = None,
     ) -> float:
-        """Share of the labelled points that get their true label, 0..1; parameters as for `fit`."""
+        """Fraction of the labelled points that get their true label, 0..1; parameters as for `fit`."""
         right = total = 0
         for cloud, truth, up in zip(*_listed(segmentations, truths, ups), strict=True):
-            known = (truth >= 0) & (cloud.supervoxels >= 0)
+            known = (truth != self._none(truth)) & (cloud.supervoxels >= 0)
             right += int((self.predict(cloud, up)[known] == truth[known]).sum())
             total += int(known.sum())
         if total == 0:
-            raise ValueError("expected at least one labelled point, got only negative labels")
+            raise ValueError("expected at least one labelled point, got none")
         return right / total
 
-    def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Parameters of the constructor by name; with `deep` also those of the estimator, as estimator__name."""
-        own = {name: getattr(self, name) for name in signature(type(self)).parameters}
-        if deep and hasattr(self.estimator, "get_params"):
-            own |= {f"estimator__{name}": value for name, value in self.estimator.get_params().items()}
-        return own
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the fitted classifier as JSON, the whole file or none.
 
-    def set_params(self, **params: Any) -> NodeClassifier:
-        """This classifier, after parameters named as in `get_params` were changed.
+        The file holds numbers and names, so loading it runs no code. `load` makes of it a classifier that predicts
+        the same; a given `estimator` is not in it, only what it learned.
 
         Raises
         ------
         ValueError
-            There is no parameter of that name, or no estimator to have it.
+            The classifier is not fitted, or learned otherwise than by decision trees: a ``RandomForestClassifier``,
+            an ``ExtraTreesClassifier`` or a ``DecisionTreeClassifier``.
+        CloudWriteError
+            The place cannot be written.
         """
-        known = self.get_params(deep=False)
-        inner = {}
-        for name, value in params.items():
-            if name.startswith("estimator__"):
-                inner[name.removeprefix("estimator__")] = value
-            elif name in known:
-                setattr(self, name, value)
-            else:
-                raise ValueError(f"expected one of the parameters {', '.join(known)}, got {name!r}")
-        if inner and not hasattr(self.estimator, "set_params"):
-            raise ValueError(
-                f"expected an estimator to set {', '.join(inner)} of, got {self.estimator!r}; give one first"
-            )
-        if inner:
-            self.estimator.set_params(**inner)
-        return self
+        check_is_fitted(self, msg="expected a fitted %(name)s to save, got a new one; call fit first")
+        settings = {name: value for name, value in self.get_params(deep=False).items() if name != "estimator"}
+        forest = StoredForest.of(self.estimator_)
+        write_file(Path(path), encode_classifier(settings, self.feature_names_, forest), CloudWriteError)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> NodeClassifier:
+        """Classifier from a file that `save` wrote.
+
+        Raises
+        ------
+        CloudReadError
+            The file cannot be read.
+        ValueError
+            The file holds no such classifier.
+        """
+        settings, names, forest = decode_classifier(read_file(Path(path), CloudReadError), str(path))
+        loaded = cls(**settings)
+        loaded.feature_names_, loaded.estimator_, loaded.classes_ = names, forest, forest.classes_
+        return loaded
+
+    def _none(self, labels: NDArray[Any]) -> int | str:
+        """The label that means none, among such labels."""
+        text = labels.dtype.kind == "U"
+        if self.unlabelled is None:
+            return "" if text else -1
+        if isinstance(self.unlabelled, str) != text:
+            kind = "text" if text else "whole numbers"
+            raise ValueError(f"expected unlabelled of the labels' kind, {kind}, got {self.unlabelled!r}")
+        return self.unlabelled
 
     def _describe(self, segmentation: Segmentation, up: ArrayLike | None) -> tuple[NDArray[np.float64], list[str]]:
         return leaf_descriptors(segmentation, up, pose=self.pose, neighbours=self.neighbours, ancestors=self.ancestors)
 
     def _fresh_estimator(self) -> Any:
-        try:
-            from sklearn.base import clone
-            from sklearn.ensemble import RandomForestClassifier
-        except ImportError as missing:
-            raise ImportError("NodeClassifier needs scikit-learn; pip install 'rangesim[learn]'") from missing
         if self.estimator is not None:
             return clone(self.estimator)
+        from sklearn.ensemble import RandomForestClassifier
+
         return RandomForestClassifier(_TREES, min_samples_leaf=2, random_state=self.random_state)
 
 
@@ -202,7 +234,7 @@ def _listed(
     """Lists of segmentations, truths and directions, also of a single one of each."""
     single = isinstance(segmentations, Segmentation)
     clouds: list[Segmentation] = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
-    labels = [np.asarray(truth) for truth in ([truths] if single else list(truths))]  # type: ignore[arg-type]
+    labels = [_labels(truth) for truth in ([truths] if single else list(truths))]  # type: ignore[arg-type]
     directions: list[Any] = [ups] if single else [None] * len(clouds) if ups is None else list(ups)  # type: ignore[arg-type]
     if not clouds or not len(clouds) == len(labels) == len(directions):
         raise ValueError(
@@ -210,8 +242,20 @@ def _listed(
             f"{len(labels)} truths, {len(directions)} ups"
         )
     for cloud, truth in zip(clouds, labels, strict=True):
-        if truth.shape != cloud.supervoxels.shape or truth.dtype.kind not in "iu":
-            raise ValueError(
-                f"expected a truth of whole numbers of shape {cloud.supervoxels.shape}, got {truth.shape} {truth.dtype}"
-            )
+        if truth.shape != cloud.supervoxels.shape:
+            raise ValueError(f"expected a truth of the points' shape {cloud.supervoxels.shape}, got {truth.shape}")
+    if len({truth.dtype.kind for truth in labels}) > 1:
+        raise ValueError("expected labels of one kind, got whole numbers and text")
     return clouds, labels, directions
+
+
+def _labels(truth: ArrayLike) -> NDArray[Any]:
+    """Labels as int64 or text; raises ValueError if they are neither."""
+    array = np.asarray(truth)
+    if array.dtype.kind == "O" and all(isinstance(label, str) for label in array.flat):
+        array = array.astype(str)
+    if array.dtype.kind in "iub":
+        return array.astype(np.int64)
+    if array.dtype.kind not in "UT":
+        raise ValueError(f"expected a truth of whole numbers or text, got {array.dtype}; number the classes")
+    return array.astype(str)

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from pcgraph.detection.planes import find_planes
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.features.primitives import Primitives, fit_primitives, primitive_moments, primitive_moments_up_tree
+from pcgraph.hierarchy import accumulate_sequential, propagate_sequential
 from pcgraph.segmentation import Segmentation
 
 GROWTH = 4.0  # each ancestor that is asked has so many times the points of the one before
@@ -180,10 +180,7 @@ def _edge_summary(segmentation: Segmentation) -> tuple[NDArray[np.float64], list
 
 def _segments(segmentation: Segmentation) -> NDArray[np.int32]:
     """Highest node above each node whose supervoxels are all of one object (`Segmentation.objects`), (k,) int32."""
-    tree = segmentation.tree
-    low, high = np.full(len(tree.parents), np.iinfo(np.int32).max, np.int32), np.full(len(tree.parents), -1, np.int32)
-    low[: tree.n_leaves] = high[: tree.n_leaves] = segmentation.objects
-    return _uniform_tops(tree.parents, low, high)
+    return _uniform_tops(segmentation.tree.parents, segmentation.objects)
 
 
 def _finite(altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -192,28 +189,16 @@ def _finite(altitudes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(known, altitudes, 2.0 * altitudes[known].max(initial=0.0))
 
 
-@njit(cache=True)
 def _climb(
     parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], least: float
 ) -> NDArray[np.int32]:
-    """First node at or above each node with `least` points, short of those that join what does not touch."""
-    reached = np.arange(len(parents), dtype=np.int32)
-    for node in range(len(parents) - 1, -1, -1):  # parents before children
-        up = parents[node]
-        if counts[node] < least and up != node and altitudes[up] < np.inf:
-            reached[node] = reached[up]
-    return reached
+    """First node at or above each node with `least` points, short of those that join what does not touch, (k,)."""
+    smaller = (counts < least) & np.isfinite(altitudes[parents])
+    return propagate_sequential(parents, np.arange(len(parents), dtype=np.int32), smaller)
 
 
-@njit(cache=True)
-def _uniform_tops(parents: NDArray[np.int32], low: NDArray[np.int32], high: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Highest node above each node, below which `low` and `high` of all leaves are one value."""
-    for node in range(len(parents)):
-        up = parents[node]
-        low[up], high[up] = min(low[up], low[node]), max(high[up], high[node])
-    top = np.arange(len(parents), dtype=np.int32)
-    for node in range(len(parents) - 1, -1, -1):
-        up = parents[node]
-        if up != node and low[up] == high[up]:
-            top[node] = top[up]
-    return top
+def _uniform_tops(parents: NDArray[np.int32], values: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Highest node above each node, below which all leaves have one value, (k,); `values` are those of the leaves."""
+    lowest, highest = (accumulate_sequential(parents, values, extreme) for extreme in ("min", "max"))
+    uniform = (lowest == highest)[parents]
+    return propagate_sequential(parents, np.arange(len(parents), dtype=np.int32), uniform)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.metrics.labellings import as_floats, as_labels
+from pcgraph.short_repr import ShortRepr
 
 
 def boundary_recall(
@@ -78,7 +79,7 @@ def _graph_of_labelled(points: ArrayLike, labels: ArrayLike, truth: ArrayLike, k
 
 
 @dataclass(frozen=True, eq=False)
-class NeighbourGraph:
+class NeighbourGraph(ShortRepr):
     """The k nearest neighbours of each point of a cloud: computed once, good for any number of labellings.
 
     The graph is directed: each point looks at its own k nearest neighbours, so that a boundary is equally thick

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 
+from pcgraph.short_repr import ShortRepr
+
 
 def contingency(labels: ArrayLike, truth: ArrayLike) -> coo_array:
     """Contingency table: number of points per pair of segment and true segment, sparse (s, g) int64.
@@ -247,7 +249,7 @@ def variation_of_information(labels: ArrayLike, truth: ArrayLike) -> VariationOf
 
 
 @dataclass(frozen=True, eq=False)
-class PanopticQuality:
+class PanopticQuality(ShortRepr):
     """Matches of segments and true segments per class; `pq`, `sq` and `rq` are means over the classes.
 
     Attributes

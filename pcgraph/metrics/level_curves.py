@@ -15,10 +15,11 @@ from pcgraph.hierarchy import ChildLists, lowest_common_ancestors, num_leaves
 from pcgraph.metrics.boundary_metrics import NeighbourGraph, check_nearness
 from pcgraph.metrics.labellings import adjusted_rand_from_pairs, count_point_pairs
 from pcgraph.metrics.node_table import Cells, NodeTable, TreeLike, parents_and_altitudes
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class LevelCurve:
+class LevelCurve(ShortRepr):
     """One score of every distinct horizontal cut of a tree, from the leaves to the root.
 
     Attributes
@@ -271,7 +272,7 @@ def _update(trees: SegmentTrees, segment: int, place: int, value: float) -> floa
 
 
 @dataclass(frozen=True, eq=False)
-class BoundaryCurve:
+class BoundaryCurve(ShortRepr):
     """Boundary recall and precision of every distinct cut of a tree, from the leaves to the root.
 
     Attributes
@@ -363,7 +364,7 @@ def _count_above(values: NDArray[np.float64], levels: NDArray[np.float64]) -> ND
 
 
 @dataclass(frozen=True, eq=False)
-class BestScales:
+class BestScales(ShortRepr):
     """The best score with one altitude for all clouds (ODS) and with the best altitude for each (OIS).
 
     Attributes

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.hierarchy import ChildLists, accumulate_sequential
 from pcgraph.metrics.labellings import count_point_pairs, largest_of_groups
 from pcgraph.metrics.node_table import NodeTable, TreeLike
+from pcgraph.short_repr import ShortRepr
 
 
 def tree_oracle(tree: TreeLike, leaves: ArrayLike, truth: ArrayLike) -> float:
@@ -59,7 +60,7 @@ def dendrogram_purity(tree: TreeLike, leaves: ArrayLike, truth: ArrayLike) -> fl
 
 
 @dataclass(frozen=True, eq=False)
-class FragmentationCurve:
+class FragmentationCurve(ShortRepr):
     """Least error against the number of regions of optimal cuts.
 
     Attributes

@@ -13,10 +13,11 @@ from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
 from pcgraph.inputs import non_negative
+from pcgraph.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class Merges:
+class Merges(ShortRepr):
     """Binary merges along the edges of a graph, until every connected component is one node.
 
     Attributes

@@ -11,12 +11,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.hierarchy import children
+from pcgraph.short_repr import ShortRepr
 
 _NONE = -1
 
 
 @dataclass(frozen=True, eq=False)
-class Energy:
+class Energy(ShortRepr):
     """Energy of a segmentation at a scale: sum over its segments of data + scale x complexity.
 
     Attributes

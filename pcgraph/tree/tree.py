@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.features.moments import Moments, moments_up_tree
-from pcgraph.features.nodes import NodeFeatures, node_features, rows
+from pcgraph.features.nodes import NodeFeatures, node_features, rows, scalar_columns
 from pcgraph.hierarchy import lowest_common_ancestors, roots
 from pcgraph.inputs import non_negative
+from pcgraph.short_repr import ShortRepr
 from pcgraph.tree.cuts import horizontal_cut, numbered_segments, persistences, stable_cut
 from pcgraph.tree.linkage import Merges
 from pcgraph.tree.optimal_cut import Energy, appearance_scales
@@ -25,7 +26,7 @@ _GAP_CANDIDATES = 8
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentationTree:
+class SegmentationTree(ShortRepr):
     """Binary merge tree; every cut of it is a segmentation, and all cuts at altitudes nest.
 
     Attributes
@@ -111,7 +112,8 @@ class SegmentationTree:
 
         Of all ways to choose nodes, none above another, the one with the largest sum of points x persistence
         (excess of mass, Campello et al. 2015). Segments may come from different altitudes. Persistence ends at
-        the largest finite altitude, so a scene that is one piece is never one segment for that alone.
+        the largest finite altitude at which two parts of `min_size` points merge, so a scene that is one piece is never
+        one segment for that alone.
 
         Parameters
         ----------
@@ -240,12 +242,12 @@ class SegmentationTree:
         return node_features(self.moments)
 
     def to_networkx(self) -> networkx.DiGraph:
-        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features."""
+        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features as numbers."""
         from networkx import DiGraph
 
         columns = {"altitude": self.altitudes, **self.features().columns()}
         tree = DiGraph()
-        tree.add_nodes_from(enumerate(rows(columns, len(self.parents))))
+        tree.add_nodes_from(enumerate(rows(scalar_columns(columns), len(self.parents))))
         tree.add_edges_from((up, node) for node, up in enumerate(self.parents.tolist()) if up != node)
         return tree
 

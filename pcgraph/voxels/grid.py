@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.spacing import bounding_box
 from pcgraph.voxels.warp import Warp
 
@@ -36,7 +37,7 @@ class Neighbourhood(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class VoxelGrid:
+class VoxelGrid(ShortRepr):
     """Occupied voxels of a cloud in ascending order of grid coordinates, whatever the points' order.
 
     Attributes

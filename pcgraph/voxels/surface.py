@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 
@@ -202,7 +203,7 @@ class LocalPlanes:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class Surface(ShortRepr):
     """Occupied voxels with their normals and supervoxels.
 
     Attributes

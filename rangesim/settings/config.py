@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import reprlib
 import sys
 import types
 import typing
@@ -19,6 +18,9 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
+
+from pcgraph.short_repr import SHORT
+from pcgraph.short_repr import ShortRepr as ShortRepr
 
 T = TypeVar("T")
 
@@ -86,13 +88,7 @@ def shown(value: Any) -> str:
         return f"{'-' if value < 0 else ''}2^{value.bit_length() - 1} or more"  # Python refuses to print the longest
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and type {value.dtype}"
-    return _SHORT.repr(value)
-
-
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 100
-_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxarray = 8
-_SHORT.maxlevel = 3
+    return SHORT.repr(value)
 
 
 def brief(error: BaseException) -> str:
@@ -134,30 +130,6 @@ def _concrete(cls: type[T], values: dict[str, Any], place: str) -> type[T]:
             f"{place}: expected 'type' to be one of {', '.join(choices)}, got {shown(tag)}{nearest(str(tag), choices)}."
         )
     return choices[tag]
-
-
-class ShortRepr:
-    """Mixin of dataclasses of arrays: a `repr` that names shapes and types instead of a thousand numbers.
-
-    For dataclasses made with `repr=False`.
-    """
-
-    def __repr__(self) -> str:
-        parts = [f"{f.name}={_in_short(getattr(self, f.name))}" for f in dataclasses.fields(self)]  # type: ignore[arg-type]
-        return f"{type(self).__name__}({', '.join(parts)})"
-
-
-def _in_short(value: Any) -> str:
-    """A few words in place of `repr`: type and shape of arrays, the number of what is many."""
-    if isinstance(value, np.ndarray) and value.size > 1:
-        return f"{value.dtype}{list(value.shape)}"
-    if isinstance(value, ShortRepr):
-        return f"{type(value).__name__}(...)"
-    if isinstance(value, Mapping) and any(isinstance(v, np.ndarray) for v in value.values()):
-        return "{" + ", ".join(f"{type(k).__name__}: {_in_short(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, (tuple, list)) and len(value) > 3:
-        return f"{len(value)} of {type(value[0]).__name__}"
-    return _SHORT.repr(value) if not dataclasses.is_dataclass(value) else f"{type(value).__name__}(...)"
 
 
 class Named:

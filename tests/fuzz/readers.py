@@ -129,6 +129,22 @@ def _edge_model(path: Path, _: Arguments) -> Any:
     return EdgeModel.load(path)
 
 
+def _node_classifier(path: Path, _: Arguments) -> Any:
+    from pcgraph.learning import NodeClassifier
+
+    return NodeClassifier.load(path)
+
+
+def _predicts(classifier: Any) -> None:
+    import numpy as np
+
+    table = np.zeros((3, len(classifier.feature_names_)))
+    table[1], table[2] = 1e300, -1.0
+    fractions = classifier.estimator_.predict_proba(table)
+    assert fractions.shape == (3, len(classifier.classes_))
+    assert np.isfinite(fractions).all()
+
+
 def _scene(path: Path, _: Arguments) -> Any:
     import rangesim
 
@@ -443,6 +459,12 @@ _OF_SEGMENT = (
         "--objects -1",
         f"--objects {10**30}",
         "--method x",
+        "--linkage x",
+        "--linkage none.json",
+        "--altitude nan",
+        "--altitude -1",
+        "--min-size 0",
+        f"--min-size {10**30}",
         "--range-growth nan",
         "--range-growth -1",
         "--range-growth 1e300",
@@ -470,6 +492,10 @@ READERS = {
         Reader(
             "edge-model", _edge_model, seeds.edge_models, by_hand=(hostile.json_trees,),
             refuses=("ValueError", *_CLOUD),
+        ),
+        Reader(
+            "node-classifier", _node_classifier, seeds.node_classifiers, by_hand=(hostile.json_trees,),
+            refuses=("ValueError", *_CLOUD), check=_predicts,
         ),
         *(
             Reader(

@@ -194,6 +194,22 @@ def edge_models() -> Seeds:
     return {"model": of_file("model.json", written("model.json", model.save))}
 
 
+def node_classifiers() -> Seeds:
+    """A forest of two trees as `NodeClassifier.save` writes it."""
+    import numpy as np
+
+    from pcgraph.learning import NodeClassifier
+    from pcgraph.learning.classifier_file import StoredForest
+
+    columns = [[1, -1, -1, -1], [2, -1, -1, -1], [1, 0, 0, 0]]
+    fractions = np.array([[0.5, 0.5], [1.0, 0.0], [0.25, 0.75], [0.0, 1.0]])
+    numbers = [np.array(column) for column in ([0, 3, 4], *columns)]
+    classifier = NodeClassifier(neighbours=0, ancestors=0)
+    classifier.estimator_ = StoredForest(np.array([2, 7]), *numbers, np.array([0.5, 0.0, 0.0, 0.0]), fractions)
+    classifier.feature_names_ = ["width", "length"]
+    return {"forest": of_file("forest.json", written("forest.json", classifier.save))}
+
+
 # --- images -----------------------------------------------------------------------------------------------------------
 
 

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +15,9 @@ from clouds import two_boxes_on_a_plane
 from typer.testing import CliRunner
 
 import pcgraph
-from pcgraph.cli import app
+from pcgraph.cli import app, member, members
 from pcgraph.io.ply import encode_ply
+from pcgraph.tree.learned import EdgeModel
 
 
 def ply(points) -> bytes:
@@ -99,6 +103,14 @@ def test_bad_options(scene, tmp_path):
         (("--voxel-size", 0), "above 0 metres, got 0"),
         (("--voxel-size", 0.1, "--seed-size", 0.01), "seed_size of at least"),
         (("--voxel-size", "nan"), "voxel_size"),
+        (("--objects", 2, "--altitude", 0.5), "--objects or --altitude, got both"),
+        (("--altitude", "nan"), "object_altitude to be a finite number"),
+        (("--min-size", 0), "min_size as a whole number of at least 1"),
+        (("--linkage", "x"), "one of convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, ward, got 'x'"),
+        (("--linkage", ""), "got ''"),
+        (("--linkage", tmp_path / "none.json"), "cannot read"),
+        (("--method", "supervoxels"), "one of surface-growth, vccs, got 'supervoxels'"),
+        (("--out", "-"), "nothing is written to a pipe, got --out -"),
         (("--out", tmp_path / "a.txt"), ".ply or .npz"),
         (("--out", tmp_path / "no" / "a.ply"), "no folder"),
         (("--out", scene), "input itself"),
@@ -128,3 +140,54 @@ def test_help_names_units():
     done = CliRunner().invoke(app, ["segment", "--help"])
     assert done.exit_code == 0
     assert "metres" in done.stdout
+
+
+def test_every_member_of_a_family_is_named_in_the_help():
+    text = CliRunner(env={"COLUMNS": "200", "TERM": "dumb"}).invoke(app, ["segment", "--help"]).stdout
+    assert [*members("SupervoxelMethod")] == ["surface-growth", "vccs"]
+    for name in (*members("SupervoxelMethod"), *members("Linkage")):
+        assert name in text
+
+
+def test_a_linkage_from_outside_has_a_name_too():
+    class OutermostLinkage(pcgraph.Linkage):
+        default_object_altitude = 1.0
+        default_part_altitude = 0.5
+
+        def merges(self, graph, leaves):
+            raise NotImplementedError
+
+    try:
+        assert isinstance(member("Linkage", "outer"), OutermostLinkage)
+    finally:
+        del OutermostLinkage
+        gc.collect()
+    assert "outermost" not in members("Linkage")
+
+
+@pytest.mark.parametrize("linkage", ["convexity", "mumford-shah", "lccp"])
+def test_linkage_and_cut(linkage, scene, tmp_path):
+    chosen = members("Linkage")[linkage]()
+    altitude = 0.4 * chosen.default_object_altitude
+    options = ("--linkage", linkage[:5], "--altitude", altitude, "--min-size", 40)
+    done = run(scene, "--out", tmp_path / "a.npz", *options, *VIEW)
+    assert done.exit_code == 0, done.output
+    result = pcgraph.segment(scene, viewpoint=(0.8, -1, 3), linkage=chosen)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.array_equal(arrays["tree_altitudes"], result.tree.altitudes)
+        assert np.array_equal(arrays["labels"], result.cut(altitude=altitude, min_size=40))
+
+
+def test_a_learned_linkage_from_its_file(scene, tmp_path):
+    names = ("step_voxels", "concavity")
+    model = EdgeModel(names, (0.0, 0.0), (1.0, 1.0), (2.0, 3.0), -2.0, 0.5)
+    model.save(tmp_path / "edges.json")
+    done = run(scene, "--out", tmp_path / "a.npz", "--linkage", tmp_path / "edges.json", *VIEW)
+    assert done.exit_code == 0, done.output
+
+
+def test_version():
+    done = CliRunner().invoke(app, ["--version"])
+    assert (done.exit_code, done.stdout) == (0, f"pcgraph {pcgraph.__version__}\n")
+    project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
+    assert pcgraph.__version__ == project["version"]

@@ -88,6 +88,18 @@ def test_a_merge_with_something_small_does_not_end_a_life():
     assert tree.cut_stable(min_size=10).tolist() == [0, 0, 0, 1]
 
 
+def test_trifles_that_come_late_do_not_make_a_scene_last():
+    #  halves of 100 points, of 50 each, become one at 1; three single points join at 2 and 3
+    counts = np.array([50, 50, 50, 50, 1, 1, 1])
+    parents = np.array([7, 7, 8, 8, 10, 11, 12, 9, 9, 10, 11, 12, 12], np.int32)
+    altitudes = np.array([0, 0, 0, 0, 0, 0, 0, 0.1, 0.1, 1.0, 2.0, 3.0, 3.0])
+    sizes = np.concatenate((counts, [100, 100, 200, 201, 202, 203]))
+    moments = Moments(sizes, np.zeros((13, 3)), np.zeros((13, 3, 3)), None)
+    late = SegmentationTree(parents, altitudes, moments)
+    assert late.cut_stable(min_size=10)[:4].tolist() == [0, 0, 1, 1]
+    assert late.cut_stable(min_size=1000).tolist() == [0] * 7
+
+
 def test_the_most_stable_cut_is_the_best_antichain():
     rng = np.random.default_rng(1)
     for _ in range(30):

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 import pcgraph
 from pcgraph.errors import CloudReadError
-from pcgraph.io.lzf import decompress
-from pcgraph.io.pcd import read_pcd
+from pcgraph.io.pcd import decompress_lzf, lzf_decompressor, read_pcd
 from pcgraph.io.ply import encode_ply, read_ply
 
 XYZ = np.array([[0.5, -1.25, 2.0], [np.nan, np.nan, np.nan], [1e-3, 4.0, -8.0], [7.0, 7.5, 9.0]], "<f4")
@@ -66,7 +65,8 @@ def test_pcd_keeps_shape_nan_colour_label_and_viewpoint(data):
     assert cloud.viewpoint.tolist() == [1, 2, 3]
 
 
-def test_lzf_copies_overlap_themselves():
+@pytest.mark.parametrize("decompress", [decompress_lzf, lzf_decompressor()])
+def test_lzf_copies_overlap_themselves(decompress):
     target = np.empty(12, np.uint8)
     stream = np.frombuffer(bytes([1, 65, 66, 0xE0, 1, 1]), np.uint8)  # "AB", then 10 bytes from 2 back
     assert decompress(stream, target) == 12

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -77,6 +78,25 @@ def test_wrong_weights_are_refused(coloured, wrong):
     weights = np.full(len(coloured.edges), np.nan) if wrong == "nan" else wrong
     with pytest.raises(ValueError, match="expected"):
         coloured.to_csr(weights)
+
+
+def test_networkx_holds_plain_numbers_that_json_and_gexf_take(coloured, boxes, plate, lone, tmp_path):
+    gap = pcgraph.segment(np.array([[0.0, 0, 1], [5.0, 0, 1]]), viewpoint=(0, 0, 0), voxel_size=0.1).tree
+    assert np.isinf(gap.altitudes[-1])
+    trees = [boxes[2].tree.to_networkx(), gap.to_networkx()]
+    for network in (coloured.to_networkx(), plate[0].to_networkx(plate[1]), lone.to_networkx(), *trees):
+        rows = [row for _, row in network.nodes(data=True)] + [row for *_, row in network.edges(data=True)]
+        assert {type(value) for row in rows for value in row.values()} <= {int, float, str}
+        text = json.dumps(nx.node_link_data(network, edges="edges"))
+        back = nx.node_link_graph(json.loads(text), edges="edges")
+        assert nx.utils.graphs_equal(back, network)
+        nx.write_gexf(network, tmp_path / "a.gexf")
+        read = nx.read_gexf(tmp_path / "a.gexf", node_type=int)
+        assert sorted(read.nodes) == sorted(network.nodes)
+        assert read.number_of_edges() == network.number_of_edges()
+        for node, row in network.nodes(data=True):
+            assert {name: read.nodes[node][name] for name in row} == row
+    assert coloured.to_networkx().nodes[0]["normal_z"] == coloured.node_features.normal[0, 2]
 
 
 def test_pyg_arrays(coloured):

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import pcgraph
+from pcgraph.io.ply import encode_ply
 
 POINTS = np.random.default_rng(0).random((20, 3))
 
@@ -18,6 +21,9 @@ BAD = {
     "strings": ((np.full((4, 3), "a"),), {}, "dtype"),
     "bool": ((np.ones((4, 3), bool),), {}, "dtype"),
     "complex": ((np.ones((4, 3), complex),), {}, "dtype"),
+    "dict": (({"points": POINTS},), {}, "got dict"),
+    "nothing": ((None,), {}, "Cloud or the name of a .pcd or .ply file, got NoneType"),
+    "object": ((object(),), {}, "expected points as an array .*got object"),
     "ragged": (([[1, 2, 3], [1, 2]],), {}, "different lengths"),
     "too large": ((POINTS * 1e200,), {}, "below"),
     "few colours": ((POINTS, POINTS[:5]), {}, "points' shape"),
@@ -71,3 +77,41 @@ def test_weights_of_methods_are_checked(method):
         method(color_weight=-1)
     with pytest.raises(ValueError, match="normal_weight"):
         method(normal_weight=float("nan"))
+
+
+COLORS = np.random.default_rng(1).integers(0, 256, (20, 3)).astype(np.uint8)
+NORMALS = np.tile([0.0, 0.0, 1.0], (20, 1))
+
+
+def same(a, b):
+    """Whether two segmentations are the same."""
+    pairs = [(a.supervoxels, b.supervoxels), (a.tree.altitudes, b.tree.altitudes), (a.viewpoint, b.viewpoint)]
+    pairs.append((a.tree.moments.centroids, b.tree.moments.centroids))
+    return all(np.array_equal(first, second) for first, second in pairs)
+
+
+def test_a_cloud_brings_its_colours_normals_and_viewpoint():
+    cloud = pcgraph.Cloud(POINTS, COLORS, NORMALS, viewpoint=np.array([0.0, 0.0, 9.0]))
+    expected = pcgraph.segment(POINTS, COLORS, NORMALS, (0, 0, 9), voxel_size=0.2)
+    assert same(pcgraph.segment(cloud, voxel_size=0.2), expected)
+    assert not same(pcgraph.segment(cloud, viewpoint=(0, 0, 8), voxel_size=0.2), expected)
+    other = pcgraph.segment(cloud, COLORS[::-1], -NORMALS, (0, 0, -9), voxel_size=0.2)
+    assert same(other, pcgraph.segment(POINTS, COLORS[::-1], -NORMALS, (0, 0, -9), voxel_size=0.2))
+    unknown = pcgraph.Cloud(POINTS - 0.5, viewpoint=np.zeros(3))  # as PCD writers put it
+    assert same(pcgraph.segment(unknown), pcgraph.segment(POINTS - 0.5))
+    later = pcgraph.update(expected, cloud)
+    assert same(later, pcgraph.update(expected, POINTS, COLORS, NORMALS, (0, 0, 9)))
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_file_by_name(kind, tmp_path):
+    columns = {name: POINTS[:, i] for i, name in enumerate("xyz")}
+    columns |= {name: COLORS[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    (tmp_path / "a.ply").write_bytes(encode_ply(columns))
+    expected = pcgraph.segment(POINTS, COLORS, voxel_size=0.2)
+    assert same(pcgraph.segment(kind(tmp_path / "a.ply"), voxel_size=0.2), expected)
+    assert same(pcgraph.update(expected, kind(tmp_path / "a.ply")), pcgraph.update(expected, POINTS, COLORS))
+    with pytest.raises(pcgraph.CloudReadError, match="cannot read"):
+        pcgraph.segment(kind(tmp_path / "b.ply"))
+    with pytest.raises(pcgraph.CloudReadError, match=r"ending in \.pcd or \.ply"):
+        pcgraph.segment(kind("POINTS"))

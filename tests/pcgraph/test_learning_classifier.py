@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
@@ -10,6 +11,9 @@ import numpy as np
 import pytest
 from simulated_rooms import room
 from sklearn.base import clone
+from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
+from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.naive_bayes import GaussianNB
 from sklearn.tree import DecisionTreeClassifier
 
 import pcgraph
@@ -55,12 +59,178 @@ def test_probabilities_and_labels_lie_on_the_points(rooms):
     assert np.array_equal(taught.classes_[share[~missing].argmax(axis=-1)], labels[~missing])
 
 
-def test_labels_may_be_any_numbers(rooms):
+NAMES = np.array(["floor", "wall", "table", "box", "ball", "lamp", ""])
+
+
+@pytest.mark.parametrize(
+    ("rename", "unlabelled"),
+    [
+        (lambda c: np.where(c >= 0, 10 * c + 7, -1), None),
+        (lambda c: np.where(c >= 0, -10 * c - 7, -1).astype(np.int16), None),
+        (lambda c: np.where(c >= 0, c - 3, 99), 99),
+        (lambda c: NAMES[c], None),
+        (lambda c: np.where(c >= 0, NAMES[c], "none").astype(object), "none"),
+    ],
+)
+def test_labels_may_be_any_numbers_and_text(rooms, rename, unlabelled, tmp_path):
     results, classes, ups = rooms
-    renamed = np.where(classes[0] >= 0, 10 * classes[0] + 7, -3)
-    plain = NodeClassifier().fit(results[0], classes[0], ups[0]).predict(results[1], ups[1])
-    other = NodeClassifier().fit(results[0], renamed, ups[0]).predict(results[1], ups[1])
-    assert np.array_equal(other, np.where(plain >= 0, 10 * plain + 7, -1))
+    plain = NodeClassifier(DecisionTreeClassifier(random_state=0)).fit(results[0], classes[0], ups[0])
+    inner = DecisionTreeClassifier(random_state=0)
+    other = NodeClassifier(inner, unlabelled=unlabelled).fit(results[0], rename(classes[0]), ups[0])
+    expected = rename(plain.predict(results[1], ups[1]))
+    # Where two classes are as probable the first is taken: their order is another.
+    assert np.mean(other.predict(results[1], ups[1]) == expected) > 0.99
+    assert np.array_equal(other.predict(results[1], ups[1]) == rename(np.array([-1]))[0], results[1].supervoxels < 0)
+    assert other.score(results[1], rename(classes[1]), ups[1]) == pytest.approx(
+        plain.score(results[1], classes[1], ups[1]), abs=0.01
+    )
+    other.save(tmp_path / "a.json")
+    loaded = NodeClassifier.load(tmp_path / "a.json")
+    assert (
+        loaded.classes_.tolist() == other.classes_.tolist() == sorted({*rename(classes[0][classes[0] >= 0]).tolist()})
+    )
+    assert np.array_equal(loaded.predict(results[1], ups[1]), other.predict(results[1], ups[1]))
+
+
+def test_labels_of_other_kinds_are_refused(rooms):
+    results, classes, _ = rooms
+    for wrong in (classes[0] + 0.5, np.full(classes[0].shape, None), [[1, 2], [3]]):
+        with pytest.raises(ValueError, match=r"truth|inhomogeneous"):
+            NodeClassifier().fit(results[0], wrong)
+    with pytest.raises(ValueError, match="one kind"):
+        NodeClassifier().fit(results[:2], [classes[0], NAMES[classes[1]]])
+    with pytest.raises(ValueError, match="unlabelled of the labels' kind"):
+        NodeClassifier(unlabelled="none").fit(results[0], classes[0])
+
+
+def test_cross_validation_over_whole_clouds(rooms):
+    results, classes, ups = rooms
+    tree = NodeClassifier(DecisionTreeClassifier(random_state=0))
+    scores = cross_val_score(tree, results, classes, cv=2, error_score="raise")
+    own = [clone(tree).fit(results[2:], classes[2:]).score(results[:2], classes[:2])]
+    own += [clone(tree).fit(results[:2], classes[:2]).score(results[2:], classes[2:])]
+    assert scores.tolist() == own
+    told = cross_val_score(tree, results, classes, cv=2, params={"ups": ups}, error_score="raise")
+    assert told.shape == (2,)
+    search = GridSearchCV(tree, {"neighbours": [0, 1], "estimator__max_depth": [2]}, cv=2, error_score="raise")
+    assert search.fit(results, classes).best_params_["estimator__max_depth"] == 2
+
+
+def test_cross_validation_of_clouds_of_different_sizes(rooms):
+    results, classes, _ = rooms
+    small = room(7, shape=(60, 80))
+    clouds, truths = [*results[:2], pcgraph.segment(small.points)], [*classes[:2], small.classes]
+    scores = cross_val_score(NodeClassifier(DecisionTreeClassifier()), clouds, truths, cv=3, error_score="raise")
+    assert scores.shape == (3,)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        None,
+        RandomForestClassifier(7, max_depth=6, random_state=1),
+        ExtraTreesClassifier(5, random_state=1),
+        DecisionTreeClassifier(random_state=2),
+    ],
+)
+def test_what_is_saved_predicts_the_same(rooms, estimator, tmp_path):
+    results, classes, ups = rooms
+    taught = NodeClassifier(estimator, ancestors=2, pose=False).fit(results[:2], classes[:2], ups[:2])
+    taught.save(tmp_path / "rooms.json")
+    loaded = NodeClassifier.load(tmp_path / "rooms.json")
+    assert loaded.get_params() == {**taught.get_params(deep=False), "estimator": None}
+    assert np.array_equal(loaded.predict_nodes(results[3]), taught.predict_nodes(results[3]))
+    loaded.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "rooms.json").read_bytes()
+    assert loaded.fit(results[0], classes[0]).score(results[0], classes[0]) > 0.5
+
+
+def test_only_trees_are_saved(rooms, tmp_path):
+    results, classes, _ = rooms
+    with pytest.raises(ValueError, match="call fit"):
+        NodeClassifier().save(tmp_path / "a.json")
+    with pytest.raises(ValueError, match="decision trees to save, got GaussianNB"):
+        NodeClassifier(GaussianNB()).fit(results[0], classes[0]).save(tmp_path / "a.json")
+    rng = np.random.RandomState(0)
+    with pytest.raises(ValueError, match="plain settings"):
+        NodeClassifier(random_state=rng).fit(results[0], classes[0]).save(tmp_path / "a.json")
+    with pytest.raises(pcgraph.CloudWriteError):
+        NodeClassifier().fit(results[0], classes[0]).save(tmp_path / "no" / "a.json")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """A small file as plain data: one tree of three nodes."""
+    content = {
+        "format": "pcgraph node classifier 1",
+        "settings": {"pose": False, "neighbours": 0, "ancestors": 0, "random_state": 0, "unlabelled": None},
+        "feature_names": ["a", "b"],
+        "classes": [3, 5],
+        "starts": [0, 3],
+        "left": [1, -1, -1],
+        "right": [2, -1, -1],
+        "features": [1, 0, 0],
+        "thresholds": [0.5, 0.0, 0.0],
+        "fractions": [[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]],
+    }
+    return tmp_path_factory.mktemp("stored"), content
+
+
+LIES = {
+    "circle": {"left": [0, -1, -1]},
+    "beyond": {"right": [3, -1, -1]},
+    "one child": {"right": [-1, -1, -1]},
+    "half a leaf": {"right": [2, -1, 1]},
+    "no such column": {"features": [2, 0, 0]},
+    "negative column": {"features": [-1, 0, 0]},
+    "nan": {"thresholds": [None, 0.0, 0.0]},
+    "huge": {"thresholds": [0.5, 0.0, 10**400]},
+    "huge child": {"left": [10**30, -1, -1]},
+    "short": {"thresholds": [0.5]},
+    "ragged": {"fractions": [[1.0], [1.0, 0.0], [0.0, 1.0]]},
+    "no fraction": {"fractions": [[0.5, 0.5], [2.0, 0.0], [0.0, 1.0]]},
+    "no classes": {"classes": [], "fractions": [[], [], []]},
+    "twice": {"classes": [3, 3]},
+    "mixed": {"classes": [3, "a"]},
+    "endless": {
+        "settings": {"pose": False, "neighbours": 10**9, "ancestors": 0, "random_state": 0, "unlabelled": None}
+    },
+    "starts": {"starts": [0, 2]},
+    "no trees": {"starts": [0]},
+    "empty tree": {"starts": [0, 0, 3]},
+    "unknown field": {"code": "import os"},
+    "other format": {"format": "pcgraph node classifier 2"},
+    "no settings": {"settings": 3},
+}
+
+
+def test_a_file_by_hand_is_read(stored):
+    folder, content = stored
+    (folder / "good.json").write_text(json.dumps(content))
+    forest = NodeClassifier.load(folder / "good.json").estimator_
+    assert forest.predict_proba(np.array([[0.0, 0.4], [9.0, 0.6]])).tolist() == [[1.0, 0.0], [0.0, 1.0]]
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_lying_files_are_refused(name, stored):
+    folder, content = stored
+    (folder / "bad.json").write_text(json.dumps(content | LIES[name]))
+    with pytest.raises(ValueError, match="expected a classifier of nodes in") as refusal:
+        NodeClassifier.load(folder / "bad.json")
+    assert len(str(refusal.value).splitlines()) == 1
+    assert len(str(refusal.value)) < 600
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\x80\x04pickle", b"[]", b'"a"', b"[" * 100_000, b'{"format":', b'{"format": [1]}', b"\xff\xfe{}"]
+)
+def test_other_files_are_refused(content, tmp_path):
+    (tmp_path / "bad.json").write_bytes(content)
+    with pytest.raises(ValueError, match="expected a classifier of nodes in"):
+        NodeClassifier.load(tmp_path / "bad.json")
+    with pytest.raises(pcgraph.CloudReadError):
+        NodeClassifier.load(tmp_path / "none.json")
 
 
 def test_the_same_seed_gives_the_same_answer(rooms):
@@ -73,6 +243,7 @@ def test_params_and_clones():
     inner = DecisionTreeClassifier(max_depth=3)
     classifier = NodeClassifier(inner, neighbours=2)
     assert classifier.get_params(deep=False) == {
+        "unlabelled": None,
         "estimator": inner,
         "pose": True,
         "neighbours": 2,
@@ -87,8 +258,6 @@ def test_params_and_clones():
     assert (twin.ancestors, twin.estimator.max_depth, inner.max_depth) == (0, 5, 3)
     with pytest.raises(ValueError, match="neighbours"):
         twin.set_params(neighbors=1)
-    with pytest.raises(ValueError, match="estimator"):
-        NodeClassifier().set_params(estimator__n=1)
 
 
 def test_columns_are_named_finite_and_nested(rooms):
@@ -139,21 +308,25 @@ def test_climbing_a_tree_drawn_by_hand():
     assert _climb(parents, altitudes, counts, 100.0)[:4].tolist() == [4, 4, 5, 5]
     altitudes[6] = 0.3
     assert _climb(parents, altitudes, counts, 100.0)[:4].tolist() == [6, 6, 6, 6]
-    labels = np.array([8, 8, 5, 6, 2**31 - 1, 2**31 - 1, 2**31 - 1], np.int32)
-    highest = np.where(labels < 100, labels, -1).astype(np.int32)
-    assert _uniform_tops(parents, labels, highest)[:4].tolist() == [4, 4, 2, 3]
+    assert _uniform_tops(parents, np.array([8, 8, 5, 6], np.int32))[:4].tolist() == [4, 4, 2, 3]
 
 
-def test_without_scikit_learn_the_error_says_what_to_install(rooms, monkeypatch):
-    results, classes, _ = rooms
-    monkeypatch.setitem(sys.modules, "sklearn.base", None)
-    with pytest.raises(ImportError, match=r"pip install 'rangesim\[learn\]'"):
-        NodeClassifier().fit(results[0], classes[0])
+def run(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip()
 
 
-def test_scikit_learn_is_loaded_only_when_it_fits():
-    code = "from pcgraph.learning import NodeClassifier; NodeClassifier(); import sys; print('sklearn' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
+def test_without_scikit_learn_only_the_classifier_is_missing():
+    code = (
+        "import sys; sys.modules['sklearn'] = sys.modules['sklearn.base'] = None\n"
+        "from pcgraph import learning; learning.accumulate, learning.leaf_descriptors\n"
+        "try: learning.NodeClassifier\nexcept ImportError as error: print(error)"
+    )
+    assert run(code) == "NodeClassifier needs scikit-learn; pip install 'rangesim[learn]'"
+
+
+def test_scikit_learn_is_loaded_with_the_classifier_only():
+    code = "from pcgraph import learning; learning.accumulate; import sys; print('sklearn' in sys.modules)"
+    assert run(code) == "False"
 
 
 def test_wrong_input_is_refused(rooms):

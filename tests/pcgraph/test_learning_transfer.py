@@ -8,7 +8,7 @@ import pytest
 from clouds import patch
 
 import pcgraph
-from pcgraph.learning import supervoxels_at, transfer
+from pcgraph.learning import propagation, supervoxels_at
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_shape_is_kept_and_empty_is_empty(valley):
 def test_blocks_change_nothing(valley, monkeypatch):
     points, _, result = valley
     at_once = supervoxels_at(result, points)
-    monkeypatch.setattr(transfer, "BLOCK", 100)
+    monkeypatch.setattr(propagation, "BLOCK", 100)
     assert np.array_equal(supervoxels_at(result, points), at_once)
 
 

@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import pcgraph
 
@@ -60,6 +63,49 @@ def test_public_names():
     assert set(pcgraph.__all__) <= set(dir(pcgraph))
 
 
+def test_the_public_names_of_rooms_are_these():
+    assert dir(pcgraph.detection) == [
+        "DetectedObject",
+        "OrientedBox",
+        "Planes",
+        "Shape",
+        "find_planes",
+        "fit_shape",
+        "object_labels",
+        "objects_on",
+        "standing_box",
+        "tight_box",
+    ]
+    assert dir(pcgraph.learning) == [
+        "NodeClassifier",
+        "accumulate",
+        "accumulate_points",
+        "leaf_descriptors",
+        "majority",
+        "propagate_labels",
+        "pure_ancestors",
+        "supervoxels_at",
+        "unpool",
+        "votes",
+    ]
+
+
+@pytest.mark.parametrize("room", [pcgraph, pcgraph.detection, pcgraph.learning])
+def test_type_checkers_see_what_loads(room):
+    """The imports under TYPE_CHECKING, which editors read, name the objects that are loaded."""
+    tree = ast.parse(Path(room.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    seen = {}
+    for node in block.body:
+        assert isinstance(node, ast.ImportFrom)
+        for alias in node.names:
+            assert alias.asname == alias.name  # else type checkers take it for private
+            seen[alias.name] = node.module
+    assert sorted(seen) == sorted(room.__all__) == dir(room)
+    for name, module in seen.items():
+        assert getattr(importlib.import_module(module), name) is getattr(room, name)
+
+
 def test_unknown_names_are_refused():
     assert not hasattr(pcgraph, "supervoxelise")
 
@@ -82,7 +128,8 @@ def test_pcgraph_never_imports_rangesim():
 
 
 def test_import_is_light():
-    code = "import sys, pcgraph; print(sorted({'numba', 'scipy', 'numpy', 'open3d'} & set(sys.modules)))"
+    heavy = {"numba", "scipy", "numpy", "open3d", "networkx", "sklearn"}
+    code = f"import sys, pcgraph; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pooling and votes: against sums over the points below each node, and a hand-drawn tree."""
+"""Accumulation and votes: against sums over the points below each node, and a hand-drawn tree."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import pytest
 
 import pcgraph
 from pcgraph.features.moments import Moments
-from pcgraph.learning.pooling import down, pool_points, pool_up
-from pcgraph.learning.voting import majority, pure_ancestors, spread_votes, votes
+from pcgraph.learning import accumulate, accumulate_points, majority, propagate_labels, pure_ancestors, unpool, votes
 from pcgraph.tree.tree import SegmentationTree
 
 
@@ -32,44 +31,44 @@ def leaves_below(tree: SegmentationTree) -> list[list[int]]:
     ]
 
 
-def test_pooling_on_a_tree_drawn_by_hand():
+def test_accumulation_on_a_tree_drawn_by_hand():
     tree, values = hand_drawn(), [6.0, 3.0, -1.0]
-    assert pool_up(tree, values, reduce="sum").tolist() == [6, 3, -1, 9, 8]
-    assert pool_up(tree, values).tolist() == [6, 3, -1, 4, 1.5]  # weighted by points
-    assert pool_up(tree, values, weights=[1, 1, 2]).tolist() == [6, 3, -1, 4.5, 1.75]
-    assert pool_up(tree, values, reduce="max").tolist() == [6, 3, -1, 6, 6]
-    assert pool_up(tree, values, reduce="min").tolist() == [6, 3, -1, 3, -1]
+    assert accumulate(tree, values, reduce="sum").tolist() == [6, 3, -1, 9, 8]
+    assert accumulate(tree, values).tolist() == [6, 3, -1, 4, 1.5]  # weighted by points
+    assert accumulate(tree, values, weights=[1, 1, 2]).tolist() == [6, 3, -1, 4.5, 1.75]
+    assert accumulate(tree, values, reduce="max").tolist() == [6, 3, -1, 6, 6]
+    assert accumulate(tree, values, reduce="min").tolist() == [6, 3, -1, 3, -1]
 
 
 def test_missing_values_are_left_out():
     tree = hand_drawn()
     values = np.array([[np.nan, np.nan], [3.0, np.nan], [np.nan, 5.0]])
-    assert np.array_equal(pool_up(tree, values)[3:], [[3, np.nan], [3, 5]], equal_nan=True)
-    assert np.array_equal(pool_up(tree, values, reduce="max")[3:], [[3, np.nan], [3, 5]], equal_nan=True)
-    assert pool_up(tree, values, reduce="sum")[3:].tolist() == [[3, 0], [3, 5]]
+    assert np.array_equal(accumulate(tree, values)[3:], [[3, np.nan], [3, 5]], equal_nan=True)
+    assert np.array_equal(accumulate(tree, values, reduce="max")[3:], [[3, np.nan], [3, 5]], equal_nan=True)
+    assert accumulate(tree, values, reduce="sum")[3:].tolist() == [[3, 0], [3, 5]]
 
 
 def test_infinity_is_a_value_and_not_a_missing_one():
     tree = hand_drawn()
     for reduce, sign in (("min", 1.0), ("max", -1.0)):
         values = sign * np.array([np.inf, 2.0, 3.0])
-        assert pool_up(tree, values, reduce=reduce).tolist() == (sign * np.array([np.inf, 2, 3, 2, 2])).tolist()
-        assert pool_up(tree, [sign * np.inf] * 3, reduce=reduce).tolist() == [sign * np.inf] * 5
-    assert pool_up(tree, [np.inf, 2.0, 3.0], weights=[0, 1, 1]).tolist() == [np.inf, 2, 3, 2, 2.5]
+        assert accumulate(tree, values, reduce=reduce).tolist() == (sign * np.array([np.inf, 2, 3, 2, 2])).tolist()
+        assert accumulate(tree, [sign * np.inf] * 3, reduce=reduce).tolist() == [sign * np.inf] * 5
+    assert accumulate(tree, [np.inf, 2.0, 3.0], weights=[0, 1, 1]).tolist() == [np.inf, 2, 3, 2, 2.5]
 
 
 def test_sums_of_whole_numbers_are_exact_or_refused(boxes):
     _, truth, result = boxes
     values = np.zeros(truth.shape, np.int64)
     values[0] = 2**53 + 1
-    assert pool_points(result, values, "sum")[-1] == 2**53 + 1
-    assert pool_points(result, np.full(truth.shape, 200, np.uint8), "sum")[-1] == 200 * len(truth)
-    assert pool_up(hand_drawn(), [2**53 + 1, 0, 0], reduce="sum")[-1] == 2**53 + 1
+    assert accumulate_points(result, values, "sum")[-1] == 2**53 + 1
+    assert accumulate_points(result, np.full(truth.shape, 200, np.uint8), "sum")[-1] == 200 * len(truth)
+    assert accumulate(hand_drawn(), [2**53 + 1, 0, 0], reduce="sum")[-1] == 2**53 + 1
     for big in (np.uint64(2**63), np.int64(-(2**63))):
         with pytest.raises(ValueError, match="add up to"):
-            pool_points(result, np.full(truth.shape, big), "sum")
+            accumulate_points(result, np.full(truth.shape, big), "sum")
         with pytest.raises(ValueError, match="add up to"):
-            pool_up(hand_drawn(), np.array([big, 0, 0], big.dtype), reduce="sum")
+            accumulate(hand_drawn(), np.array([big, 0, 0], big.dtype), reduce="sum")
 
 
 @pytest.mark.parametrize("reduce", ["sum", "mean", "max", "min"])
@@ -77,7 +76,7 @@ def test_nodes_hold_what_their_points_do(boxes, reduce):
     points, _, result = boxes
     values = np.column_stack((points, np.random.default_rng(0).normal(size=len(points))))
     values[::7, 3] = np.nan
-    pooled = pool_points(result, values, reduce)
+    pooled = accumulate_points(result, values, reduce)
     direct = getattr(np, f"nan{reduce}")
     for node, leaves in enumerate(leaves_below(result.tree)):
         assert pooled[node] == pytest.approx(direct(values[np.isin(result.supervoxels, leaves)], axis=0), rel=1e-9)
@@ -85,7 +84,7 @@ def test_nodes_hold_what_their_points_do(boxes, reduce):
 
 def test_means_of_the_points_are_the_centroids(boxes):
     points, _, result = boxes
-    assert pool_points(result, points) == pytest.approx(result.tree.moments.centroids, rel=1e-9, abs=1e-12)
+    assert accumulate_points(result, points) == pytest.approx(result.tree.moments.centroids, rel=1e-9, abs=1e-12)
 
 
 def test_votes_count_points(boxes):
@@ -108,7 +107,7 @@ def test_majority_prefers_the_smaller_of_equals_and_knows_nothing_without_votes(
 def test_highest_pure_ancestor_on_a_tree_drawn_by_hand():
     tree = hand_drawn()
     leaf_votes = np.array([[9, 1], [0, 0], [0, 8]])
-    counts = pool_up(tree, leaf_votes, reduce="sum")
+    counts = accumulate(tree, leaf_votes, reduce="sum")
     assert pure_ancestors(tree, counts, 0.9).tolist() == [3, 3, 2]
     assert pure_ancestors(tree, counts, 0.95).tolist() == [-1, -1, 2]
     assert pure_ancestors(tree, counts, 0.5).tolist() == [4, 4, 4]
@@ -121,7 +120,7 @@ def test_one_click_per_object_labels_the_scene(boxes):
     for thing in range(3):
         at = np.flatnonzero(truth == thing)
         clicks[at[len(at) // 2]] = thing
-    labels = spread_votes(result, clicks, share=1.0)
+    labels = propagate_labels(result, clicks, fraction=1.0)
     assert np.mean(labels == truth) > 0.97
 
 
@@ -131,42 +130,42 @@ def test_down_keeps_the_shape_and_marks_what_is_missing():
     points[2, 3] = np.nan
     result = pcgraph.segment(points, voxel_size=0.3)
     tree = result.tree
-    assert np.array_equal(down(result, np.arange(tree.n_leaves)), result.supervoxels)
-    sizes = down(result, tree.moments.counts, tree.cut_nodes(n=1))
+    assert np.array_equal(unpool(result, np.arange(tree.n_leaves)), result.supervoxels)
+    sizes = unpool(result, tree.moments.counts, tree.cut_nodes(n=1))
     assert sizes.shape == (6, 8)
     assert sizes[2, 3] == -1
     assert set(sizes.ravel().tolist()) == {47, -1}
-    places = down(result, tree.moments.centroids)
+    places = unpool(result, tree.moments.centroids)
     assert places.shape == (6, 8, 3)
     assert np.isnan(places[2, 3]).all()
     assert np.isfinite(places).all(axis=-1).sum() == 47
-    assert not down(result, np.ones(tree.n_leaves, bool))[2, 3]
+    assert not unpool(result, np.ones(tree.n_leaves, bool))[2, 3]
 
 
 def test_wrong_input_is_refused(boxes):
     _, truth, result = boxes
     tree = result.tree
     with pytest.raises(ValueError, match="expected values of"):
-        pool_up(tree, np.zeros(3))
+        accumulate(tree, np.zeros(3))
     with pytest.raises(ValueError, match="reduce"):
-        pool_up(tree, np.zeros(tree.n_leaves), reduce="median")
+        accumulate(tree, np.zeros(tree.n_leaves), reduce="median")
     with pytest.raises(ValueError, match="reduce"):
-        pool_points(result, truth, "median")
+        accumulate_points(result, truth, "median")
     with pytest.raises(ValueError, match="weights"):
-        pool_up(tree, np.zeros(tree.n_leaves), weights=np.full(tree.n_leaves, -1.0))
+        accumulate(tree, np.zeros(tree.n_leaves), weights=np.full(tree.n_leaves, -1.0))
     with pytest.raises(ValueError, match="points' shape"):
-        pool_points(result, truth[:-1])
+        accumulate_points(result, truth[:-1])
     with pytest.raises(ValueError, match="below n_classes"):
         votes(result, truth, 2)
     with pytest.raises(ValueError, match="one row"):
-        down(result, np.zeros(3))
+        unpool(result, np.zeros(3))
     with pytest.raises(ValueError, match="per node"):
-        down(result, np.zeros(tree.n_leaves), tree.cut_nodes(n=2))
+        unpool(result, np.zeros(tree.n_leaves), tree.cut_nodes(n=2))
     assert majority([[1, 2]]).tolist() == [1]
     for votes_ in (np.ones(3), [1, 2], [[0.5, 1.0]]):
         with pytest.raises(ValueError, match="votes as whole numbers"):
             majority(votes_)
-    with pytest.raises(ValueError, match="share"):
+    with pytest.raises(ValueError, match="fraction"):
         pure_ancestors(tree, votes(result, truth), 1.5)
     for altitude in (np.nan, "a"):
         with pytest.raises(ValueError, match="altitude"):

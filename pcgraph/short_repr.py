@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A `repr` of one to five lines for dataclasses of arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+import reprlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+MAX_LINES = 5
+MAX_COLUMNS = 100
+SHORT = reprlib.Repr()
+"""`repr` of plain values, cut to a readable length."""
+SHORT.maxstring = SHORT.maxother = 100
+SHORT.maxlist = SHORT.maxtuple = SHORT.maxarray = 8
+SHORT.maxlevel = 3
+
+
+class ShortRepr:
+    """Mixin of dataclasses of arrays: a `repr` that names shapes and types instead of a thousand numbers."""
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if cls.__repr__ is ShortRepr.__repr__:
+            cls.__repr__ = ShortRepr.__repr__  # type: ignore[method-assign]  # a class's own one is left by @dataclass
+
+    def __repr__(self) -> str:
+        name = type(self).__name__
+        parts = [f"{f.name}={in_short(getattr(self, f.name))}" for f in dataclasses.fields(self)]  # type: ignore[arg-type]
+        line = f"{name}({', '.join(parts)})"
+        return line if len(line) <= MAX_COLUMNS else f"{name}(\n" + "\n".join(_filled(parts)) + ")"
+
+
+def in_short(value: Any) -> str:
+    """A few words in place of `repr`: type and shape of arrays, the number of what is many."""
+    if isinstance(value, np.ndarray) and value.size > 1:
+        if value.ndim == 1 and value.size <= 4 and value.dtype.kind in "iufb":
+            return np.array2string(value, precision=4, separator=", ")
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, ShortRepr):
+        return f"{type(value).__name__}(...)"
+    if isinstance(value, Mapping) and any(isinstance(v, np.ndarray) for v in value.values()):
+        return "{" + ", ".join(f"{type(k).__name__}: {in_short(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, (tuple, list)) and len(value) > 3:
+        return f"{len(value)} of {type(value[0]).__name__}"
+    return SHORT.repr(value) if not dataclasses.is_dataclass(value) else f"{type(value).__name__}(...)"
+
+
+def _filled(parts: list[str]) -> list[str]:
+    """Lines of parts, indented; what does not fit on so many lines is counted."""
+    lines = ["   "]
+    for number, part in enumerate(parts):
+        if lines[-1].strip() and len(lines[-1]) + len(part) + 2 > MAX_COLUMNS:
+            if len(lines) == MAX_LINES - 1:
+                lines[-1] += f" and {len(parts) - number} more"
+                return lines
+            lines.append("   ")
+        lines[-1] += f" {part}" + ("," if number < len(parts) - 1 else "")
+    return lines
