@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pcgraph.detection.boxes import OrientedBox, standing_box, tight_box
     from pcgraph.detection.objects import DetectedObject, object_labels, objects_on
-    from pcgraph.detection.planes import Planes, find_planes
+    from pcgraph.detection.plane_detection import Planes, find_planes
     from pcgraph.detection.shapes import Shape, fit_shape
 
 __all__ = [
@@ -28,9 +28,9 @@ __all__ = [
 _HOMES = {
     "DetectedObject": "objects",
     "OrientedBox": "boxes",
-    "Planes": "planes",
+    "Planes": "plane_detection",
     "Shape": "shapes",
-    "find_planes": "planes",
+    "find_planes": "plane_detection",
     "fit_shape": "shapes",
     "object_labels": "objects",
     "objects_on": "objects",

@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from pcgraph.detection.planes import find_planes
+from pcgraph.detection.plane_detection import find_planes
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.features.primitive_moments import pool_up_tree, primitive_moments
 from pcgraph.features.primitives import Primitives, fit_primitives
