@@ -289,13 +289,17 @@ def connected_pieces(segmentation: Segmentation, support: _Support, above: NDArr
 MIN_INSIDE = 0.5
 """Fraction of a piece within the box of a larger one above which it belongs to it: most of it."""
 MAX_GAP = 8.0
-"""Voxel edges, across which the inside of a cup may belong to its outside."""
+"""Voxel edges, across which the inside of a cup may belong to its outside: what its wall and a depth edge take. On mOSD
+from 8 to 32 nothing changes; at 4 three cups of 32 objects fall apart."""
 MAX_GAP_FRACTION = 0.5
-"""The same, in lengths of the larger one's footprint: an opening is not wider than half the cup."""
+"""The same, in lengths of the larger one's footprint, for things of few voxels: an opening reaches to half the cup at
+most. On mOSD from 0.25 to 2 nothing changes; at 0.125 cups fall apart."""
 MAX_TOP_DIFFERENCE = 2.0
-"""Voxel edges by which the tops of the inside and the outside of a cup may differ: a voxel of each."""
+"""Voxel edges by which the tops of the inside and the outside of a cup may differ: a voxel of each. On mOSD from 1 to 4
+nothing changes."""
 MIN_CONVEXITY = 0.05
-"""Below this a piece is hollow or flat."""
+"""Below this a piece is hollow or flat: between the 0 of a plane, with what noise does to it, and the 0.5 of a sphere.
+On mOSD from -0.1 to 0.2 nothing changes."""
 
 
 def linked_pieces(pieces: list[Piece], edge: float) -> NDArray[np.int32]:

@@ -183,14 +183,14 @@ def members(groups: NDArray[np.int32], n_groups: int) -> list[NDArray[np.int64]]
 # -------------------------------------------------------------------------------------------- tolerances from the noise
 
 NOISE_FACTOR = 3.5
-"""Default tolerance over the noise: no supervoxel of the tables of 12 real clouds (mOSD) lies further off."""
+"""Default tolerance over the noise: a supervoxel's residual is itself an estimate, and above the flattest quarter's."""
 MIN_TOLERANCE = 0.02
 """Voxel edges: the least default tolerance, where there is no noise, so that rounding does not decide."""
 MAX_TOLERANCE = 1.0
 """Voxel edges: the largest default tolerance, where nothing is flat; beyond it a step of a voxel would be a plane."""
 MIN_WIDTH = 0.8
-"""Width (second standard deviation) over tolerance below which a supervoxel is degenerate: noise of the size of the
-tolerance then tilts its normal by about a radian."""
+"""Width (second standard deviation) over tolerance below which a supervoxel is degenerate: what may
+count as its thickness is then more than its width, so its normal may point anywhere."""
 
 
 def planar_patches(segmentation: Segmentation, tolerance: float | None, angle: float) -> PlanarPatches:
