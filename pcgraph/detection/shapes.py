@@ -33,8 +33,8 @@ normals, 60 off those of the ends, as normals at the edge between them lean to t
 MIN_THICKNESS = 2.0
 """Thickness of a box over the residual of its plane, at least: a flat patch has room for a flat box in its noise."""
 MIN_GAIN = 0.7
-"""A plane is given up only for a shape of less than this times its residual: boxes, spheres and cylinders contain planes
-as limits, and so always fit a little better."""
+"""A plane is given up only for a shape of less than this times its residual: boxes, spheres and cylinders contain
+planes as limits, and so always fit a little better."""
 MIN_WALL_POINTS = 5
 """Points for a circle, which has three parameters, to say more than that it can be drawn."""
 MAX_RADIUS = 100.0
