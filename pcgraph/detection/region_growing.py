@@ -7,6 +7,7 @@ geometry that they share. Supervoxels are known by their moments alone, so every
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -271,7 +272,7 @@ def _sums(
     weights: NDArray[np.float64], values: NDArray[np.float64], of: NDArray[np.int32], p: int
 ) -> NDArray[np.float64]:
     """Weighted sum of values (n, ...) by region, (p, ...)."""
-    columns = values.reshape(len(values), -1).T
+    columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = np.stack([np.bincount(of, weights * column, p) for column in columns], axis=1)
     return sums.astype(np.float64, copy=False).reshape(p, *values.shape[1:])
 

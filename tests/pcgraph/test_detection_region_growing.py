@@ -145,3 +145,8 @@ def test_a_turn_that_distances_do_not_show_is_noise_of_the_normals(shows, turn):
     free = np.zeros(n, bool)
     patches = PlanarPatches(moments, normals, np.ones(n), free, 0.0, np.empty((0, 2), np.int32), np.empty(0, bool))
     assert turning_angles(patches, np.zeros(n, np.int32))[0] == pytest.approx(turn, rel=0.05)
+
+
+def test_no_region_has_no_turning_angle():
+    patches = scattered_patches(5, 1, 0)
+    assert turning_angles(patches, np.full(5, -1, np.int32)).shape == (0,)
