@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from pcgraph.detection.objects import DetectedObject as DetectedObject
     from pcgraph.detection.objects import object_labels as object_labels
     from pcgraph.detection.objects import objects_on as objects_on
-    from pcgraph.detection.planes import Planes as Planes
-    from pcgraph.detection.planes import find_planes as find_planes
+    from pcgraph.detection.plane_detection import Planes as Planes
+    from pcgraph.detection.plane_detection import find_planes as find_planes
     from pcgraph.detection.shapes import Shape as Shape
     from pcgraph.detection.shapes import fit_shape as fit_shape
 else:
@@ -23,7 +23,7 @@ else:
         submod_attrs={
             "boxes": ["OrientedBox", "standing_box", "tight_box"],
             "objects": ["DetectedObject", "object_labels", "objects_on"],
-            "planes": ["Planes", "find_planes"],
+            "plane_detection": ["Planes", "find_planes"],
             "shapes": ["Shape", "fit_shape"],
         },
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Oriented boxes around points: standing on a plane, or free."""
+"""Oriented boxes around points, standing on a plane or free; convex outlines and rectangles in a plane."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
-from pcgraph.detection.hulls import FLAT, smallest_rectangle
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors
 from pcgraph.short_repr import ShortRepr
 
-_SAME_NORMAL = 1e6  # steps per unit in which normals of facets are told apart
-_MOST_FACETS = 64  # the largest ones; noise makes hundreds of small ones
+FLAT = 1e-7
+"""Width over length below which points lie on a line (or, a dimension up, in a plane): Qhull needs more than that."""
+_NORMAL_STEPS = 1e6
+"""Steps per unit in which normals of facets are told apart: Qhull cuts one flat side into triangles with equal normals
+up to rounding."""
+_MAX_FACETS = 64
+"""The largest facets are tried; noise makes hundreds of small ones."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ def standing_box(points: ArrayLike, up: ArrayLike, bottom: float | None = None) 
 def _standing(places: NDArray[np.float64], up: NDArray[np.float64], bottom: float | None = None) -> OrientedBox:
     basis = plane_basis(up)
     flat, heights = places @ basis.T, places @ up
-    rectangle = smallest_rectangle(flat)
+    rectangle = smallest_rectangle(outline(flat))
     low = float(heights.min()) if bottom is None else bottom
     high = max(float(heights.max()), low)
     axes = np.vstack((rectangle.axes @ basis, up))
@@ -122,8 +126,10 @@ def tight_box(points: ArrayLike) -> OrientedBox:
         best = _standing(local, principal[:, 0])
     else:
         hull = ConvexHull(local)
-        corners = local[hull.vertices]
-        best = min((_standing(corners, normal) for normal in _facets(hull)), key=lambda box: box.volume)
+        corners, normals = local[hull.vertices], _facets(hull)
+        volumes = _volumes(hull, normals)
+        smallest = normals[volumes <= (1.0 + 1e-6) * volumes.min()]  # equal ones are told apart exactly
+        best = min((_standing(corners, normal) for normal in smallest), key=lambda box: box.volume)
     order = np.argsort(-best.size, kind="stable")
     axes = best.axes[order]
     axes[2] *= np.sign(np.linalg.det(axes))
@@ -142,17 +148,141 @@ def plane_basis(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two unit vectors, rows of (2, 3), that form a right-handed frame with a unit normal as the third."""
     helper = np.zeros(3)
     helper[int(np.abs(normal).argmin())] = 1.0
-    first = np.cross(helper, normal)
+    first = _cross(helper, normal)
     first /= np.linalg.norm(first)
-    return np.stack((first, np.cross(normal, first)))
+    return np.stack((first, _cross(normal, first)))
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cross product of two vectors, (3,); `np.cross` takes ten times as long for one."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _facets(hull: ConvexHull) -> NDArray[np.float64]:
     """Unit normals of the hull's largest sides, one of each, (f, 3); opposite ones are the same."""
     normals = hull.equations[:, :3]
     largest = np.take_along_axis(normals, np.abs(normals).argmax(axis=1)[:, None], axis=1)
-    whole = np.rint(normals * np.sign(largest) * _SAME_NORMAL)
+    whole = np.rint(normals * np.sign(largest) * _NORMAL_STEPS)
     _, first, side = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     a, b, c = hull.points[hull.simplices].transpose(1, 0, 2)
     areas = np.bincount(side.ravel(), np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    return normals[first[np.argsort(-areas, kind="stable")[:_MOST_FACETS]]]
+    return normals[first[np.argsort(-areas, kind="stable")[:_MAX_FACETS]]]
+
+
+def _volumes(hull: ConvexHull, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Volume, up to rounding, of the smallest box around a hull that stands along each unit normal, (f,) float64.
+
+    The outline seen along a normal consists of edges of the hull between a side that faces it and one that does not;
+    the box has a side along one of these.
+    """
+    sides = np.repeat(np.arange(len(hull.simplices)), 3)
+    across = hull.neighbors.ravel()  # of a triangle, the neighbour opposite each corner
+    ends = np.stack((np.roll(hull.simplices, -1, axis=1), np.roll(hull.simplices, 1, axis=1)), axis=-1).reshape(-1, 2)
+    once = sides < across
+    along = hull.points[ends[once, 1]] - hull.points[ends[once, 0]]
+    facing = hull.equations[:, :3] @ normals.T
+    normal, edge = np.nonzero((facing[sides[once]] * facing[across[once]] <= 1e-9).T)
+    first = along[edge] - np.einsum("ta,ta->t", along[edge], normals[normal])[:, None] * normals[normal]
+    length = np.linalg.norm(first, axis=1)
+    seen = length > 1e-9 * np.linalg.norm(along[edge], axis=1)  # others run along the normal
+    normal, first = normal[seen], first[seen] / length[seen, None]
+    corners = hull.points[hull.vertices]
+    areas = np.ptp(corners @ first.T, axis=0) * np.ptp(corners @ np.cross(normals[normal], first).T, axis=0)
+    least = np.full(len(normals), np.inf)
+    np.minimum.at(least, normal, areas)
+    return least * np.ptp(corners @ normals.T, axis=0)
+
+
+# ----------------------------------------------------------------------------------- outlines and rectangles
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Rectangle in a plane.
+
+    Attributes
+    ----------
+    center : (2,) float64, metres
+    axes : (2, 2) float64
+        Rows are unit vectors, the second a quarter turn to the left of the first.
+    size : (2,) float64, metres
+        Full lengths along the axes, the longer first.
+    """
+
+    center: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    size: NDArray[np.float64]
+
+    @property
+    def area(self) -> float:
+        """Length times width, square metres."""
+        return float(self.size.prod())
+
+
+def outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners of the convex hull, (h, 2) float64, counterclockwise; two of points on a line, one of equal points.
+
+    Parameters
+    ----------
+    points : (n, 2) float64, metres
+        n >= 1.
+    """
+    middle = points.mean(axis=0)
+    local = points - middle
+    _, along = np.linalg.eigh(local.T @ local)
+    spans = np.ptp(local @ along, axis=0)
+    if spans[1] == 0.0:
+        return points[:1].copy()
+    if spans[0] <= FLAT * spans[1]:
+        reach = local @ along[:, 1]
+        return points[[int(reach.argmin()), int(reach.argmax())]]
+    hull = ConvexHull(local)
+    return local[hull.vertices] + middle
+
+
+def smallest_rectangle(hull: NDArray[np.float64]) -> Rectangle:
+    """Rectangle of least area around a convex outline, (h, 2) float64, as `outline` returns it.
+
+    Notes
+    -----
+    One side lies along a side of the outline (Freeman and Shapira 1975), so all of these are tried.
+    """
+    origin = hull.mean(axis=0)
+    local = hull - origin
+    sides = np.roll(local, -1, axis=0) - local
+    lengths = np.linalg.norm(sides, axis=1)
+    along = sides[lengths > 0.0] / lengths[lengths > 0.0, None]
+    if not len(along):
+        along = np.array([[1.0, 0.0]])
+    across = np.stack((-along[:, 1], along[:, 0]), axis=1)
+    u, v = local @ along.T, local @ across.T
+    spans = np.stack((np.ptp(u, axis=0), np.ptp(v, axis=0)), axis=1)
+    best = int(spans.prod(axis=1).argmin())
+    axes = np.stack((along[best], across[best]))
+    middle = np.array([u[:, best].max() + u[:, best].min(), v[:, best].max() + v[:, best].min()]) / 2.0
+    size = spans[best]
+    center = origin + middle @ axes
+    if size[0] < size[1]:
+        axes, size = np.stack((axes[1], -axes[0])), size[::-1].copy()
+    return Rectangle(center, axes, size)
+
+
+def inside_outline(points: NDArray[np.float64], hull: NDArray[np.float64], margin: float) -> NDArray[np.bool_]:
+    """Whether points, (n, 2), lie within a convex outline or nearer than `margin` to a side's line, (n,) bool.
+
+    Parameters
+    ----------
+    points : (n, 2) float64, metres
+    hull : (h, 2) float64, metres
+        As `outline` returns it.
+    margin : float, metres
+    """
+    if len(hull) < 3:
+        a, b = hull[0], hull[-1]
+        reach = np.clip((points - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-300), 0.0, 1.0)
+        return np.linalg.norm(points - a - reach[:, None] * (b - a), axis=1) <= margin
+    sides = np.roll(hull, -1, axis=0) - hull
+    inward = np.stack((-sides[:, 1], sides[:, 0]), axis=1) / np.linalg.norm(sides, axis=1, keepdims=True)
+    heights = points @ inward.T - np.einsum("ij,ij->i", hull, inward)
+    return (heights >= -margin).all(axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from pcgraph.detection.planes import find_planes
+from pcgraph.detection.plane_detection import find_planes
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.features.primitives import Primitives, fit_primitives, primitive_moments, primitive_moments_up_tree
 from pcgraph.hierarchy import accumulate_sequential, propagate_sequential
