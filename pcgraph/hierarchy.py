@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from pcgraph.parallel import kernel
 
 Operation = Literal["sum", "max", "min"]
 _OPERATIONS: tuple[Operation, ...] = ("sum", "max", "min")
@@ -46,7 +47,7 @@ def num_leaves(parents: NDArray[np.int32]) -> int:
     return int(parents.min()) if len(parents) > 1 else 1
 
 
-@njit(cache=True)
+@kernel
 def children(parents: NDArray[np.int32]) -> NDArray[np.int32]:
     """The two children of each node of a binary hierarchy, (k, 2) int32, the smaller first; -1 for leaves."""
     pairs = np.full((len(parents), 2), -1, np.int32)
@@ -111,7 +112,7 @@ def _neutral(operation: Operation, dtype: np.dtype[Any]) -> float:
     return np.iinfo(dtype).min if operation == "max" else np.iinfo(dtype).max
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _accumulate(parents: NDArray[np.int32], values: NDArray[Any], operation: int) -> None:
     for node in range(len(parents)):
         up = parents[node]
@@ -146,7 +147,7 @@ def roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:
     return propagation_sources(parents, np.ones(len(parents), np.bool_))
 
 
-@njit(cache=True)
+@kernel
 def propagation_sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Node whose value each node has after `propagate_sequential`, (k,) int32: it or one above it."""
     sources = np.arange(len(parents)).astype(np.int32)
@@ -193,7 +194,7 @@ def lowest_common_ancestors(
     return _ancestors_of_pairs(ancestor_index(parents), *ends)
 
 
-@njit(cache=True)
+@kernel
 def lowest_common_ancestor(index: AncestorIndex, a: int, b: int) -> int:
     """Lowest common ancestor of two leaves: the one whose part was linked first climbs until both meet."""
     node = a
@@ -205,7 +206,7 @@ def lowest_common_ancestor(index: AncestorIndex, a: int, b: int) -> int:
     return node
 
 
-@njit(cache=True)
+@kernel
 def _ancestors_of_pairs(index: AncestorIndex, first: NDArray[np.int32], second: NDArray[np.int32]) -> NDArray[np.int32]:
     nodes = np.empty(len(first), np.int32)
     for i in range(len(first)):
@@ -213,7 +214,7 @@ def _ancestors_of_pairs(index: AncestorIndex, first: NDArray[np.int32], second: 
     return nodes
 
 
-@njit(cache=True)
+@kernel
 def _linked(parents: NDArray[np.int32], n_leaves: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     k = len(parents)
     links, merges = np.arange(n_leaves).astype(np.int32), np.full(n_leaves, k, np.int32)

@@ -19,13 +19,13 @@ routine = njit(cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
-SMALLEST_BLOCK = 4096
+MIN_BLOCK = 4096
 """Elements; starting a thread costs as much as some thousands of them."""
-SMALLEST_ROWS = 16
+MIN_ROWS = 16
 """The same for elements that are rows of an image."""
 
 
-def in_blocks(loop: Callable[..., None], n: int, *arguments: object, smallest: int = SMALLEST_BLOCK) -> None:
+def in_blocks(loop: Callable[..., None], n: int, *arguments: object, smallest: int = MIN_BLOCK) -> None:
     """Run `loop(start, stop, *arguments)` for blocks that cover 0..n, at the same time.
 
     Threads are started anew and joined: no pool outlives the call, so a process may fork at any time and

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from pcgraph.features.moments import Moments, grouped_moments
+from pcgraph.parallel import kernel
 from pcgraph.voxels.eigen import symmetric_eigen
 
 MAX_TURNING_ANGLE = 0.05
@@ -184,7 +184,7 @@ def grown_regions(patches: PlanarPatches) -> NDArray[np.int32]:
     return _grow(patches.state, lists.indptr, lists.indices, lists.data == 2, seeds, patches.cos_angle)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grow(patches, indptr, neighbours, smooth, seeds, cos_angle):  # type: ignore[no-untyped-def]
     """Region of each supervoxel, grown from the seeds in their order.
 
@@ -320,7 +320,7 @@ def _region_state(patches: PlanarPatches, regions: NDArray[np.int32], p: int) ->
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_best_first(regions, pairs, apart, cos_angle):  # type: ignore[no-untyped-def]
     """Region, the one of lowest number, that each of p regions becomes part of, (p,) int64.
 
@@ -372,7 +372,7 @@ def _join_best_first(regions, pairs, apart, cos_angle):  # type: ignore[no-untyp
     return into
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _queue_pairs(queue, regions, i, others, joins, cos_angle):  # type: ignore[no-untyped-def]
     """The queue, grown if needed, with those pairs of region i and each other that may lie in one plane."""
     p = len(regions.counts)
@@ -398,7 +398,7 @@ def _queue_pairs(queue, regions, i, others, joins, cos_angle):  # type: ignore[n
     return queue
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _least_misfit(regions, i, k, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Lower bound of the misfit of two regions whose centroids are (dx, dy, dz) apart, without eigenvectors.
 
@@ -427,7 +427,7 @@ def _least_misfit(regions, i, k, dx, dy, dz):  # type: ignore[no-untyped-def]
     return np.sqrt(max(least - 1e-9 * trace, 0.0) / limit) * (1.0 - 1e-9)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _misfit(regions, a, b, cos_angle, fit):  # type: ignore[no-untyped-def]
     """Distance of two regions, a < b, to their common plane over their tolerances; infinite if a normal is off it."""
     total = _start(fit, regions, a)
@@ -453,7 +453,7 @@ class _PairQueue(NamedTuple):
     """(1,): entries in use."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _with_room(queue):  # type: ignore[no-untyped-def]
     """The same queue with room for twice as many."""
     n = len(queue.pairs)
@@ -464,7 +464,7 @@ def _with_room(queue):  # type: ignore[no-untyped-def]
     return larger
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _heap_push(queue, misfit, pair, stamp):  # type: ignore[no-untyped-def]
     """Add an entry; there must be room."""
     at = queue.size[0]
@@ -478,14 +478,14 @@ def _heap_push(queue, misfit, pair, stamp):  # type: ignore[no-untyped-def]
     queue.misfits[at], queue.pairs[at], queue.stamps[at] = misfit, pair, stamp
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _move(queue, source, target):  # type: ignore[no-untyped-def]
     """Copy an entry."""
     queue.misfits[target], queue.pairs[target] = queue.misfits[source], queue.pairs[source]
     queue.stamps[target] = queue.stamps[source]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _heap_pop(queue):  # type: ignore[no-untyped-def]
     """Remove the first entry."""
     queue.size[0] -= 1
@@ -517,7 +517,7 @@ class _Rings(NamedTuple):
     """(2 q,): region to which a link leads, by its first number."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _neighbour_rings(p, pairs):  # type: ignore[no-untyped-def]
     """Rings of p regions of which these pairs, (q, 2), touch."""
     rings = _Rings(np.full(p, -1), np.empty(2 * len(pairs), np.int64), np.empty(2 * len(pairs), np.int64))
@@ -531,7 +531,7 @@ def _neighbour_rings(p, pairs):  # type: ignore[no-untyped-def]
     return rings
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_rings(rings, i, j):  # type: ignore[no-untyped-def]
     """Region i takes the neighbours of region j."""
     a, b = rings.last[i], rings.last[j]
@@ -540,7 +540,7 @@ def _join_rings(rings, i, j):  # type: ignore[no-untyped-def]
     rings.last[i] = max(a, b) if min(a, b) < 0 else a
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _touching(rings, i, into, seen, mark, touching):  # type: ignore[no-untyped-def]
     """Number of regions that touch region i, which are written to `touching`; `seen` holds the mark of each."""
     n, link = 0, rings.last[i]
@@ -556,7 +556,7 @@ def _touching(rings, i, into, seen, mark, touching):  # type: ignore[no-untyped-
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root(into, k):  # type: ignore[no-untyped-def]
     """Region that a region has become part of; halves the way there."""
     while into[k] != k:
@@ -595,7 +595,7 @@ def assign_unassigned(patches: PlanarPatches, regions: NDArray[np.int32], apart:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_planes(patches, planes, unassigned, choices, slices, cos_angle):  # type: ignore[no-untyped-def]
     """Plane, of its slice of the choices, in which each of u supervoxels lies best, (u,) int32; -1 if in none.
 
@@ -645,7 +645,7 @@ class _Fit(NamedTuple):
     vectors: NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _start(fit, patches, j):  # type: ignore[no-untyped-def]
     """Number of points of patch j; mean and scatter of the fit become its own."""
     for a in range(3):
@@ -655,7 +655,7 @@ def _start(fit, patches, j):  # type: ignore[no-untyped-def]
     return patches.counts[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_moments(count, mean, scatter, patches, j):  # type: ignore[no-untyped-def]
     """Number of points of a group and patch j together; `mean` and `scatter` of the group become those of both.
 
@@ -673,7 +673,7 @@ def _add_moments(count, mean, scatter, patches, j):  # type: ignore[no-untyped-d
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mean_square_distance(patches, j, fit):  # type: ignore[no-untyped-def]
     """Mean square distance of the points of patch j to the fitted plane, square metres."""
     offset = spread = 0.0
@@ -684,13 +684,13 @@ def _mean_square_distance(patches, j, fit):  # type: ignore[no-untyped-def]
     return offset * offset + max(spread, 0.0) / patches.counts[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cosine(normals, j, normal):  # type: ignore[no-untyped-def]
     """|cosine| between row j of unit vectors and a unit vector."""
     return abs(normals[j, 0] * normal[0] + normals[j, 1] * normal[1] + normals[j, 2] * normal[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit_normal(scatter, fit, normal):  # type: ignore[no-untyped-def]
     """Set `normal` to the direction of least scatter, on the side where it was."""
     work, vectors = fit.work, fit.vectors

@@ -266,21 +266,3 @@ def accumulate_means(
                 means[node, column] /= counts[node]
             if up != node:
                 means[up, column] += counts[node] * means[node, column]
-
-
-@kernel
-def accumulate_sums(parents: NDArray[np.int32], values: NDArray[Any]) -> None:
-    """Set every node's row to the sum of the rows at and below it.
-
-    Parameters
-    ----------
-    parents : (k,) int32
-        Larger than the node's own number.
-    values : (k, c) numbers
-        Overwritten.
-    """
-    for node in range(len(parents)):
-        up = parents[node]
-        if up != node:
-            for column in range(values.shape[1]):
-                values[up, column] += values[node, column]

@@ -7,12 +7,12 @@ from numbers import Real
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.hierarchy import accumulate_sequential
 from pcgraph.inputs import positive
+from pcgraph.parallel import kernel
 from pcgraph.segmentation import Segmentation
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.surface import Surface
@@ -321,7 +321,7 @@ def propagate_labels(
     return unpool(segmentation, majority(counts), np.where(nodes < 0, np.arange(tree.n_leaves), nodes))
 
 
-@njit(cache=True)
+@kernel
 def _highest(parents: NDArray[np.int32], chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Highest chosen node on the way from each node to the root, -1 without; parents before children."""
     highest = np.full(len(parents), -1, np.int32)

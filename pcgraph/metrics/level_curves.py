@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.hierarchy import ChildLists, lowest_common_ancestors, num_leaves
 from pcgraph.metrics.boundary_metrics import NeighbourGraph, check_nearness
 from pcgraph.metrics.labellings import adjusted_rand_from_pairs, count_point_pairs
 from pcgraph.metrics.node_table import Cells, NodeTable, TreeLike, parents_and_altitudes
+from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
 
 
@@ -216,7 +216,7 @@ class SegmentTrees(NamedTuple):
     begins: NDArray[np.int64]
 
 
-@njit(cache=True)
+@kernel
 def _sums_of_best_overlaps(
     order: NDArray[np.int64],
     children: ChildLists,
@@ -254,7 +254,7 @@ def _sums_of_best_overlaps(
     return sums
 
 
-@njit(cache=True)
+@kernel
 def _update(trees: SegmentTrees, segment: int, place: int, value: float) -> float:
     """Set a value of a segment tree; returns the change of the tree's maximum."""
     n = trees.begins[segment + 1] - trees.begins[segment]

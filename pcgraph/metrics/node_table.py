@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.hierarchy import ChildLists, checked_parents, child_lists, num_leaves
 from pcgraph.metrics.labellings import count_pairs, labelled, largest_of_groups, relabel_sequential
+from pcgraph.parallel import kernel
 
 
 class HasParentsAndAltitudes(Protocol):
@@ -172,7 +172,7 @@ class NodeTable:
         return np.concatenate([[0.0], np.cumsum(steps)]) + values[: self.n_leaves].sum()
 
 
-@njit(cache=True)
+@kernel
 def _accumulate_cells(
     children: ChildLists,
     leaf_starts: NDArray[np.int64],
@@ -208,7 +208,7 @@ def _accumulate_cells(
     return starts, segments[:end].copy(), counts[:end].copy(), above[:end].copy()
 
 
-@njit(cache=True)
+@kernel
 def _enlarged(array: NDArray[np.int64], length: int, filler: int) -> NDArray[np.int64]:
     longer = np.full(length, filler, array.dtype)
     longer[: len(array)] = array

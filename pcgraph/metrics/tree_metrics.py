@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.hierarchy import ChildLists, accumulate_sequential
 from pcgraph.metrics.labellings import count_point_pairs, largest_of_groups
 from pcgraph.metrics.node_table import NodeTable, TreeLike
+from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
 
 
@@ -123,7 +123,7 @@ def _scores_of_nodes(table: NodeTable, measure: str) -> NDArray[np.float64]:
     raise ValueError(f"expected measure 'consistency', 'hamming' or 'covering', got {measure!r}")
 
 
-@njit(cache=True)
+@kernel
 def _optimal_cuts(
     scores: NDArray[np.float64], children: ChildLists, leaf_counts: NDArray[np.int64], limit: int
 ) -> NDArray[np.float64]:
@@ -154,7 +154,7 @@ def _optimal_cuts(
     return best[: min(n_leaves, limit)]
 
 
-@njit(cache=True)
+@kernel
 def _combine(left: NDArray[np.float64], right: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Write the best sums of a cut of one part with a cut of the other, by the number of regions of both."""
     out[:] = -np.inf

@@ -6,12 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.parallel import kernel
 from pcgraph.tree.contraction import ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.linkage import Linkage, Merges, check_cost
 
@@ -80,7 +80,7 @@ def average_linkage(
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))  # a mean may round down by one last place
 
 
-@njit(cache=True)
+@kernel
 def _merge(graph: ContractedGraph) -> None:
     sums = graph.sums
     while graph.heap.size[0] > 0:

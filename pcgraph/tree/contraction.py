@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.parallel import kernel
 from pcgraph.tree.linkage import Merges
 
 NONE = -1
@@ -95,7 +95,7 @@ class ContractedGraph(NamedTuple):
         return Merges(self.pairs[: self.done[0]], self.altitudes[: self.done[0]])
 
 
-@njit(cache=True)
+@kernel
 def _insert_edges(graph: ContractedGraph, edges: NDArray[np.int32], costs: NDArray[np.float64]) -> None:
     heap, halves, clusters = graph.heap, graph.halves, graph.clusters
     for node in range(len(clusters)):
@@ -107,7 +107,7 @@ def _insert_edges(graph: ContractedGraph, edges: NDArray[np.int32], costs: NDArr
         heap_update(heap, edge, costs[edge])
 
 
-@njit(cache=True)
+@kernel
 def contract_cheapest(graph: ContractedGraph) -> tuple[int, int, int]:
     """Merge the two clusters at the ends of the cheapest edge, at its cost.
 
@@ -155,7 +155,7 @@ def contract_cheapest(graph: ContractedGraph) -> tuple[int, int, int]:
 # --- the edges of a cluster -------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@kernel
 def _insert(halves: NDArray[Any], clusters: NDArray[Any], half: int, cluster: int) -> None:
     """Put a half-edge at the head of a cluster's list."""
     first = clusters[cluster].first
@@ -166,7 +166,7 @@ def _insert(halves: NDArray[Any], clusters: NDArray[Any], half: int, cluster: in
     clusters[cluster].degree += 1
 
 
-@njit(cache=True)
+@kernel
 def _remove(halves: NDArray[Any], clusters: NDArray[Any], half: int) -> None:
     """Take a half-edge out of its list."""
     cluster, after, before = halves[half].end, halves[half].after, halves[half].before
@@ -179,7 +179,7 @@ def _remove(halves: NDArray[Any], clusters: NDArray[Any], half: int) -> None:
     clusters[cluster].degree -= 1
 
 
-@njit(cache=True)
+@kernel
 def _edge_between(halves: NDArray[Any], clusters: NDArray[Any], a: int, b: int) -> int:
     """Edge between two clusters or -1, by a walk along the shorter list."""
     if clusters[b].degree < clusters[a].degree:
@@ -195,14 +195,14 @@ def _edge_between(halves: NDArray[Any], clusters: NDArray[Any], a: int, b: int) 
 # --- the heap ---------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@kernel
 def heap_update(heap: EdgeHeap, edge: int, cost: float) -> None:
     """Change the cost of an edge, and put it in its place."""
     heap.edges[edge].cost = cost
     _sift(heap, edge)
 
 
-@njit(cache=True)
+@kernel
 def heap_remove(heap: EdgeHeap, edge: int) -> None:
     """Take an edge out."""
     at, last = heap.edges[edge].place, heap.size[0] - 1
@@ -213,7 +213,7 @@ def heap_remove(heap: EdgeHeap, edge: int) -> None:
         _sift(heap, moved)
 
 
-@njit(cache=True)
+@kernel
 def _sift(heap: EdgeHeap, edge: int) -> None:
     """Move an edge up, and then down, to where it belongs."""
     edges, order, size = heap.edges, heap.order, heap.size[0]
@@ -239,6 +239,6 @@ def _sift(heap: EdgeHeap, edge: int) -> None:
     order[at], edges[edge].place = edge, at
 
 
-@njit(cache=True)
+@kernel
 def _is_cheaper(edges: NDArray[Any], a: int, b: int) -> bool:
     return edges[a].cost < edges[b].cost or (edges[a].cost == edges[b].cost and a < b)

@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.hierarchy import children, num_leaves, propagate_sequential, propagation_sources
+from pcgraph.parallel import kernel
 
 
 def horizontal_cut(
@@ -67,7 +67,7 @@ def _whole(name: str, value: int) -> int:
     return int(value)
 
 
-@njit(cache=True)
+@kernel
 def numbered_segments(nodes: NDArray[np.int32], n_nodes: int) -> NDArray[np.int32]:
     """Segment of each leaf, (n_leaves,) int32, numbered from 0 in the order of their first leaf.
 
@@ -146,7 +146,7 @@ def core_of_leaf(parents: NDArray[np.int32], counts: NDArray[np.int64], chosen: 
     return propagate_sequential(parents, core, core < 0)[: num_leaves(parents)].copy()
 
 
-@njit(cache=True)
+@kernel
 def _cores_below(
     children: NDArray[np.int32], counts: NDArray[np.int64], chosen: NDArray[np.bool_]
 ) -> NDArray[np.int32]:
@@ -224,7 +224,7 @@ def stable_nodes(
     return taken & ~below  # the highest of each chain of taken nodes
 
 
-@njit(cache=True)
+@kernel
 def _more_stable(
     children: NDArray[np.int32],
     persistence: NDArray[np.float64],

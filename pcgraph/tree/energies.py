@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.hierarchy import accumulate_sequential, lowest_common_ancestors
+from pcgraph.parallel import kernel
 from pcgraph.tree.optimal_cut import Energy
 from pcgraph.tree.tree import SegmentationTree
 
@@ -83,7 +83,7 @@ def _complexity(tree: SegmentationTree, graph: AdjacencyGraph | None) -> NDArray
     return np.ones(len(tree.parents)) if graph is None else boundary_lengths(tree, graph)
 
 
-@njit(cache=True)
+@kernel
 def _variances(
     parents: NDArray[np.int32], counts: NDArray[np.int64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:

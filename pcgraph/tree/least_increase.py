@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.parallel import kernel
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.linkage import Linkage, Merges, check_numbers
 from pcgraph.voxels.eigen import symmetric_eigen
@@ -174,7 +174,7 @@ class _State(NamedTuple):
     plane: float
 
 
-@njit(cache=True)
+@kernel
 def _first_costs(state: _State, edges: NDArray[np.int32], lengths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Cost of each edge, (m,), and the residuals that it needs."""
     if state.plane > 0.0:
@@ -186,7 +186,7 @@ def _first_costs(state: _State, edges: NDArray[np.int32], lengths: NDArray[np.fl
     return costs
 
 
-@njit(cache=True)
+@kernel
 def _merge(state: _State, graph: ContractedGraph) -> None:
     heap, halves, lengths = graph.heap, graph.halves, graph.sums
     while heap.size[0] > 0:
@@ -199,7 +199,7 @@ def _merge(state: _State, graph: ContractedGraph) -> None:
             half = halves[half].after
 
 
-@njit(cache=True)
+@kernel
 def _cost(state: _State, lengths: NDArray[np.float64], edge: int, a: int, b: int) -> float:
     """Energy of the union of the two regions at an edge less the sum of theirs, per length where there are lengths."""
     reduced = state.masses[a] * state.masses[b] / (state.masses[a] + state.masses[b])
@@ -213,7 +213,7 @@ def _cost(state: _State, lengths: NDArray[np.float64], edge: int, a: int, b: int
     return increase / lengths[0, edge] if len(lengths) > 0 else increase
 
 
-@njit(cache=True)
+@kernel
 def _unite(state: _State, kept: int, gone: int) -> None:
     """Give the first of two regions the moments of both."""
     masses, values, centroids, scatters, residuals, plane = state
@@ -229,7 +229,7 @@ def _unite(state: _State, kept: int, gone: int) -> None:
     masses[kept] = total
 
 
-@njit(cache=True)
+@kernel
 def _scatter_of_union(
     centroids: NDArray[np.float64], scatters: NDArray[np.float64], a: int, b: int, reduced: float
 ) -> NDArray[np.float64]:
@@ -241,7 +241,7 @@ def _scatter_of_union(
     return union
 
 
-@njit(cache=True)
+@kernel
 def _least_eigenvalue(matrix: NDArray[np.float64]) -> float:
     """Least eigenvalue of a symmetric positive semi-definite matrix, which is overwritten."""
     symmetric_eigen(matrix, np.empty((3, 3)))

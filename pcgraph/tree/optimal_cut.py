@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.hierarchy import children
+from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
 
 _NONE = -1
@@ -94,7 +94,7 @@ class _Bends(NamedTuple):
     following: NDArray[np.int32]
 
 
-@njit(cache=True)
+@kernel
 def _appearances(
     parents: NDArray[np.int32],
     children: NDArray[np.int32],
@@ -136,7 +136,7 @@ def _appearances(
     return scales
 
 
-@njit(cache=True)
+@kernel
 def _crossing(data: float, complexity: float, data_below: float, complexity_below: float) -> float:
     """Least scale >= 0 from which on the node's own energy is no larger than that below it."""
     if data <= data_below:
@@ -146,7 +146,7 @@ def _crossing(data: float, complexity: float, data_below: float, complexity_belo
     return (data - data_below) / (complexity_below - complexity)
 
 
-@njit(cache=True)
+@kernel
 def _meld(bends: _Bends, a: int, b: int) -> int:
     """Two heaps as one."""
     if a == _NONE:
@@ -160,7 +160,7 @@ def _meld(bends: _Bends, a: int, b: int) -> int:
     return a
 
 
-@njit(cache=True)
+@kernel
 def _pop(bends: _Bends, heap: int) -> int:
     """A heap without its top: children melded in pairs, then the pairs from the last to the first."""
     first, following = bends.first, bends.following

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.hierarchy import AncestorIndex, ancestor_index, lowest_common_ancestor
+from pcgraph.parallel import kernel
 from pcgraph.tree.tree import SegmentationTree
 from pcgraph.voxels.surface import Surface
 
@@ -49,7 +49,7 @@ def point_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float
     return voxel_saliency(tree, surface)[surface.grid.voxel_of_point]
 
 
-@njit(cache=True)
+@kernel
 def _strongest_contacts(
     index: AncestorIndex,
     altitudes: NDArray[np.float64],

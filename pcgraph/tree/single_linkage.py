@@ -6,12 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.parallel import kernel
 from pcgraph.tree.linkage import Linkage, Merges, check_cost
 
 
@@ -70,7 +70,7 @@ def minimum_spanning_forest(
     return Merges(pairs, costs[forest]), forest
 
 
-@njit(cache=True)
+@kernel
 def _root_of(roots: NDArray[np.int64], node: int) -> int:
     """Representative of a node's set; paths are halved on the way."""
     while roots[node] != node:
@@ -79,7 +79,7 @@ def _root_of(roots: NDArray[np.int64], node: int) -> int:
     return node
 
 
-@njit(cache=True)
+@kernel
 def _kruskal(n_nodes: int, edges: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Merges, and which edges made them; edges come in ascending order of cost."""
     roots, size = np.arange(n_nodes), np.ones(n_nodes, np.int64)

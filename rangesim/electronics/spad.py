@@ -87,7 +87,7 @@ class SpadDetector(PhotoDetector):
         return np.asarray(pixel.photons * np.asarray(radiance, dtype=np.float64) + pixel.dark)
 
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
-        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from pcgraph.parallel import MIN_ROWS, in_blocks
         from rangesim.electronics.shot_noise import count_first_photons, count_photons
 
         gate, height = _counting(gate), radiance.shape[1]
@@ -102,7 +102,7 @@ class SpadDetector(PhotoDetector):
                 else:
                     count_photons(rngs[row], means, pixel, result[:, row])
 
-        in_blocks(read, height, smallest=SMALLEST_ROWS)
+        in_blocks(read, height, smallest=MIN_ROWS)
         return result
 
     def _pixel(self, gate: Gate, rig: Rig, exposure_s: float) -> CountingPixel:

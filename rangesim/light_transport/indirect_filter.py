@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+from pcgraph.parallel import MIN_ROWS, in_blocks
 
 LEVELS = 2
 """The window is 3^LEVELS pixels wide."""
@@ -75,7 +75,7 @@ class LightFilter:
             some = image[begin : begin + CHANNELS_AT_ONCE]
             before, after = some, self.scratch[: len(some)]
             for level, weights in enumerate(self.weights):
-                in_blocks(_apply, image.shape[1], weights, 3**level, before, after, smallest=SMALLEST_ROWS)
+                in_blocks(_apply, image.shape[1], weights, 3**level, before, after, smallest=MIN_ROWS)
                 before, after = after, before
             if before is not some:
                 some[:] = before
@@ -84,7 +84,7 @@ class LightFilter:
 def mixed_pixels(guides: Guides) -> NDArray[np.bool_]:
     """(h, w) whether a pixel sees an edge with something behind it."""
     mixed = np.zeros(guides.instance.shape, np.bool_)
-    in_blocks(_find_mixed, len(mixed), guides.instance, guides.position, guides.normal, mixed, smallest=SMALLEST_ROWS)
+    in_blocks(_find_mixed, len(mixed), guides.instance, guides.position, guides.normal, mixed, smallest=MIN_ROWS)
     return mixed
 
 
@@ -92,7 +92,7 @@ def level_weights(guides: Guides, mixed: NDArray[np.bool_], step: int) -> NDArra
     """(h, 9, w) float32 weights of the 3 x 3 pixels `step` apart, row by row; they add up to 1."""
     h, w = guides.instance.shape
     weights = np.zeros((h, 9, w), np.float32)
-    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights, smallest=SMALLEST_ROWS)
+    in_blocks(_weigh, h, step, guides.instance, guides.position, guides.normal, mixed, weights, smallest=MIN_ROWS)
     return weights
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+from pcgraph.parallel import MIN_ROWS, in_blocks
 from rangesim.decoding.range_image import RangeImage
 from rangesim.settings.config import ShortRepr
 
@@ -148,7 +148,7 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
     limits = np.maximum(MAX_SLOPE * np.hypot(*np.meshgrid(steps, steps)) * _pixel_size(rays), STEP_FLOOR)
     normals = np.empty((*z.shape, 3))
     arguments = (radius, limits, z, 1 / z, np.ascontiguousarray(rays, dtype=np.float64), normals)
-    in_blocks(_fit_normals, len(z), *arguments, smallest=SMALLEST_ROWS)
+    in_blocks(_fit_normals, len(z), *arguments, smallest=MIN_ROWS)
     return normals
 
 

@@ -81,7 +81,7 @@ class DirectToF(Sensor):
         return (TransientHistogram(self.start_s * c, width_m, self.bins * fine, period_m, is_shared=has_pulse),)
 
     def frames(self, channels: Sequence[np.ndarray], white: np.ndarray, ambient: np.ndarray) -> np.ndarray:
-        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from pcgraph.parallel import MIN_ROWS, in_blocks
         from rangesim.decoding.matched_filter import gaussian_filter
 
         variance = (self._fine * self.sigma_bins) ** 2 - SHARED_VARIANCE
@@ -99,7 +99,7 @@ class DirectToF(Sensor):
                     histogram = histogram.reshape(self.bins, self._fine, -1).sum(axis=1)
                 np.add(histogram, evenly[row], out=result[:, row])
 
-        in_blocks(of_rows, fine.shape[1], smallest=SMALLEST_ROWS)
+        in_blocks(of_rows, fine.shape[1], smallest=MIN_ROWS)
         return result
 
     @property
@@ -179,7 +179,7 @@ class DirectToFDecoder(Decoder):
         check_fields(self)
 
     def decode(self, capture: Capture) -> RangeImage:
-        from pcgraph.parallel import SMALLEST_ROWS, in_blocks
+        from pcgraph.parallel import MIN_ROWS, in_blocks
 
         sensor = of_type(capture.sensor, DirectToF)
         height, width = capture.frames.shape[1:]
@@ -192,7 +192,7 @@ class DirectToFDecoder(Decoder):
                 position[row], peak[row], background[row] = found
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
 
-        in_blocks(measure, height, smallest=SMALLEST_ROWS)
+        in_blocks(measure, height, smallest=MIN_ROWS)
         length = (sensor.start_s + position * sensor.bin_s) * SPEED_OF_LIGHT
         bright = bright_level(peak)
         is_strong = peak >= self._least_counts(background) if capture.is_digital else peak > self.relative_peak * bright

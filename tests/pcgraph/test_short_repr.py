@@ -41,7 +41,7 @@ def test_results_print_in_five_lines(boxes):
     points, truth, result = boxes
     planes = detection.find_planes(result)
     graph = metrics.NeighbourGraph.of(points)
-    curve = metrics.level_curve(result.tree.parents, result.tree.altitudes, result.supervoxels, truth)
+    curve = metrics.level_curve(result.tree, result.supervoxels, truth)
     things = [
         *(pcgraph.Cloud(points), result, result.graph, result.graph.edge_features, result.graph.node_features),
         *(result.tree, result.tree.moments, result.tree.features(), result.surface, result.surface.grid),

@@ -41,12 +41,12 @@ def test_the_warm_up_leaves_nothing_to_compile():
 
 
 FIRST = """
-from pcgraph.tree import average
+from pcgraph.tree import average_linkage
 from pcgraph.warmup import compile_in_two_processes, must_compile
 
 print(must_compile())
 compile_in_two_processes()
-print(must_compile(), len(average._merge.nopython_signatures))
+print(must_compile(), len(average_linkage._merge.nopython_signatures))
 """
 
 
