@@ -18,10 +18,10 @@ from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.inputs import CleanCloud, Points, as_arrays, clean_cloud, clean_viewpoint, fraction, non_negative, positive
 from pcgraph.parallel import side_by_side
 from pcgraph.segmentation import Segmentation
-from pcgraph.supervoxels.method import SupervoxelMethod
+from pcgraph.supervoxels.method import SupervoxelMethod, checked_supervoxels
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.average_linkage import ConvexityLinkage
-from pcgraph.tree.linkage import Linkage
+from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.grid import VoxelGrid, grid_union, voxel_grid, voxel_means
 from pcgraph.voxels.spacing import bounding_box, median_spacing
@@ -231,7 +231,9 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
         normals[scan.initial_labels >= 0] = earlier.surface.normals
-    supervoxels = method.supervoxels(grid, normals, scan.seed_size, scan.initial_labels)
+    supervoxels = checked_supervoxels(
+        method.supervoxels(grid, normals, scan.seed_size, scan.initial_labels), grid.n_voxels, method
+    )
     leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
     surface = Surface(grid, normals, supervoxels)
     leaves, touching = side_by_side(
@@ -239,7 +241,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     )
     nodes = node_features(leaves)
     graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes)
-    tree = segmentation_tree(linkage.merges(graph, leaves), leaves)
+    tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
         labels=cloud.spread(objects[leaf_of_point]),

@@ -44,7 +44,8 @@ def in_short(value: Any) -> str:
         return f"{type(value).__name__}(...)"
     if isinstance(value, Mapping) and any(isinstance(v, np.ndarray) for v in value.values()):
         return "{" + ", ".join(f"{type(k).__name__}: {in_short(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, (tuple, list)) and len(value) > 3:
+    many = isinstance(value, (tuple, list)) and (len(value) > 3 or any(isinstance(v, np.ndarray) for v in value))
+    if many and value:
         return f"{len(value)} of {type(value[0]).__name__}"
     return SHORT.repr(value) if not dataclasses.is_dataclass(value) else f"{type(value).__name__}(...)"
 

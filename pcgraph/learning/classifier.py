@@ -127,6 +127,10 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
             The classifier was fitted on descriptors that this version does not know.
         """
         check_is_fitted(self, msg="expected a fitted %(name)s, got a new one; call fit first")
+        if not isinstance(segmentation, Segmentation):
+            raise ValueError(
+                f"expected one Segmentation, as pcgraph.segment returns, got {type(segmentation).__name__}"
+            )
         table, names = self._describe(segmentation, up)
         if names != self.feature_names_:
             raise ValueError("expected a classifier of this version's descriptors, got another's; fit it again")
@@ -238,8 +242,8 @@ def _listed(
     directions: list[Any] = [ups] if single else [None] * len(clouds) if ups is None else list(ups)  # type: ignore[arg-type]
     if not clouds or not len(clouds) == len(labels) == len(directions):
         raise ValueError(
-            f"expected one truth (and one up, if any) per segmentation, got {len(clouds)} segmentations, "
-            f"{len(labels)} truths, {len(directions)} ups"
+            f"expected one truth (and one up, if any) per segmentation, got {len(clouds)} segmentations and "
+            f"{len(labels)} truths" + (f", {len(directions)} ups" if ups is not None else "")
         )
     for cloud, truth in zip(clouds, labels, strict=True):
         if truth.shape != cloud.supervoxels.shape:

@@ -268,6 +268,10 @@ class PanopticQuality(ShortRepr):
     missed: NDArray[np.int64]
     overlap_sums: NDArray[np.float64]
 
+    def __repr__(self) -> str:
+        """The three means, and how many classes."""
+        return f"PanopticQuality(pq={self.pq:.3f}, sq={self.sq:.3f}, rq={self.rq:.3f}, classes={len(self.classes)})"
+
     @property
     def of_classes(self) -> NDArray[np.float64]:
         """PQ of each class, (c,), 0..1."""

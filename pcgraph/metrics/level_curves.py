@@ -151,6 +151,9 @@ def level_score(name: str, *, larger_is_better: bool, alias: str | None = None) 
 
     def add(after_merges: AfterMerges) -> AfterMerges:
         for key in (name, alias or name):
+            taken = LEVEL_SCORES.get(key)
+            if taken is not None and taken.after_merges.__module__ != after_merges.__module__:
+                raise ValueError(f"expected a name of its own for a score, got {key!r}, which is taken")
             LEVEL_SCORES[key] = LevelScore(name, larger_is_better, after_merges)
         return after_merges
 

@@ -48,3 +48,22 @@ class SupervoxelMethod(ABC):
     ) -> NDArray[np.int32]:
         """Supervoxel of each point, (n,) int32, given that of each voxel, (v,) int32: that of the point's voxel."""
         return supervoxels[grid.voxel_of_point]
+
+
+def checked_supervoxels(found: NDArray[np.int32], n_voxels: int, method: object) -> NDArray[np.int32]:
+    """The supervoxels that a method made of so many voxels, (v,) int32.
+
+    Raises
+    ------
+    ValueError
+        They are not one whole number per voxel, 0..k - 1, with none left out.
+    """
+    name = f"{type(method).__name__}.supervoxels"
+    labels = np.asarray(found)
+    if labels.shape != (n_voxels,) or labels.dtype.kind not in "iu":
+        raise ValueError(
+            f"expected {name} to return a whole number for each of {n_voxels} voxels, got {labels.shape} {labels.dtype}"
+        )
+    if labels.min() < 0 or labels.max() >= n_voxels or not np.bincount(labels).all():
+        raise ValueError(f"expected {name} to number supervoxels 0..k - 1 without a gap, and to give each voxel one")
+    return np.ascontiguousarray(labels, np.int32)

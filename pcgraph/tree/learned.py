@@ -214,10 +214,12 @@ class EdgeModel(msgspec.Struct, frozen=True):
         try:
             file = msgspec.json.decode(text, type=_EdgeModelFile)
         except RecursionError:
-            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}, which is nested too deep") from None
+            raise ValueError(
+                f"expected JSON that LearnedLinkage.save wrote, got {path}, which is nested too deep"
+            ) from None
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
             reason = ascii(str(error))[1:-1][:200]  # it may quote the file
-            raise ValueError(f"expected JSON that EdgeModel.save wrote, got {path}: {reason}") from None
+            raise ValueError(f"expected JSON that LearnedLinkage.save wrote, got {path}: {reason}") from None
         return cls(**{name: getattr(file, name) for name in cls.__struct_fields__})
 
 

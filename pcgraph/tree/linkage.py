@@ -32,6 +32,33 @@ class Merges(ShortRepr):
     altitudes: NDArray[np.float64]
 
 
+def checked_merges(merges: Merges, n_nodes: int, linkage: object) -> Merges:
+    """The merges that a linkage made of so many nodes.
+
+    Raises
+    ------
+    ValueError
+        They are no `Merges`, join what is not there or joined already, or altitudes are negative, not finite, or
+        decrease.
+    """
+    name = f"{type(linkage).__name__}.merges"
+    if not isinstance(merges, Merges):
+        raise ValueError(f"expected {name} to return Merges, got {type(merges).__name__}")
+    pairs, altitudes = np.asarray(merges.pairs), np.asarray(merges.altitudes)
+    t = len(altitudes)
+    if pairs.shape != (t, 2) or pairs.dtype.kind not in "iu" or t > max(n_nodes - 1, 0):
+        raise ValueError(
+            f"expected {name} to return pairs (t, 2) of whole numbers and altitudes (t,), t up to {n_nodes - 1}, "
+            f"got {pairs.shape} {pairs.dtype} and {altitudes.shape}"
+        )
+    joined = np.bincount(pairs.ravel(), minlength=1) if t and pairs.min() >= 0 and pairs.max() < n_nodes + t else [2]
+    if t and (max(joined) > 1 or (pairs.max(axis=1) >= n_nodes + np.arange(t)).any()):
+        raise ValueError(f"expected {name} to join nodes that are there and not joined yet, 0..{n_nodes - 1} at first")
+    if not (np.isfinite(altitudes).all() and (altitudes >= 0).all() and (np.diff(altitudes) >= 0).all()):
+        raise ValueError(f"expected {name} to return finite altitudes, not negative and not decreasing")
+    return merges
+
+
 class Linkage(ABC):
     """How a graph becomes a tree.
 

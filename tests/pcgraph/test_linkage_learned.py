@@ -118,7 +118,7 @@ def good():
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "model.json"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"^expected JSON that EdgeModel.save wrote, got .*model.json") as refusal:
+    with pytest.raises(ValueError, match=r"^expected JSON that LearnedLinkage.save wrote, got .*model.json") as refusal:
         EdgeModel.load(path)
     assert str(refusal.value).isprintable()
     assert len(str(refusal.value)) < 300 + len(str(path))
