@@ -100,7 +100,7 @@ def segment(
     min_size: Annotated[int, typer.Option(help="Points that every segment has at least.")] = 1,
     range_growth: Annotated[
         float,
-        typer.Option(help="Power of the range with which voxels grow, 0 to 1; 0.5 suits scanners. Default: 0."),
+        typer.Option(help="Power of the range with which voxels grow, from 0 to below 1; 0.5 suits scanners."),
     ] = 0.0,
     color: Annotated[bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")] = True,
     viewpoint: Annotated[

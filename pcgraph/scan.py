@@ -160,6 +160,8 @@ def update(
     -----
     Nothing is ever taken away: what has moved between the scans is there twice.
     """
+    if not isinstance(earlier, Segmentation):
+        raise ValueError(f"expected the Segmentation of the scans so far, got {type(earlier).__name__}")
     points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
     if object_altitude is None and linkage is None:
         object_altitude = earlier.object_altitude

@@ -58,8 +58,8 @@ class CameraWarp(Warp):
         """ValueError if a point does not lie in front of the camera."""
         if points[:, 2].min() <= self.viewpoint[2]:
             raise ValueError(
-                f"camera=True expects all points in front of the viewpoint (z > {self.viewpoint[2]:g} m), "
-                f"got z down to {points[:, 2].min():g} m; pass camera=False"
+                f"expected all points in front of the camera (z > {self.viewpoint[2]:g} m), as voxels grow with depth, "
+                f"got z down to {points[:, 2].min():g} m; segment (the first scan, for update) with camera=False"
             )
 
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
