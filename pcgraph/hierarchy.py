@@ -3,8 +3,8 @@
 
 A hierarchy of k nodes is one array `parents`, (k,) int32: leaves first, every parent after its children, the last
 node the root and its own parent. So one pass in ascending order meets children before parents, and one in
-descending order parents before children. Trees, metrics and learning rest on these functions, which bear the
-names that they have in Higra. Nothing here checks its input; `checked_parents` does that once, at the door.
+descending order parents before children. Trees, metrics and learning rest on these functions, named after those of
+Higra. They do not check their input: `checked_parents` does that once, at the door.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def num_leaves(parents: NDArray[np.int32]) -> int:
 
 
 @kernel
-def children(parents: NDArray[np.int32]) -> NDArray[np.int32]:
+def binary_children(parents: NDArray[np.int32]) -> NDArray[np.int32]:
     """The two children of each node of a binary hierarchy, (k, 2) int32, the smaller first; -1 for leaves."""
     pairs = np.full((len(parents), 2), -1, np.int32)
     for node in range(len(parents)):

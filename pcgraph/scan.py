@@ -168,6 +168,7 @@ def update(
     settings = Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
+    compile_in_two_processes()
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp)

@@ -8,16 +8,19 @@ lock, so threads are no help; a second process compiles what graph and tree need
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import numba
 import numpy as np
 from numba import config
 from numpy.typing import NDArray
@@ -40,6 +43,16 @@ _PATIENCE_S = 120.0  # after which the second process is given up
 
 _lock = Lock()
 _done = False
+
+
+def _forget_lock() -> None:
+    """Make the lock anew in a forked process, where nobody is left to give it back."""
+    global _lock
+    _lock = Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_lock)
 
 
 def compile_kernels() -> None:
@@ -77,7 +90,8 @@ def compile_in_two_processes() -> None:
         try:
             with _no_garbage_collection():
                 compile_voxels()
-            other.wait(_PATIENCE_S)
+            with suppress(subprocess.TimeoutExpired):
+                other.wait(_PATIENCE_S)
         finally:
             if other.poll() is None:
                 other.kill()
@@ -144,22 +158,34 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 def _is_cached(kernel: Any) -> bool:
-    """Whether numba's cache has an index of this kernel that is not older than its source."""
+    """Whether numba's cache has an index of this kernel, of this version of numba and not older than its source."""
     source = kernel.py_func.__code__
     try:
         written = Path(source.co_filename).stat().st_mtime
         names = Path(kernel.stats.cache_path).glob(f"*.{source.co_name}-{source.co_firstlineno}.*.nbi")
-        return any(name.stat().st_mtime >= written for name in names)
-    except OSError:  # the source is no plain file, or another process clears the cache: nothing can be said
+        return any(name.stat().st_mtime >= written and _version_of(name) == numba.__version__ for name in names)
+    except (
+        OSError,
+        EOFError,
+        pickle.UnpicklingError,
+    ):  # the source is no plain file, or another process clears the cache: nothing can be said
         return True
 
 
+def _version_of(index: Path) -> object:
+    """The version of numba that an index of its cache begins with."""
+    with index.open("rb") as file:
+        return pickle.load(file)  # as numba does
+
+
 def _second_process() -> subprocess.Popen[bytes] | None:
-    """The process that compiles graph and tree; None where there is but one thread or no interpreter to start."""
-    if config.NUMBA_NUM_THREADS < 2 or not Path(sys.executable or "").name.startswith("python"):
+    """The process that compiles graph and tree; None where there is but one thread, no interpreter to start, or where
+    other processes of a pool are likely to compile too."""
+    in_pool = multiprocessing.parent_process() is not None or "PYTEST_XDIST_WORKER" in os.environ
+    if in_pool or config.NUMBA_NUM_THREADS < 2 or not Path(sys.executable or "").name.startswith("python"):
         return None
     code = "import gc; gc.disable(); from pcgraph.warmup import compile_graph_and_tree; compile_graph_and_tree()"
-    paths = os.pathsep.join(path for path in sys.path if path)
+    paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
     quiet = subprocess.DEVNULL
     try:
         return subprocess.Popen(

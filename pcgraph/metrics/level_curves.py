@@ -295,7 +295,7 @@ class BoundaryCurve(ShortRepr):
 
     @property
     def f_measure(self) -> LevelCurve:
-        """Harmonic mean of both, 0..1, as a curve for `best_scales`: the classical ODS and OIS."""
+        """Harmonic mean of both, 0..1, as a curve for `best_scales`: ODS and OIS."""
         sums = self.recall + self.precision
         values = 2 * self.recall * self.precision / np.where(sums > 0, sums, 1.0)
         return LevelCurve(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import config
 from numpy.typing import NDArray
 
 from pcgraph.parallel import kernel
@@ -21,6 +22,12 @@ NONE = -1
 EDGE = np.dtype([("cost", np.float64), ("place", np.int64)])
 HALF_EDGE = np.dtype([("end", np.int64), ("after", np.int64), ("before", np.int64)])
 CLUSTER = np.dtype([("first", np.int64), ("degree", np.int64), ("tree_node", np.int64)])
+
+
+def _records(n: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """A table of n records, whose fields kernels name as attributes; so do they where they are not compiled."""
+    table = np.empty(n, dtype)
+    return table.view(np.recarray) if config.DISABLE_JIT else table
 
 
 class EdgeHeap(NamedTuple):
@@ -78,9 +85,9 @@ class ContractedGraph(NamedTuple):
         """A graph before its first merge; `sums` change with it."""
         m, most = len(edges), max(n_nodes - 1, 0)
         graph = cls(
-            EdgeHeap(np.empty(m, EDGE), np.empty(m, np.int64), np.zeros(1, np.int64)),
-            np.empty(2 * m, HALF_EDGE),
-            np.empty(n_nodes, CLUSTER),
+            EdgeHeap(_records(m, EDGE), np.empty(m, np.int64), np.zeros(1, np.int64)),
+            _records(2 * m, HALF_EDGE),
+            _records(n_nodes, CLUSTER),
             sums,
             np.empty(m, np.int64),
             np.empty((most, 2), np.int32),

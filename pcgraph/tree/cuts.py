@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.hierarchy import children, num_leaves, propagate_sequential, propagation_sources
+from pcgraph.hierarchy import binary_children, num_leaves, propagate_sequential, propagation_sources
 from pcgraph.parallel import kernel
 
 
@@ -122,7 +122,7 @@ def size_cores(parents: NDArray[np.int32], counts: NDArray[np.int64], min_size: 
         If the whole tree has fewer points, its root is the only core.
     """
     enough = counts >= min(min_size, int(counts[-1]))
-    pairs = children(parents)
+    pairs = binary_children(parents)
     inner = pairs[:, 0] >= 0
     enough_below = enough[pairs] & inner[:, None]
     chosen = enough & ~enough_below.any(axis=1)
@@ -142,7 +142,7 @@ def core_of_leaf(parents: NDArray[np.int32], counts: NDArray[np.int64], chosen: 
     chosen : (k,) bool
         At least one, none above another.
     """
-    core = _cores_below(children(parents), counts, chosen)
+    core = _cores_below(binary_children(parents), counts, chosen)
     return propagate_sequential(parents, core, core < 0)[: num_leaves(parents)].copy()
 
 
@@ -213,7 +213,7 @@ def stable_nodes(
     Source: Campello et al. 2015 (excess of mass, HDBSCAN), with altitude in place of 1 / density, so what lasts long
     at high altitude counts as much as what lasts long at low altitude.
     """
-    across_gap, pairs = np.isinf(altitudes), children(parents)
+    across_gap, pairs = np.isinf(altitudes), binary_children(parents)
     smaller = np.where(pairs[:, 0] >= 0, counts[pairs].min(axis=1), 0)
     levels = np.minimum(altitudes, altitudes[~across_gap & (smaller >= min_size)].max(initial=0.0))
     persistence = levels[parents] - levels

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.hierarchy import children
+from pcgraph.hierarchy import binary_children
 from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
 
@@ -76,7 +76,7 @@ def appearance_scales(
     bends of the function wait in a heap with the last one on top; two heaps merge in constant time, and every
     bend leaves once: O(k log k) in any tree, however deep.
     """
-    return _appearances(parents, children(parents), data, complexity)
+    return _appearances(parents, binary_children(parents), data, complexity)
 
 
 class _Bends(NamedTuple):

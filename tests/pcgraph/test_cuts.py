@@ -11,7 +11,7 @@ from clouds import refines
 from graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
 
 from pcgraph.features.moments import Moments
-from pcgraph.hierarchy import children
+from pcgraph.hierarchy import binary_children
 from pcgraph.tree.average_linkage import ConvexityLinkage
 from pcgraph.tree.energies import boundary_lengths, plane_energy, variance_energy
 from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
@@ -122,7 +122,7 @@ def random_tree(n, rng, integers=True):
 
 
 def all_cuts(tree):
-    pairs = children(tree.parents).tolist()
+    pairs = binary_children(tree.parents).tolist()
 
     def below(node):
         a, b = pairs[node]
@@ -163,7 +163,7 @@ def random_energy(tree, rng):
     """Any data, and complexities of which a parent has at most as much as its children."""
     k = len(tree.parents)
     complexity = rng.integers(1, 6, k).astype(float)
-    for node, (a, b) in enumerate(children(tree.parents).tolist()):
+    for node, (a, b) in enumerate(binary_children(tree.parents).tolist()):
         if a >= 0:
             complexity[node] = min(complexity[node], complexity[a] + complexity[b])
     return Energy(rng.integers(0, 40, k).astype(float), complexity)

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.hierarchy import (
     accumulate_sequential,
     ancestor_index,
+    binary_children,
     checked_parents,
     child_lists,
-    children,
     lowest_common_ancestor,
     lowest_common_ancestors,
     num_leaves,
@@ -54,8 +54,8 @@ def path(parents: NDArray[np.int32], node: int) -> list[int]:
 
 def test_leaves_and_children():
     assert [num_leaves(parents) for parents in (CHAIN, FLAT, ONE)] == [3, 4, 1]
-    assert children(CHAIN).tolist() == [[-1, -1], [-1, -1], [-1, -1], [0, 1], [2, 3]]
-    assert children(ONE).tolist() == [[-1, -1]]
+    assert binary_children(CHAIN).tolist() == [[-1, -1], [-1, -1], [-1, -1], [0, 1], [2, 3]]
+    assert binary_children(ONE).tolist() == [[-1, -1]]
     for parents, expected in ((CHAIN, [[], [], [], [0, 1], [2, 3]]), (FLAT, [[], [], [], [], [0, 1, 2, 3]])):
         lists = child_lists(parents)
         assert [lists.nodes[a:b].tolist() for a, b in zip(lists.starts, lists.starts[1:], strict=False)] == expected
