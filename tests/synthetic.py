@@ -11,7 +11,7 @@ import numpy as np
 from rangesim.response import DenseResponse, FirstReturn, LightPath, NumpyMath, Response, SparseResponse
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import Sensor
-from rangesim.signals import EnergySplit, GroundTruth, StillSignals
+from rangesim.signals import EnergySplit, GroundTruth, Signals, StillSignals
 
 
 def stereo_rig(width: int = 160, height: int = 120, baseline_m: float = 0.2, **changes: object) -> Rig:
@@ -90,3 +90,10 @@ def counted_return() -> tuple[FirstReturn, list[None]]:
             return super().weights(path, m)
 
     return Counted(), traces
+
+
+def all_bytes(signals: Signals) -> bytes:
+    """Channels, energy split and truth of a pass, to compare passes to the last bit."""
+    assert isinstance(signals, StillSignals)
+    parts = [signals.channels, vars(signals.energy), vars(signals.truth)]
+    return b"".join(np.ascontiguousarray(x).tobytes() for p in parts for x in p.values() if isinstance(x, np.ndarray))

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from synthetic import all_bytes
 
 import rangesim
-from rangesim import AmcwToF, DirectToF, Rig, Scene, Signals, StructuredLight, transport
+from rangesim import AmcwToF, DirectToF, Rig, Scene, StructuredLight, transport
 from rangesim.light_transport import kernel_launches, photons
 from rangesim.light_transport.loop import _dealt
 from rangesim.light_transport.photons import trace_photons
@@ -54,11 +55,6 @@ def tabletop() -> Scene:
 
 def sensors() -> list[rangesim.Sensor]:
     return [StructuredLight(axes=("columns",)), AmcwToF(), DirectToF(bins=32, bin_s=400e-12)]
-
-
-def all_bytes(signals: Signals) -> bytes:
-    arrays = [*signals.channels.values(), *vars(signals.energy).values(), signals.truth.z, signals.truth.instance]
-    return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
 
 
 # ---- A signal ends the work soon --------------------------------------------------------------------

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from delta_scenes import GLASS, MIRROR, matte, rig_of, scene_of, wall
+from synthetic import all_bytes
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, StructuredLight, look_at, transport
@@ -36,11 +37,6 @@ def all_sensors() -> list[rangesim.Sensor]:
         DirectToF(bins=64, bin_s=400e-12),
         IdealToF(),
     ]
-
-
-def all_bytes(signals: rangesim.Signals) -> bytes:
-    arrays = [*signals.channels.values(), *vars(signals.energy).values(), signals.truth.z, signals.truth.instance]
-    return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
 
 
 # ---- Closed forms -----------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from synthetic import all_bytes
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, Scene, Sensor, Signals, StructuredLight, transport
@@ -65,11 +66,6 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 def straight_rig(scene: Scene, baseline_m: float, projector: Intrinsics) -> Rig:
     """Camera of 64 x 48 pixels and a projector beside it that looks the same way."""
     return Rig(scene.camera.resized(64, 48), projector, scene.T_world_camera, translation(baseline_m, 0, 0))
-
-
-def all_bytes(signals: Signals) -> bytes:
-    arrays = [*signals.channels.values(), *vars(signals.energy).values(), signals.truth.z, signals.truth.normal]
-    return b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
 
 
 # ---- Tracks and timings -----------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from synthetic import all_bytes
 
 import rangesim
 from rangesim import (
@@ -43,13 +44,6 @@ def pair(scene: Scene, width: int = 48) -> list[Rig]:
     """A rig, and one whose camera stands 12 cm to the right, turned inwards."""
     rig = scene.rig(width=width)
     return [rig, rig.with_camera(look_at((0.12, 0, 0), (0, 0, scene.working_distance_m), up=(0, -1, 0)))]
-
-
-def all_bytes(signals: rangesim.Signals) -> bytes:
-    assert isinstance(signals, rangesim.StillSignals)
-    parts = [signals.channels, vars(signals.energy), vars(signals.truth)]
-    arrays = [np.asarray(x) for part in parts for x in part.values() if isinstance(x, np.ndarray)]
-    return b"".join(x.tobytes() for x in arrays)
 
 
 def test_another_camera_leaves_the_emitter_where_it_is(tabletop: Scene) -> None:

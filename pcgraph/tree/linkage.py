@@ -51,8 +51,8 @@ def checked_merges(merges: Merges, n_nodes: int, linkage: object) -> Merges:
             f"expected {name} to return pairs (t, 2) of whole numbers and altitudes (t,), t up to {n_nodes - 1}, "
             f"got {pairs.shape} {pairs.dtype} and {altitudes.shape}"
         )
-    joined = np.bincount(pairs.ravel(), minlength=1) if t and pairs.min() >= 0 and pairs.max() < n_nodes + t else [2]
-    if t and (max(joined) > 1 or (pairs.max(axis=1) >= n_nodes + np.arange(t)).any()):
+    are_there = bool((pairs >= 0).all() and (pairs < n_nodes + np.arange(t)[:, None]).all())
+    if not are_there or (np.bincount(pairs.ravel(), minlength=1) > 1).any():
         raise ValueError(f"expected {name} to join nodes that are there and not joined yet, 0..{n_nodes - 1} at first")
     if not (np.isfinite(altitudes).all() and (altitudes >= 0).all() and (np.diff(altitudes) >= 0).all()):
         raise ValueError(f"expected {name} to return finite altitudes, not negative and not decreasing")

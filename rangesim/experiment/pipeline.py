@@ -79,6 +79,7 @@ def run(
     import mitsuba as mi
 
     from pcgraph.warmup import compile_kernels
+    from rangesim.light_transport.kernel_launches import report_part
     from rangesim.report import write_report
 
     tell = progress or _unwatched
@@ -102,7 +103,7 @@ def run(
             stage = f"Tracing light, pass {number} of {len(passes)} ({', '.join(i.name for i in instruments)})"
             begin, end = (_fraction(number, len(passes), of_pass) for of_pass in (0.0, 1.0))
             tell(stage, begin)
-            told = None if progress is None else partial(_tell_part, tell, stage, begin, end - begin)
+            told = progress and partial(report_part, partial(tell, stage), begin, end - begin)
             with timed(times, f"transport_{number}"):
                 signals = _trace(experiment, scene, rig, instruments, told)
             write_pass(signals, folder / f"pass_{number}.npz")
@@ -264,10 +265,6 @@ def _trace(
     (instrument,) = instruments
     timings = {instrument.sensor: instrument.timing}
     return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[instrument.sensor]
-
-
-def _tell_part(tell: Progress, stage: str, begin: float, part: float, fraction: float) -> None:
-    tell(stage, begin + part * fraction)
 
 
 def _fraction(number: int, passes: int, of_pass: float) -> float:

@@ -117,7 +117,7 @@ def transport(
     signals = []
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))
-        one, truncation = view.trace(responses, photons, adaptive, launches, part)
+        one, truncation = view.trace(responses, photons, launches, part)
         of = f" of camera {number}" if len(views) > 1 else ""
         warn_of_truncation(truncation, settings.max_depth, of, stacklevel=3)  # where `transport` was called
         signals.append(replace(one, truncation=truncation))
@@ -144,7 +144,7 @@ class _CameraPass:
         adaptive: AdaptiveSampling | None,
         number: int,
     ) -> None:
-        self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
+        self.scene, self.rig, self.here, self.adaptive = scene, rig, scene.in_renderer(rig), adaptive
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
         self.traced = traced._replace(camera=Device.camera(self.here))
         self.truth, self.guides = ground_truth(scene, self.traced, rig)
@@ -161,12 +161,12 @@ class _CameraPass:
         self,
         responses: Sequence[Response],
         photons: Photons | None,
-        adaptive: AdaptiveSampling | None,
         launches: Launches,
         report: Report,
     ) -> tuple[StillSignals, Truncation]:
         """Signals of this camera, and how much of the light they lack; photons are those of its emitter."""
-        settings, rig, guides, fewest = self.settings, self.rig, self.guides, int(self.samples.min())
+        settings, rig, guides, adaptive = self.settings, self.rig, self.guides, self.adaptive
+        fewest = int(self.samples.min())
         maps = caustic_maps(photons, self.here, settings.caustic_radius_m)
         view, of_paths = View(self.traced, maps), PathSettings.of(self.scene, settings)
         keeps_apart = settings.indirect == "filtered"
