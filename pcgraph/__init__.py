@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from pcgraph.tree.linkage import Linkage as Linkage
     from pcgraph.tree.linkage import Merges as Merges
     from pcgraph.tree.optimal_cut import Energy as Energy
+    from pcgraph.tree.region_linkage import RegionLinkage as RegionLinkage
     from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
     from pcgraph.voxels.surface import Surface as Surface
@@ -78,6 +79,7 @@ else:
             "tree.least_increase": ["MumfordShahLinkage", "WardLinkage"],
             "tree.linkage": ["Linkage", "Merges"],
             "tree.optimal_cut": ["Energy"],
+            "tree.region_linkage": ["RegionLinkage"],
             "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
             "voxels.surface": ["Surface"],

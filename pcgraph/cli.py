@@ -86,26 +86,29 @@ def segment(
     linkage: Annotated[
         str,
         typer.Option(
-            help="How the graph becomes a tree: convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, ward, or the "
-            ".json file of a learned one."
+            help="How the graph becomes a tree: region, convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, ward, "
+            "or the .json file of a learned one."
         ),
-    ] = "convexity",
+    ] = "region",
     objects: Annotated[
         int | None, typer.Option(help="Exact number of segments. Default: as many as --altitude leaves.")
     ] = None,
     altitude: Annotated[
         float | None,
-        typer.Option(help="Altitude of the cut, in the linkage's unit (convexity: radians). Default: the linkage's."),
+        typer.Option(help="Altitude of the cut, in the linkage's unit (default: radians). Default: the linkage's."),
     ] = None,
     min_size: Annotated[int, typer.Option(help="Points that every segment has at least.")] = 1,
     range_growth: Annotated[
-        float,
-        typer.Option(help="Power of the range with which voxels grow, from 0 to below 1; 0.5 suits scanners."),
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Power of the range with which voxels grow, from 0 to below 1. Default: 0.5 for what looks like one "
+            "scan, else 0."
+        ),
+    ] = None,
     color: Annotated[bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")] = True,
     viewpoint: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Sensor position x y z in metres. Default: the file's, else a guess from the cloud."),
+        typer.Option(help="Sensor position x y z in metres. Default: the file's, else found from the cloud."),
     ] = None,
 ) -> None:
     """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.

@@ -106,8 +106,8 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     return CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept)
 
 
-def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64]:
-    """The viewpoint, (3,) or (n, 3) float64, metres: as given, or by the rule that `pcgraph.segment` documents."""
+def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64] | None:
+    """The viewpoint, (3,) or (n, 3) float64, metres: as given, the origin of an organised cloud, or None."""
     if viewpoint is not None:
         given = _numbers("viewpoint", viewpoint).astype(np.float64)
         per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
@@ -118,12 +118,7 @@ def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[n
                 f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
             )
         return position
-    low, high = bounding_box(cloud.points)
-    if len(cloud.shape) == 2 or (low > 0.0).any() or (high < 0.0).any():
-        return np.zeros(3)
-    above = (low + high) / 2.0
-    above[2] += 10.0 * float(np.linalg.norm(high - low)) + 1e-3
-    return above
+    return np.zeros(3) if len(cloud.shape) == 2 else None
 
 
 def _excerpt(values: NDArray[np.float64]) -> str:

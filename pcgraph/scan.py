@@ -15,22 +15,25 @@ from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import contacts, edge_features
+from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import CleanCloud, Points, as_arrays, clean_cloud, clean_viewpoint, fraction, non_negative, positive
 from pcgraph.parallel import side_by_side
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod, checked_supervoxels
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
-from pcgraph.tree.average_linkage import ConvexityLinkage
 from pcgraph.tree.linkage import Linkage, checked_merges
+from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.grid import VoxelGrid, grid_union, voxel_grid, voxel_means
-from pcgraph.voxels.spacing import bounding_box, median_spacing
+from pcgraph.voxels.spacing import bounding_box, median_spacing, spacing_law
 from pcgraph.voxels.surface import Surface
-from pcgraph.voxels.warp import choose_warp
+from pcgraph.voxels.visibility import visible_sides
+from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
 VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0
+RANGE_GROWTH = 0.5
 
 
 def segment(
@@ -42,7 +45,7 @@ def segment(
     voxel_size: float | None = None,
     seed_size: float | None = None,
     camera: bool | None = None,
-    range_growth: float = 0.0,
+    range_growth: float | None = None,
     method: SupervoxelMethod | None = None,
     linkage: Linkage | None = None,
     object_altitude: float | None = None,
@@ -61,8 +64,9 @@ def segment(
         Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
     viewpoint : (3,) or points' shape float, metres, the points' frame, optional
         Where the sensor stood, for all points or for each; estimated normals point to its side, and convexity
-        depends on that. Default: the origin for organised clouds and for clouds whose bounding box leaves the
-        origin out; otherwise a place high above (+z) the box.
+        depends on that. Default: the origin for organised clouds. A list of points whose spacing grows with range
+        from one place (`pcgraph.voxels.spacing.spacing_law`) was seen from there; of any other, the outside is found
+        from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
     voxel_size : float, metres, optional
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
     seed_size : float, metres, optional
@@ -73,11 +77,12 @@ def segment(
         voxels grow with range. (A missing point stored as (0, 0, 0) lies at the viewpoint: make it NaN.)
     range_growth : float, 0..1, without 1
         Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
-        scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece.
+        scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece. Default:
+        0.5 where the spacing grows with range from the one viewpoint, given or found, and `camera` is not in use.
     method : SupervoxelMethod, optional
         How voxels become supervoxels; default `SurfaceGrowth()`.
     linkage : Linkage, optional
-        How the graph becomes a tree; default `ConvexityLinkage()`, whose altitudes are radians of concavity.
+        How the graph becomes a tree; default `RegionLinkage()`, whose altitudes are radians of concavity.
     object_altitude : float, the linkage's unit, optional
         Altitude above which two parts are two objects: the cut that gives `labels`. Default: the linkage's.
 
@@ -100,18 +105,16 @@ def segment(
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
     points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
-    settings = Settings.of(method or SurfaceGrowth(), linkage or ConvexityLinkage(), object_altitude)
+    settings = Settings.of(method or SurfaceGrowth(), linkage or RegionLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals)
     position = clean_viewpoint(viewpoint, cloud)
     voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
-    growth = fraction("range_growth", range_growth)
     compile_in_two_processes()
-    warp = choose_warp(
-        cloud.points, position, _is_camera(cloud, position, growth) if camera is None else camera, growth
-    )
+    position, warp = _place_and_warp(cloud, position, camera, range_growth)
     grid = voxel_grid(cloud.points, cloud.colors, voxel_size, warp)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
-    scan = Scan(cloud, position, grid, _orientation_points(grid, position), initial_labels, seed_size)
+    position, orientation = _orientation(grid, position)
+    scan = Scan(cloud, position, grid, orientation, initial_labels, seed_size)
     return segment_scan(scan, None, settings)
 
 
@@ -176,7 +179,7 @@ def update(
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
     orientation = np.empty((union.grid.n_voxels, 3))
-    orientation[union.second] = _orientation_points(seen, position)
+    position, orientation[union.second] = _orientation(seen, position)
     orientation[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
     scan = Scan(cloud, position, union.grid, orientation, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
@@ -243,7 +246,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: _leaves(cloud, surface, leaf_of_point, earlier), lambda: contacts(grid, normals, supervoxels)
     )
     nodes = node_features(leaves)
-    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes)
+    near = gaps(grid, normals, supervoxels, nodes, touching.edges)
+    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near)
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
@@ -281,13 +285,38 @@ def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArr
     return np.where(usable, means / np.where(usable, length, 1.0), estimated)
 
 
-def _orientation_points(grid: VoxelGrid, position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From where the voxels were seen: one place, (3,), or the mean of those of each voxel's points, (v, 3)."""
+def _place_and_warp(
+    cloud: CleanCloud, position: NDArray[np.float64] | None, camera: bool | None, range_growth: float | None
+) -> tuple[NDArray[np.float64] | None, Warp]:
+    """From where the cloud was seen, if that is known or its spacing tells; and how its voxels grow."""
+    if camera is None:
+        camera = position is not None and _is_camera(cloud, position, range_growth)
+    growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
+    if position is None or (range_growth is None and position.ndim == 1 and not camera):
+        law = spacing_law(cloud.points, position)
+        if law.holds:
+            position = law.viewpoint
+            growth = RANGE_GROWTH if range_growth is None and not camera else growth
+    if position is None and not (camera or growth):
+        return None, Warp()
+    return position, choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
+
+
+def _orientation(
+    grid: VoxelGrid, position: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """From where the cloud was seen, and a place on the outer side of each voxel, (3,) or (v, 3).
+
+    Voxels of points that were seen from several places take the mean of those.
+    """
+    if position is None:
+        sides = visible_sides(grid)
+        return sides.viewpoint, sides.outside
     if position.ndim == 1:
-        return position
+        return position, position
     low, high = bounding_box(position)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
-    return middle + reach * voxel_means((position - middle) / reach, grid)
+    return position, middle + reach * voxel_means((position - middle) / reach, grid)
 
 
 def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> tuple[float, float]:
@@ -301,7 +330,7 @@ def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None)
     return voxel, seed
 
 
-def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float) -> bool:
+def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float | None) -> bool:
     """Whether a camera at the viewpoint may have taken this as one image."""
     if len(cloud.shape) != 2 or viewpoint.ndim != 1 or range_growth:
         return False

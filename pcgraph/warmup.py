@@ -29,12 +29,14 @@ from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.gaps import gaps
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
-from pcgraph.tree.average_linkage import ConvexityLinkage
+from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
-from pcgraph.voxels.spacing import some_blocks
+from pcgraph.voxels.spacing import some_blocks, spacing_law
+from pcgraph.voxels.visibility import visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
 
 _EDGE = 24  # points along the cloud's edges
@@ -104,7 +106,9 @@ def compile_voxels() -> None:
     points = image.reshape(-1, 3)
     method, warp = SurfaceGrowth(), CameraWarp(np.zeros(3), 1.0)
     some_blocks(points)
+    spacing_law(points)
     grid = voxel_grid(points, np.full(points.shape, 0.5), 3.5 * _SPACING, warp)
+    visible_sides(grid)
     planes = method.planes(grid, np.zeros(3))
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
     method.supervoxel_of_point(points, grid, planes, supervoxels)
@@ -133,8 +137,9 @@ def compile_graph_and_tree() -> None:
     normals = np.tile([0.0, 0, -1], (n, 1))
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
-    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes)
-    segmentation_tree(ConvexityLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
+    near = gaps(grid, normals, labels, nodes, touching.edges)
+    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near)
+    segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
 
 
 def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -72,6 +72,28 @@ class EdgeFeatures(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
+class Gaps(ShortRepr):
+    """Supervoxels that lie close by without touching; one row per pair.
+
+    Attributes
+    ----------
+    edges : (g, 2) int32
+        Node pairs i < j in ascending order, none of which touch.
+    edge_features : EdgeFeatures
+        g rows; contacts are the voxels on either side that face the other.
+    widths : (g,) float64, voxel edges
+        Least distance between centroids of their voxels.
+    weights : (g,) float64
+        What the gap counts as a contact, in voxels: e^(1 - width) for each that faces the other side.
+    """
+
+    edges: NDArray[np.int32]
+    edge_features: EdgeFeatures
+    widths: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class AdjacencyGraph(ShortRepr):
     """Supervoxels as nodes and their contacts as edges.
 
@@ -83,11 +105,14 @@ class AdjacencyGraph(ShortRepr):
         m rows.
     node_features : NodeFeatures
         One row per supervoxel.
+    gaps : Gaps, optional
+        Supervoxels that nearly touch. They are no edges, but a linkage may merge across them.
     """
 
     edges: NDArray[np.int32]
     edge_features: EdgeFeatures
     node_features: NodeFeatures
+    gaps: Gaps | None = None
 
     @property
     def n_nodes(self) -> int:

@@ -49,7 +49,7 @@ class WardLinkage(Linkage):
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest increase first."""
-        regions = _regions(graph, leaves, self.position, self.normal, self.color, 0.0)
+        regions = regions_of(graph, leaves, self.position, self.normal, self.color, 0.0)
         return least_increase_linkage(regions, graph.edges, None)
 
 
@@ -83,12 +83,12 @@ class MumfordShahLinkage(Linkage):
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the smallest scale first."""
-        regions = _regions(graph, leaves, 0.0, self.normal, self.color, self.plane**2)
+        regions = regions_of(graph, leaves, 0.0, self.normal, self.color, self.plane**2)
         lengths = graph.edge_features.contact_voxels / 2.0  # boundary voxels of both sides
         return least_increase_linkage(regions, graph.edges, lengths)
 
 
-def _regions(
+def regions_of(
     graph: AdjacencyGraph, leaves: Moments, position: float, normal: float, color: float, plane: float
 ) -> Regions:
     """Supervoxels as regions, in lengths of a voxel edge and masses of a mean supervoxel."""
@@ -155,15 +155,14 @@ def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: 
     """
     sums = np.empty((0, len(edges))) if lengths is None else lengths[None].astype(np.float64)
     n = len(regions.masses)
-    masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
-    state = _State(masses, values, centroids, scatters, np.zeros(n), float(regions.plane))
+    state = RegionState.of(regions)
     graph = ContractedGraph.of(n, edges, _first_costs(state, edges, sums), sums)
     _merge(state, graph)
     merges = graph.merges()
     return Merges(merges.pairs, np.maximum.accumulate(np.maximum(merges.altitudes, 0.0)))
 
 
-class _State(NamedTuple):
+class RegionState(NamedTuple):
     """Regions while they merge, with their residuals (n,): sums of squared distances to their planes."""
 
     masses: NDArray[np.float64]
@@ -173,13 +172,25 @@ class _State(NamedTuple):
     residuals: NDArray[np.float64]
     plane: float
 
+    @classmethod
+    def of(cls, regions: Regions) -> RegionState:
+        """The regions before they merge; residuals are not set."""
+        masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
+        return cls(masses, values, centroids, scatters, np.zeros(len(masses)), float(regions.plane))
+
 
 @kernel
-def _first_costs(state: _State, edges: NDArray[np.int32], lengths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cost of each edge, (m,), and the residuals that it needs."""
+def set_residuals(state: RegionState) -> None:
+    """Set the sums of squared distances of regions to their planes, where these count."""
     if state.plane > 0.0:
         for a in range(len(state.masses)):
             state.residuals[a] = _least_eigenvalue(state.scatters[a].copy())
+
+
+@kernel
+def _first_costs(state: RegionState, edges: NDArray[np.int32], lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cost of each edge, (m,), and the residuals that it needs."""
+    set_residuals(state)
     costs = np.empty(len(edges))
     for edge in range(len(edges)):
         costs[edge] = _cost(state, lengths, edge, edges[edge, 0], edges[edge, 1])
@@ -187,11 +198,11 @@ def _first_costs(state: _State, edges: NDArray[np.int32], lengths: NDArray[np.fl
 
 
 @kernel
-def _merge(state: _State, graph: ContractedGraph) -> None:
+def _merge(state: RegionState, graph: ContractedGraph) -> None:
     heap, halves, lengths = graph.heap, graph.halves, graph.sums
     while heap.size[0] > 0:
         kept, gone, _ = contract_cheapest(graph)
-        _unite(state, kept, gone)
+        unite(state, kept, gone)
         half = graph.clusters[kept].first
         while half != NONE:
             edge = half >> 1
@@ -200,8 +211,15 @@ def _merge(state: _State, graph: ContractedGraph) -> None:
 
 
 @kernel
-def _cost(state: _State, lengths: NDArray[np.float64], edge: int, a: int, b: int) -> float:
-    """Energy of the union of the two regions at an edge less the sum of theirs, per length where there are lengths."""
+def _cost(state: RegionState, lengths: NDArray[np.float64], edge: int, a: int, b: int) -> float:
+    """Increase of energy by merging the two regions at an edge, per length where there are lengths."""
+    increase = energy_increase(state, a, b)
+    return increase / lengths[0, edge] if len(lengths) > 0 else increase
+
+
+@kernel
+def energy_increase(state: RegionState, a: int, b: int) -> float:
+    """Energy of the union of two regions less the sum of theirs."""
     reduced = state.masses[a] * state.masses[b] / (state.masses[a] + state.masses[b])
     increase = 0.0
     for i in range(state.values.shape[1]):
@@ -210,11 +228,11 @@ def _cost(state: _State, lengths: NDArray[np.float64], edge: int, a: int, b: int
     if state.plane > 0.0:
         union = _scatter_of_union(state.centroids, state.scatters, a, b, reduced)
         increase += state.plane * (_least_eigenvalue(union) - state.residuals[a] - state.residuals[b])
-    return increase / lengths[0, edge] if len(lengths) > 0 else increase
+    return increase
 
 
 @kernel
-def _unite(state: _State, kept: int, gone: int) -> None:
+def unite(state: RegionState, kept: int, gone: int) -> None:
     """Give the first of two regions the moments of both."""
     masses, values, centroids, scatters, residuals, plane = state
     total = masses[kept] + masses[gone]

@@ -3,16 +3,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks, kernel
+from pcgraph.short_repr import ShortRepr
 
 _SAMPLE = 4096  # points whose nearest neighbour is sought
 _CROWD = 1 << 16  # points among which it is sought, about
 _BLOCKS = 16  # of space, along each axis
 _NO_SPACING_M = 0.01
+_THINNED = 1 << 14  # points among which the law of spacing is looked for,
+_READINGS = 1 << 10  # and at how many of them spacing is read
+_MIN_READINGS = 1 << 8  # with fewer the law is not looked for
+_NEIGHBOUR = 8
+_TRIMMINGS = 2
+_TINY = float(np.finfo(np.float64).tiny)
+_MIN_EXPLAINED = 0.5
+_MIN_EXPONENT = 0.5
+_MAX_EXPONENT = 1.5
+_OWN_ORIGIN = 0.1  # explained variance by which another place must beat the frame's origin
 
 
 def bounding_box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -112,3 +125,150 @@ def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Whole numbers without a pattern, by one step of a multiplicative hash."""
     spread = values * np.uint64(0xD6E8FEB86659FD93)
     return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+
+
+# --- spacing that grows with range: one scan from one place -----------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SpacingLaw(ShortRepr):
+    """Spacing in proportion to a power of the range from one place: the cloud is one scan, and was taken from there.
+
+    Attributes
+    ----------
+    viewpoint : (3,) float64, metres
+    exponent : float, 0..1.5
+        About 1 for a beam of constant angle, more where noise grows with range as well.
+    explained : float, 0..1
+        Fraction of the variance of the spacing's logarithm that the law explains.
+    """
+
+    viewpoint: NDArray[np.float64]
+    exponent: float
+    explained: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the law says more than chance would."""
+        return self.explained >= _MIN_EXPLAINED and self.exponent >= _MIN_EXPONENT
+
+
+def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None) -> SpacingLaw:
+    """The power law between spacing and range that explains most, over a sample free of the points' order.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+        Finite, n >= 1.
+    viewpoint : (3,) float64, metres, optional
+        From where the cloud was seen. Default: the place that explains most, or the origin if it does as well.
+
+    Notes
+    -----
+    Log spacing, by the distance to the eighth neighbour in a thinned cloud, is regressed on log range. Places all
+    around and within the cloud are tried, then moved by ever smaller steps; readings far off the line, such as noise,
+    are left out.
+    """
+    nowhere = SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0)
+    places, spacing = _readings(points)
+    if len(places) < _MIN_READINGS:
+        return nowhere
+    low, high = bounding_box(places)
+    middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
+    origin, logs = -middle / reach, np.log(spacing / reach)
+    places = (places - middle) / reach
+    place = None if viewpoint is None else (viewpoint - middle) / reach
+    kept = np.ones(len(logs), bool)
+    for _ in range(_TRIMMINGS):
+        found = _most_telling_place(places[kept], logs[kept]) if place is None else place
+        explained, exponent = _regressions(places[kept], logs[kept], found[None])
+        residuals = logs - exponent[0] * np.log(_ranges(places, found))
+        residuals -= np.median(residuals[kept])
+        spread = 1.4826 * float(np.median(np.abs(residuals[kept])))
+        kept = np.abs(residuals) <= 2.5 * max(spread, 0.1)
+    if viewpoint is None:
+        of_origin, exponent_of_origin = _regressions(places[kept], logs[kept], origin[None])
+        if of_origin[0] >= explained[0] - _OWN_ORIGIN:
+            return SpacingLaw(np.zeros(3), float(exponent_of_origin[0]), float(of_origin[0]))
+    return SpacingLaw(middle + reach * found, float(exponent[0]), float(explained[0]))
+
+
+def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Some places, (m, 3), and the spacing there, (m,), in a cloud thinned by the points' hashes."""
+    chosen = points
+    if len(points) > _THINNED:
+        taken = np.empty(len(points), np.bool_)
+        in_blocks(_thin, len(points), points, np.uint64(_THINNED / len(points) * 2.0**64), taken)
+        chosen = points[taken]
+    if len(chosen):
+        chosen = _each_place_once(chosen)[0]
+    if len(chosen) <= _NEIGHBOUR:
+        return chosen[:0], np.empty(0)
+    sample = chosen[:_READINGS]
+    spacing = cKDTree(chosen).query(sample, k=_NEIGHBOUR + 1)[0][:, -1]
+    usable = np.isfinite(spacing) & (spacing > 0.0)
+    return sample[usable], spacing[usable]
+
+
+def _ranges(places: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances from a viewpoint, (m,), none so near that its logarithm outweighs all others."""
+    return np.sqrt(((places - viewpoint) ** 2).sum(axis=-1)) + 1e-3
+
+
+def _regressions(
+    places: NDArray[np.float64], logs: NDArray[np.float64], viewpoints: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Explained fraction of the variance, and exponent, (k,) each, of the law about each of k viewpoints."""
+    x = np.log(_ranges(places[None], viewpoints[:, None]))
+    x -= x.mean(axis=1, keepdims=True)
+    y = logs - logs.mean()
+    variance, squares = float(y @ y), np.einsum("ij,ij->i", x, x)
+    slope = np.clip((x @ y) / np.maximum(squares, _TINY), 0.0, _MAX_EXPONENT)
+    left = ((y - slope[:, None] * x) ** 2).sum(axis=1)
+    return 1.0 - left / max(variance, _TINY), slope
+
+
+def _most_telling_place(places: NDArray[np.float64], logs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The place, (3,), about which spacing follows the law best, found by a pattern search around the cloud."""
+    low, high = bounding_box(places)
+    steps = (np.arange(5) + 0.5) / 5
+    inside = low + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
+    reach = float(np.linalg.norm(high - low)) / 2.0
+    outside = [(low + high) / 2.0 + far * reach * sphere_directions(40) for far in (1.2, 2.0)]
+    candidates, some = np.concatenate((inside, *outside)), slice(None, None, 4)
+    place = candidates[int(np.argmax(_regressions(places[some], logs[some], candidates)[0]))]
+    best = _regressions(places, logs, place[None])[0][0]
+    moves, step = np.concatenate((np.eye(3), -np.eye(3), sphere_directions(8))), 0.3 * reach
+    for _ in range(14):
+        tried = place + step * moves
+        explained = _regressions(places, logs, tried)[0]
+        if explained.max() > best + 1e-4:
+            place, best = tried[int(np.argmax(explained))], float(explained.max())
+        else:
+            step *= 0.5
+    return place
+
+
+def sphere_directions(n: int) -> NDArray[np.float64]:
+    """Unit vectors evenly over the sphere, (n, 3) float64, from +z downwards: a Fibonacci lattice."""
+    number = np.arange(n) + 0.5
+    z = 1.0 - 2.0 * number / n
+    angle = np.pi * (3.0 - np.sqrt(5.0)) * number
+    across = np.sqrt(1.0 - z * z)
+    return np.stack((across * np.cos(angle), across * np.sin(angle), z), axis=1)
+
+
+@kernel
+def _thin(start: int, stop: int, points: NDArray[np.float64], limit: np.uint64, taken: NDArray[np.bool_]) -> None:
+    """Set whether a hash of each point's place lies below a limit."""
+    bits = points.view(np.uint64)
+    for p in range(start, stop):
+        h = np.uint64(0x9E3779B97F4A7C15)
+        for axis in range(3):
+            h ^= bits[p, axis] if points[p, axis] != 0.0 else np.uint64(0)
+            h *= np.uint64(0xD6E8FEB86659FD93)
+            h ^= h >> np.uint64(32)
+        h *= np.uint64(0xC2B2AE3D27D4EB4F)
+        h ^= h >> np.uint64(29)
+        h *= np.uint64(0xD6E8FEB86659FD93)
+        taken[p] = h < limit

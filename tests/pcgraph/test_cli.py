@@ -106,7 +106,7 @@ def test_bad_options(scene, tmp_path):
         (("--objects", 2, "--altitude", 0.5), "--objects or --altitude, got both"),
         (("--altitude", "nan"), "object_altitude to be a finite number"),
         (("--min-size", 0), "min_size as a whole number of at least 1"),
-        (("--linkage", "x"), "one of convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, ward, got 'x'"),
+        (("--linkage", "x"), "one of convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, region, ward, got 'x'"),
         (("--linkage", ""), "got ''"),
         (("--linkage", tmp_path / "none.json"), "cannot read"),
         (("--method", "supervoxels"), "one of surface-growth, vccs, got 'supervoxels'"),

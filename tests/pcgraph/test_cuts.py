@@ -18,6 +18,7 @@ from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage
 from pcgraph.tree.lccp import LccpLinkage
 from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
 from pcgraph.tree.optimal_cut import Energy
+from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.saliency import point_saliency, voxel_saliency
 from pcgraph.tree.single_linkage import QuasiFlatLinkage
 from pcgraph.tree.tree import SegmentationTree
@@ -262,19 +263,21 @@ def test_saliency_above_a_level_is_the_boundary_of_that_cut(boxes):
 
 @pytest.mark.parametrize(
     "linkage",
-    [FelzenszwalbLinkage(), LccpLinkage(), MumfordShahLinkage(), QuasiFlatLinkage(), WardLinkage()],
+    [FelzenszwalbLinkage(), LccpLinkage(), MumfordShahLinkage(), QuasiFlatLinkage(), RegionLinkage(), WardLinkage()],
     ids=lambda linkage: type(linkage).__name__,
 )
 def test_faces_of_boxes_are_the_parts_of_other_linkages_too(boxes, linkage):
     result = boxes[2]
-    expected = result.tree.cut(altitude=ConvexityLinkage().default_part_altitude)
+    convexity = ConvexityLinkage()
+    tree = tree_of(convexity, result.graph, result.leaves)
+    expected = tree.cut(altitude=convexity.default_part_altitude)
     parts = tree_of(linkage, result.graph, result.leaves).cut(altitude=linkage.default_part_altitude)
     assert np.array_equal(parts, expected)
 
 
 def test_faces_of_boxes_are_parts_and_boxes_are_objects(boxes):
     _, truth, result = boxes
-    linkage = ConvexityLinkage()
+    linkage = result.linkage
     parts, objects = result.tree.levels([linkage.default_part_altitude, linkage.default_object_altitude]).T
     assert parts.max() + 1 == 7  # the plane, and three faces of either box
     assert objects.max() + 1 == 3

@@ -41,6 +41,7 @@ def test_public_names():
         "Primitive",
         "Primitives",
         "QuasiFlatLinkage",
+        "RegionLinkage",
         "Segmentation",
         "SegmentationTree",
         "SupervoxelMethod",

@@ -42,12 +42,12 @@ def test_the_warm_up_leaves_nothing_to_compile():
 
 
 FIRST = """
-from pcgraph.tree import average_linkage
+from pcgraph.tree import region_linkage
 from pcgraph.warmup import compile_in_two_processes, must_compile
 
 print(must_compile())
 compile_in_two_processes()
-print(must_compile(), len(average_linkage._merge.nopython_signatures))
+print(must_compile(), len(region_linkage._merge.nopython_signatures))
 """
 
 

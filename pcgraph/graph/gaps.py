@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaps: supervoxels that do not touch but lie close by, where a surface was sampled too thinly or is hidden in part."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pcgraph.features.nodes import NodeFeatures
+from pcgraph.graph.adjacency import Gaps
+from pcgraph.graph.contacts import Contacts, edge_features
+from pcgraph.voxels.grid import VoxelGrid
+
+_WIDTH = 3.0  # voxel edges between centroids, at most
+_RIM = 8  # voxels around one amid a surface; a voxel with fewer lies where a surface ends
+
+
+def gaps(
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    supervoxels: NDArray[np.int32],
+    nodes: NodeFeatures,
+    touching: NDArray[np.int32],
+) -> Gaps:
+    """Pairs of supervoxels that do not touch, but whose boundary voxels come within three voxel edges of each other.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    normals : (v, 3) float64
+        Unit normals of the voxels.
+    supervoxels : (v,) int32
+        Supervoxel of each voxel.
+    nodes : NodeFeatures of k supervoxels
+    touching : (m, 2) int32
+        Pairs of supervoxels that touch, the smaller first.
+
+    Notes
+    -----
+    Only voxels with fewer than eight around them are looked at: those at the ends of surfaces.
+    """
+    k = np.int64(len(nodes.size))
+    rim = np.flatnonzero(np.diff(grid.indptr) < _RIM)
+    pairs = np.empty((0, 2), np.int64)
+    places = grid.warped[rim] / grid.size
+    if len(rim) > 1:
+        pairs = cKDTree(places, balanced_tree=False).query_pairs(_WIDTH, p=np.inf, output_type="ndarray")
+    pairs = pairs[supervoxels[rim[pairs[:, 0]]] != supervoxels[rim[pairs[:, 1]]]]
+    width = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    pairs, width = pairs[width <= _WIDTH], width[width <= _WIDTH]
+    voxel = rim[pairs.T.ravel()]  # each side of each pair
+    other = supervoxels[rim[pairs[:, ::-1].T.ravel()]].astype(np.int64)
+    own, width = supervoxels[voxel].astype(np.int64), np.tile(width, 2)
+    key = np.minimum(own, other) * k + np.maximum(own, other)
+    new = ~np.isin(key, touching[:, 0].astype(np.int64) * k + touching[:, 1])
+    voxel, own, other, width, key = voxel[new], own[new], other[new], width[new], key[new]
+    order = np.lexsort((width, other, voxel))  # of each voxel the shortest way to each other supervoxel
+    first = order[np.flatnonzero(np.diff(voxel[order] * k + other[order], prepend=-1))]
+    voxel, own, other, width, key = voxel[first], own[first], other[first], width[first], key[first]
+    keys, edge = np.unique(key, return_inverse=True)
+    edges = np.stack((keys // k, keys % k), axis=1).astype(np.int32)
+    n = len(edges)
+    side = 2 * edge + (own > other)
+    voxels = np.bincount(side, minlength=2 * n)
+
+    def sums(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([np.bincount(side, rows[:, axis], 2 * n) for axis in range(3)], axis=1).astype(np.float64)
+
+    directions = sums(normals[voxel])
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    shortest = np.full(n, np.inf)
+    np.minimum.at(shortest, edge, width)
+    facing = Contacts(
+        edges=edges,
+        voxels=voxels.reshape(-1, 2),
+        positions=(sums(grid.centroids[voxel]) / np.maximum(voxels, 1)[:, None]).reshape(-1, 2, 3),
+        normals=directions.reshape(-1, 2, 3),
+        lengths=np.bincount(edge, 0.5 * grid.edge_lengths[voxel], n).astype(np.float64),
+    )
+    weights = np.bincount(edge, np.exp(1.0 - width), n).astype(np.float64)
+    return Gaps(edges, edge_features(nodes, facing), shortest, weights)
