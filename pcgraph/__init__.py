@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from pcgraph.tree.region_linkage import RegionLinkage as RegionLinkage
     from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
+    from pcgraph.voxels.outliers import OUTLIER as OUTLIER
     from pcgraph.voxels.surface import Surface as Surface
 else:
     import lazy_loader
@@ -82,6 +83,7 @@ else:
             "tree.region_linkage": ["RegionLinkage"],
             "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
+            "voxels.outliers": ["OUTLIER"],
             "voxels.surface": ["Surface"],
         },
     )

@@ -62,6 +62,8 @@ class CleanCloud(ShortRepr):
         Leading shape of what came in.
     kept : (n,) int64
         Flat indices of those points.
+    outliers : (o,) int64
+        Flat indices of finite points that were left out as outliers.
     """
 
     points: NDArray[np.float64]
@@ -69,12 +71,21 @@ class CleanCloud(ShortRepr):
     normals: NDArray[np.float64] | None
     shape: tuple[int, ...]
     kept: NDArray[np.int64]
+    outliers: NDArray[np.int64]
 
-    def spread(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Labels of the finite points in the shape of what came in, -1 elsewhere."""
+    def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
+        """Labels of the points in the shape of what came in, -1 where it was not finite."""
         full = np.full(self.shape, -1, np.int32)
         full.reshape(-1)[self.kept] = labels
+        full.reshape(-1)[self.outliers] = of_outliers
         return full
+
+    def without(self, outliers: NDArray[np.bool_]) -> CleanCloud:
+        """The points but for some, (n,) bool."""
+        colors = None if self.colors is None else self.colors[~outliers]
+        normals = None if self.normals is None else self.normals[~outliers]
+        gone = np.sort(np.concatenate((self.outliers, self.kept[outliers])))
+        return CleanCloud(self.points[~outliers], colors, normals, self.shape, self.kept[~outliers], gone)
 
 
 def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike | None) -> CleanCloud:
@@ -103,7 +114,8 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     largest = float(np.abs(bounding_box(places)).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
-    return CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept)
+    none = np.empty(0, np.int64)
+    return CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
 
 
 def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64] | None:

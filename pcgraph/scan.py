@@ -24,7 +24,8 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
-from pcgraph.voxels.grid import VoxelGrid, grid_union, voxel_grid, voxel_means
+from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means
+from pcgraph.voxels.outliers import OUTLIER, is_near, outlier_voxels
 from pcgraph.voxels.spacing import bounding_box, median_spacing, spacing_law
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_sides
@@ -34,6 +35,8 @@ from pcgraph.warmup import compile_in_two_processes
 VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0
 RANGE_GROWTH = 0.5
+_CLEANINGS = 2
+_FEW_OUTLIERS = 0.95  # of the points are left
 
 
 def segment(
@@ -57,7 +60,8 @@ def segment(
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
         Of a `Cloud`, and of a file that `read_cloud` reads, colours, normals and viewpoint are used too where none
         are given (not a viewpoint of zeros, which PCD files hold where none is known).
-        NaN and infinite points are left out and labelled -1. Organised points (h, w, 3) are taken for a
+        NaN and infinite points are left out and labelled -1, outliers, no denser around than noise would be, -2
+        (`pcgraph.voxels.outliers.outlier_voxels`). Organised points (h, w, 3) are taken for a
         camera's image in the camera's frame (z forward) unless `viewpoint` or `camera` say otherwise.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
@@ -89,7 +93,7 @@ def segment(
     Returns
     -------
     Segmentation
-        Every finite point has a supervoxel; the voxels that hold points of a supervoxel are connected
+        Every finite point but outliers has a supervoxel; the voxels that hold points of a supervoxel are connected
         (26-neighbourhood). The same points give the same supervoxels in any order, and node features up to the
         rounding of sums; the number of threads changes nothing.
 
@@ -107,15 +111,21 @@ def segment(
     points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
     settings = Settings.of(method or SurfaceGrowth(), linkage or RegionLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals)
-    position = clean_viewpoint(viewpoint, cloud)
-    voxel_size, seed_size = _sizes(cloud, voxel_size, seed_size)
+    place = clean_viewpoint(viewpoint, cloud)
+    _sizes(cloud, voxel_size, seed_size)
     compile_in_two_processes()
-    position, warp = _place_and_warp(cloud, position, camera, range_growth)
-    grid = voxel_grid(cloud.points, cloud.colors, voxel_size, warp)
+    for _ in range(_CLEANINGS):
+        voxel, seed = _sizes(cloud, voxel_size, seed_size)
+        position, warp = _place_and_warp(cloud, place, camera, range_growth)
+        grid = voxel_grid(cloud.points, cloud.colors, voxel, warp)
+        n_points = len(cloud.points)
+        cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
+        if len(cloud.points) >= _FEW_OUTLIERS * n_points:
+            break  # else spacing and place were those of noise, to a good part
+    position = place if position is not None and position.ndim > 1 else position
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     position, orientation = _orientation(grid, position)
-    scan = Scan(cloud, position, grid, orientation, initial_labels, seed_size)
-    return segment_scan(scan, None, settings)
+    return segment_scan(Scan(cloud, position, grid, orientation, initial_labels, seed), None, settings)
 
 
 def update(
@@ -175,6 +185,8 @@ def update(
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp)
+    lonely = outlier_voxels(seen) & ~is_near(seen, before.grid)
+    cloud, seen, position = _without(lonely, cloud, seen, position)
     union = grid_union(before.grid, seen)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
@@ -251,7 +263,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
-        labels=cloud.spread(objects[leaf_of_point]),
+        labels=cloud.spread(objects[leaf_of_point], OUTLIER),
         supervoxels=cloud.spread(leaf_of_point),
         objects=objects,
         graph=graph,
@@ -300,6 +312,17 @@ def _place_and_warp(
     if position is None and not (camera or growth):
         return None, Warp()
     return position, choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
+
+
+def _without(
+    voxels: NDArray[np.bool_], cloud: CleanCloud, grid: VoxelGrid, place: NDArray[np.float64] | None
+) -> tuple[CleanCloud, VoxelGrid, NDArray[np.float64] | None]:
+    """Cloud, grid and viewpoints without some voxels."""
+    if not voxels.any():
+        return cloud, grid, place
+    points = voxels[grid.voxel_of_point]
+    place = place if place is None or place.ndim == 1 else place[~points]
+    return cloud.without(points), grid_without(grid, voxels), place
 
 
 def _orientation(

@@ -14,6 +14,7 @@ from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.tree.linkage import Linkage
 from pcgraph.tree.tree import SegmentationTree
+from pcgraph.voxels.outliers import OUTLIER
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.warp import CameraWarp
 
@@ -29,10 +30,11 @@ class Segmentation:
     Attributes
     ----------
     labels : (n,) or (h, w) int32
-        Object of each point, the default cut of the tree; -1 where the point is not finite.
+        Object of each point, the default cut of the tree; -1 where the point is not finite, -2 (`OUTLIER`) where it
+        is an outlier, which belongs to nothing.
     supervoxels : (n,) or (h, w) int32
         Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where the point is not
-        finite.
+        finite or an outlier.
     objects : (k,) int32
         Object of each supervoxel, also of those that hold no point of the last scan.
     graph : AdjacencyGraph
@@ -46,7 +48,7 @@ class Segmentation:
     object_altitude : float, the linkage's unit
         What was used.
     viewpoint : (3,) or (n, 3) float64, metres, the points' frame
-        What was used, given or derived; one per finite point if so given.
+        What was used, given or derived; one per point that has a supervoxel if so given.
     """
 
     labels: NDArray[np.int32]
@@ -63,8 +65,10 @@ class Segmentation:
 
     def __repr__(self) -> str:
         """What there is, in one line."""
+        outliers = np.count_nonzero(self.outliers)
+        beside = f" and {outliers} outliers" if outliers else ""
         return (
-            f"Segmentation({np.count_nonzero(self.supervoxels >= 0)} points, {self.tree.n_leaves} supervoxels, "
+            f"Segmentation({np.count_nonzero(self.supervoxels >= 0)} points{beside}, {self.tree.n_leaves} supervoxels, "
             f"{len(self.graph.edges)} edges, {int(self.objects.max()) + 1} objects, "
             f"voxels of {self.voxel_size:.3g} m, seeds every {self.seed_size:.3g} m)"
         )
@@ -73,6 +77,11 @@ class Segmentation:
     def voxel_size(self) -> float:
         """Edge length of a voxel where the grid's warp keeps lengths, metres: what was used, given or derived."""
         return self.surface.grid.size
+
+    @property
+    def outliers(self) -> NDArray[np.bool_]:
+        """Whether each point is an outlier, in the input's shape: no denser around than noise would be."""
+        return self.labels == OUTLIER
 
     @property
     def camera(self) -> bool:
@@ -85,8 +94,10 @@ class Segmentation:
         return self.tree.moments[: self.tree.n_leaves]
 
     def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
-        """Segment of each point in the input's shape, -1 where not finite; see `SegmentationTree.cut`."""
-        return self.on_points(self.tree.cut(n, altitude, min_size))
+        """Segment of each point in the input's shape, negative as in `labels`; see `SegmentationTree.cut`."""
+        segments = self.on_points(self.tree.cut(n, altitude, min_size))
+        segments[self.outliers] = OUTLIER
+        return segments
 
     def on_points(self, values: ArrayLike) -> NDArray[Any]:
         """Values of supervoxels on the points, in the input's shape + s.
@@ -97,7 +108,7 @@ class Segmentation:
 
         Returns
         -------
-        Points that are not finite have NaN, or -1 where the values are whole numbers, or False.
+        Points that are not finite, and outliers, have NaN, or -1 where the values are whole numbers, or False.
 
         Raises
         ------

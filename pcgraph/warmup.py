@@ -35,6 +35,7 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
+from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.spacing import some_blocks, spacing_law
 from pcgraph.voxels.visibility import visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
@@ -108,6 +109,7 @@ def compile_voxels() -> None:
     some_blocks(points)
     spacing_law(points)
     grid = voxel_grid(points, np.full(points.shape, 0.5), 3.5 * _SPACING, warp)
+    outlier_voxels(grid)
     visible_sides(grid)
     planes = method.planes(grid, np.zeros(3))
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))

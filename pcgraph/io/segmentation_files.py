@@ -101,15 +101,17 @@ def encode_segmentation(
 
 
 def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Colour of each label, (n, 3) uint8: hues a golden angle apart, so that close numbers differ."""
+    """Colour of each label, (n, 3) uint8: hues a golden angle apart, so that close numbers differ; grey if negative."""
     hue = labels * 0.618033988749895 % 1.0
     value = 0.95 - 0.25 * (labels // 8 % 3) / 2.0
     ramp = np.abs((hue[:, None] * 6.0 + np.array([0.0, 4.0, 2.0])) % 6.0 - 3.0) - 1.0
-    return np.rint(255.0 * value[:, None] * (0.35 + 0.65 * np.clip(ramp, 0.0, 1.0))).astype(np.uint8)
+    colors = np.rint(255.0 * value[:, None] * (0.35 + 0.65 * np.clip(ramp, 0.0, 1.0))).astype(np.uint8)
+    colors[labels < 0] = 128
+    return colors
 
 
 def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) -> bytes:
-    finite = segmentation.supervoxels.reshape(-1) >= 0
+    finite = np.isfinite(cloud.points.reshape(-1, 3)).all(axis=1)
     points = cloud.points.reshape(-1, 3)[finite]
     kept = labels.reshape(-1)[finite]
     colors = label_colors(kept)

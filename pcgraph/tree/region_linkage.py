@@ -70,6 +70,9 @@ class RegionLinkage(Linkage):
         return region_linkage(graph, leaves, edges, costs, weights)
 
 
+_STEPS = float(1 << 20)
+
+
 class _Shape(NamedTuple):
     """Constants of the altitude, as in `RegionLinkage`; the width of a region of mass m is `width` sqrt(m)."""
 
@@ -145,11 +148,12 @@ def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
 
 @kernel
 def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, shape: _Shape) -> float:
-    """Altitude at which the two regions at an edge merge, radians."""
+    """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
     increase = max(energy_increase(state, a, b), 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(min(state.masses[a], state.masses[b]))
     evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
     evidence *= increase / (increase + shape.e0) * (scale / (scale + shape.l0)) ** shape.p
-    return evidence * (width / (length + width)) ** shape.q
+    evidence *= (width / (length + width)) ** shape.q
+    return round(evidence * _STEPS) / _STEPS

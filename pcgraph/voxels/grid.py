@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -92,6 +92,31 @@ class VoxelGrid(ShortRepr):
     def neighbourhood(self) -> Neighbourhood:
         """Which voxels touch, as kernels take it."""
         return Neighbourhood(self.indptr, self.neighbours)
+
+
+def grid_without(grid: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
+    """The grid without some of its voxels, (v,) bool, and without their points."""
+    stays, point_stays = ~voxels, ~voxels[grid.voxel_of_point]
+    number = np.cumsum(stays, dtype=np.int32) - 1
+    point_number = np.cumsum(point_stays) - 1
+    source = np.repeat(np.arange(grid.n_voxels), np.diff(grid.indptr))
+    pairs = stays[source] & stays[grid.neighbours]
+    degrees = np.bincount(source[pairs], minlength=grid.n_voxels)[stays]
+    counts = grid.counts[stays]
+    return replace(
+        grid,
+        cells=grid.cells[stays],
+        voxel_of_point=number[grid.voxel_of_point[point_stays]],
+        order=point_number[grid.order[point_stays[grid.order]]],
+        starts=np.concatenate(([0], np.cumsum(counts))),
+        counts=counts,
+        warped=grid.warped[stays],
+        centroids=grid.centroids[stays],
+        edge_lengths=grid.edge_lengths[stays],
+        colors=None if grid.colors is None else grid.colors[stays],
+        indptr=np.concatenate(([0], np.cumsum(degrees))),
+        neighbours=number[grid.neighbours[pairs]],
+    )
 
 
 def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, size: float, warp: Warp) -> VoxelGrid:

@@ -19,7 +19,7 @@ from pcgraph.voxels.spacing import bounding_box, sphere_directions
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 
-_CELLS = 2000  # of the coarse grid on which places are compared, about
+_CELLS = 3000  # of the coarse grid on which places are compared, about
 _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
 _INSIDE = 48  # free places within the bounding box, of a lattice of
@@ -27,7 +27,8 @@ _LATTICE = 8  # along each side
 _CLEARANCE = 2.5  # cells between a free place and the next surface
 _ROUNDS = 12  # of agreement between places and orientations
 _VIEWS = 16  # places that the voxels themselves are looked at from
-_CLOSED = 0.98  # of all directions hit by something: a hollow seen from within
+_CLOSED = 0.95  # of all directions hit by something: a hollow seen from within,
+_OPEN = 0.99  # of the voxels visible from outside: there is nothing in it
 _FILLING = 4  # rounds of orientation by the voxels around, of those that are seen from nowhere
 _BINS_PER_RADIAN = 0.282  # of the octahedral map, over its width
 
@@ -99,7 +100,7 @@ def visible_from(
     """
     rays = centres - place
     ranges = _lengths(rays)
-    bins = int(np.clip(1.0 / (_BINS_PER_RADIAN * float(np.median(widths / ranges))), 64, 1024))
+    bins = int(np.clip(2.0 / (_BINS_PER_RADIAN * float(np.median(widths / ranges))), 64, 1024))
     seen = np.empty(len(centres), np.bool_)
     _look(rays, ranges, widths, np.full((bins, bins), np.inf), seen)
     return seen
@@ -129,14 +130,29 @@ def _telling_places(
         rays = place - coarse.centroids
         seen = visible_from(place, coarse.centroids, coarse.edge_lengths)
         sides[k] = np.where(seen, np.einsum("ij,ij->i", rays, normals) / _lengths(rays), 0.0)
-    if (sides[: len(outside)] != 0.0).any(axis=0).mean() > _CLOSED:  # nothing is hidden within: an object, not a room
-        is_open = [_hit_directions(coarse.centroids - place) < _CLOSED for place in inside]
-        kept = np.flatnonzero([True] * len(outside) + is_open)
-        places, sides = places[kept], sides[kept]
+    is_closed = np.array([_hit_directions(coarse.centroids - place) > _CLOSED for place in inside], bool)
+    if is_closed.any():
+        from_outside = np.zeros(len(centres), bool)
+        for place in outside:
+            from_outside |= visible_from(place, centres, widths)
+        if from_outside.mean() > _OPEN:  # nothing is hidden within: an object, not a room
+            chosen = _spread_choice(sides[: len(outside)] != 0.0, np.ones(len(outside)))
+            return outside[chosen], np.ones(len(chosen))
     weights = _agreement(sides, places[:, 2] >= low[2])
-    order = np.argsort(-weights, kind="stable")[:_VIEWS]
-    order = order[weights[order] > 0.0]
-    return places[order], weights[order]
+    chosen = _spread_choice(sides != 0.0, weights)
+    return places[chosen], weights[chosen]
+
+
+def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Some of the places, by weight and by how much each sees, (k, n) bool, that those before see seldom or never."""
+    interest, left = np.ones(seen.shape[1]), weights.copy()
+    chosen: list[int] = []
+    while len(chosen) < _VIEWS and left.any():
+        best = int(np.argmax(left**2 * (seen @ interest)))
+        chosen.append(best)
+        interest[seen[best]] *= 0.5
+        left[best] = 0.0
+    return np.array(chosen)
 
 
 def _agreement(sides: NDArray[np.float64], leaders: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -159,9 +175,9 @@ def _agreement(sides: NDArray[np.float64], leaders: NDArray[np.bool_]) -> NDArra
 
 def _coarse(centres: NDArray[np.float64], width: float) -> VoxelGrid:
     """Voxels in larger ones, as few as still show their shape."""
-    size = 2.0 * width
+    size = width
     while (coarse := voxel_grid(centres, None, size, Warp())).n_voxels > 2 * _CELLS:
-        size *= 2.0 if coarse.n_voxels > 8 * _CELLS else 1.5
+        size *= 2.0 if coarse.n_voxels > 8 * _CELLS else 1.4
     return coarse
 
 
@@ -178,8 +194,8 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
 
 
 def _hit_directions(rays: NDArray[np.float64]) -> float:
-    """Fraction of the directions in which there is something, on a map of 16 x 16 bins."""
-    bins = 16
+    """Fraction of the directions in which there is something, on a map of 12 x 12 bins."""
+    bins = 12
     hit = np.zeros((bins, bins), np.bool_)
     _mark(rays, hit)
     return float(hit.mean())
@@ -232,7 +248,7 @@ def _look(
                     nearest[p, q] = ranges[i]
     for i in range(n):
         # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-        depth = 2.0 * widths[i] + 1.5 * ranges[i] / per_radian
+        depth = widths[i] + ranges[i] / per_radian
         seen[i] = at[i, 0] >= 0 and ranges[i] <= nearest[at[i, 0], at[i, 1]] + depth
 
 

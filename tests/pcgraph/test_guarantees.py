@@ -17,10 +17,14 @@ import pcgraph
 from pcgraph.voxels.grid import voxel_grid
 
 
-def assert_covered_and_connected(points, result):
-    """Every finite point has a label; the voxels that hold points of a supervoxel are one piece of the grid."""
+def assert_covered_and_connected(points, result, outliers=0.01):
+    """Every finite point but outliers has a label; the voxels that hold points of a supervoxel are one piece."""
     flat = np.asarray(points, float).reshape(-1, 3)
+    outlier = result.outliers.reshape(-1)
     finite = np.isfinite(flat).all(axis=1)
+    assert np.array_equal(result.labels.reshape(-1) == -1, ~finite)
+    assert outlier.sum() < outliers * max(len(flat), 300)
+    finite &= ~outlier
     for labels in (result.labels, result.supervoxels):
         assert labels.dtype == np.int32
         assert labels.shape == np.shape(points)[:-1]

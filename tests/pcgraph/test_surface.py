@@ -36,6 +36,7 @@ def test_public_names():
         "Moments",
         "MumfordShahLinkage",
         "NodeFeatures",
+        "OUTLIER",
         "Occlusions",
         "PcgraphError",
         "Primitive",

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Outliers: points that belong to nothing, no denser around than noise spread through the whole volume would be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import pdtrc
+
+from pcgraph.parallel import in_blocks, kernel
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
+from pcgraph.voxels.spacing import bounding_box
+
+OUTLIER = -2
+"""Label of a point that belongs to nothing."""
+
+_MIN_POINTS = 1000  # of fewer points none is called an outlier
+_SPARSE = 0.25  # of the median number of points around a point
+_CHANCE = 1e-4  # with which noise alone is as dense as what is kept
+_DENSE_NOISE = 0.1  # points of noise around a voxel
+_MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
+_REACH = 3.0  # voxel edges, as far as gaps are bridged
+_VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * _REACH**3
+_MAX_FRACTION = 2.0 / 3.0
+
+
+def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
+    """Whether the points of each voxel are outliers, (v,) bool.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+
+    Notes
+    -----
+    The density of noise is what sparse voxels hold, over the volume of the bounding box. A voxel is an outlier if noise
+    of this density had, with a chance of more than 1 in 10 000, as many points in the voxels around it. Where noise is
+    so thin that a reach of three voxel edges is nearly empty of it, there must be as few points within that reach, too,
+    so that the thin far end of a scan is not taken for noise. Clouds of fewer than 1000 points, and those of which more
+    than two thirds would be outliers, have none.
+    """
+    nothing = np.zeros(grid.n_voxels, np.bool_)
+    n_points = int(grid.counts.sum())
+    around = np.empty(grid.n_voxels, np.int64)
+    in_blocks(_count_around, grid.n_voxels, grid.indptr, grid.neighbours, grid.counts, around)
+    if n_points < _MIN_POINTS:
+        return nothing
+    order = np.argsort(around, kind="stable")
+    points = np.cumsum(grid.counts[order])
+    typical = float(around[order[np.searchsorted(points, (n_points + 1) // 2)]])  # median over the points
+    sparse = around <= _SPARSE * typical
+    low, high = bounding_box(grid.cells)
+    volume = float(np.prod(np.maximum(high - low + 1.0, _MIN_EXTENT)))
+    density = float(grid.counts[sparse].sum()) / volume
+    others = around - grid.counts
+    outlier = sparse & (grid.counts <= _least_significant(density) + 1)
+    outlier &= others < _least_significant(density * MAX_NEIGHBOURS)
+    background = density * _VOLUME_OF_REACH
+    if background < 1.0 and outlier.any():
+        alone = np.flatnonzero(outlier)
+        places = grid.warped / grid.size
+        near = cKDTree(places).query_ball_point(places[alone], _REACH, return_length=False)
+        held = np.array([grid.counts[voxels].sum() for voxels in near]) - grid.counts[alone]
+        outlier[alone] = held < _least_significant(background)
+    if density * MAX_NEIGHBOURS > _DENSE_NOISE:  # then some lies beside surfaces, in voxels of its own
+        degrees = np.maximum(np.diff(grid.indptr), 1)
+        outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _SPARSE * others / degrees)
+    return outlier if grid.counts[outlier].sum() <= _MAX_FRACTION * n_points else nothing
+
+
+def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:
+    """Whether each voxel lies within three voxel edges of one of another grid of the same size and warp, (v,) bool."""
+    distances = cKDTree(other.warped / other.size).query(grid.warped / grid.size, distance_upper_bound=_REACH)[0]
+    near: NDArray[np.bool_] = np.isfinite(distances)
+    return near
+
+
+def _least_significant(expected: float) -> int:
+    """Least number of points that noise, of which so many are expected, reaches with a chance below `_CHANCE`."""
+    number = 1
+    while pdtrc(number - 1, expected) >= _CHANCE:
+        number += 1
+    return number
+
+
+@kernel
+def _count_around(
+    start: int,
+    stop: int,
+    indptr: NDArray[np.int64],
+    neighbours: NDArray[np.int32],
+    counts: NDArray[np.int64],
+    around: NDArray[np.int64],
+) -> None:
+    """Set the number of points in each voxel and those around it."""
+    for i in range(start, stop):
+        around[i] = counts[i]
+        for a in range(indptr[i], indptr[i + 1]):
+            around[i] += counts[neighbours[a]]

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Outliers: noise through the whole volume has a label of its own, and what is thin keeps its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clouds import two_boxes_on_a_plane
+
+import pcgraph
+from pcgraph.voxels.grid import grid_without, voxel_grid
+from pcgraph.voxels.outliers import OUTLIER, outlier_voxels
+from pcgraph.voxels.warp import Warp
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """Two boxes on a plane, their truth, viewpoint, and the segmentation."""
+    points, truth, viewpoint = two_boxes_on_a_plane()
+    return points, truth, viewpoint, pcgraph.segment(points, viewpoint=viewpoint)
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.5])
+def test_noise_through_the_volume_is_no_object(clean, fraction):
+    points, truth, viewpoint, before = clean
+    rng = np.random.default_rng(3)
+    low, high = points.min(axis=0), points.max(axis=0) + np.array((0.0, 0.0, 0.5))
+    noise = rng.uniform(low, high, (int(fraction * len(points)), 3))
+    result = pcgraph.segment(np.concatenate((points, noise)), viewpoint=viewpoint)
+    outliers = result.outliers
+    assert outliers[len(points) :].mean() > 0.75  # the rest lies on or beside the surfaces
+    assert outliers[: len(points)].mean() < 0.001
+    n = len(points)
+    covering = pcgraph.metrics.segmentation_covering(result.labels[:n], truth)
+    assert covering > pcgraph.metrics.segmentation_covering(before.labels, truth) - 0.02
+    assert (result.supervoxels[outliers] == -1).all()
+    assert (result.cut(n=2)[outliers] == OUTLIER).all()
+    assert np.isnan(result.on_points(np.zeros(result.tree.n_leaves))[outliers]).all()
+    assert f"{outliers.sum()} outliers" in repr(result)
+
+
+def test_surfaces_alone_have_no_outliers(clean):
+    assert not clean[3].outliers.any()
+    assert "outliers" not in repr(clean[3])
+
+
+def test_few_points_are_never_outliers():
+    points = np.random.default_rng(0).uniform(0, 1, (999, 3))
+    assert not outlier_voxels(voxel_grid(points, None, 0.02, Warp())).any()
+
+
+def test_a_cloud_without_any_surface_is_not_all_outliers():
+    points = np.random.default_rng(0).uniform(0, 1, (5000, 3))
+    assert (pcgraph.segment(points).labels >= 0).mean() > 1 / 3
+
+
+def test_a_grid_without_some_voxels_is_that_of_the_other_points():
+    rng = np.random.default_rng(1)
+    points, colors = rng.uniform(0, 1, (3000, 3)), rng.uniform(0, 1, (3000, 3))
+    grid = voxel_grid(points, colors, 0.11, Warp())
+    gone = rng.random(grid.n_voxels) < 0.3
+    left = ~gone[grid.voxel_of_point]
+    thinned, expected = grid_without(grid, gone), voxel_grid(points[left], colors[left], 0.11, Warp())
+    for name in ("cells", "voxel_of_point", "order", "starts", "counts", "warped", "colors", "indptr", "neighbours"):
+        assert np.array_equal(getattr(thinned, name), getattr(expected, name)), name
+
+
+def test_files_keep_outliers(clean, tmp_path):
+    points, _, viewpoint, _ = clean
+    far = np.array([[3.0, 3.0, 9.0]])
+    cloud = pcgraph.Cloud(np.concatenate((points, far)))
+    result = pcgraph.segment(cloud, viewpoint=viewpoint)
+    assert result.labels[-1] == OUTLIER
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert len(read.points) == len(points) + 1
+    assert read.labels is not None
+    assert read.labels[-1] == OUTLIER
+
+
+def test_an_update_keeps_single_points_beside_what_was_seen(clean):
+    points, _, viewpoint, before = clean
+    rng = np.random.default_rng(5)
+    some = points[rng.permutation(len(points))[:1500]] + [0.0, 0.0, 1e-4]
+    noise = rng.uniform(points.min(axis=0) + np.array((0.0, 0.0, 0.4)), points.max(axis=0) + 2.0, (60, 3))
+    after = pcgraph.update(before, np.concatenate((some, noise)), viewpoint=viewpoint)
+    assert not after.outliers[:1500].any()
+    assert after.outliers[1500:].mean() > 0.8

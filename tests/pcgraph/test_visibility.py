@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The outside of surfaces, and the place of the sensor, found from the points alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pcgraph
+from pcgraph.voxels.spacing import spacing_law
+from pcgraph.voxels.visibility import visible_from
+
+
+def faces(low, high, spacing, sides="-x +x -y +y -z +z"):
+    """Points on faces of a box, and the normals that point out of it."""
+    points, normals = [], []
+    for side in sides.split():
+        axis, upper = "xyz".index(side[1]), side[0] == "+"
+        a, b = (i for i in range(3) if i != axis)
+        u, v = np.meshgrid(*(np.arange(low[i] + spacing / 2, high[i], spacing) for i in (a, b)), indexing="ij")
+        face = np.empty((u.size, 3))
+        face[:, axis], face[:, a], face[:, b] = (high if upper else low)[axis], u.ravel(), v.ravel()
+        points.append(face)
+        normals.append(np.tile((1.0 if upper else -1.0) * np.eye(3)[axis], (u.size, 1)))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+def fraction_outward(points, normals):
+    """Fraction of points on the right side of their voxel's plane, of those that lie on it (not on another face)."""
+    result = pcgraph.segment(points)
+    assert not result.outliers.any()
+    cosines = np.einsum("ij,ij->i", result.surface.normals[result.surface.grid.voxel_of_point], normals)
+    own = np.abs(cosines) > 0.7
+    assert own.mean() > 0.8
+    return float((cosines[own] > 0.0).mean())
+
+
+ROOM = faces((0, 0, 0), (4, 3, 2.5), 0.04)
+THING = faces((1.5, 1.0, 0.02), (2.3, 1.8, 0.9), 0.04, "-x +x -y +y +z")
+
+
+def test_a_room_is_seen_from_within():
+    points = np.concatenate((ROOM[0], THING[0]))
+    assert fraction_outward(points, np.concatenate((-ROOM[1], THING[1]))) > 0.96
+
+
+def test_a_room_without_a_ceiling_is_one_too():
+    walls = faces((0, 0, 0), (4, 3, 2.5), 0.04, "-x +x -y +y -z")
+    points = np.concatenate((walls[0], THING[0]))
+    assert fraction_outward(points, np.concatenate((-walls[1], THING[1]))) > 0.96
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (30, -4, 2)])
+def test_a_closed_thing_is_seen_from_outside(place):
+    assert fraction_outward(ROOM[0] + place, ROOM[1]) > 0.96
+
+
+def test_things_on_the_ground_are_seen_from_above():
+    ground = faces((0, 0, -1), (8, 8, 0), 0.05, "+z")
+    corners = [(x, y) for x in (1, 4, 6) for y in (1, 3, 6)]
+    things = [faces((x, y, 0.03), (x + 0.6, y + 0.7, 0.8), 0.05, "-x +x -y +y +z") for x, y in corners]
+    points, normals = (np.concatenate([cloud[i] for cloud in (ground, *things)]) for i in (0, 1))
+    hidden = np.zeros(len(points), bool)
+    for x, y in corners:
+        inside = (points[:, 0] > x) & (points[:, 0] < x + 0.6) & (points[:, 1] > y) & (points[:, 1] < y + 0.7)
+        hidden |= inside & (points[:, 2] == 0.0)
+    assert fraction_outward(points[~hidden], normals[~hidden]) > 0.97
+
+
+def test_a_square_in_front_hides_one_behind():
+    near, behind, beside = [0.0, 0.0, 1.0], [0.02, 0.0, 3.0], [1.0, 0.0, 3.0]
+    seen = visible_from(np.zeros(3), np.array([near, behind, beside]), np.full(3, 0.2))
+    assert seen.tolist() == [True, False, True]
+
+
+# --- the law of spacing -----------------------------------------------------------------------------------------------
+
+
+def scanned_scene(seed=0, n=160):
+    """Ground and a wall as beams of constant angle meet them, from a scanner at the origin 1.5 m above the ground."""
+    rng = np.random.default_rng(seed)
+    down, around = np.meshgrid(np.linspace(-0.3, 1.1, n), np.linspace(-np.pi, np.pi, 3 * n), indexing="ij")
+    rays = np.stack((np.cos(down) * np.cos(around), np.cos(down) * np.sin(around), -np.sin(down)), axis=-1)
+    rays = rays.reshape(-1, 3) + rng.normal(0, 1e-3, (rays.size // 3, 3))
+    with np.errstate(divide="ignore"):
+        ground = np.where(rays[:, 2] < 0, -1.5 / rays[:, 2], np.inf)
+        wall = np.where(rays[:, 0] > 0, 12.0 / rays[:, 0], np.inf)
+    ranges = np.minimum(ground, wall)
+    return (rays * ranges[:, None])[ranges < 60]
+
+
+def test_one_scan_tells_from_where_it_was_taken():
+    law = spacing_law(scanned_scene())
+    assert law.holds
+    assert law.viewpoint.tolist() == [0, 0, 0]  # the frame's origin, as it explains as much as any other place
+    assert law.exponent == pytest.approx(1.2, abs=0.3)
+
+
+def test_the_place_follows_the_scan():
+    points = scanned_scene()
+    turn, shift = Rotation.from_rotvec([0.3, -0.4, 0.5]).as_matrix(), np.array([300.0, -80.0, 12.0])
+    law = spacing_law(1e3 * (points @ turn.T + shift))
+    assert law.holds
+    assert np.linalg.norm(law.viewpoint / 1e3 - shift) < 4.0  # of a scene of 60 m
+
+
+def test_even_spacing_follows_no_law():
+    points = np.concatenate((ROOM[0], THING[0]))
+    assert not spacing_law(points + np.random.default_rng(0).normal(0, 1e-3, points.shape)).holds
+    assert not spacing_law(np.zeros((2000, 3))).holds
+    assert not spacing_law(scanned_scene()[:200]).holds  # too few to say
+
+
+def test_a_law_is_free_of_order_and_of_duplicates():
+    points = scanned_scene()
+    mixed = np.random.default_rng(0).permutation(points)
+    one, other, twice = (spacing_law(cloud) for cloud in (points, mixed, np.concatenate((points, points[:100]))))
+    assert one.viewpoint.tobytes() == other.viewpoint.tobytes()
+    assert (one.exponent, one.explained) == (other.exponent, other.explained)
+    assert twice.explained == pytest.approx(one.explained, abs=0.05)
+
+
+def test_voxels_of_one_scan_grow_with_range_unless_told():
+    points = scanned_scene()
+    assert np.ptp(pcgraph.segment(points).surface.grid.edge_lengths) > 0
+    assert np.ptp(pcgraph.segment(points, range_growth=0.0).surface.grid.edge_lengths) == 0
+    assert np.ptp(pcgraph.segment(points, viewpoint=(0, 0, 0)).surface.grid.edge_lengths) > 0
