@@ -18,7 +18,8 @@ Columns, means over a domain's clouds; those that count in the domain are named 
 
     wov            weighted overlap of the objects with the true segments (segmentation covering)
     oracle, parts  weighted overlap of the best node of the tree for each true segment; the same for true parts
-    things         mean over cars, poles and people with 30 points and more of the IoU of the best object
+    things         mean over cars, poles and people, or the furniture of a room, with 30 points and more each, of the
+                   IoU of the best object
     ground         the same for ground alone
     purity, mIoU   every segment of a cut into a given number (in the heading) takes its most frequent true label:
                    fraction of the points that are right, and mean over the true segments of their IoU. Labels that
@@ -288,6 +289,8 @@ def _judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
     row["one"] = 1.0 / max(row["objects"], 1.0)
     if sample.things is not None:
         row["things"] = _mean_overlap(complete, sample.truth, sample.things)
+    if sample.ground >= 0:
+        row["ground"] = _mean_overlap(complete, sample.truth, np.array([sample.ground]))
     return row
 
 
