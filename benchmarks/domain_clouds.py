@@ -28,6 +28,7 @@ import pcgraph
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CACHE = Path(__file__).resolve().parent.parent / "build" / "domain_clouds"  # git ignores it
+NOISE = -2
 MIN_THING = 30  # points; cars, poles and people with fewer are not judged
 
 
@@ -44,7 +45,7 @@ class Sample:
     points : (n, 3) or (h, w, 3) float or int
         Metres, unless the domain is in millimetres.
     truth : same leading shape, int32
-        True segment of each point, -1 where it is not judged.
+        True segment of each point, -1 where it is not judged, -2 for noise.
     colors : same leading shape + (3,), uint8, or None
     viewpoint : (3,) or points' shape float, or None
         Where the sensor stood; told to `best` only.
@@ -135,7 +136,7 @@ def domains(superpoints: Path | None = None) -> list[Domain]:
         Domain("simulated room A", rooms, lambda: simulated_room("A"), 300, room, 0.02),
         Domain("simulated room B", rooms, lambda: simulated_room("B"), 300, room, 0.02),
         Domain("street sweep A", things, lambda: street_sweep(1), 300, road, 0.2),
-        Domain("street sweep B", things, lambda: street_sweep(2), 300, road, 0.2),
+        Domain("street sweep B", things, lambda: street_sweep(7), 300, road, 0.2),
         Domain("street mobile", levels, lambda: street_mobile(3), 300, road, 0.2, large=True),
         Domain("airborne tile", aerial, airborne_tile, 100, air, 0.3),
         *(Domain(f"isprs samp{k}", aerial, partial(isprs, k), 100, air, 0.5) for k in (11, 12, 21, 23, 31, 41)),
@@ -190,7 +191,7 @@ def _with_noise(sample: Sample, fraction: float, seed: int) -> Sample:
         sample,
         points=np.concatenate((sample.points, outliers.astype(sample.points.dtype)))[order],
         colors=np.concatenate((sample.colors, rng.integers(0, 256, (more, 3), np.uint8)))[order],
-        truth=np.concatenate((sample.truth, np.full(more, -1, np.int32)))[order],
+        truth=np.concatenate((sample.truth, np.full(more, NOISE, np.int32)))[order],
         clean=sample,
     )
 

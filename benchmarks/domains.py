@@ -25,7 +25,7 @@ Columns, means over a domain's clouds; those that count in the domain are named 
                    fraction of the points that are right, and mean over the true segments of their IoU. Labels that
                    come without a tree keep their largest segments up to that number; the others count as one
     one            1 / number of objects
-    change         wov less that of the same cloud without noise
+    change, noise  wov less that of the same cloud without noise; IoU of the points that have no label with the noise
     objects, single, s    objects, those of one point, seconds per cloud
 
 A point without a label belongs to one more segment, that of all such points. The last line is JSON: for each domain
@@ -45,9 +45,10 @@ from typing import Any
 
 import numpy as np
 from baselines import felzenszwalb, normal_graph, plane_and_clusters
-from domain_clouds import Domain, MissingDataError, Sample, domains
+from domain_clouds import NOISE, Domain, MissingDataError, Sample, domains
 from numpy.typing import NDArray
 from peers import PclSetting, pcl_driver, run_pcl
+from scipy.spatial import cKDTree
 
 import pcgraph
 from pcgraph.metrics import tree_oracle, weighted_overlap
@@ -55,11 +56,12 @@ from pcgraph.metrics.labellings import contingency, intersections_over_union, la
 from pcgraph.tree.linkage import Linkage
 
 Row = dict[str, float]
-COLUMNS = ("wov", "oracle", "parts", "things", "ground", "purity", "mIoU", "one", "change")
+COLUMNS = ("wov", "oracle", "parts", "things", "ground", "purity", "mIoU", "one", "change", "noise")
 COUNTS = ("objects", "single", "s")
 ALTITUDES = (0.25, 0.5, 2.0, 4.0)  # times the default
-VOXELS = (1.0, 2.0, 4.0)  # times the default
-VOXELS_OF_LARGE = (2.0, 4.0, 8.0)
+SPACINGS = 3.5  # median distances between nearest points: the voxels that others get, and the unit of the next two
+VOXELS = (None, 2.0, 4.0)
+VOXELS_OF_LARGE = (None, 4.0, 8.0)
 SCALES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 MIN_POINTS = (3, 10)
 
@@ -189,8 +191,8 @@ def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
         rows: dict[float, list[Row]] = {altitude: [] for altitude in (1.0, *ALTITUDES)}
         for sample in samples:
             knobs = view | {"linkage": linkage}
-            if size != 1.0:
-                knobs["voxel_size"] = size * _default_voxel(sample)
+            if size is not None:
+                knobs["voxel_size"] = size * _usual_voxel(sample)
             if "viewpoint" in view:
                 knobs["viewpoint"] = sample.viewpoint
             row, result = _segmented(domain, sample, **knobs)
@@ -200,13 +202,16 @@ def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
                 rows[altitude].append(row | _judged(sample, labels))
         told = [f"{name}={value}" if name == "range_growth" else name for name, value in view.items()]
         for altitude, found in rows.items():
-            named = [*told, type(linkage).__name__, f"voxels x{size:g}", f"altitude x{altitude:g}"]
+            sized = [] if size is None else [f"voxels x{size:g}"]
+            named = [*told, type(linkage).__name__, *sized, f"altitude x{altitude:g}"]
             yield ", ".join(named), _mean(found)
 
 
 @functools.cache
-def _default_voxel(sample: Sample) -> float:
-    return pcgraph.segment(sample.points, sample.colors).voxel_size
+def _usual_voxel(sample: Sample) -> float:
+    points = sample.points[np.isfinite(sample.points).all(axis=-1)].astype(np.float64)
+    some = np.random.default_rng(0).choice(points, min(len(points), 20_000), replace=False)
+    return SPACINGS * float(np.median(cKDTree(points).query(some, 2)[0][:, 1]))
 
 
 # --- What people use ----------------------------------------------------------------------------------------------
@@ -242,7 +247,7 @@ def _pcl(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
     for size in (1.0, 2.0):
         rows = []
         for sample in samples:
-            voxel = size * _default_voxel(sample)
+            voxel = size * _usual_voxel(sample)
             points = sample.points.reshape(1, -1, 3) if sample.points.ndim == 2 else sample.points
             colors = np.zeros(points.shape, np.uint8) if sample.colors is None else sample.colors.reshape(points.shape)
             start = time.perf_counter()
@@ -289,6 +294,9 @@ def _judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
     row["one"] = 1.0 / max(row["objects"], 1.0)
     if sample.things is not None:
         row["things"] = _mean_overlap(complete, sample.truth, sample.things)
+    if sample.clean is not None:
+        lost, noise = labels < 0, sample.truth == NOISE
+        row["noise"] = float(np.count_nonzero(lost & noise) / np.count_nonzero(lost | noise))
     if sample.ground >= 0:
         row["ground"] = _mean_overlap(complete, sample.truth, np.array([sample.ground]))
     return row
