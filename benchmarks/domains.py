@@ -194,7 +194,7 @@ def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
             if size is not None:
                 knobs["voxel_size"] = size * _usual_voxel(sample)
             if "viewpoint" in view:
-                knobs["viewpoint"] = sample.viewpoint
+                knobs["viewpoint"] = _one_viewpoint(sample) if "range_growth" in view else sample.viewpoint
             row, result = _segmented(domain, sample, **knobs)
             rows[1.0].append(row)
             for altitude in ALTITUDES:
@@ -205,6 +205,12 @@ def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
             sized = [] if size is None else [f"voxels x{size:g}"]
             named = [*told, type(linkage).__name__, *sized, f"altitude x{altitude:g}"]
             yield ", ".join(named), _mean(found)
+
+
+def _one_viewpoint(sample: Sample) -> NDArray[np.float64]:
+    """The viewpoint, or the middle of several."""
+    assert sample.viewpoint is not None
+    return sample.viewpoint if sample.viewpoint.ndim == 1 else sample.viewpoint.mean(axis=0)
 
 
 @functools.cache
