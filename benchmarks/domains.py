@@ -22,8 +22,9 @@ Columns, means over a domain's clouds; those that count in the domain are named 
                    IoU of the best object
     ground         the same for ground alone
     purity, mIoU   every segment of a cut into a given number (in the heading) takes its most frequent true label:
-                   fraction of the points that are right, and mean over the true segments of their IoU. Labels that
-                   come without a tree keep their largest segments up to that number; the others count as one
+                   fraction of the points that are right, and mean over the true segments of their IoU. Felzenszwalb's
+                   k is the one that gives this number or just fewer; other labels that come without a tree keep
+                   their largest segments up to it, and the rest counts as one
     one            1 / number of objects
     change, noise  wov less that of the same cloud without noise; IoU of the points that have no label with the noise
     objects, single, s    objects, those of one point, seconds per cloud
@@ -44,7 +45,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from baselines import felzenszwalb, normal_graph, plane_and_clusters
+from baselines import NormalGraph, felzenszwalb, normal_graph, plane_and_clusters
 from domain_clouds import NOISE, Domain, MissingDataError, Sample, domains
 from numpy.typing import NDArray
 from peers import PclSetting, pcl_driver, run_pcl
@@ -63,6 +64,7 @@ SPACINGS = 3.5  # median distances between nearest points: the voxels that other
 VOXELS = (None, 2.0, 4.0)
 VOXELS_OF_LARGE = (None, 4.0, 8.0)
 SCALES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+BISECTIONS = 10
 MIN_POINTS = (3, 10)
 
 
@@ -229,12 +231,29 @@ def _felzenszwalb(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, 
         finite, start = np.isfinite(sample.points).all(axis=-1), time.perf_counter()
         graph = normal_graph(sample.points[finite])
         seconds = time.perf_counter() - start
+        cut = _voted(sample.truth, _spread(finite, _felzenszwalb_cut(graph, _segments(domain, sample))))
         for scale in SCALES:
             start = time.perf_counter()
             labels = _spread(finite, felzenszwalb(graph, scale))
-            rows[scale].append(_of_labels(domain, sample, labels) | {"s": seconds + time.perf_counter() - start})
+            taken = seconds + time.perf_counter() - start
+            rows[scale].append(_judged(sample, labels) | cut | {"s": taken})
     for scale, found in rows.items():
         yield f"k {scale:g}", _mean(found)
+
+
+def _felzenszwalb_cut(graph: NormalGraph, number: int) -> NDArray[np.integer]:
+    """Most segments that are no more than a number, by bisection of k."""
+    low, high = np.log(SCALES[0]) - 7.0, np.log(SCALES[-1]) + 7.0
+    best = _largest(felzenszwalb(graph, float(np.exp(high))), number)  # more if there are gaps
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        labels = felzenszwalb(graph, float(np.exp(middle)))
+        if labels.max() < number:
+            high = middle
+            best = labels if labels.max() >= best.max() else best
+        else:
+            low = middle
+    return best
 
 
 def _dbscan(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
@@ -347,7 +366,7 @@ def _segments(domain: Domain, sample: Sample) -> int:
     return domain.segments if sample.superpoints is None else len(np.unique(sample.superpoints))
 
 
-def _spread(finite: NDArray[np.bool_], labels: NDArray[np.int32]) -> NDArray[np.int32]:
+def _spread(finite: NDArray[np.bool_], labels: NDArray[np.integer]) -> NDArray[np.int32]:
     full = np.full(finite.shape, -1, np.int32)
     full[finite] = labels
     return full
