@@ -143,7 +143,7 @@ def domains(superpoints: Path | None = None) -> list[Domain]:
         Domain("bins A", levels, partial(bins, "A"), 100, (0.02, 0.04, 0.08), 0.03),
         Domain("bins C", levels, partial(bins, "C"), 100, (0.02, 0.04, 0.08), 0.03),
         Domain("plane 2 mm", ("one",), planes, 1, (0.01, 0.03), 0.01),
-        Domain("plane 2 mm, in mm", ("one",), planes_in_millimetres, 1, (10.0, 30.0), 10.0),
+        Domain("plane in mm", ("one",), planes_in_millimetres, 1, (10.0, 30.0), 10.0),
     ]
     files = sorted(superpoints.glob("*.npz")) if superpoints else []
     cuts = ("purity", "mIoU")

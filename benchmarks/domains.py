@@ -119,12 +119,7 @@ def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> dict[
     plain = _mean([_segmented(domain, sample, linkage=pcgraph.MumfordShahLinkage())[0] for sample in samples])
     rows["mumford_shah"] = plain
     _show("Mumford-Shah", plain)
-    for name, baseline in (
-        ("Felzenszwalb", _felzenszwalb),
-        ("DBSCAN", _dbscan),
-        ("PCL", _pcl),
-        ("superpoints", _brought),
-    ):
+    for name, baseline in BASELINES.items():
         found = _best(domain, baseline(domain, samples))
         if found is not None:
             rows["baselines"][name] = found[0]
