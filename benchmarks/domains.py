@@ -226,7 +226,9 @@ def _felzenszwalb(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, 
         finite, start = np.isfinite(sample.points).all(axis=-1), time.perf_counter()
         graph = normal_graph(sample.points[finite])
         seconds = time.perf_counter() - start
-        cut = _voted(sample.truth, _spread(finite, _felzenszwalb_cut(graph, _segments(domain, sample))))
+        cut = {}
+        if "purity" in domain.scores:  # else not worth the time
+            cut = _voted(sample.truth, _spread(finite, _felzenszwalb_cut(graph, _segments(domain, sample))))
         for scale in SCALES:
             start = time.perf_counter()
             labels = _spread(finite, felzenszwalb(graph, scale))

@@ -70,9 +70,8 @@ def street(seed: int, half_length: float = 100.0) -> Street:
 def _ground(made: Street, half_length: float) -> None:
     kerb = made.half_width
     x = np.linspace(-half_length, half_length, 300)
-    half = np.concatenate(
-        ([0.0, 1.5, 3.0, kerb], kerb + np.array([0.03, 2.0, 4.0, 8.0, 20.0, 45.0]))
-    )  # 3 cm: the kerb's face
+    beside = kerb + np.array([0.03, 2.0, 4.0, 8.0, 20.0, 45.0])  # the kerb's face leans by 3 cm
+    half = np.concatenate(([0.0, 1.5, 3.0, kerb], beside))
     y = np.concatenate((-half[:0:-1], half))
     at = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     grid = np.concatenate((at, made.height(at[..., 0], at[..., 1])[..., None]), axis=-1)
