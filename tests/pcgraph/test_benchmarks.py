@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the benchmarks of pcgraph stand on: the synthetic rooms, and the drivers of the libraries compared with."""
+"""What the benchmarks of pcgraph stand on: synthetic rooms and streets, and what pcgraph is compared with."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import subprocess
 
 import numpy as np
 import pytest
+from baselines import felzenszwalb, normal_graph, plane_and_clusters
 from clouds import two_boxes_on_a_plane
 from peers import PclSetting, run_lin, run_pcl
 from room import SPACING_M, rooms
+from scanned_scenes import Scene, ball, box, rod, scan, sphere_of_rays
+from scanned_streets import GROUND, SENSOR_M, street, sweep
 from scipy.spatial import cKDTree
 
 PLAIN = PclSetting(0.01, 0.06, color=0.0, spatial=0.4, normal=1.0, camera=False)
@@ -30,6 +33,51 @@ def test_rooms_are_as_dense_when_there_are_more():
     for points in (few, many):
         distance = cKDTree(points).query(points[::50], k=2)[0][:, 1]
         assert 0.6 * SPACING_M < np.median(distance) < SPACING_M
+
+
+@pytest.mark.parametrize(
+    ("solid", "distance"),
+    [(ball((3, 0, 0), (1, 1, 1)), 2.0), (box((2, -1, -1), (4, 1, 1)), 2.0), (rod((3, 0, -1), (3, 0, 1), 0.5), 2.5)],
+)
+def test_a_solid_is_where_it_was_put(solid, distance):
+    scene = Scene()
+    scene.add(scene.thing("solid"), solid)
+    found = scan(scene, np.zeros((1, 3)), [np.eye(3)], 0.0, np.random.default_rng(0))
+    assert len(found.points) == 1  # the rays along y and z miss it
+    np.testing.assert_allclose(found.points, [[distance, 0.0, 0.0]], atol=0.02)
+
+
+def test_a_sweep_lies_on_the_ground_and_is_the_same_for_the_same_seed():
+    made = street(3, half_length=40.0)
+    found, again = sweep(made, 0), sweep(street(3, half_length=40.0), 0)
+    np.testing.assert_array_equal(found.points, again.points)
+    place = made.on_ground(0.0, -1.75) + np.array([0.0, 0.0, SENSOR_M])
+    ground = found.points[found.things == made.scene.numbers(GROUND)[0]] + place
+    ground = ground[np.linalg.norm(ground - place, axis=1) < 15.0]
+    below = made.height(ground[:, 0], ground[:, 1]) - ground[:, 2]
+    assert np.median(np.abs(below)) < 0.02
+    rays = sphere_of_rays(np.array([0.0, 90.0]), np.array([0.0, -24.9]))
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0)
+
+
+def test_felzenszwalb_parts_two_planes_at_a_right_angle():
+    s, t = (c.ravel() for c in np.meshgrid(np.linspace(0.0, 1.0, 40), np.linspace(0.0, 1.0, 40)))
+    points = np.concatenate((np.stack((s, t, 0 * s), axis=1), np.stack((s, 0 * s, t), axis=1)[t > 0]))
+    labels = felzenszwalb(normal_graph(points), 0.5)
+    away = points[:, 1:].max(axis=1) > 0.1
+    assert len(np.unique(labels[away & (points[:, 2] == 0)])) == len(np.unique(labels[away & (points[:, 1] == 0)])) == 1
+    assert labels[0] == labels.min() == 0
+    assert len(np.unique(labels[away])) == 2
+
+
+def test_clusters_stand_on_the_plane():
+    rng = np.random.default_rng(0)
+    plane = rng.uniform((-2, -2, 0), (2, 2, 0), (4000, 3))
+    blobs = [rng.uniform(-0.1, 0.1, (200, 3)) + np.array([x, 0.0, 0.5]) for x in (-1.0, 1.0)]
+    labels = plane_and_clusters(np.concatenate((plane, *blobs, [[0.0, 0.0, 3.0]])), 0.05, 0.2, 3)
+    assert (labels[:4000] == 0).all()
+    assert sorted({*labels[4000:4200]} | {*labels[4200:4400]}) == [1, 2]
+    assert labels[-1] == -1
 
 
 def _corner(concave: bool) -> np.ndarray:

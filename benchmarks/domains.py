@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is pcgraph's default good on every kind of cloud? One table of clouds against settings and what people use.
+
+    python benchmarks/domains.py [--domains "room1,street sweep A"] [--quick] [--superpoints FOLDER]
+
+Rows of each domain (`domain_clouds.py`):
+
+    default        `pcgraph.segment(points, colors)` and nothing else
+    best knobs     the best of a fixed grid: viewpoint told or not, camera or growth of voxels with range, voxel size,
+                   linkage, object altitude. Each score takes its own best; the setting named is that of the first score
+    Mumford-Shah   `linkage=MumfordShahLinkage()` and nothing else
+    PCL            VCCS and LCCP, best of two voxel sizes
+    Felzenszwalb   on the normals of a graph of the 8 nearest points, best of several k, each score its own
+    DBSCAN         after a plane by RANSAC, best of several radii, each score its own
+    superpoints    those that the file brings along
+
+Columns, means over a domain's clouds; those that count in the domain are named in its heading:
+
+    wov            weighted overlap of the objects with the true segments (segmentation covering)
+    oracle, parts  weighted overlap of the best node of the tree for each true segment; the same for true parts
+    things         mean over cars, poles and people, or the furniture of a room, with 30 points and more each, of the
+                   IoU of the best object
+    ground         the same for ground alone
+    purity, mIoU   every segment of a cut into a given number (in the heading) takes its most frequent true label:
+                   fraction of the points that are right, and mean over the true segments of their IoU. Felzenszwalb's
+                   k is the one that gives this number or just fewer; other labels that come without a tree keep
+                   their largest segments up to it, and the rest counts as one
+    one            1 / number of objects
+    change, noise  wov less that of the same cloud without noise; IoU of the points that have no label with the noise
+    objects, single, s    objects, those of one point, seconds per cloud
+
+A point without a label belongs to one more segment, that of all such points. The last line is JSON: for each domain
+default, best, baselines; and worst_loss, the least of default - max(best, baselines) over the scores that count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from baselines import NormalGraph, felzenszwalb, normal_graph, plane_and_clusters
+from domain_clouds import NOISE, Domain, MissingDataError, Sample, domains
+from numpy.typing import NDArray
+from peers import PclSetting, pcl_driver, run_pcl
+from scipy.spatial import cKDTree
+
+import pcgraph
+from pcgraph.metrics import tree_oracle, weighted_overlap
+from pcgraph.metrics.labellings import contingency, intersections_over_union, largest_of_groups
+from pcgraph.tree.linkage import Linkage
+
+Row = dict[str, float]
+COLUMNS = ("wov", "oracle", "parts", "things", "ground", "purity", "mIoU", "one", "change", "noise")
+COUNTS = ("objects", "single", "s")
+ALTITUDES = (0.25, 0.5, 2.0, 4.0)  # times the default
+SPACINGS = 3.5  # median distances between nearest points: the voxels that others get, and the unit of the next two
+VOXELS = (None, 2.0, 4.0)
+VOXELS_OF_LARGE = (None, 4.0, 8.0)
+SCALES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+BISECTIONS = 10
+MIN_POINTS = (3, 10)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--domains", help="names, comma-separated, or the beginnings of names; default: all")
+    parser.add_argument("--quick", action="store_true", help="leave out large clouds and the best knobs")
+    parser.add_argument("--superpoints", type=Path, help="folder of .npz with points, labels, superpoints (and colors)")
+    args = parser.parse_args()
+    chosen = _chosen(domains(args.superpoints), args.domains, args.quick)
+    _warm_up()
+    report: dict[str, Any] = {}
+    for domain in chosen:
+        try:
+            samples = domain.samples()
+        except MissingDataError as missing:
+            print(f"\n{domain.name}: left out, {missing}")
+            continue
+        report[domain.name] = _measure(domain, samples, with_best=not args.quick)
+    losses = {name: rows["loss"] for name, rows in report.items() if rows["loss"] is not None}
+    worst = min(losses, key=losses.__getitem__, default=None)
+    print(json.dumps(report | {"worst_loss": losses[worst] if worst else None, "worst_domain": worst}))
+
+
+def _chosen(every: list[Domain], names: str | None, quick: bool) -> list[Domain]:
+    if names is None:
+        return [domain for domain in every if not (quick and domain.large)]
+    beginnings = [name.strip() for name in names.split(",")]
+    for beginning in beginnings:
+        if not any(domain.name.startswith(beginning) for domain in every):
+            raise SystemExit(f"no domain {beginning!r}; there are: {', '.join(domain.name for domain in every)}")
+    return [domain for domain in every if domain.name.startswith(tuple(beginnings))]
+
+
+def _warm_up() -> None:
+    """Compile all that is timed."""
+    points = np.random.default_rng(0).random((3000, 3)) * (1.0, 1.0, 0.001)
+    for linkage in (None, pcgraph.MumfordShahLinkage(), pcgraph.ConvexityLinkage()):
+        found = pcgraph.segment(points, linkage=linkage)
+    tree_oracle(found.tree, found.supervoxels, found.labels)
+    felzenszwalb(normal_graph(points), 1.0)
+
+
+def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> dict[str, Any]:
+    sizes = sum(int(np.isfinite(sample.points).all(axis=-1).sum()) for sample in samples) // len(samples)
+    number = _segments(domain, samples[0])
+    print(f"\n{domain.name}: {len(samples)} x {sizes} points; counts: {', '.join(domain.scores)}; cuts of {number}")
+    print(" " * 14 + "".join(f"{name:>8s}" for name in (*COLUMNS, *COUNTS)))
+    default = _mean([_segmented(domain, sample)[0] for sample in samples])
+    _show("default", default)
+    rows: dict[str, Any] = {"default": default, "best": None, "baselines": {}}
+    plain = _mean([_segmented(domain, sample, linkage=pcgraph.MumfordShahLinkage())[0] for sample in samples])
+    rows["mumford_shah"] = plain
+    _show("Mumford-Shah", plain)
+    for name, baseline in BASELINES.items():
+        found = _best(domain, baseline(domain, samples))
+        if found is not None:
+            rows["baselines"][name] = found[0]
+            _show(name, *found)
+    if with_best:
+        found = _best(domain, [("default", default), ("Mumford-Shah", plain), *_grid(domain, samples)])
+        assert found is not None
+        rows["best"] = found[0] | {"knobs": found[1]}
+        _show("best knobs", *found)
+    rivals = [row for row in (rows["best"], *rows["baselines"].values()) if row is not None]
+    losses = {
+        score: round(default[score] - max(rival[score] for rival in rivals if score in rival), 4)
+        for score in domain.scores
+        if score in default and any(score in rival for rival in rivals)
+    }
+    rows["losses"], rows["loss"] = losses, min(losses.values(), default=None)
+    print(" " * 14 + f"default against the best of the others: {losses}", flush=True)
+    return rows
+
+
+# --- pcgraph ------------------------------------------------------------------------------------------------------
+
+
+def _segmented(domain: Domain, sample: Sample, **knobs: Any) -> tuple[Row, pcgraph.Segmentation]:
+    """Scores of one call."""
+    start = time.perf_counter()
+    result = pcgraph.segment(sample.points, sample.colors, **knobs)
+    seconds = time.perf_counter() - start
+    row = _judged(sample, result.labels) | _of_tree(domain, sample, result) | {"s": seconds}
+    if sample.clean is not None:
+        clean = pcgraph.segment(sample.clean.points, sample.clean.colors, **knobs)
+        row["change"] = row["wov"] - _judged(sample.clean, clean.labels)["wov"]
+    return row, result
+
+
+def _of_tree(domain: Domain, sample: Sample, result: pcgraph.Segmentation) -> Row:
+    """Scores of the tree and of its cut into the domain's number of segments."""
+    number = min(_segments(domain, sample), result.tree.n_leaves)
+    row = {"oracle": _oracle(result, sample.truth)} | _voted(sample.truth, result.cut(n=number))
+    if sample.parts is not None:
+        row["parts"] = _oracle(result, sample.parts)
+    return row
+
+
+def _oracle(result: pcgraph.Segmentation, truth: NDArray[np.int32]) -> float:
+    """Tree oracle; points outside all supervoxels, should there be any, are lost."""
+    judged = truth >= 0
+    held = float(np.mean(result.supervoxels[judged] >= 0))
+    return held * tree_oracle(result.tree, result.supervoxels, truth)
+
+
+def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
+    """Scores of all settings."""
+    known, first = samples[0].viewpoint is not None, pcgraph.segment(samples[0].points, samples[0].colors)
+    views: list[dict[str, Any]] = [{}]
+    if known:
+        views += [{"viewpoint": True}, {"viewpoint": True, "range_growth": 0.5}]
+    if known and samples[0].camera:
+        views += [{"viewpoint": True, "camera": True}]
+    linkages: list[Linkage] = [first.linkage]
+    linkages += [
+        other for other in (pcgraph.ConvexityLinkage(), pcgraph.MumfordShahLinkage()) if other != first.linkage
+    ]
+    sizes = VOXELS_OF_LARGE if domain.large else VOXELS
+    for view, linkage, size in itertools.product(views, linkages, sizes):
+        rows: dict[float, list[Row]] = {altitude: [] for altitude in (1.0, *ALTITUDES)}
+        for sample in samples:
+            knobs = view | {"linkage": linkage}
+            if size is not None:
+                knobs["voxel_size"] = size * _usual_voxel(sample)
+            if "viewpoint" in view:
+                knobs["viewpoint"] = _one_viewpoint(sample) if "range_growth" in view else sample.viewpoint
+            row, result = _segmented(domain, sample, **knobs)
+            rows[1.0].append(row)
+            for altitude in ALTITUDES:
+                labels = result.cut(altitude=altitude * result.object_altitude)
+                rows[altitude].append(row | _judged(sample, labels))
+        told = [f"{name}={value}" if name == "range_growth" else name for name, value in view.items()]
+        for altitude, found in rows.items():
+            sized = [] if size is None else [f"voxels x{size:g}"]
+            named = [*told, type(linkage).__name__, *sized, f"altitude x{altitude:g}"]
+            yield ", ".join(named), _mean(found)
+
+
+def _one_viewpoint(sample: Sample) -> NDArray[np.float64]:
+    """The viewpoint, or the middle of several."""
+    assert sample.viewpoint is not None
+    return sample.viewpoint if sample.viewpoint.ndim == 1 else sample.viewpoint.mean(axis=0)
+
+
+@functools.cache
+def _usual_voxel(sample: Sample) -> float:
+    points = sample.points[np.isfinite(sample.points).all(axis=-1)].astype(np.float64)
+    some = np.random.default_rng(0).choice(points, min(len(points), 20_000), replace=False)
+    return SPACINGS * float(np.median(cKDTree(points).query(some, 2)[0][:, 1]))
+
+
+# --- What people use ----------------------------------------------------------------------------------------------
+
+
+def _felzenszwalb(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
+    rows: dict[float, list[Row]] = {scale: [] for scale in SCALES}
+    for sample in samples:
+        finite, start = np.isfinite(sample.points).all(axis=-1), time.perf_counter()
+        graph = normal_graph(sample.points[finite])
+        seconds = time.perf_counter() - start
+        cut = {}
+        if "purity" in domain.scores:  # else not worth the time
+            cut = _voted(sample.truth, _spread(finite, _felzenszwalb_cut(graph, _segments(domain, sample))))
+        for scale in SCALES:
+            start = time.perf_counter()
+            labels = _spread(finite, felzenszwalb(graph, scale))
+            taken = seconds + time.perf_counter() - start
+            rows[scale].append(_judged(sample, labels) | cut | {"s": taken})
+    for scale, found in rows.items():
+        yield f"k {scale:g}", _mean(found)
+
+
+def _felzenszwalb_cut(graph: NormalGraph, number: int) -> NDArray[np.integer]:
+    """Most segments that are no more than a number, by bisection of k."""
+    low, high = np.log(SCALES[0]) - 7.0, np.log(SCALES[-1]) + 7.0
+    best = _largest(felzenszwalb(graph, float(np.exp(high))), number)  # more if there are gaps
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        labels = felzenszwalb(graph, float(np.exp(middle)))
+        if labels.max() < number:
+            high = middle
+            best = labels if labels.max() >= best.max() else best
+        else:
+            low = middle
+    return best
+
+
+def _dbscan(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
+    for radius, least in itertools.product(domain.radii, MIN_POINTS):
+        rows = []
+        for sample in samples:
+            finite, start = np.isfinite(sample.points).all(axis=-1), time.perf_counter()
+            labels = _spread(finite, plane_and_clusters(sample.points[finite], domain.ground, radius, least))
+            rows.append(_of_labels(domain, sample, labels) | {"s": time.perf_counter() - start})
+        yield f"radius {radius:g}, {least} points", _mean(rows)
+
+
+def _pcl(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
+    if _missing_pcl():
+        return
+    for size in (1.0, 2.0):
+        rows = []
+        for sample in samples:
+            voxel = size * _usual_voxel(sample)
+            points = sample.points.reshape(1, -1, 3) if sample.points.ndim == 2 else sample.points
+            colors = np.zeros(points.shape, np.uint8) if sample.colors is None else sample.colors.reshape(points.shape)
+            start = time.perf_counter()
+            setting = PclSetting(voxel, 5.0 * voxel, 0.0, 1.0, 4.0, camera=sample.organised)
+            segments = run_pcl(points.astype(np.float32), colors, setting, repeats=0).segments
+            seconds = time.perf_counter() - start
+            labels = np.where(segments > 0, segments, -1).reshape(sample.truth.shape)
+            rows.append(_of_labels(domain, sample, labels) | {"s": seconds})
+        yield f"voxels x{size:g}", _mean(rows)
+
+
+@functools.cache
+def _missing_pcl() -> bool:
+    try:
+        pcl_driver()
+    except SystemExit as reason:
+        print(f"(rows of PCL are left out: {reason})")
+        return True
+    return False
+
+
+def _brought(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
+    if all(sample.superpoints is not None for sample in samples):
+        yield "", _mean([_voted(sample.truth, sample.superpoints) for sample in samples])
+
+
+BASELINES = {"Felzenszwalb": _felzenszwalb, "DBSCAN": _dbscan, "PCL": _pcl, "superpoints": _brought}
+
+
+# --- Scores -------------------------------------------------------------------------------------------------------
+
+
+def _of_labels(domain: Domain, sample: Sample, labels: NDArray[np.integer]) -> Row:
+    """Scores of labels that have no tree."""
+    return _judged(sample, labels) | _voted(sample.truth, _largest(labels, _segments(domain, sample)))
+
+
+def _judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
+    """Scores of objects."""
+    sizes = np.bincount(labels[labels >= 0])
+    complete = _completed(labels)
+    row = {"wov": weighted_overlap(complete, sample.truth)}
+    row |= {"objects": float(np.count_nonzero(sizes)), "single": float(np.count_nonzero(sizes == 1))}
+    row["one"] = 1.0 / max(row["objects"], 1.0)
+    if sample.things is not None:
+        row["things"] = _mean_overlap(complete, sample.truth, sample.things)
+    if sample.clean is not None:
+        lost, noise = labels < 0, sample.truth == NOISE
+        row["noise"] = float(np.count_nonzero(lost & noise) / np.count_nonzero(lost | noise))
+    if sample.ground >= 0:
+        row["ground"] = _mean_overlap(complete, sample.truth, np.array([sample.ground]))
+    return row
+
+
+def _mean_overlap(labels: NDArray[np.integer], truth: NDArray[np.int32], chosen: NDArray[np.integer]) -> float:
+    """Mean over some true segments of the IoU of the best segment."""
+    table = contingency(labels, truth)
+    names = np.unique(truth[(truth >= 0) & (labels >= 0)])
+    best = largest_of_groups(intersections_over_union(table), table.col, len(names))
+    return float(np.mean(best[np.isin(names, chosen)]))
+
+
+def _voted(truth: NDArray[np.int32], segments: NDArray[np.integer] | None) -> Row:
+    """Purity, and mean IoU of the true segments, if every segment takes its most frequent true label."""
+    assert segments is not None
+    table = contingency(_completed(segments), truth)
+    order = np.argsort(table.data, kind="stable")
+    vote = np.empty(table.shape[0], np.int64)
+    vote[table.row[order]] = table.col[order]
+    n = table.shape[1]
+    right = vote[table.row] == table.col
+    common = np.bincount(table.col[right], table.data[right], n)
+    voted, true = np.bincount(vote[table.row], table.data, n), np.bincount(table.col, table.data, n)
+    return {"purity": float(common.sum() / true.sum()), "mIoU": float(np.mean(common / (voted + true - common)))}
+
+
+def _completed(labels: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Labels with one more for all points that have none."""
+    return np.where(labels >= 0, labels, labels.max() + 1).astype(np.int64)
+
+
+def _largest(labels: NDArray[np.integer], n: int) -> NDArray[np.int64]:
+    """The n - 1 largest segments, and one of the others."""
+    names, segment, sizes = np.unique(_completed(labels), return_inverse=True, return_counts=True)
+    rank = np.empty(len(names), np.int64)
+    rank[np.argsort(-sizes, kind="stable")] = np.arange(len(names))
+    return np.minimum(rank[segment], n - 1).reshape(labels.shape)
+
+
+def _segments(domain: Domain, sample: Sample) -> int:
+    return domain.segments if sample.superpoints is None else len(np.unique(sample.superpoints))
+
+
+def _spread(finite: NDArray[np.bool_], labels: NDArray[np.integer]) -> NDArray[np.int32]:
+    full = np.full(finite.shape, -1, np.int32)
+    full[finite] = labels
+    return full
+
+
+def _mean(rows: list[Row]) -> Row:
+    return {score: float(np.mean([row[score] for row in rows])) for score in rows[0]}
+
+
+def _best(domain: Domain, rows: Iterator[tuple[str, Row]] | list[tuple[str, Row]]) -> tuple[Row, str] | None:
+    """Each score's best, with the rest and the name of the row that is best in the domain's first score it has."""
+    found = list(rows)
+    if not found:
+        return None
+    first = next((score for score in domain.scores if score in found[0][1]), "wov")
+    name, row = max(found, key=lambda one: one[1].get(first, 0.0))
+    return row | {score: max(other[score] for _, other in found) for score in COLUMNS if score in row}, name
+
+
+def _show(name: str, row: Row, setting: str = "") -> None:
+    values = [f"{row[score]:8.3f}" if score in row else " " * 8 for score in COLUMNS]
+    values += [f"{row[count]:8.0f}" if count in row else " " * 8 for count in COUNTS[:2]]
+    values.append(f"{row['s']:8.2f}" if "s" in row else " " * 8)
+    print(f"{name:14s}{''.join(values)}  {setting}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
