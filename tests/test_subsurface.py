@@ -246,7 +246,7 @@ def test_sun_and_lamps_reach_a_medium_as_in_volpath() -> None:
     for lights in ({"sun": sun}, {"panel": panel}, {"sun": sun, "sky": {"type": "constant", "radiance": 0.2}}):
         scene = scene_of(ball(), medium(100.0, 0.9, 0.5), size=(48, 36), fov=20.0, floor=floor(), **lights)
         rig = scene.rig(baseline_m=0.1)
-        signals = transport(scene, rig, [], spp=512, max_depth=1000, rr_depth=50, photons=0, glint=False, seed=3)
+        signals = transport(scene, rig, [], spp=256, max_depth=1000, rr_depth=50, photons=0, glint=False, seed=3)
         camera = {
             "type": "perspective",
             "fov": 20.0,
@@ -264,7 +264,7 @@ def test_sun_and_lamps_reach_a_medium_as_in_volpath() -> None:
             }
         )
         volpath = mi.load_dict({"type": "volpath", "max_depth": 10_000, "rr_depth": 300})
-        reference = render(plain, volpath, spp=512, seed=11)
+        reference = render(plain, volpath, spp=256, seed=11)
         assert abs(z_score(signals.energy.ambient, reference)) < 5
         assert signals.energy.ambient.mean() == pytest.approx(reference.mean(), rel=0.015)
 
