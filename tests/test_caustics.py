@@ -399,9 +399,9 @@ def test_a_gather_whose_radius_grows_with_distance_is_the_sum_over_all_photons(
     landed = Photons(*columns, maps, none, per_pixel=1.0)
     radius = GatheringRadius(0.05, (0.02, 0.07), np.array([-1.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.05]))
     built = photon_maps.PhotonMaps(landed, radius, irradiance=1e-9)
-    points, sample = on_the_plane(2000), np.arange(2000) % maps
+    points, sample = on_the_plane(500), np.arange(500) % maps
     place, many = mi.Point3f(points.T), mi.UInt32(sample.astype(np.uint32))
-    active, half = dr.full(mi.Bool, True, 2000), dr.full(mi.Float, 0.5, 2000)
+    active, half = dr.full(mi.Bool, True, 500), dr.full(mi.Float, 0.5, 500)
     reach = built.reach(place)
     found = built.gather(0, place, mi.Normal3f(0, 0, 1), reach, many, half, half, active)
 
@@ -443,7 +443,7 @@ def test_flux_depends_on_neither_radius_nor_number_of_photons(photons: int, radi
     rays = rig.camera.normalise(rig.camera.pixel_centres()) * 0.05
     expected = landed.flux[seen].sum(dtype=float) / 16
     options = {"spp": 64, "max_depth": 2, "photons": photons, "caustic_radius_m": radius_m}
-    caustic = np.mean([transport(scene, rig, [], seed=s, **options).energy.caustic for s in range(8)], axis=0)
+    caustic = np.mean([transport(scene, rig, [], seed=s, **options).energy.caustic for s in range(4)], axis=0)
     inside = np.abs(rays).max(axis=-1) < 0.05 * np.tan(np.radians(55)) - 0.01
     received = float(caustic[inside].sum(dtype=float)) * np.pi / 0.5 * (0.05 / rig.camera.fx) ** 2
     assert received == pytest.approx(expected, rel=0.01)

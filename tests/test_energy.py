@@ -156,7 +156,7 @@ def integrating_sphere(*parts: dict[str, Any], albedo: float) -> float:
         T_world_camera = look_at((0, 0, 0), ahead, up)
         rig = Rig(camera, Intrinsics.from_fov(64, 64, 30), T_world_camera,
                   np.linalg.inv(T_world_camera) @ T_world_projector, projector_power_w=POWER_W)  # fmt: skip
-        signals = transport(scene, rig, [], spp=256, max_depth=40, rr_depth=40, glint=False, caustic_radius_m=0.15)
+        signals = transport(scene, rig, [], spp=96, max_depth=40, rr_depth=40, glint=False, caustic_radius_m=0.15)
         wall_seen = signals.truth.instance == 0
         radiance = signals.energy.projector
         received += float((radiance * solid_angle)[wall_seen].sum()) * np.pi / albedo * radius**2

@@ -185,10 +185,11 @@ def test_settings_of_adaptive_sampling_out_of_range_are_refused(matte: Scene) ->
 
 def test_where_nothing_can_be_read_no_samples_are_wasted() -> None:
     scene = load_scene("glassware")
+    sensor = AmcwToF()
+    signals = transport(scene, scene.rig(0.03, **SMALL_IMAGE), [sensor], spp=16)
+    signals_of = {sensor: signals}.__getitem__
     for exposure_s in (1e-12, 10.0):
-        one = Instrument("one", AmcwToF(), exposure_s=exposure_s)
-        signals = transport(scene, scene.rig(0.03, **SMALL_IMAGE), [one.sensor], spp=16)
-        signals_of = {one.sensor: signals}.__getitem__
+        one = Instrument("one", sensor, exposure_s=exposure_s)
         assert (AdaptiveSampling((one,)).samples(signals.truth, signals_of) == FIRST_SPP).all()
 
 

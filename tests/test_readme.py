@@ -41,9 +41,13 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
     assert list((tmp_path / "out" / "segments").glob("*.ply"))
 
 
+ARGUMENTS = {"segmentation": ["--width", "320"], "two_cameras": ["--width", "80"]}
+"""Of the examples that can be had smaller."""
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
 def test_examples_run(path: Path, tmp_path: Path) -> None:
-    assert run([sys.executable, str(path)], tmp_path)
+    assert run([sys.executable, str(path), *ARGUMENTS.get(path.stem, [])], tmp_path)
 
 
 def test_links_between_documents_lead_somewhere() -> None:

@@ -311,10 +311,11 @@ def test_a_scene_finds_no_files_of_another(tmp_path: Path) -> None:
 
 def test_every_load_of_smooth_meshes_gives_the_same_bytes(tmp_path: Path) -> None:
     """Eight meshes without normals, with a texture: Mitsuba's threads alone make other normals of them in each load."""
+    import mitsuba as mi
     import trimesh
     from PIL import Image
 
-    ball = trimesh.creation.icosphere(subdivisions=6)
+    ball = trimesh.creation.icosphere(subdivisions=5)
     ball.vertices *= np.random.default_rng(0).uniform(0.8, 1.2, (len(ball.vertices), 1))
     ball.export(tmp_path / "ball.ply")
     Image.fromarray(np.arange(64, dtype=np.uint8).reshape(8, 8)).save(tmp_path / "paint.png")
@@ -326,11 +327,11 @@ def test_every_load_of_smooth_meshes_gives_the_same_bytes(tmp_path: Path) -> Non
     )
     path = write(tmp_path / "scene.xml", f'<scene version="3.0.0">{SENSOR}{shapes}</scene>')
 
-    def measured() -> bytes:
-        scene = rangesim.load_scene(path)
-        return rangesim.transport(scene, scene.rig(width=64, height=48), [], spp=4).energy.direct.tobytes()
+    def normals() -> bytes:
+        parameters = mi.traverse(rangesim.load_scene(path).mitsuba)
+        return b"".join(np.array(parameters[f"{x}.vertex_normals"]).tobytes() for x in range(8))
 
-    assert len({measured() for _ in range(6)}) == 1
+    assert len({normals() for _ in range(4)}) == 1
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])

@@ -201,18 +201,19 @@ def test_stripes_finer_than_the_mean_free_path_lose_their_contrast() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "inside"),
+    ("shape", "inside", "white"),
     [
-        (ball, (10.0, 0.9, 0.0)),
-        (ball, (100.0, 0.99, MILK_G)),
-        (ball, (1000.0, 0.95, 0.0)),
-        (slab, (200.0, 0.95, -0.3)),
-        (slab, (100.0, 0.9, MILK_G)),
+        (ball, (10.0, 0.9, 0.0), True),
+        (ball, (100.0, 0.99, MILK_G), False),
+        (ball, (1000.0, 0.95, 0.0), False),
+        (slab, (200.0, 0.95, -0.3), False),
+        (slab, (100.0, 0.9, MILK_G), True),
     ],
 )
-def test_white_and_stripes_agree_with_volpath(shape: Any, inside: tuple[float, float, float]) -> None:
+def test_white_and_stripes_agree_with_volpath(shape: Any, inside: tuple[float, float, float], white: bool) -> None:
     """In a large scene, because Mitsuba's integrator starts rays 0.1 mm off each surface: too much of a free path of
-    1 mm. Ours measures from the surface itself, and gives the same in any units."""
+    1 mm. Ours measures from the surface itself, and gives the same in any units. White is half stripes: it is looked at
+    by itself for one body of each shape."""
     import mitsuba as mi
 
     sigma_t, albedo, g = inside
@@ -225,10 +226,10 @@ def test_white_and_stripes_agree_with_volpath(shape: Any, inside: tuple[float, f
     signals = transport(scene, rig, [response], spp=256, max_depth=1000, rr_depth=50, photons=0, seed=3)
     plain = plain_scene(scene, rig, {"type": "hdrfilm", "pixel_format": "luminance"})
     volpath = mi.load_dict({"type": "volpath", "max_depth": 10_000, "rr_depth": 300})
-    for own, pattern in (
-        (signals.energy.projector, np.ones_like(stripes[0])),
-        (signals.channels[response][0], stripes[0]),
-    ):
+    compared = [(signals.channels[response][0], stripes[0])]
+    if white:
+        compared.append((signals.energy.projector, np.ones_like(stripes[0])))
+    for own, pattern in compared:
         show(plain, pattern)
         reference = render(plain, volpath, spp=256, seed=11)
         assert abs(z_score(own, reference)) < 5
@@ -245,7 +246,7 @@ def test_sun_and_lamps_reach_a_medium_as_in_volpath() -> None:
     for lights in ({"sun": sun}, {"panel": panel}, {"sun": sun, "sky": {"type": "constant", "radiance": 0.2}}):
         scene = scene_of(ball(), medium(100.0, 0.9, 0.5), size=(48, 36), fov=20.0, floor=floor(), **lights)
         rig = scene.rig(baseline_m=0.1)
-        signals = transport(scene, rig, [], spp=512, max_depth=1000, rr_depth=50, photons=0, glint=False, seed=3)
+        signals = transport(scene, rig, [], spp=256, max_depth=1000, rr_depth=50, photons=0, glint=False, seed=3)
         camera = {
             "type": "perspective",
             "fov": 20.0,
@@ -263,7 +264,7 @@ def test_sun_and_lamps_reach_a_medium_as_in_volpath() -> None:
             }
         )
         volpath = mi.load_dict({"type": "volpath", "max_depth": 10_000, "rr_depth": 300})
-        reference = render(plain, volpath, spp=512, seed=11)
+        reference = render(plain, volpath, spp=256, seed=11)
         assert abs(z_score(signals.energy.ambient, reference)) < 5
         assert signals.energy.ambient.mean() == pytest.approx(reference.mean(), rel=0.015)
 

@@ -18,6 +18,7 @@ Light seen in mirrors, through glass and on glossy surfaces is not smooth, and l
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -63,16 +64,28 @@ class LightFilter:
     """Lets neighbouring pixels share indirect light, as the guides say."""
 
     def __init__(self, guides: Guides) -> None:
-        mixed = mixed_pixels(guides)
-        self.weights = [level_weights(guides, mixed, 3**level) for level in range(LEVELS)]
+        self.guides = guides
+
+    @cached_property
+    def weights(self) -> list[NDArray[np.float32]]:
+        """Of the neighbours of each level, made when there is light to be shared."""
+        guides, mixed = self.guides, mixed_pixels(self.guides)
+        weights = [level_weights(guides, mixed, 3**level) for level in range(LEVELS)]
         reflectance = np.where(guides.instance >= 0, guides.reflectance, np.float32(1)).astype(np.float32)
-        _of_radiance(self.weights[0], self.weights[-1], reflectance)
-        self.scratch = np.empty((CHANNELS_AT_ONCE, *reflectance.shape), np.float32)
+        _of_radiance(weights[0], weights[-1], reflectance)
+        return weights
+
+    @cached_property
+    def scratch(self) -> NDArray[np.float32]:
+        """(CHANNELS_AT_ONCE, h, w) float32, for every other level."""
+        return np.empty((CHANNELS_AT_ONCE, *self.guides.instance.shape), np.float32)
 
     def apply(self, image: NDArray[np.float32]) -> None:
-        """Filter an image (c, h, w) in place."""
+        """Filter an image (c, h, w) in place; without light, as after a pass of direct light alone, it stays."""
         for begin in range(0, len(image), CHANNELS_AT_ONCE):
             some = image[begin : begin + CHANNELS_AT_ONCE]
+            if not some.any():
+                continue
             before, after = some, self.scratch[: len(some)]
             for level, weights in enumerate(self.weights):
                 in_blocks(_apply, image.shape[1], weights, 3**level, before, after, smallest=MIN_ROWS)

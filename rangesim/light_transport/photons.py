@@ -167,20 +167,21 @@ def _worthwhile_pixels(scene: Any, projector: Device) -> tuple[np.ndarray, np.nd
     chance = np.where(
         mask, 1.0, DEFENSIVE_FRACTION / (1 - DEFENSIVE_FRACTION) * max(mask.sum(), 1) / max(rest.sum(), 1)
     )
-    order = np.argsort(_morton(np.arange(w * h) % w, np.arange(w * h) // w))
+    # Places grow along every row of the image: runs, which a stable sort merges
+    order = np.argsort(_morton(w, h).ravel(), kind="stable")
     return order, chance[order]
 
 
-def _morton(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Place along the Morton curve: even steps along it are spread evenly over the image."""
+def _morton(w: int, h: int) -> np.ndarray:
+    """(h, w) uint32, place along the Morton curve: even steps along it are spread evenly over the image."""
 
     def spread(a: np.ndarray) -> np.ndarray:
-        a = a.astype(np.uint64)
         for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
-            a = (a | (a << np.uint64(shift))) & np.uint64(mask)
+            a = (a | (a << np.uint32(shift))) & np.uint32(mask)
         return a
 
-    return spread(x) | (spread(y) << np.uint64(1))
+    x, y = (np.arange(n, dtype=np.uint32) for n in (w, h))
+    return spread(x) | (spread(y)[:, None] << np.uint32(1))
 
 
 def shift_of(seed: int) -> float:

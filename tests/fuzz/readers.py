@@ -530,8 +530,8 @@ READERS = {
         ),
         Reader(
             "report", _rangesim, _with_arguments(seeds.results, "report {entry}"),
-            ("result/*.json", "result/*.npz", "result/*/capture/00*"), (_by_suffix,), share=0.2, command="rangesim",
-            may_write=("result/report.html",),
+            ("result/*.json", "result/*.npz", "result/*/capture/00*"), (_sidecar_trees,), share=0.2,
+            command="rangesim", may_write=("result/report.html",),
         ),
         Reader(
             "verify", _rangesim, _with_arguments(seeds.results, "verify {entry}"), ("result/manifest.json",),
