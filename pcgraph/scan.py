@@ -35,8 +35,9 @@ from pcgraph.warmup import compile_in_two_processes
 VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0
 RANGE_GROWTH = 0.5
-_CLEANINGS = 2
 _FEW_OUTLIERS = 0.95  # of the points are left
+_MIN_JOINED = 0.5  # of the voxels
+_MIN_GAIN = 0.1
 
 
 def segment(
@@ -112,19 +113,22 @@ def segment(
     settings = Settings.of(method or SurfaceGrowth(), linkage or RegionLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals)
     place = clean_viewpoint(viewpoint, cloud)
-    _sizes(cloud, voxel_size, seed_size)
+    voxel, seed = _sizes(cloud, voxel_size, seed_size)
     compile_in_two_processes()
-    for _ in range(_CLEANINGS):
+    position, warp = _place_and_warp(cloud, place, camera, range_growth)
+    grid = voxel_grid(cloud.points, cloud.colors, voxel, warp)
+    n_points = len(cloud.points)
+    cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
+    if len(cloud.points) < _FEW_OUTLIERS * n_points:  # spacing and place were those of noise, to a good part
         voxel, seed = _sizes(cloud, voxel_size, seed_size)
         position, warp = _place_and_warp(cloud, place, camera, range_growth)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp)
-        n_points = len(cloud.points)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        if len(cloud.points) >= _FEW_OUTLIERS * n_points:
-            break  # else spacing and place were those of noise, to a good part
-    position = place if position is not None and position.ndim > 1 else position
+    if voxel_size is None:
+        grid = _without_dust(cloud, grid, seed)
+        seed = SEEDS_PER_VOXEL * grid.size if seed_size is None else seed
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
-    position, orientation = _orientation(grid, position)
+    position, orientation = _orientation(grid, place if place is not None and place.ndim > 1 else position)
     return segment_scan(Scan(cloud, position, grid, orientation, initial_labels, seed), None, settings)
 
 
@@ -351,6 +355,24 @@ def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
     return voxel, seed
+
+
+def _without_dust(cloud: CleanCloud, grid: VoxelGrid, seed_size: float) -> VoxelGrid:
+    """The grid, or one of voxels twice or four times as large where that makes a surface of what falls apart.
+
+    On a surface most voxels have at least five others around them.
+    """
+    joined = _joined(grid)
+    while joined < _MIN_JOINED and grid.size < seed_size:
+        larger = voxel_grid(cloud.points, cloud.colors, 2.0 * grid.size, grid.warp)
+        if _joined(larger) < joined + _MIN_GAIN:
+            break  # a line stays a line
+        grid, joined = larger, _joined(larger)
+    return grid
+
+
+def _joined(grid: VoxelGrid) -> float:
+    return float((np.diff(grid.indptr) >= 5).mean())
 
 
 def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float | None) -> bool:
