@@ -35,7 +35,7 @@ class RegionLinkage(Linkage):
     -----
     Two regions A and B merge at
 
-        (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^p  (w / (b + w))^q
+        (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^1/2  (w / (b + w))^3/4
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
     increase of the squared distances to the regions' best planes by the merge, and l = E / b that per length b of the
@@ -51,7 +51,7 @@ class RegionLinkage(Linkage):
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     gap: float = 0.25
 
-    default_object_altitude = 0.4
+    default_object_altitude = 0.35
     default_part_altitude = 0.03
 
     def __post_init__(self) -> None:
@@ -80,12 +80,10 @@ class _Shape(NamedTuple):
     c1: float
     e0: float
     l0: float
-    p: float
-    q: float
     width: float
 
 
-_SHAPE = _Shape(c0=0.08, c1=0.031, e0=4.2, l0=0.4, p=0.46, q=0.675, width=7.7)
+_SHAPE = _Shape(c0=0.08, c1=0.031, e0=4.2, l0=0.4, width=7.7)
 
 
 def region_linkage(
@@ -153,7 +151,8 @@ def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, 
     increase = max(energy_increase(state, a, b), 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(min(state.masses[a], state.masses[b]))
+    shortness = width / (length + width)
     evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
-    evidence *= increase / (increase + shape.e0) * (scale / (scale + shape.l0)) ** shape.p
-    evidence *= (width / (length + width)) ** shape.q
+    evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
+    evidence *= math.sqrt(shortness * math.sqrt(shortness))
     return round(evidence * _STEPS) / _STEPS
