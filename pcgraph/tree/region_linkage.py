@@ -71,6 +71,7 @@ class RegionLinkage(Linkage):
 
 
 _STEPS = float(1 << 20)
+_MANY = 40  # edges of a region
 
 
 class _Shape(NamedTuple):
@@ -133,15 +134,34 @@ def _first_altitudes(
 
 @kernel
 def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
-    heap, halves = graph.heap, graph.halves
+    """Merge along the lowest edge until there is none.
+
+    After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
+    hardly changes, an edge gets it when it comes up.
+    """
+    heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
+    is_old = np.zeros(len(heap.edges), np.bool_)
     while heap.size[0] > 0:
-        kept, gone, _ = contract_cheapest(graph)
+        edge = heap.order[0]
+        if is_old[edge]:
+            is_old[edge] = False
+            a, b = halves[2 * edge].end, halves[2 * edge + 1].end
+            heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
+            continue
+        kept, gone, n_parallel = contract_cheapest(graph)
         unite(state, kept, gone)
-        half = graph.clusters[kept].first
+        few, half = clusters[kept].degree <= _MANY, clusters[kept].first
         while half != NONE:
             edge = half >> 1
-            heap_update(heap, edge, _altitude(state, graph.sums, edge, kept, halves[half ^ 1].end, shape))
+            is_old[edge] = not few
+            if few:
+                heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, shape))
             half = halves[half].after
+        for edge in graph.parallel[:n_parallel]:
+            if is_old[edge]:  # two became one: both old altitudes say little
+                is_old[edge] = False
+                a, b = halves[2 * edge].end, halves[2 * edge + 1].end
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
 
 
 @kernel

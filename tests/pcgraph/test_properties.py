@@ -27,6 +27,8 @@ from pcgraph import (
 )
 from pcgraph.voxels.grid import voxel_grid
 
+pytestmark = pytest.mark.filterwarnings("ignore::pcgraph.plausibility.CloudWarning")  # any cloud, sane or not
+
 METHODS = [SurfaceGrowth(), Vccs(), SurfaceGrowth(0.0, 0.0, 0.0), Vccs(color_weight=0.0)]
 LINKAGES = [
     ConvexityLinkage(),

@@ -23,6 +23,7 @@ def test_public_names():
         "BoundaryStrength",
         "Cloud",
         "CloudReadError",
+        "CloudWarning",
         "CloudWriteError",
         "Continuations",
         "ConvexityLinkage",
