@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -309,24 +307,6 @@ def test_climbing_a_tree_drawn_by_hand():
     altitudes[6] = 0.3
     assert _climb(parents, altitudes, counts, 100.0)[:4].tolist() == [6, 6, 6, 6]
     assert _uniform_tops(parents, np.array([8, 8, 5, 6], np.int32))[:4].tolist() == [4, 4, 2, 3]
-
-
-def run(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip()
-
-
-def test_without_scikit_learn_only_the_classifier_is_missing():
-    code = (
-        "import sys; sys.modules['sklearn'] = sys.modules['sklearn.base'] = None\n"
-        "from pcgraph import learning; learning.accumulate, learning.leaf_descriptors\n"
-        "try: learning.NodeClassifier\nexcept ImportError as error: print(error)"
-    )
-    assert run(code) == "NodeClassifier needs scikit-learn; pip install 'rangesim[learn]'"
-
-
-def test_scikit_learn_is_loaded_with_the_classifier_only():
-    code = "from pcgraph import learning; learning.accumulate; import sys; print('sklearn' in sys.modules)"
-    assert run(code) == "False"
 
 
 def test_wrong_input_is_refused(rooms):
