@@ -115,7 +115,7 @@ def test_unassigned_supervoxels_go_where_they_lie_best(apart):
 
 
 def test_thousands_of_regions_need_no_table_of_pairs():
-    n = 12_000
+    n = 6_000
     patches = scattered_patches(n, n, 0, reach=10.0)  # hardly any two in one plane
     before = getrusage(RUSAGE_SELF).ru_maxrss
     joined = join_coplanar(patches, np.arange(n, dtype=np.int32), True)

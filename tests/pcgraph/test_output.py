@@ -388,7 +388,7 @@ def test_a_disk_that_fails_at_any_step_leaves_the_old_or_the_new(tmp_path: Path)
         publish(target, OLD)
         write(target, MINE)
         with pytest.MonkeyPatch.context() as patch:
-            count_down(patch, step, lambda: OSError(number, os.strerror(number)))
+            count_down(patch, step, partial(OSError, number, os.strerror(number)))
             with pytest.raises((Refused, OSError)) as caught:
                 publish(target, NEW)
             assert "\n" not in str(caught.value)
