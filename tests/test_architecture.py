@@ -63,7 +63,7 @@ STOREYS = [
     "scan",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = {"detection", "learning", "io", "cli"}
+ON_TOP = {"detection", "learning", "io", "families", "cli"}
 """What stands on these and may import all of them."""
 
 

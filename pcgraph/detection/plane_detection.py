@@ -67,6 +67,10 @@ class Planes(ShortRepr):
     up: NDArray[np.float64]
     plane_of_supervoxel: NDArray[np.int32]
 
+    def _counts(self) -> str:
+        roles = [f"{np.count_nonzero(self.roles == role)} {role}" for role in sorted({*self.roles.tolist()})]
+        return f"{len(self)} plane{'' if len(self) == 1 else 's'}" + (f" ({', '.join(roles)})" if roles else "")
+
     def __len__(self) -> int:
         """Number of planes."""
         return len(self.offsets)
