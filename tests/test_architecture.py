@@ -51,6 +51,7 @@ STOREYS = [
     "output",
     "cloud",
     "parallel",
+    "disjoint_sets",
     "hierarchy",
     "voxels",
     "inputs",
