@@ -61,14 +61,14 @@ def member(family: str, name: str) -> Any:
     return known[fitting[0]]()
 
 
-def refusal(family: str, given: object) -> str:
-    """What to say of an argument that is no member of a family: which classes there are, and which may be meant."""
+def refusal(argument: str, family: str, given: object) -> str:
+    """What to say of an argument that is no member of its family: which classes there are, and which may be meant."""
     known = members(family)
     own = {name: kind for name, kind in known.items() if kind.__module__.startswith("pcgraph.")}
-    classes = ", ".join(f"{kind.__name__}()" for kind in own.values())
+    classes = ", ".join(f"pcgraph.{kind.__name__}()" for kind in own.values())
     near = get_close_matches(given.lower(), own, 1) if isinstance(given, str) else []
     hint = f"; did you mean pcgraph.{own[near[0]].__name__}()?" if near else ""
-    return f"expected a pcgraph.{family} such as {classes}, got {ascii(given)[:100]}{hint}"
+    return f"expected a {argument} such as {classes}, got {ascii(given)[:100]}{hint}"
 
 
 def _member_in(family: str, path: Path, attribute: str) -> Any:

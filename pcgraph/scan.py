@@ -219,17 +219,17 @@ class Settings:
     def of(cls, method: SupervoxelMethod, linkage: Linkage, object_altitude: float | None) -> Settings:
         """Settings; without an altitude the linkage's default."""
         if not isinstance(method, SupervoxelMethod):
-            raise ValueError(_refusal("SupervoxelMethod", method))
+            raise ValueError(_refusal("method", "SupervoxelMethod", method))
         if not isinstance(linkage, Linkage):
-            raise ValueError(_refusal("Linkage", linkage))
+            raise ValueError(_refusal("linkage", "Linkage", linkage))
         altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
         return cls(method, linkage, non_negative("object_altitude", altitude))
 
 
-def _refusal(family: str, given: object) -> str:
+def _refusal(argument: str, family: str, given: object) -> str:
     from pcgraph.families import refusal
 
-    return refusal(family, given)
+    return refusal(argument, family, given)
 
 
 def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
