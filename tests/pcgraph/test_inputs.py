@@ -123,5 +123,5 @@ def test_a_name_in_place_of_a_linkage_or_method_is_told_which_there_are():
         pcgraph.segment(np.ones((3, 3)), linkage="ward")
     with pytest.raises(ValueError, match=classes + " 3$"):
         pcgraph.segment(np.ones((3, 3)), linkage=3)
-    with pytest.raises(ValueError, match=r"SurfaceGrowth\(\), pcgraph\.Vccs\(\), got 'Vcs'; did you mean pcgraph\.Vccs\(\)"):
+    with pytest.raises(ValueError, match=r"pcgraph\.Vccs\(\), got 'Vcs'; did you mean pcgraph\.Vccs\(\)"):
         pcgraph.segment(np.ones((3, 3)), method="Vcs")
