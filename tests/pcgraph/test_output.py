@@ -660,12 +660,12 @@ def test_a_process_killed_while_it_clears_up_leaves_what_the_next_one_knows(tmp_
 def test_processes_that_meet_say_so_and_nothing_else(tmp_path: Path) -> None:
     """Claims that are made while others are given up: no work is lost, and no other error comes."""
     code = (
-        "import time; until = time.time() + 0.8\n"
+        "import time; os.fsync = os.fstat; until = time.time() + 0.5\n"
         "while time.time() < until:\n"
         "    try:\n"
         "        with new_directory(sys.argv[1], KIND) as folder:\n"
         "            fill(folder, 'a')\n"
-        "            if os.urandom(1) < b'\\x80': raise KeyError\n"
+        "            if os.urandom(1) < b'\\xe0': raise KeyError\n"
         "    except KeyError: pass\n"
         "    except OSError as error:\n"
         "        if 'another process' not in str(error): print(error)\n"
@@ -676,15 +676,24 @@ def test_processes_that_meet_say_so_and_nothing_else(tmp_path: Path) -> None:
     assert "cannot create the directory" not in said
 
 
-def test_a_directory_that_goes_while_it_is_made_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another process gives it up between `mkdir`, which finds it there, and the look at what is there."""
-    make, gone = Path.mkdir, [tmp_path / "n"]
+@pytest.mark.parametrize(
+    ("name", "problem"), [("n", FileExistsError), (f"n/{STAGING}", FileNotFoundError), (f"n/{STAGING}", None)]
+)
+def test_a_directory_that_goes_while_it_is_made_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, problem: type[OSError] | None
+) -> None:
+    """Another process gives it up: where `mkdir` has found it, before `mkdir` looks into it, or after `mkdir`."""
+    make, gone = Path.mkdir, [tmp_path / name]
 
     def mkdir(path: Path, *args: object, **kwargs: object) -> None:
-        if path in gone:
+        lost = path in gone
+        if lost:
             gone.remove(path)
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+        if lost and problem is not None:
+            raise problem(errno.EIO, "lost", str(path))
         make(path, *args, **kwargs)  # type: ignore[arg-type]
+        if lost:
+            path.rmdir()
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
     publish(tmp_path / "n", NEW)
