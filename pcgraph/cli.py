@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import inspect
 import os
-import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +13,7 @@ import typer
 
 import pcgraph
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.families import member
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,29 +24,6 @@ if TYPE_CHECKING:
     from pcgraph.tree.linkage import Linkage
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
-
-
-def members(family: str) -> dict[str, type[Any]]:
-    """Classes of a family of pcgraph by name, those that need no argument: MumfordShahLinkage is mumford-shah."""
-    for name in dir(pcgraph):
-        getattr(pcgraph, name)  # a class is known once it is loaded
-    waiting, found = [getattr(pcgraph, family)], {}
-    while waiting:
-        kind = waiting.pop()
-        waiting += kind.__subclasses__()
-        needed = [p for p in inspect.signature(kind).parameters.values() if p.default is p.empty]
-        if not inspect.isabstract(kind) and not needed:
-            found[re.sub("(?<=.)([A-Z])", r"-\1", kind.__name__.removesuffix(family)).lower()] = kind
-    return dict(sorted(found.items()))
-
-
-def member(family: str, name: str) -> Any:
-    """A new member of a family by name, or by a beginning of it that fits no other; ValueError if there is none."""
-    known = members(family)
-    fitting = [name] if name in known else [one for one in known if name and one.startswith(name)]
-    if len(fitting) != 1:
-        raise ValueError(f"expected one of {', '.join(known)}, got {ascii(name)[:100]}")
-    return known[fitting[0]]()
 
 
 def _version(wanted: bool) -> None:
@@ -81,13 +57,15 @@ def segment(
     ] = None,
     method: Annotated[
         str,
-        typer.Option(help="How supervoxels form: surface-growth keeps to edges within a point, vccs is PCL's."),
+        typer.Option(
+            help="How supervoxels form: surface-growth keeps to edges within a point, vccs is PCL's, or FILE.py:CLASS."
+        ),
     ] = "surface-growth",
     linkage: Annotated[
         str,
         typer.Option(
             help="How the graph becomes a tree: region, convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, ward, "
-            "or the .json file of a learned one."
+            "the .json file of a learned one, or FILE.py:CLASS for one of your own (the file is run)."
         ),
     ] = "region",
     objects: Annotated[

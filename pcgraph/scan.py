@@ -244,11 +244,17 @@ class Settings:
     def of(cls, method: SupervoxelMethod, linkage: Linkage, object_altitude: float | None) -> Settings:
         """Settings; without an altitude the linkage's default."""
         if not isinstance(method, SupervoxelMethod):
-            raise ValueError(f"expected a method such as pcgraph.SurfaceGrowth() or pcgraph.Vccs(), got {method!r}")
+            raise ValueError(_refusal("method", "SupervoxelMethod", method))
         if not isinstance(linkage, Linkage):
-            raise ValueError(f"expected a linkage such as pcgraph.ConvexityLinkage(), got {linkage!r}")
+            raise ValueError(_refusal("linkage", "Linkage", linkage))
         altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
         return cls(method, linkage, non_negative("object_altitude", altitude))
+
+
+def _refusal(argument: str, family: str, given: object) -> str:
+    from pcgraph.families import refusal
+
+    return refusal(argument, family, given)
 
 
 def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:

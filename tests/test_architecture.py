@@ -51,6 +51,7 @@ STOREYS = [
     "output",
     "cloud",
     "parallel",
+    "disjoint_sets",
     "hierarchy",
     "voxels",
     "inputs",
@@ -63,7 +64,7 @@ STOREYS = [
     "scan",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = {"detection", "learning", "io", "cli"}
+ON_TOP = {"detection", "learning", "io", "families", "cli"}
 """What stands on these and may import all of them."""
 
 
