@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -178,10 +179,18 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
 
     if must_compile():
         typer.echo("pcgraph: compiling its kernels, which takes ten seconds or so; done once.", err=True)
-    try:
-        return pcgraph.segment(cloud, **settings)
-    except ValueError as error:
-        raise CloudReadError(f"cannot segment {path}: {error}") from None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            result = pcgraph.segment(cloud, **settings)
+        except ValueError as error:
+            raise CloudReadError(f"cannot segment {path}: {error}") from None
+    for warning in caught:
+        if issubclass(warning.category, pcgraph.CloudWarning):
+            typer.echo(f"pcgraph: warning: {warning.message}.", err=True)
+        else:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    return result
 
 
 def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:

@@ -60,6 +60,7 @@ STOREYS = [
     "graph",
     "tree",
     "segmentation",
+    "plausibility",
     "warmup",
     "scan",
 ]

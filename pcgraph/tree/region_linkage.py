@@ -51,8 +51,8 @@ class RegionLinkage(Linkage):
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     gap: float = 0.25
 
-    default_object_altitude = 0.35
-    default_part_altitude = 0.03
+    default_object_altitude = 0.4
+    default_part_altitude = 0.06
 
     def __post_init__(self) -> None:
         check_cost(self.cost)
@@ -84,7 +84,7 @@ class _Shape(NamedTuple):
     width: float
 
 
-_SHAPE = _Shape(c0=0.08, c1=0.031, e0=4.2, l0=0.4, width=7.7)
+_SHAPE = _Shape(c0=0.08, c1=0.031, e0=1.0, l0=0.1, width=7.7)
 
 
 def region_linkage(

@@ -244,3 +244,12 @@ def test_version():
     assert (done.exit_code, done.stdout) == (0, f"pcgraph {pcgraph.__version__}\n")
     project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
     assert pcgraph.__version__ == project["version"]
+
+
+def test_warnings_are_a_line_on_stderr(tmp_path):
+    points = np.random.default_rng(0).uniform(0, 1, (900, 3))
+    pcgraph.write_segmentation(tmp_path / "a.ply", pcgraph.Cloud(points), pcgraph.segment(points, voxel_size=0.3))
+    done = run(tmp_path / "a.ply", "--out", tmp_path / "b.npz", "--voxel-size", 0.002)
+    assert done.exit_code == 0
+    assert "pcgraph: warning: expected far fewer objects than supervoxels" in done.stderr
+    assert "cli.py" not in done.stderr

@@ -30,8 +30,8 @@ def test_the_altitude_of_two_regions_is_the_formula():
     union = a + b + n[0] * n[1] / n.sum() * np.outer(apart, apart)
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
-    evidence = cost + 0.08 + 0.031 * math.log(1 + scale / 0.4)
-    weighed = increase / (increase + 4.2) * math.sqrt(scale / (scale + 0.4)) * (width / (length + width)) ** 0.75
+    evidence = cost + 0.08 + 0.031 * math.log(1 + scale / 0.1)
+    weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
 
