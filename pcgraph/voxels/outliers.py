@@ -17,6 +17,7 @@ OUTLIER = -2
 
 _MIN_POINTS = 1000  # of fewer points none is called an outlier
 _SPARSE = 0.25  # of the median number of points around a point
+_FAINT = 0.05  # of the mean number of points in the voxels around
 _CHANCE = 1e-4  # with which noise alone is as dense as what is kept
 _MUCH_NOISE = 0.03  # of the points
 _MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
@@ -66,7 +67,7 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
         outlier[alone] = held < _least_significant(background)
     if grid.counts[outlier].sum() > _MUCH_NOISE * n_points:  # then some lies beside surfaces, in voxels of its own
         degrees = np.maximum(np.diff(grid.indptr), 1)
-        outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _SPARSE * others / degrees)
+        outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _FAINT * others / degrees)
     return outlier if grid.counts[outlier].sum() <= _MAX_FRACTION * n_points else nothing
 
 
