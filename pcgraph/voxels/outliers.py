@@ -17,7 +17,7 @@ OUTLIER = -2
 
 _MIN_POINTS = 1000  # of fewer points none is called an outlier
 _SPARSE = 0.25  # of the median number of points around a point
-_FAINT = 0.05  # of the mean number of points in the voxels around
+_FAINT = 0.12  # of the mean number of points in the voxels around
 _CHANCE = 1e-4  # with which noise alone is as dense as what is kept
 _MUCH_NOISE = 0.03  # of the points
 _MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
