@@ -31,11 +31,13 @@ from pcgraph.tree.lccp import LccpLinkage
 from pcgraph.tree.learned import LeafTruth, LearnedLinkage, leaf_truth
 from pcgraph.tree.least_increase import MumfordShahLinkage, WardLinkage
 from pcgraph.tree.linkage import Linkage
+from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.single_linkage import QuasiFlatLinkage
 from pcgraph.tree.tree import SegmentationTree, segmentation_tree
 
 LINKAGES: dict[str, Linkage] = {
-    "convexity (default)": ConvexityLinkage(),
+    "region (default)": RegionLinkage(),
+    "convexity": ConvexityLinkage(),
     "LCCP": LccpLinkage(),
     "LCCP, sanity check": LccpLinkage(sanity=True),
     "quasi-flat zones": QuasiFlatLinkage(),
@@ -127,7 +129,7 @@ def _show(name: str, row: dict[str, float]) -> None:
 
 def _measure_cuts(cases: list[Case]) -> dict[str, dict[str, float]]:
     """Other cuts of the default tree."""
-    linkage = ConvexityLinkage()
+    linkage = RegionLinkage()
     altitude, rows = linkage.default_object_altitude, {}
     trees = [case.tree(linkage)[0] for case in cases]
     cuts = {
