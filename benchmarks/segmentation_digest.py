@@ -124,7 +124,7 @@ def of_metrics(name: str, result: Segmentation, cloud: LabelledCloud) -> Iterato
     yield from parts(f"{name}/boundary curve", metrics.boundary_curve(graph, tree, leaves, truth))
     yield from parts(f"{name}/compactness", metrics.compactness(graph, leaves))
     yield from parts(
-        f"{name}/explained variation", metrics.explained_variation(leaves, cloud.colors[inside].astype(float))
+        f"{name}/explained variation", metrics.explained_variation(cloud.colors[inside].astype(float), leaves)
     )
 
 

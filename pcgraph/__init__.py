@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.occlusion import Occlusions as Occlusions
     from pcgraph.io import read_cloud as read_cloud
     from pcgraph.io import write_segmentation as write_segmentation
+    from pcgraph.plausibility import CloudWarning as CloudWarning
     from pcgraph.scan import segment as segment
     from pcgraph.scan import update as update
     from pcgraph.segmentation import Segmentation as Segmentation
@@ -67,6 +68,7 @@ else:
             "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
             "graph.occlusion": ["Continuations", "Occlusions"],
             "io": ["read_cloud", "write_segmentation"],
+            "plausibility": ["CloudWarning"],
             "scan": ["segment", "update"],
             "segmentation": ["Segmentation"],
             "supervoxels.method": ["SupervoxelMethod"],

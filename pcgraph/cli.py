@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import inspect
 import os
-import re
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +14,7 @@ import typer
 
 import pcgraph
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.families import member
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,29 +25,6 @@ if TYPE_CHECKING:
     from pcgraph.tree.linkage import Linkage
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
-
-
-def members(family: str) -> dict[str, type[Any]]:
-    """Classes of a family of pcgraph by name, those that need no argument: MumfordShahLinkage is mumford-shah."""
-    for name in dir(pcgraph):
-        getattr(pcgraph, name)  # a class is known once it is loaded
-    waiting, found = [getattr(pcgraph, family)], {}
-    while waiting:
-        kind = waiting.pop()
-        waiting += kind.__subclasses__()
-        needed = [p for p in inspect.signature(kind).parameters.values() if p.default is p.empty]
-        if not inspect.isabstract(kind) and not needed:
-            found[re.sub("(?<=.)([A-Z])", r"-\1", kind.__name__.removesuffix(family)).lower()] = kind
-    return dict(sorted(found.items()))
-
-
-def member(family: str, name: str) -> Any:
-    """A new member of a family by name, or by a beginning of it that fits no other; ValueError if there is none."""
-    known = members(family)
-    fitting = [name] if name in known else [one for one in known if name and one.startswith(name)]
-    if len(fitting) != 1:
-        raise ValueError(f"expected one of {', '.join(known)}, got {ascii(name)[:100]}")
-    return known[fitting[0]]()
 
 
 def _version(wanted: bool) -> None:
@@ -81,13 +58,15 @@ def segment(
     ] = None,
     method: Annotated[
         str,
-        typer.Option(help="How supervoxels form: surface-growth keeps to edges within a point, vccs is PCL's."),
+        typer.Option(
+            help="How supervoxels form: surface-growth keeps to edges within a point, vccs is PCL's, or FILE.py:CLASS."
+        ),
     ] = "surface-growth",
     linkage: Annotated[
         str,
         typer.Option(
             help="How the graph becomes a tree: region, convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, ward, "
-            "or the .json file of a learned one."
+            "the .json file of a learned one, or FILE.py:CLASS for one of your own (the file is run)."
         ),
     ] = "region",
     objects: Annotated[
@@ -205,10 +184,18 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
 
     if must_compile():
         typer.echo("pcgraph: compiling its kernels, which takes ten seconds or so; done once.", err=True)
-    try:
-        return pcgraph.segment(cloud, **settings)
-    except ValueError as error:
-        raise CloudReadError(f"cannot segment {path}: {error}") from None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            result = pcgraph.segment(cloud, **settings)
+        except ValueError as error:
+            raise CloudReadError(f"cannot segment {path}: {error}") from None
+    for warning in caught:
+        if issubclass(warning.category, pcgraph.CloudWarning):
+            typer.echo(f"pcgraph: warning: {warning.message}.", err=True)
+        else:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    return result
 
 
 def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:

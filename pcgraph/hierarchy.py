@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.parallel import kernel
 
-Operation = Literal["sum", "max", "min"]
-_OPERATIONS: tuple[Operation, ...] = ("sum", "max", "min")
+Reduction = Literal["sum", "max", "min"]
+_REDUCTIONS: tuple[Reduction, ...] = ("sum", "max", "min")
 
 
 def checked_parents(parents: ArrayLike) -> NDArray[np.int32]:
@@ -79,9 +79,7 @@ def child_lists(parents: NDArray[np.int32]) -> ChildLists:
     return ChildLists(starts, np.argsort(parents[:-1], kind="stable"))
 
 
-def accumulate_sequential(
-    parents: NDArray[np.int32], values: NDArray[Any], operation: Operation = "sum"
-) -> NDArray[Any]:
+def accumulate_sequential(parents: NDArray[np.int32], values: NDArray[Any], reduce: Reduction = "sum") -> NDArray[Any]:
     """Values of all nodes from those of the leaves: the sum, largest or smallest of everything at and below a node.
 
     Parameters
@@ -89,7 +87,7 @@ def accumulate_sequential(
     parents : (k,) int32
     values : (n_leaves, ...) or (k, ...) bool, int or float, without NaN
         Given for all nodes, those of inner nodes count too.
-    operation : "sum", "max" or "min"
+    reduce : "sum", "max" or "min"
 
     Returns
     -------
@@ -97,31 +95,31 @@ def accumulate_sequential(
         Sums add the children in ascending order to the node's own value.
     """
     dtype = np.dtype(np.float64 if values.dtype.kind == "f" else np.int64)
-    totals = np.full((len(parents), *values.shape[1:]), _neutral(operation, dtype), dtype)
+    totals = np.full((len(parents), *values.shape[1:]), _neutral(reduce, dtype), dtype)
     totals[: len(values)] = values
-    _accumulate(parents, totals.reshape(len(parents), -1), _OPERATIONS.index(operation))
+    _accumulate(parents, totals.reshape(len(parents), -1), _REDUCTIONS.index(reduce))
     return totals
 
 
-def _neutral(operation: Operation, dtype: np.dtype[Any]) -> float:
+def _neutral(reduce: Reduction, dtype: np.dtype[Any]) -> float:
     """Value that changes nothing."""
-    if operation == "sum":
+    if reduce == "sum":
         return 0
     if dtype.kind == "f":
-        return -np.inf if operation == "max" else np.inf
-    return np.iinfo(dtype).min if operation == "max" else np.iinfo(dtype).max
+        return -np.inf if reduce == "max" else np.inf
+    return np.iinfo(dtype).min if reduce == "max" else np.iinfo(dtype).max
 
 
 @kernel
-def _accumulate(parents: NDArray[np.int32], values: NDArray[Any], operation: int) -> None:
+def _accumulate(parents: NDArray[np.int32], values: NDArray[Any], reduction: int) -> None:
     for node in range(len(parents)):
         up = parents[node]
         if up == node:
             continue
         for column in range(values.shape[1]):
-            if operation == 0:
+            if reduction == 0:
                 values[up, column] += values[node, column]
-            elif operation == 1:
+            elif reduction == 1:
                 values[up, column] = max(values[up, column], values[node, column])
             else:
                 values[up, column] = min(values[up, column], values[node, column])

@@ -315,8 +315,8 @@ class _Staging:
 
     def take(self, kind: DirectoryKind) -> bool:
         """Try to lock the staging directory, made if need be; whether it was still there."""
-        self.target.mkdir(parents=True, exist_ok=True)
         try:
+            self.target.mkdir(parents=True, exist_ok=True)
             self.path.mkdir(exist_ok=True)
             if not _is_staging(self.path):
                 if os.path.lexists(self.path):
@@ -324,6 +324,12 @@ class _Staging:
                 return False
             self.handle = _lock(self.path)
         except FileNotFoundError:  # its owner has just removed it
+            return False
+        except FileExistsError:  # a file is in the way, or a directory was that its owner has just removed
+            if any(
+                os.path.lexists(path) and not path.is_dir() for path in (self.path, self.target, *self.target.parents)
+            ):
+                raise
             return False
         return True
 

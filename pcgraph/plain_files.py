@@ -76,6 +76,7 @@ def write_file(path: Path, content: bytes, error: type[Exception], make_parents:
 def write_files(contents: Mapping[Path, bytes], error: type[Exception], make_parents: bool = False) -> None:
     """Write files; a reader finds the old content of each or the new, never a part, also after a crash.
 
+    Older files are replaced: who calls this names the files, and who makes names up asks first whose a file is.
     None is replaced before all are on the disk, and a signal leaves all or none. Links are written through. What
     killed processes left beside them is cleared.
 

@@ -28,6 +28,7 @@ from pcgraph.inputs import (
     positive,
 )
 from pcgraph.parallel import side_by_side
+from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod, checked_supervoxels
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
@@ -138,12 +139,17 @@ def segment(
         position, warp = _place_and_warp(cloud, place, camera, range_growth)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
+    _warn_of_input(points, cloud, voxel_size, voxel)
     if voxel_size is None:
         grid = _without_dust(cloud, grid, seed)
         seed = SEEDS_PER_VOXEL * grid.size if seed_size is None else seed
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
+    if place is not None and place.ndim == 1 and viewpoint is not None:
+        warn_of_viewpoint(place, grid)
     position, orientation = _orientation(grid, place if place is not None and place.ndim > 1 else position)
-    return segment_scan(Scan(cloud, position, grid, orientation, initial_labels, seed), None, settings)
+    result = segment_scan(Scan(cloud, position, grid, orientation, initial_labels, seed), None, settings)
+    warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
+    return result
 
 
 def update(
@@ -253,11 +259,17 @@ class Settings:
     def of(cls, method: SupervoxelMethod, linkage: Linkage, object_altitude: float | None) -> Settings:
         """Settings; without an altitude the linkage's default."""
         if not isinstance(method, SupervoxelMethod):
-            raise ValueError(f"expected a method such as pcgraph.SurfaceGrowth() or pcgraph.Vccs(), got {method!r}")
+            raise ValueError(_refusal("method", "SupervoxelMethod", method))
         if not isinstance(linkage, Linkage):
-            raise ValueError(f"expected a linkage such as pcgraph.ConvexityLinkage(), got {linkage!r}")
+            raise ValueError(_refusal("linkage", "Linkage", linkage))
         altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
         return cls(method, linkage, non_negative("object_altitude", altitude))
+
+
+def _refusal(argument: str, family: str, given: object) -> str:
+    from pcgraph.families import refusal
+
+    return refusal(argument, family, given)
 
 
 def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
@@ -371,6 +383,13 @@ def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
     return voxel, seed
+
+
+def _warn_of_input(points: Points, cloud: CleanCloud, given_size: float | None, voxel: float) -> None:
+    spacing = voxel / VOXELS_PER_SPACING if given_size is None else median_spacing(cloud.points)
+    warn_of_rounding(points, cloud.points, spacing)  # type: ignore[arg-type]
+    if given_size is None:
+        warn_of_duplicates(cloud.points, spacing)
 
 
 def _without_dust(cloud: CleanCloud, grid: VoxelGrid, seed_size: float) -> VoxelGrid:

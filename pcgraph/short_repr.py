@@ -28,9 +28,14 @@ class ShortRepr:
         if cls.__repr__ is ShortRepr.__repr__:
             cls.__repr__ = ShortRepr.__repr__  # type: ignore[method-assign]  # a class's own one is left by @dataclass
 
+    def _counts(self) -> str:
+        """How many of what there are, in a few words, which come first; none by default."""
+        return ""
+
     def __repr__(self) -> str:
-        name = type(self).__name__
-        parts = [f"{f.name}={in_short(getattr(self, f.name))}" for f in dataclasses.fields(self)]  # type: ignore[arg-type]
+        name, counts = type(self).__name__, self._counts()
+        parts = [counts] if counts else []
+        parts += [f"{f.name}={in_short(getattr(self, f.name))}" for f in dataclasses.fields(self)]  # type: ignore[arg-type]
         line = f"{name}({', '.join(parts)})"
         return line if len(line) <= MAX_COLUMNS else f"{name}(\n" + "\n".join(_filled(parts)) + ")"
 

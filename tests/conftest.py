@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +18,16 @@ with suppress(EnvironmentProblem):  # tests that render say it again; those of d
 
 # A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Importing and collecting make objects by the hundred thousand that stay, and no garbage to look for among them.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is collected, but what is there by now is not looked through again and again."""
+    gc.freeze()
+    gc.enable()
+
 
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

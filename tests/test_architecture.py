@@ -52,6 +52,7 @@ STOREYS = [
     "cloud",
     "columns",
     "parallel",
+    "disjoint_sets",
     "hierarchy",
     "voxels",
     "inputs",
@@ -60,11 +61,12 @@ STOREYS = [
     "graph",
     "tree",
     "segmentation",
+    "plausibility",
     "warmup",
     "scan",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
-ON_TOP = {"detection", "learning", "io", "cli"}
+ON_TOP = {"detection", "learning", "io", "families", "cli"}
 """What stands on these and may import all of them."""
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from small_result import ROOT, SENSORS, small_experiment, small_result
 
+import pcgraph
 import rangesim
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
@@ -144,7 +145,10 @@ def test_the_result_holds_every_stage() -> None:
         assert m.image.z.shape == (90, 120) == m.truth.z.shape
         assert (np.isfinite(m.image.z) == (m.image.status == Status.OK)).all()
         assert m.segmentation is not None
-        assert (m.segmentation.supervoxels >= 0).sum() == m.metadata.points == m.image.valid.sum()
+        assert (m.segmentation.labels != -1).sum() == m.metadata.points == m.image.valid.sum()
+        outliers = m.segmentation.labels == pcgraph.OUTLIER
+        assert np.array_equal(m.segmentation.supervoxels == -1, (m.segmentation.labels == -1) | outliers)
+        assert outliers.sum() < 0.02 * m.metadata.points
         assert {"exposure", "decode", "noise", "causes", "points", "segmentation"} == set(m.metadata.times_s)
         assert m.rows[-1]["material"] == "all"
     acquired = {m.name: m.metadata.acquisition_s for m in result.measurements}

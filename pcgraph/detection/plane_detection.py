@@ -67,6 +67,10 @@ class Planes(ShortRepr):
     up: NDArray[np.float64]
     plane_of_supervoxel: NDArray[np.int32]
 
+    def _counts(self) -> str:
+        roles = [f"{np.count_nonzero(self.roles == role)} {role}" for role in sorted({*self.roles.tolist()})]
+        return f"{len(self)} plane{'' if len(self) == 1 else 's'}" + (f" ({', '.join(roles)})" if roles else "")
+
     def __len__(self) -> int:
         """Number of planes."""
         return len(self.offsets)
@@ -203,14 +207,13 @@ def planar_patches(segmentation: Segmentation, tolerance: float | None, angle: f
         tolerances = np.clip(NOISE_FACTOR * noise, MIN_TOLERANCE * edge, MAX_TOLERANCE * edge)
     else:
         tolerances = np.full(len(moments), positive("tolerance", tolerance))
-    width = np.sqrt(np.maximum(np.linalg.eigvalsh(nodes.covariance)[:, 1], 0.0))
     i, j = segmentation.graph.edges.T
     edges = segmentation.graph.edge_features
     return PlanarPatches(
         moments=moments,
         normals=nodes.normal,
         tolerances=tolerances,
-        degenerate=width < MIN_WIDTH * tolerances,
+        degenerate=nodes.deviations[:, 1] < MIN_WIDTH * tolerances,
         cos_angle=float(np.cos(angle)),
         edges=segmentation.graph.edges,
         smooth=(edges.step <= np.minimum(tolerances[i], tolerances[j])) & (edges.normal_angle <= angle),

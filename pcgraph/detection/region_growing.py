@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from pcgraph.disjoint_sets import root_of
 from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.parallel import kernel
 from pcgraph.voxels.eigen import symmetric_eigen
@@ -368,7 +369,7 @@ def _join_best_first(regions, pairs, apart, cos_angle):  # type: ignore[no-untyp
         others = present[: p - joins] if apart else touching[: _touching(rings, i, into, seen, p + joins, touching)]
         queue = _queue_pairs(queue, regions, i, others, joins, cos_angle)
     for k in range(p):
-        into[k] = _root(into, k)
+        into[k] = root_of(into, k)
     return into
 
 
@@ -546,7 +547,7 @@ def _touching(rings, i, into, seen, mark, touching):  # type: ignore[no-untyped-
     n, link = 0, rings.last[i]
     while link >= 0:
         link = rings.following[link]
-        k = _root(into, rings.to[link])
+        k = root_of(into, rings.to[link])
         if k != i and seen[k] != mark:
             seen[k] = mark
             touching[n] = k
@@ -554,15 +555,6 @@ def _touching(rings, i, into, seen, mark, touching):  # type: ignore[no-untyped-
         if link == rings.last[i]:
             break
     return n
-
-
-@kernel
-def _root(into, k):  # type: ignore[no-untyped-def]
-    """Region that a region has become part of; halves the way there."""
-    while into[k] != k:
-        into[k] = into[into[k]]
-        k = into[k]
-    return k
 
 
 # ------------------------------------------------------------------------------------------------------- assignment

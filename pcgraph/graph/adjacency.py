@@ -114,6 +114,9 @@ class AdjacencyGraph(ShortRepr):
     node_features: NodeFeatures
     gaps: Gaps | None = None
 
+    def _counts(self) -> str:
+        return f"{self.n_nodes} nodes, {len(self.edges)} edges"
+
     @property
     def n_nodes(self) -> int:
         """Number of supervoxels."""
@@ -192,7 +195,7 @@ class AdjacencyGraph(ShortRepr):
     def write_graphml(self, path: str | PathLike[str], occlusions: Occlusions | None = None) -> None:
         """Write the graph with all features, vectors as scalars (``normal_x``), whole or not at all.
 
-        ``networkx.read_graphml(path, node_type=int)`` reads it back.
+        An older file of that name is replaced. ``networkx.read_graphml(path, node_type=int)`` reads it back.
 
         Parameters
         ----------

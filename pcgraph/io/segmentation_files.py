@@ -67,7 +67,7 @@ def write_segmentation(
     segmentation: Segmentation,
     labels: NDArray[np.int32] | None = None,
 ) -> None:
-    """Nothing; writes a whole file or none.
+    """Write a segmentation, the whole file or none; an older file of that name is replaced.
 
     Parameters
     ----------

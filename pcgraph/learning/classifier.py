@@ -175,7 +175,7 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         return right / total
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the fitted classifier as JSON, the whole file or none.
+        """Write the fitted classifier as JSON, the whole file or none; an older file of that name is replaced.
 
         The file holds numbers and names, so loading it runs no code. `load` makes of it a classifier that predicts
         the same; a given `estimator` is not in it, only what it learned.

@@ -94,7 +94,7 @@ def _node_descriptors(
 ) -> tuple[NDArray[np.float64], list[str]]:
     """The same columns for all k nodes of the tree."""
     features = segmentation.tree.features()
-    deviations = np.sqrt(np.maximum(np.linalg.eigvalsh(features.covariance), 0.0))
+    deviations = features.deviations
     shades = np.sqrt(np.maximum(np.einsum("kii->ki", features.color_covariance), 0.0))
     columns = {
         "thickness": deviations[:, 0],

@@ -54,15 +54,15 @@ def _circularity(
     return np.where(somewhere, np.minimum(1.0, area / (2 * np.pi * np.where(somewhere, moment, 1.0))), 1.0)
 
 
-def explained_variation(labels: ArrayLike, values: ArrayLike) -> float:
+def explained_variation(values: ArrayLike, labels: ArrayLike) -> float:
     """Explained variation EV, 0..1 (Moore et al. 2008): fraction of the values' variance that lies between segments.
 
     Parameters
     ----------
-    labels : (n,) or (h, w) int
-        Points negative are left out.
     values : (n,), (n, c), (h, w) or (h, w, c) float
         Colours, normals or positions; the unit drops out if all channels share it.
+    labels : (n,) or (h, w) int
+        Points negative are left out.
 
     Returns
     -------

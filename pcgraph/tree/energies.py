@@ -29,8 +29,7 @@ def plane_energy(tree: SegmentationTree, graph: AdjacencyGraph | None = None) ->
     ValueError
         The graph is not of the tree's leaves.
     """
-    residual = np.linalg.eigvalsh(tree.moments.scatters)[:, 0]
-    return Energy(np.maximum(residual, 0.0), _complexity(tree, graph))
+    return Energy(tree.moments.counts * tree.features().residual ** 2, _complexity(tree, graph))
 
 
 def variance_energy(tree: SegmentationTree, values: ArrayLike, graph: AdjacencyGraph | None = None) -> Energy:

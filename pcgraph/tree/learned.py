@@ -189,7 +189,7 @@ class EdgeModel(msgspec.Struct, frozen=True):
         return 0.5 * (1.0 + np.tanh(0.5 * logit))  # the logistic function without overflow
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the model as JSON, the whole file or none.
+        """Write the model as JSON, the whole file or none; an older file of that name is replaced.
 
         Raises
         ------

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.parallel import kernel
+from pcgraph.parallel import kernel, routine
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.linkage import Linkage, Merges, check_numbers
-from pcgraph.voxels.eigen import symmetric_eigen
+from pcgraph.voxels.eigen import least_eigenvalue
 
 
 @dataclass(frozen=True)
@@ -107,6 +107,9 @@ def regions_of(
     return Regions(leaves.counts / mean_count, values, centroids, leaves.scatters / (unit**2 * mean_count), plane)
 
 
+_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
 class Regions(NamedTuple):
     """What the energy of n regions is made of.
 
@@ -164,7 +167,8 @@ def least_increase_linkage(regions: Regions, edges: NDArray[np.int32], lengths: 
 
 
 class RegionState(NamedTuple):
-    """Regions while they merge, with their residuals (n,): sums of squared distances to their planes."""
+    """Regions while they merge: scatters are (n, 6) xx, yy, zz, xy, xz, yz, residuals (n,) sums of squared distances
+    to their planes."""
 
     masses: NDArray[np.float64]
     values: NDArray[np.float64]
@@ -177,7 +181,8 @@ class RegionState(NamedTuple):
     def of(cls, regions: Regions) -> RegionState:
         """The regions before they merge; residuals are not set."""
         masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
-        return cls(masses, values, centroids, scatters, np.zeros(len(masses)), float(regions.plane))
+        upper = np.stack([scatters[:, i, j] for i, j in _AXES], axis=1)
+        return cls(masses, values, centroids, upper, np.zeros(len(masses)), float(regions.plane))
 
 
 @kernel
@@ -185,7 +190,8 @@ def set_residuals(state: RegionState) -> None:
     """Set the sums of squared distances of regions to their planes, where these count."""
     if state.plane > 0.0:
         for a in range(len(state.masses)):
-            state.residuals[a] = _least_eigenvalue(state.scatters[a].copy())
+            s = state.scatters[a]
+            state.residuals[a] = least_eigenvalue(s[0], s[1], s[2], s[3], s[4], s[5])
 
 
 @kernel
@@ -227,8 +233,7 @@ def energy_increase(state: RegionState, a: int, b: int) -> float:
         gap = state.values[a, i] - state.values[b, i]
         increase += reduced * gap * gap
     if state.plane > 0.0:
-        union = _scatter_of_union(state.centroids, state.scatters, a, b, reduced)
-        increase += state.plane * (_least_eigenvalue(union) - state.residuals[a] - state.residuals[b])
+        increase += state.plane * (_least_of_union(state, a, b, reduced) - state.residuals[a] - state.residuals[b])
     return increase
 
 
@@ -239,8 +244,12 @@ def unite(state: RegionState, kept: int, gone: int) -> None:
     total = masses[kept] + masses[gone]
     fraction = masses[gone] / total
     if plane > 0.0:
-        scatters[kept] = _scatter_of_union(centroids, scatters, kept, gone, masses[kept] * fraction)
-        residuals[kept] = _least_eigenvalue(scatters[kept].copy())
+        reduced = masses[kept] * fraction
+        residuals[kept] = _least_of_union(state, kept, gone, reduced)
+        for column in range(6):
+            i, j = _AXES[column]
+            shift = (centroids[kept, i] - centroids[gone, i]) * (centroids[kept, j] - centroids[gone, j])
+            scatters[kept, column] += scatters[gone, column] + reduced * shift
     for i in range(values.shape[1]):
         values[kept, i] += fraction * (values[gone, i] - values[kept, i])
     for i in range(3):
@@ -248,20 +257,18 @@ def unite(state: RegionState, kept: int, gone: int) -> None:
     masses[kept] = total
 
 
-@kernel
-def _scatter_of_union(
-    centroids: NDArray[np.float64], scatters: NDArray[np.float64], a: int, b: int, reduced: float
-) -> NDArray[np.float64]:
-    union = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            shift = (centroids[a, i] - centroids[b, i]) * (centroids[a, j] - centroids[b, j])
-            union[i, j] = scatters[a, i, j] + scatters[b, i, j] + reduced * shift
-    return union
-
-
-@kernel
-def _least_eigenvalue(matrix: NDArray[np.float64]) -> float:
-    """Least eigenvalue of a symmetric positive semi-definite matrix, which is overwritten."""
-    symmetric_eigen(matrix, np.empty((3, 3)))
-    return max(min(matrix[0, 0], matrix[1, 1], matrix[2, 2]), 0.0)
+@routine
+def _least_of_union(state: RegionState, a: int, b: int, reduced: float) -> float:
+    """Sum of squared distances of the union of two regions to its plane."""
+    p, q = state.scatters[a], state.scatters[b]
+    x = state.centroids[a, 0] - state.centroids[b, 0]
+    y = state.centroids[a, 1] - state.centroids[b, 1]
+    z = state.centroids[a, 2] - state.centroids[b, 2]
+    return least_eigenvalue(
+        p[0] + q[0] + reduced * x * x,
+        p[1] + q[1] + reduced * y * y,
+        p[2] + q[2] + reduced * z * z,
+        p[3] + q[3] + reduced * x * y,
+        p[4] + q[4] + reduced * x * z,
+        p[5] + q[5] + reduced * y * z,
+    )

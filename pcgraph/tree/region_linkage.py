@@ -35,7 +35,7 @@ class RegionLinkage(Linkage):
     -----
     Two regions A and B merge at
 
-        (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^p  (w / (b + w))^q
+        (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^1/2  (w / (b + w))^3/4
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
     increase of the squared distances to the regions' best planes by the merge, and l = E / b that per length b of the
@@ -52,7 +52,7 @@ class RegionLinkage(Linkage):
     gap: float = 0.25
 
     default_object_altitude = 0.4
-    default_part_altitude = 0.03
+    default_part_altitude = 0.06
 
     def __post_init__(self) -> None:
         check_cost(self.cost)
@@ -71,6 +71,7 @@ class RegionLinkage(Linkage):
 
 
 _STEPS = float(1 << 20)
+_MANY = 40  # edges of a region
 
 
 class _Shape(NamedTuple):
@@ -80,12 +81,10 @@ class _Shape(NamedTuple):
     c1: float
     e0: float
     l0: float
-    p: float
-    q: float
     width: float
 
 
-_SHAPE = _Shape(c0=0.08, c1=0.031, e0=4.2, l0=0.4, p=0.46, q=0.675, width=7.7)
+_SHAPE = _Shape(c0=0.08, c1=0.031, e0=1.0, l0=0.1, width=7.7)
 
 
 def region_linkage(
@@ -135,15 +134,34 @@ def _first_altitudes(
 
 @kernel
 def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
-    heap, halves = graph.heap, graph.halves
+    """Merge along the lowest edge until there is none.
+
+    After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
+    hardly changes, an edge gets it when it comes up.
+    """
+    heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
+    is_old = np.zeros(len(heap.edges), np.bool_)
     while heap.size[0] > 0:
-        kept, gone, _ = contract_cheapest(graph)
+        edge = heap.order[0]
+        if is_old[edge]:
+            is_old[edge] = False
+            a, b = halves[2 * edge].end, halves[2 * edge + 1].end
+            heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
+            continue
+        kept, gone, n_parallel = contract_cheapest(graph)
         unite(state, kept, gone)
-        half = graph.clusters[kept].first
+        few, half = clusters[kept].degree <= _MANY, clusters[kept].first
         while half != NONE:
             edge = half >> 1
-            heap_update(heap, edge, _altitude(state, graph.sums, edge, kept, halves[half ^ 1].end, shape))
+            is_old[edge] = not few
+            if few:
+                heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, shape))
             half = halves[half].after
+        for edge in graph.parallel[:n_parallel]:
+            if is_old[edge]:  # two became one: both old altitudes say little
+                is_old[edge] = False
+                a, b = halves[2 * edge].end, halves[2 * edge + 1].end
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
 
 
 @kernel
@@ -153,7 +171,8 @@ def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, 
     increase = max(energy_increase(state, a, b), 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(min(state.masses[a], state.masses[b]))
+    shortness = width / (length + width)
     evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
-    evidence *= increase / (increase + shape.e0) * (scale / (scale + shape.l0)) ** shape.p
-    evidence *= (width / (length + width)) ** shape.q
+    evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
+    evidence *= math.sqrt(shortness * math.sqrt(shortness))
     return round(evidence * _STEPS) / _STEPS

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.disjoint_sets import root_of
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
@@ -71,15 +72,6 @@ def minimum_spanning_forest(
 
 
 @kernel
-def _root_of(roots: NDArray[np.int64], node: int) -> int:
-    """Representative of a node's set; paths are halved on the way."""
-    while roots[node] != node:
-        roots[node] = roots[roots[node]]
-        node = roots[node]
-    return node
-
-
-@kernel
 def _kruskal(n_nodes: int, edges: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Merges, and which edges made them; edges come in ascending order of cost."""
     roots, size = np.arange(n_nodes), np.ones(n_nodes, np.int64)
@@ -87,7 +79,7 @@ def _kruskal(n_nodes: int, edges: NDArray[np.int32]) -> tuple[NDArray[np.int32],
     pairs, taken = np.empty((max(n_nodes - 1, 0), 2), np.int32), np.empty(max(n_nodes - 1, 0), np.int64)
     t = 0
     for e in range(len(edges)):
-        a, b = _root_of(roots, edges[e, 0]), _root_of(roots, edges[e, 1])
+        a, b = root_of(roots, edges[e, 0]), root_of(roots, edges[e, 1])
         if a == b:
             continue
         if size[b] > size[a]:

@@ -45,6 +45,11 @@ class SegmentationTree(ShortRepr):
     altitudes: NDArray[np.float64]
     moments: Moments
 
+    def _counts(self) -> str:
+        apart = np.count_nonzero(np.isinf(self.altitudes))
+        what = f", {apart + 1} parts that do not touch" if apart else ""
+        return f"{self.n_leaves} leaves, {len(self.parents)} nodes{what}"
+
     @property
     def n_leaves(self) -> int:
         """Number of supervoxels."""

@@ -17,8 +17,9 @@ OUTLIER = -2
 
 _MIN_POINTS = 1000  # of fewer points none is called an outlier
 _SPARSE = 0.25  # of the median number of points around a point
+_FAINT = 0.12  # of the mean number of points in the voxels around
 _CHANCE = 1e-4  # with which noise alone is as dense as what is kept
-_DENSE_NOISE = 0.1  # points of noise around a voxel
+_MUCH_NOISE = 0.03  # of the points
 _MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
 _REACH = 3.0  # voxel edges, as far as gaps are bridged
 _VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * _REACH**3
@@ -37,7 +38,8 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     The density of noise is what sparse voxels hold, over the volume of the bounding box. A voxel is an outlier if noise
     of this density had, with a chance of more than 1 in 10 000, as many points in the voxels around it. Where noise is
     so thin that a reach of three voxel edges is nearly empty of it, there must be as few points within that reach, too,
-    so that the thin far end of a scan is not taken for noise. Clouds of fewer than 1000 points, and those of which more
+    so that the thin far end of a scan is not taken for noise. Where many are outliers, so are the few points of voxels
+    beside full ones. Clouds of fewer than 1000 points, and those of which more
     than two thirds would be outliers, have none.
     """
     nothing = np.zeros(grid.n_voxels, np.bool_)
@@ -63,9 +65,9 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
         near = cKDTree(places).query_ball_point(places[alone], _REACH, return_length=False)
         held = np.array([grid.counts[voxels].sum() for voxels in near]) - grid.counts[alone]
         outlier[alone] = held < _least_significant(background)
-    if density * MAX_NEIGHBOURS > _DENSE_NOISE:  # then some lies beside surfaces, in voxels of its own
+    if grid.counts[outlier].sum() > _MUCH_NOISE * n_points:  # then some lies beside surfaces, in voxels of its own
         degrees = np.maximum(np.diff(grid.indptr), 1)
-        outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _SPARSE * others / degrees)
+        outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _FAINT * others / degrees)
     return outlier if grid.counts[outlier].sum() <= _MAX_FRACTION * n_points else nothing
 
 

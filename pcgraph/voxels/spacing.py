@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ _SAMPLE = 4096  # points whose nearest neighbour is sought
 _CROWD = 1 << 16  # points among which it is sought, about
 _BLOCKS = 16  # of space, along each axis
 _NO_SPACING_M = 0.01
+_THIN = 0.01  # of its extent: a cloud whose points, at their spacing, cover so little
 _THINNED = 1 << 14  # points among which the law of spacing is looked for,
 _READINGS = 1 << 10  # and at how many of them spacing is read
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
@@ -49,7 +51,9 @@ def median_spacing(points: NDArray[np.float64]) -> float:
     Returns
     -------
     float
-        > 0; 0.01 if all points coincide.
+        > 0; 0.01 if all points coincide. Where most points nearly coincide with another, as in scans laid on each
+        other, it is an eighth of the median distance to the eighth (elsewhere that is less), or, if copies are many and
+        near, the distance to the nearest other place.
 
     Notes
     -----
@@ -60,15 +64,30 @@ def median_spacing(points: NDArray[np.float64]) -> float:
     crowd, hashes = _each_place_once(drawn)
     if 2 * len(crowd) < len(drawn) < len(points):  # duplicates took the room of others
         crowd, hashes = _each_place_once(_some_places(_each_place_once(points)[0]))
+    spacing = _median_spacing(crowd, hashes)
+    low, high = bounding_box(crowd)
+    if spacing * math.sqrt(len(crowd)) < _THIN * float((high - low).max()):  # perhaps the points are copies of others
+        cells = np.unique(np.floor((crowd - low) / (100.0 * spacing)), axis=0, return_index=True)[1]
+        of_cells = _median_spacing(crowd[cells], hashes[cells])
+        if of_cells > 1000.0 * spacing and len(cells) > 1:
+            return of_cells
+    return spacing
+
+
+def _median_spacing(crowd: NDArray[np.float64], hashes: NDArray[np.uint64]) -> float:
+    """Median distance to the nearest of distinct points, (n, 3), read at some of them."""
     if len(crowd) == 1:
         return _NO_SPACING_M
     sample = np.arange(len(crowd))
     if len(crowd) > _SAMPLE:  # the smallest hashes: as good as random, yet a property of the points
         sample = np.argpartition(hashes, _SAMPLE)[:_SAMPLE]
     tree = cKDTree(crowd, balanced_tree=False, compact_nodes=False)
-    distances = tree.query(crowd[sample], k=2)[0][:, 1]
-    distances = distances[(distances > 0.0) & np.isfinite(distances)]
-    return float(np.median(distances)) if len(distances) else _NO_SPACING_M
+    distances = tree.query(crowd[sample], k=_NEIGHBOUR + 1)[0][:, 1:]
+    nearest = distances[:, 0][(distances[:, 0] > 0.0) & np.isfinite(distances[:, 0])]
+    if not len(nearest):
+        return _NO_SPACING_M
+    eighth = distances[:, -1][np.isfinite(distances[:, -1])]
+    return max(float(np.median(nearest)), float(np.median(eighth)) / _NEIGHBOUR if len(eighth) else 0.0)
 
 
 def _each_place_once(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint64]]:

@@ -7,6 +7,7 @@ tried: those from which much of it is visible, always from the same side, tell w
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ _INSIDE = 48  # free places within the bounding box, of a lattice of
 _LATTICE = 8  # along each side
 _CLEARANCE = 2.5  # cells between a free place and the next surface
 _ROUNDS = 12  # of agreement between places and orientations
-_VIEWS = 16  # places that the voxels themselves are looked at from
+_VIEWS = 12  # places that the voxels themselves are looked at from
 _CLOSED = 0.95  # of all directions hit by something: a hollow seen from within,
 _OPEN = 0.99  # of the voxels visible from outside: there is nothing in it
 _FILLING = 4  # rounds of orientation by the voxels around, of those that are seen from nowhere
@@ -73,11 +74,8 @@ def visible_sides(grid: VoxelGrid) -> VisibleSides:
     middle, reach = (low + high) / 2.0, max(float((high - low).max()) / 2.0, float(grid.edge_lengths.min()))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
     places, weights = _telling_places(centres, widths)
-    towards = np.zeros((grid.n_voxels, 3))
-    for place, weight in zip(places, weights, strict=True):
-        rays = place - centres
-        lengths = _lengths(rays)
-        towards += (weight * visible_from(place, centres, widths) / lengths)[:, None] * rays
+    towards = np.empty((grid.n_voxels, 3))
+    in_blocks(_look_around, grid.n_voxels, places, weights, seen_from(places, centres, widths), centres, towards)
     filled = np.empty_like(towards)
     for _ in range(_FILLING):
         in_blocks(_fill, grid.n_voxels, grid.indptr, grid.neighbours, towards, filled)
@@ -98,11 +96,19 @@ def visible_from(
     centres : (n, 3) float64, metres
     widths : (n,) float64, metres
     """
-    rays = centres - place
-    ranges = _lengths(rays)
-    bins = int(np.clip(2.0 / (_BINS_PER_RADIAN * float(np.median(widths / ranges))), 64, 1024))
-    seen = np.empty(len(centres), np.bool_)
-    _look(rays, ranges, widths, np.full((bins, bins), np.inf), seen)
+    return seen_from(place[None], centres, widths)[0]
+
+
+def seen_from(
+    places: NDArray[np.float64], centres: NDArray[np.float64], widths: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether each of n squares is visible from each of k places, (k, n) bool; see `visible_from`."""
+    seen = np.empty((len(places), len(centres)), np.bool_)
+    some = slice(None, None, max(1, len(centres) // 1000))  # to know how fine a map it takes
+    ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
+    typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
+    bins = np.clip(1.5 / (_BINS_PER_RADIAN * typical), 64, 1024).astype(np.int64)
+    in_blocks(_look, len(places), places, bins, centres, widths, seen, smallest=1)
     return seen
 
 
@@ -125,19 +131,14 @@ def _telling_places(
     upwards = np.zeros((coarse.n_voxels, 3))
     upwards[:, 2] = 1.0
     normals = fitted_windows(coarse, upwards).normals
-    sides = np.empty((len(places), coarse.n_voxels))
+    sides = np.where(seen_from(places, coarse.centroids, coarse.edge_lengths), 1.0, 0.0)
     for k, place in enumerate(places):
         rays = place - coarse.centroids
-        seen = visible_from(place, coarse.centroids, coarse.edge_lengths)
-        sides[k] = np.where(seen, np.einsum("ij,ij->i", rays, normals) / _lengths(rays), 0.0)
+        sides[k] *= np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
     is_closed = np.array([_hit_directions(coarse.centroids - place) > _CLOSED for place in inside], bool)
-    if is_closed.any():
-        from_outside = np.zeros(len(centres), bool)
-        for place in outside:
-            from_outside |= visible_from(place, centres, widths)
-        if from_outside.mean() > _OPEN:  # nothing is hidden within: an object, not a room
-            chosen = _spread_choice(sides[: len(outside)] != 0.0, np.ones(len(outside)))
-            return outside[chosen], np.ones(len(chosen))
+    if is_closed.any() and seen_from(outside, centres, widths).any(axis=0).mean() > _OPEN:
+        chosen = _spread_choice(sides[: len(outside)] != 0.0, np.ones(len(outside)))
+        return outside[chosen], np.ones(len(chosen))
     weights = _agreement(sides, places[:, 2] >= low[2])
     chosen = _spread_choice(sides != 0.0, weights)
     return places[chosen], weights[chosen]
@@ -175,9 +176,9 @@ def _agreement(sides: NDArray[np.float64], leaders: NDArray[np.bool_]) -> NDArra
 
 def _coarse(centres: NDArray[np.float64], width: float) -> VoxelGrid:
     """Voxels in larger ones, as few as still show their shape."""
-    size = width
+    size = width * max(1.0, math.sqrt(len(centres) / (1.5 * _CELLS)))  # as many as a surface would have
     while (coarse := voxel_grid(centres, None, size, Warp())).n_voxels > 2 * _CELLS:
-        size *= 2.0 if coarse.n_voxels > 8 * _CELLS else 1.4
+        size *= 1.4
     return coarse
 
 
@@ -225,31 +226,60 @@ def _mark(rays: NDArray[np.float64], hit: NDArray[np.bool_]) -> None:
 
 @kernel
 def _look(
-    rays: NDArray[np.float64],
-    ranges: NDArray[np.float64],
+    start: int,
+    stop: int,
+    places: NDArray[np.float64],
+    bins_of: NDArray[np.int64],
+    centres: NDArray[np.float64],
     widths: NDArray[np.float64],
-    nearest: NDArray[np.float64],
     seen: NDArray[np.bool_],
 ) -> None:
-    """Set what is seen: `nearest` takes the least range in each bin of directions that a square may cover."""
-    n, bins = len(rays), len(nearest)
-    per_radian = _BINS_PER_RADIAN * bins
-    at = np.empty((n, 2), np.int32)
-    for i in range(n):
-        if ranges[i] <= 0.0:
-            at[i, 0] = -1
-            continue
-        u, v = _bin_of(rays[i, 0], rays[i, 1], rays[i, 2], bins)
-        at[i, 0], at[i, 1] = min(int(u), bins - 1), min(int(v), bins - 1)
-        half = min(0.5 * widths[i] / ranges[i] * per_radian, 8.0)
-        for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
-            for q in range(max(int(v - half), 0), min(int(v + half), bins - 1) + 1):
-                if ranges[i] < nearest[p, q]:
-                    nearest[p, q] = ranges[i]
-    for i in range(n):
-        # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-        depth = widths[i] + ranges[i] / per_radian
-        seen[i] = at[i, 0] >= 0 and ranges[i] <= nearest[at[i, 0], at[i, 1]] + depth
+    """Set what is seen from each place, by the least range in each bin of directions that a square may cover."""
+    n = len(centres)
+    at, ranges = np.empty(n, np.int32), np.empty(n, np.float32)
+    for k in range(start, stop):
+        bins = bins_of[k]
+        per_radian = _BINS_PER_RADIAN * bins
+        nearest = np.full(bins * bins, np.float32(np.inf), np.float32)
+        for i in range(n):
+            x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
+            ranges[i] = math.sqrt(x * x + y * y + z * z)
+            if ranges[i] <= 0.0:
+                at[i] = -1
+                continue
+            u, v = _bin_of(x, y, z, bins)
+            at[i] = min(int(u), bins - 1) * bins + min(int(v), bins - 1)
+            half = min(0.5 * widths[i] / ranges[i] * per_radian, 8.0)
+            for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
+                for q in range(max(int(v - half), 0), min(int(v + half), bins - 1) + 1):
+                    if ranges[i] < nearest[p * bins + q]:
+                        nearest[p * bins + q] = ranges[i]
+        for i in range(n):
+            # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
+            depth = widths[i] + ranges[i] / per_radian
+            seen[k, i] = at[i] >= 0 and ranges[i] <= nearest[at[i]] + depth
+
+
+@kernel
+def _look_around(
+    start: int,
+    stop: int,
+    places: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    seen: NDArray[np.bool_],
+    centres: NDArray[np.float64],
+    towards: NDArray[np.float64],
+) -> None:
+    """Set the weighted sum of the unit vectors from each square to the places that see it."""
+    for i in range(start, stop):
+        towards[i, 0] = towards[i, 1] = towards[i, 2] = 0.0
+        for k in range(len(places)):
+            if seen[k, i]:
+                x, y, z = places[k, 0] - centres[i, 0], places[k, 1] - centres[i, 1], places[k, 2] - centres[i, 2]
+                scale = weights[k] / math.sqrt(x * x + y * y + z * z)
+                towards[i, 0] += scale * x
+                towards[i, 1] += scale * y
+                towards[i, 2] += scale * z
 
 
 @kernel

@@ -145,7 +145,7 @@ class ComparisonRecord(Record, frozen=True, kw_only=True):
 _CAUSES = {"cause": ArraySpec("uint8", high=max(Cause)), "tolerance_m": ArraySpec("float64", (), low=1e-9, high=1e9)}
 _SEGMENTATION = {
     "supervoxels": ArraySpec("int32", low=-1),
-    "labels": ArraySpec("int32", low=-1),
+    "labels": ArraySpec("int32", low=-2),
     "parents": ArraySpec("int32", ("nodes",), low=0, per_pixel=2),
     "altitudes": ArraySpec("float64", ("nodes",), low=0, inf=True, per_pixel=2),
 }
@@ -155,7 +155,7 @@ _SEGMENTATION = {
 class Segmentation(ShortRepr):
     """Supervoxels of a point cloud and the tree that merges them.
 
-    supervoxels, labels : (h, w) int32, supervoxel and object per pixel, -1 without a point.
+    supervoxels, labels : (h, w) int32, supervoxel and object per pixel, -1 without a point, -2 (labels) for outliers.
     parents : (k,) int32, parent of each tree node, the supervoxels first; a root is its own parent.
     altitudes : (k,) float64, not decreasing towards the root.
     """

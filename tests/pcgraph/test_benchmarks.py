@@ -8,10 +8,10 @@ import subprocess
 
 import numpy as np
 import pytest
+import room
 from baselines import felzenszwalb, normal_graph, plane_and_clusters
 from clouds import two_boxes_on_a_plane
 from peers import PclSetting, run_lin, run_pcl
-from room import SPACING_M, rooms
 from scanned_scenes import Scene, ball, box, rod, scan, sphere_of_rays
 from scanned_streets import GROUND, SENSOR_M, street, sweep
 from scipy.spatial import cKDTree
@@ -19,20 +19,20 @@ from scipy.spatial import cKDTree
 PLAIN = PclSetting(0.01, 0.06, color=0.0, spatial=0.4, normal=1.0, camera=False)
 
 
-@pytest.mark.parametrize("n", [1, 50_000, 1_500_000])
-def test_rooms_have_exactly_the_points_asked_for(n):
-    points, colors = rooms(n)
-    assert points.shape == colors.shape == (n, 3)
-    assert np.isfinite(points).all()
-    assert all(np.array_equal(a, b) for a, b in zip(rooms(n), (points, colors), strict=True))
-
-
-def test_rooms_are_as_dense_when_there_are_more():
-    few, many = (rooms(n)[0] for n in (200_000, 1_600_000))
-    assert many[:, 0].max() > 5.0 > few[:, 0].max()  # a second room
-    for points in (few, many):
-        distance = cKDTree(points).query(points[::50], k=2)[0][:, 1]
-        assert 0.6 * SPACING_M < np.median(distance) < SPACING_M
+def test_rooms_have_exactly_the_points_asked_for_and_are_as_dense_when_there_are_more(monkeypatch):
+    monkeypatch.setattr(room, "CELLS", 2)  # of furniture: a fourth of what takes most of the points
+    monkeypatch.setattr(room, "SIDE_M", 2.5)
+    widths = []
+    for n in (1, 50_000, 500_000):
+        points, colors = room.rooms(n)
+        assert points.shape == colors.shape == (n, 3)
+        assert np.isfinite(points).all()
+        assert all(np.array_equal(a, b) for a, b in zip(room.rooms(n), (points, colors), strict=True))
+        widths.append(points[:, 0].max())
+        if n > 1:
+            distance = cKDTree(points).query(points[:: n // 4000], k=2)[0][:, 1]
+            assert 0.6 * room.SPACING_M < np.median(distance) < room.SPACING_M
+    assert widths[-1] > room.SIDE_M > widths[-2]  # a second room
 
 
 @pytest.mark.parametrize(

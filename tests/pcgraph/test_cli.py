@@ -15,7 +15,8 @@ from clouds import two_boxes_on_a_plane
 from typer.testing import CliRunner
 
 import pcgraph
-from pcgraph.cli import app, member, members
+from pcgraph.cli import app
+from pcgraph.families import member, members
 from pcgraph.io.ply import encode_ply
 from pcgraph.tree.learned import EdgeModel
 
@@ -106,10 +107,13 @@ def test_bad_options(scene, tmp_path):
         (("--objects", 2, "--altitude", 0.5), "--objects or --altitude, got both"),
         (("--altitude", "nan"), "object_altitude to be a finite number"),
         (("--min-size", 0), "min_size as a whole number of at least 1"),
-        (("--linkage", "x"), "one of convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, region, ward, got 'x'"),
+        (
+            ("--linkage", "x"),
+            "convexity, felzenszwalb, lccp, mumford-shah, quasi-flat, region, ward, or FILE.py:NAME, got 'x'",
+        ),
         (("--linkage", ""), "got ''"),
         (("--linkage", tmp_path / "none.json"), "cannot read"),
-        (("--method", "supervoxels"), "one of surface-growth, vccs, got 'supervoxels'"),
+        (("--method", "supervoxels"), "one of surface-growth, vccs, or FILE.py:NAME, got 'supervoxels'"),
         (("--out", "-"), "nothing is written to a pipe, got --out -"),
         (("--out", tmp_path / "a.txt"), ".ply or .npz"),
         (("--out", tmp_path / "no" / "a.ply"), "no folder"),
@@ -178,6 +182,55 @@ def test_linkage_and_cut(linkage, scene, tmp_path):
         assert np.array_equal(arrays["labels"], result.cut(altitude=altitude, min_size=40))
 
 
+OWN = """
+from dataclasses import dataclass
+import pcgraph
+from pcgraph.tree.single_linkage import single_linkage
+
+@dataclass(frozen=True)
+class Angles(pcgraph.Linkage):
+    power: float = 1.0
+    default_object_altitude = 0.5
+    default_part_altitude = 0.1
+
+    def merges(self, graph, leaves):
+        return single_linkage(graph.n_nodes, graph.edges, graph.edge_features.normal_angle**self.power)
+
+squared = Angles(2.0)
+nothing = 3
+
+@dataclass(frozen=True)
+class Needs(Angles):
+    def __post_init__(self):
+        raise RuntimeError("no")
+"""
+
+
+def test_a_linkage_of_a_file_of_ones_own(scene, tmp_path):
+    own, cut = tmp_path / "own.py", {}
+    own.write_text(OWN)
+    for name in ("Angles", "squared"):
+        done = run(scene, "--out", tmp_path / f"{name}.npz", "--linkage", f"{own}:{name}", *VIEW)
+        assert done.exit_code == 0, done.output
+        with np.load(tmp_path / f"{name}.npz") as arrays:
+            cut[name] = arrays["tree_altitudes"]
+        (tmp_path / f"{name}.npz").unlink()
+    assert cut["squared"] == pytest.approx(cut["Angles"] ** 2)
+    (tmp_path / "fails.py").write_text("1 / 0")
+    files = ["fails.py", "own.py", scene.name]
+    for name, message in (
+        ("own.py:Other", "expected Other to be a Linkage or a class of them, got None"),
+        ("own.py:nothing", "got 3"),
+        ("own.py:Needs", "Needs: RuntimeError: no"),
+        ("fails.py:A", "fails: ZeroDivisionError: division by zero"),
+        ("none.py:A", "none.py does not exist"),
+    ):
+        done = run(scene, "--out", tmp_path / "out.npz", "--linkage", tmp_path / name)
+        assert_refused(done, message, tmp_path, files)
+    done = run(scene, "--out", tmp_path / "out.npz", "--method", f"{own}:Angles")
+    assert_refused(done, "expected Angles to be a SupervoxelMethod", tmp_path, files)
+
+
 def test_a_learned_linkage_from_its_file(scene, tmp_path):
     names = ("step_voxels", "concavity")
     model = EdgeModel(names, (0.0, 0.0), (1.0, 1.0), (2.0, 3.0), -2.0, 0.5)
@@ -213,3 +266,12 @@ def test_features_by_name_and_columns_from_end_to_end(tmp_path):
     (tmp_path / "a.segments.npz").unlink()
     done = run(tmp_path / "a.ply", "--out", tmp_path / "b.ply", "--features", "rings")
     assert_refused(done, "got 'rings'; there are: Intensity, time", tmp_path, ["a.ply"])
+
+
+def test_warnings_are_a_line_on_stderr(tmp_path):
+    points = np.random.default_rng(0).uniform(0, 1, (900, 3))
+    pcgraph.write_segmentation(tmp_path / "a.ply", pcgraph.Cloud(points), pcgraph.segment(points, voxel_size=0.3))
+    done = run(tmp_path / "a.ply", "--out", tmp_path / "b.npz", "--voxel-size", 0.002)
+    assert done.exit_code == 0
+    assert "pcgraph: warning: expected far fewer objects than supervoxels" in done.stderr
+    assert "cli.py" not in done.stderr

@@ -23,6 +23,8 @@ from pcgraph.errors import CloudReadError
 from pcgraph.io.pcd import read_pcd
 from pcgraph.io.ply import read_ply
 
+pytestmark = pytest.mark.filterwarnings("ignore::pcgraph.plausibility.CloudWarning")  # any cloud, sane or not
+
 READERS = {"pcd": read_pcd, "ply": read_ply}
 FILES = {name: (READERS[name[:3]], content) for name, content in CORPUS.items()}
 

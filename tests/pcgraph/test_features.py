@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import pcgraph
 from pcgraph.features.moments import moments_of_groups, moments_up_tree
 from pcgraph.features.nodes import node_features
 from pcgraph.features.primitives import EXPONENTS, primitive_moments, primitive_moments_up_tree
@@ -172,3 +173,12 @@ def test_verticality_needs_a_direction(up):
     features = node_features(moments_of_groups(np.eye(3), None, np.zeros(3, np.int32), 1))
     with pytest.raises(ValueError, match="expected up"):
         features.verticality(up)
+
+
+def test_deviations_are_the_roots_of_lapacks_eigenvalues(boxes):
+    tree = boxes[2].tree
+    nodes = tree.features()
+    expected = np.sqrt(np.maximum(np.linalg.eigvalsh(nodes.covariance), 0.0))
+    assert nodes.deviations == pytest.approx(expected, rel=1e-9, abs=1e-7)
+    squares = np.linalg.eigvalsh(tree.moments.scatters)[:, 0]
+    assert pcgraph.plane_energy(tree).data == pytest.approx(np.maximum(squares, 0.0), rel=1e-6, abs=1e-9)

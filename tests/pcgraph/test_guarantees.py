@@ -33,16 +33,18 @@ def assert_covered_and_connected(points, result, outliers=0.01):
     grid = voxel_grid(flat[finite], None, result.voxel_size, result.surface.grid.warp)
     leaf = result.supervoxels.reshape(-1)[finite]
     # Of a voxel on a boundary the points may belong to several supervoxels: each of its shares is a piece.
-    shares = np.unique(np.stack((grid.voxel_of_point, leaf), axis=1), axis=0)
-    assert np.array_equal(np.unique(shares[:, 0]), np.arange(grid.n_voxels))
-    at = {(voxel, owner): piece for piece, (voxel, owner) in enumerate(shares.tolist())}
-    links = [
-        (piece, at[other, owner])
-        for (voxel, owner), piece in at.items()
-        for other in grid.neighbours[grid.indptr[voxel] : grid.indptr[voxel + 1]].tolist()
-        if (other, owner) in at
-    ]
-    matrix = csr_array((np.ones(len(links)), np.array(links, int).reshape(-1, 2).T), shape=(len(shares),) * 2)
+    owners = int(leaf.max()) + 1
+    shares = np.flatnonzero(np.bincount(grid.voxel_of_point.astype(np.int64) * owners + leaf))
+    voxel, owner = np.divmod(shares, owners)
+    assert np.array_equal(np.unique(voxel), np.arange(grid.n_voxels))
+    degrees = np.diff(grid.indptr)[voxel]
+    piece = np.repeat(np.arange(len(shares)), degrees)
+    within = np.arange(len(piece)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
+    beside = grid.neighbours[grid.indptr[voxel[piece]] + within].astype(np.int64) * owners + owner[piece]
+    other = np.searchsorted(shares, beside).clip(max=len(shares) - 1)
+    linked = shares[other] == beside
+    links = (piece[linked], other[linked])
+    matrix = csr_array((np.ones(len(links[0])), links), shape=(len(shares),) * 2)
     pieces, _ = connected_components(matrix, directed=False)
     assert pieces == result.graph.n_nodes == leaf.max() + 1
 

@@ -115,3 +115,13 @@ def test_a_file_by_name(kind, tmp_path):
         pcgraph.segment(kind(tmp_path / "b.ply"))
     with pytest.raises(pcgraph.CloudReadError, match=r"ending in \.pcd or \.ply"):
         pcgraph.segment(kind("POINTS"))
+
+
+def test_a_name_in_place_of_a_linkage_or_method_is_told_which_there_are():
+    classes = r"ConvexityLinkage\(\), .*QuasiFlatLinkage\(\), .*WardLinkage\(\), got"
+    with pytest.raises(ValueError, match=classes + r" 'ward'; did you mean pcgraph\.WardLinkage\(\)\?$"):
+        pcgraph.segment(np.ones((3, 3)), linkage="ward")
+    with pytest.raises(ValueError, match=classes + " 3$"):
+        pcgraph.segment(np.ones((3, 3)), linkage=3)
+    with pytest.raises(ValueError, match=r"pcgraph\.Vccs\(\), got 'Vcs'; did you mean pcgraph\.Vccs\(\)"):
+        pcgraph.segment(np.ones((3, 3)), method="Vcs")

@@ -76,11 +76,11 @@ def test_variation_of_information_by_hand():
 def test_explained_variation_by_hand():
     values = np.array([0.0, 2.0, 10.0, 12.0])
     # Total 4 * 25 + 4 * 1 about 6 = 16 + 36 + ... : 36 + 16 + 16 + 36; between segments 4 * 25.
-    assert metrics.explained_variation(np.array([0, 0, 1, 1]), values) == pytest.approx(100 / 104)
-    assert metrics.explained_variation(np.zeros(4, int), values) == 0
-    assert metrics.explained_variation(np.arange(4), values[:, None] * [1, 2, 3]) == 1
-    assert metrics.explained_variation(np.arange(2), np.full((2, 3), 7.0)) == 1
-    masked = metrics.explained_variation(np.array([[0, 0, 1], [1, -1, -1]]), np.array([[0, 2, 10], [12, np.nan, 5]]))
+    assert metrics.explained_variation(values, np.array([0, 0, 1, 1])) == pytest.approx(100 / 104)
+    assert metrics.explained_variation(values, np.zeros(4, int)) == 0
+    assert metrics.explained_variation(values[:, None] * [1, 2, 3], np.arange(4)) == 1
+    assert metrics.explained_variation(np.full((2, 3), 7.0), np.arange(2)) == 1
+    masked = metrics.explained_variation(np.array([[0, 2, 10], [12, np.nan, 5]]), np.array([[0, 0, 1], [1, -1, -1]]))
     assert masked == pytest.approx(100 / 104)
 
 
@@ -138,11 +138,11 @@ def test_bad_arguments():
     with pytest.raises(ValueError, match="classes of the labels' shape"):
         metrics.panoptic_quality(FOUND, TRUTH, FOUND[:2], TRUTH[:2])
     with pytest.raises(ValueError, match="values for labels"):
-        metrics.explained_variation(FOUND, np.zeros((9, 3)))
+        metrics.explained_variation(np.zeros((9, 3)), FOUND)
     with pytest.raises(ValueError, match="finite values"):
-        metrics.explained_variation(FOUND, np.full(10, np.nan))
+        metrics.explained_variation(np.full(10, np.nan), FOUND)
     with pytest.raises(ValueError, match="at least one point"):
-        metrics.explained_variation(-FOUND, np.zeros(10))
+        metrics.explained_variation(np.zeros(10), -FOUND)
 
 
 def test_every_public_name_resolves_and_says_what_it_is():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import signature
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ OF_TWO: dict[str, Callable[[ArrayLike, ArrayLike], object]] = {
     "panoptic_quality": lambda labels, truth: metrics.panoptic_quality(labels, truth, labels, truth).pq,
     "boundary_recall": lambda labels, truth: metrics.boundary_recall(POINTS, labels, truth, k=2),
     "boundary_precision": lambda labels, truth: metrics.boundary_precision(POINTS, labels, truth, k=2),
-    "explained_variation": lambda labels, _: metrics.explained_variation(labels, POINTS),
+    "explained_variation": lambda labels, _: metrics.explained_variation(POINTS, labels),
     "compactness": lambda labels, _: metrics.compactness(POINTS, labels, k=2),
     "tree_oracle": lambda labels, truth: metrics.tree_oracle(TREE, labels, truth),
     "level_curve": lambda labels, truth: metrics.level_curve(TREE, labels, truth).values.tolist(),
@@ -59,9 +60,9 @@ def test_masked_points_and_values_take_no_part():
     assert metrics.NeighbourGraph.of(places, k=2).members.tolist() == [0, 1, 2, 4, 5, 6, 7]
     valid = np.ma.masked_array(np.ones(8, bool), np.arange(8) == 5)
     assert metrics.NeighbourGraph.of(POINTS, valid, k=2).members.tolist() == [0, 1, 2, 3, 4, 6, 7]
-    for refused in (metrics.explained_variation, lambda labels, points: metrics.compactness(points, labels)):
+    for refused in (metrics.explained_variation, metrics.compactness):
         with pytest.raises(ValueError, match="expected finite"):
-            refused(TRUTH, places)
+            refused(places, TRUTH)
 
 
 def test_labels_without_end_are_refused():
@@ -98,3 +99,12 @@ def test_curves_compare_and_hash_as_objects():
         assert thing == thing
         assert thing != metrics.NeighbourGraph.of(POINTS, k=2)
         assert len({thing, thing}) == 1
+
+
+def test_all_metrics_take_the_points_then_the_segments_then_the_truth():
+    order = ["graph", "tree", "points", "values", "labels", "leaves", "truth"]
+    functions = [getattr(metrics, name) for name in dir(metrics) if name.islower()]
+    assert len(functions) > 15
+    for function in functions:
+        taken = [order.index(argument) for argument in signature(function).parameters if argument in order]
+        assert taken == sorted(taken), function

@@ -99,7 +99,7 @@ def test_refining_never_loses_what_segments_can_achieve(seed: int):
     assert halves.merge <= others.merge + 1e-12
     assert halves.split >= others.split - 1e-12
     values = np.random.default_rng(seed + 2).normal(size=(len(true), 3))
-    assert metrics.explained_variation(fine, values) >= metrics.explained_variation(coarse, values) - 1e-12
+    assert metrics.explained_variation(values, fine) >= metrics.explained_variation(values, coarse) - 1e-12
 
 
 @given(seeds)

@@ -3,15 +3,20 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from sklearn.tree import DecisionTreeClassifier
 
+import pcgraph
 from pcgraph import plain_files
+from pcgraph.learning import NodeClassifier
 from pcgraph.plain_files import write_file, write_files
+from pcgraph.tree.learned import EdgeModel
 
 
 class Refused(Exception):
@@ -102,3 +107,54 @@ def test_a_signal_takes_what_is_half_written_and_its_directories_away(
     worker.join(10)
     assert list(tmp_path.iterdir()) == []
     assert not plain_files._abandon()
+
+
+@pytest.fixture(scope="module")
+def savers(boxes):
+    """Calls that save something to a path, by the ending of its name."""
+    points, truth, result = boxes
+    model = EdgeModel(("step_voxels",), (0.0,), (1.0,), (2.0,), -2.0, 0.5)
+    taught = NodeClassifier(DecisionTreeClassifier(max_depth=2)).fit(result, truth)
+    return {
+        "graphml": result.graph.write_graphml,
+        "linkage.json": pcgraph.LearnedLinkage(model).save,
+        "model.json": model.save,
+        "classifier.json": taught.save,
+        "ply": lambda path: pcgraph.write_segmentation(path, pcgraph.Cloud(points), result),
+        "npz": lambda path: pcgraph.write_segmentation(path, pcgraph.Cloud(points), result),
+    }
+
+
+SAVERS = ("graphml", "linkage.json", "model.json", "classifier.json", "ply", "npz")
+
+
+@pytest.mark.parametrize("ending", SAVERS)
+def test_everything_that_saves_replaces_whole_files_or_none(savers, ending, tmp_path, monkeypatch):
+    save, path = savers[ending], tmp_path / f"a.{ending}"
+    save(path)
+    whole = path.read_bytes()
+    path.write_text("mine")
+    path.chmod(0o640)
+    (tmp_path / f"link.{ending}").symlink_to(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", raising(OSError(errno.ENOSPC, "full")))
+        with pytest.raises(pcgraph.CloudWriteError, match="no space left"):
+            save(path)
+    assert path.read_text() == "mine"
+    save(str(tmp_path / f"link.{ending}"))
+    assert (tmp_path / f"link.{ending}").is_symlink()
+    assert path.read_bytes() == whole or ending == "npz"  # whose archive holds the time
+    assert path.stat().st_mode & 0o777 == 0o640
+    folder = tmp_path / f"folder.{ending}"
+    folder.mkdir()
+    for place in (folder, tmp_path / "nowhere" / path.name):
+        with pytest.raises(pcgraph.CloudWriteError):
+            save(place)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([path.name, f"link.{ending}", folder.name])
+
+
+def raising(problem):
+    def call(*_, **__):
+        raise problem
+
+    return call

@@ -27,6 +27,8 @@ from pcgraph import (
 )
 from pcgraph.voxels.grid import voxel_grid
 
+pytestmark = pytest.mark.filterwarnings("ignore::pcgraph.plausibility.CloudWarning")  # any cloud, sane or not
+
 METHODS = [SurfaceGrowth(), Vccs(), SurfaceGrowth(0.0, 0.0, 0.0), Vccs(color_weight=0.0)]
 LINKAGES = [
     ConvexityLinkage(),
@@ -299,7 +301,7 @@ def test_a_shift_by_whole_cells_of_both_grids_changes_ties_at_most(rng, steps):
         for move in (np.zeros(3), np.array(steps) * 0.5)
     )
     assert np.array_equal(first.surface.grid.voxel_of_point, second.surface.grid.voxel_of_point)
-    assert first.surface.normals == pytest.approx(second.surface.normals, abs=1e-9)
+    assert np.abs(first.surface.normals - second.surface.normals).max() <= 1e-9
     assert pcgraph.metrics.weighted_overlap(second.supervoxels, first.supervoxels) > 0.75
 
 

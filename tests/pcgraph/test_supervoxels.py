@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
+import numba
 import numpy as np
 import pytest
 from clouds import SPACING, patch, two_boxes_on_a_plane
@@ -14,6 +11,7 @@ from test_guarantees import DEGENERATE, assert_covered_and_connected
 
 import pcgraph
 from pcgraph.metrics import undersegmentation_error
+from pcgraph.parallel import MIN_BLOCK
 
 
 @pytest.mark.parametrize("method", [pcgraph.SurfaceGrowth(), pcgraph.Vccs()], ids=["surface", "vccs"])
@@ -62,32 +60,17 @@ def test_colour_weight_makes_supervoxels_keep_to_colours():
     assert error < 0.6 * undersegmentation_error(blind.supervoxels, truth)
 
 
-CODE = """
-import sys, hashlib
-import numpy as np
-sys.path.insert(0, sys.argv[1])
-from clouds import two_boxes_on_a_plane
-import pcgraph
-points, _, viewpoint = two_boxes_on_a_plane()
-points = np.vstack([points + (0.0, 0.0, 0.002 * k) for k in range(4)])  # enough for several blocks
-result = pcgraph.segment(points, points % 1.0, viewpoint=viewpoint)
-digest = hashlib.sha256()
-for array in (result.supervoxels, result.labels, result.surface.normals, result.tree.parents, result.tree.altitudes):
-    digest.update(np.ascontiguousarray(array).tobytes())
-digest.update(result.tree.moments.scatters.tobytes())
-print(digest.hexdigest())
-"""
-
-
-def test_the_number_of_threads_changes_no_byte():
-    here = os.path.dirname(__file__)
-    digests = set()
-    for threads in ("1", "2", "3", "7"):
-        environment = {**os.environ, "NUMBA_NUM_THREADS": threads}
-        done = subprocess.run(
-            [sys.executable, "-c", CODE, here], capture_output=True, text=True, check=True, env=environment, timeout=300
-        )
-        digests.add(done.stdout)
-    assert len(digests) == 1
-    points, _, _ = two_boxes_on_a_plane()
-    assert 4 * len(points) > 2 * 4096 * 7  # blocks for all seven
+def test_the_number_of_threads_changes_no_byte(monkeypatch):
+    points, _, viewpoint = two_boxes_on_a_plane()
+    points = np.vstack([points + np.array([0.0, 0.0, 0.002 * k]) for k in range(4)])
+    assert len(points) > 2 * MIN_BLOCK * 7  # blocks for all seven
+    clouds = ((points, points % 1.0, viewpoint), (np.random.default_rng(2).random((3000, 3)), None, None))
+    for cloud, colors, seen_from in clouds:
+        digests = set()
+        for threads in (1, 2, 3, 7):
+            monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", threads)
+            result = pcgraph.segment(cloud, colors, viewpoint=seen_from)
+            tree = (result.tree.parents, result.tree.altitudes, result.tree.moments.scatters)
+            arrays = (result.supervoxels, result.labels, result.surface.normals, *tree)
+            digests.add(b"".join(array.tobytes() for array in arrays))
+        assert len(digests) == 1

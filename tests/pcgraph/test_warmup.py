@@ -5,79 +5,101 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import subprocess
 import sys
+from ast import literal_eval
+from pathlib import Path
 
 import pytest
 
+import pcgraph
 from pcgraph import warmup
+from pcgraph.graph import contacts
+from pcgraph.supervoxels import clustering
 
-CODE = """
+KERNELS = """
 import sys
 import numpy as np
+from pcgraph import warmup
 from pcgraph.scan import segment
-from pcgraph.warmup import compile_kernels
+
+def kernels():
+    modules = [m for name, m in sys.modules.items() if name.startswith("pcgraph")]
+    return {id(k): k for m in modules for k in vars(m).values() if hasattr(k, "nopython_signatures")}.values()
 
 def compiled():
-    modules = [m for name, m in sys.modules.items() if name.startswith("pcgraph")]
-    kernels = {id(k): k for m in modules for k in vars(m).values() if hasattr(k, "nopython_signatures")}
-    return {(k.py_func.__qualname__, str(s)) for k in kernels.values() for s in k.nopython_signatures}
+    return {(k.py_func.__qualname__, str(s)) for k in kernels() for s in k.nopython_signatures}
 
-compile_kernels()
-before = compiled()
 y, x = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(-0.4, 0.4, 80), indexing="ij")
 image = np.stack((x, y, 1.0 + 0.1 * (x > 0.1)), axis=-1)
+"""
+FIRST = """
+from pcgraph.graph import contacts
+from pcgraph.supervoxels import clustering
+from pcgraph.tree import region_linkage
+
+missing = clustering._expand, contacts._relate
+print(warmup.must_compile(), [warmup._is_cached(kernel) for kernel in missing])
+warmup.compile_in_two_processes()
+print([warmup._is_cached(kernel) for kernel in missing], len(region_linkage._merge.nopython_signatures))
+print({k.py_func.__name__ for k in kernels() if k.stats.cache_misses})
+warmup.compile_graph_and_tree()
+before = compiled()
+segment(image, np.full(image.shape, 0.5))
+print(compiled() - before)
+print(before)
+"""
+LATER = """
+print(warmup.must_compile())
+warmup.compile_kernels()
+before = compiled()
 image[::7, ::5] = np.nan
 normals = np.zeros_like(image)
 normals[..., 2] = -1.0
 segment(image, np.full(image.shape, 0.5, np.float32), normals, (0.0, 0.0, 0.0))
 segment(image.reshape(-1, 3))
-print(len(before) > 5, compiled() - before)
+print(compiled() - before)
+print([(k.py_func.__qualname__, str(s)) for k in kernels() for s in k.stats.cache_misses])
 """
 
 
-def test_the_warm_up_leaves_nothing_to_compile():
-    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, timeout=300)
-    assert done.stdout == "True set()\n"
+def run(code: str, folder: Path | None = None, **environment: str) -> str:
+    """What a process prints that is no worker of the tests: workers start no second process.
+
+    It imports the pcgraph in `folder`, or else that of the tests.
+    """
+    variables = {name: value for name, value in os.environ.items() if name != "PYTEST_XDIST_WORKER"} | environment
+    line = [sys.executable, "-P", "-c", code]
+    variables["PYTHONPATH"] = str(folder or Path(pcgraph.__file__).parents[1])
+    return subprocess.run(line, capture_output=True, text=True, check=True, timeout=300, env=variables).stdout
 
 
-FIRST = """
-from pcgraph.tree import region_linkage
-from pcgraph.warmup import compile_in_two_processes, must_compile
+def test_where_kernels_are_missing_a_second_process_compiles_those_of_the_tree(tmp_path):
+    """This one compiles those of voxels meanwhile. A process that starts later finds all in the cache, and after
+    `compile_kernels` nothing is left to compile whatever the form of the cloud.
 
-print(must_compile())
-compile_in_two_processes()
-print(must_compile(), len(region_linkage._merge.nopython_signatures))
-"""
-
-
-@pytest.mark.slow
-def test_on_an_empty_cache_a_second_process_compiles_the_tree(tmp_path):
-    """This one compiles voxels meanwhile; a process that starts later finds all in the cache."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "2"}
-    environment.pop("PYTEST_XDIST_WORKER", None)  # workers of the tests start no second process
-    done = subprocess.run(
-        [sys.executable, "-c", FIRST], capture_output=True, text=True, check=True, timeout=300, env=environment
-    )
-    assert done.stdout == "True\nFalse 0\n"
-    done = subprocess.run([sys.executable, "-c", LATER], capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout == "False 0\n"
-
-
-LATER = """
-import sys
-import numpy as np
-from pcgraph.scan import segment
-from pcgraph.warmup import must_compile
-
-needed = must_compile()
-y, x = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(-0.4, 0.4, 80), indexing="ij")
-image = np.stack((x, y, 1.0 + 0.1 * (x > 0.1)), axis=-1)
-segment(image, np.full(image.shape, 0.5))
-modules = [m for name, m in sys.modules.items() if name.startswith("pcgraph")]
-kernels = {id(k): k for m in modules for k in vars(m).values() if hasattr(k, "nopython_signatures")}
-print(needed, sum(sum(k.stats.cache_misses.values()) for k in kernels.values()))
-"""
+    The package is a copy with the cache of the tests, less the two kernels that tell whether a cache is filled. That
+    the halves forget no other shows in the first process, which then compares what both compile with what a call needs.
+    """
+    source, package = Path(pcgraph.__file__).parent, tmp_path / "pcgraph"
+    shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))  # with times, which caches know
+    modules = [module for name, module in sys.modules.items() if name.startswith("pcgraph.")]
+    for kernel in (k for module in modules for k in vars(module).values() if hasattr(k, "nopython_signatures")):
+        file = Path(kernel.py_func.__code__.co_filename)
+        cache = package / file.parent.relative_to(source) / "__pycache__"
+        cache.mkdir(exist_ok=True)
+        left_out = kernel in (clustering._expand, contacts._relate)
+        kept = f"{file.stem}.{kernel.py_func.__name__}-*.nb?"
+        for kernel_file in () if left_out else Path(kernel.stats.cache_path).glob(kept):
+            shutil.copy2(kernel_file, cache)
+    environment = {"NUMBA_NUM_THREADS": "2", "NUMBA_CACHE_DIR": ""}
+    *said, needed = run(KERNELS + FIRST, tmp_path, **environment).splitlines()
+    assert said == ["True [False, False]", "[True, True] 0", "{'_expand'}", "set()"]
+    *said, compiled_later = run(KERNELS + LATER, tmp_path, **environment).splitlines()
+    assert said == ["False", "set()"]
+    assert len(literal_eval(needed)) > 5
+    assert literal_eval(needed).isdisjoint(literal_eval(compiled_later))
 
 
 @pytest.fixture
@@ -129,6 +151,4 @@ def test_everything_runs_uncompiled_too():
         "for kind in (pcgraph.ConvexityLinkage(), pcgraph.WardLinkage()):\n"
         "    print(pcgraph.segment(points, linkage=kind, voxel_size=0.15).graph.n_nodes > 1)"
     )
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout == "True\nTrue\n"
+    assert run(code, NUMBA_DISABLE_JIT="1") == "True\nTrue\n"

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linkages and supervoxel methods by name: those of the package, those loaded since, and those of files of a user's."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from difflib import get_close_matches
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from zlib import crc32
+
+import pcgraph
+from pcgraph.errors import PcgraphError
+
+_SEPARATOR = ".py:"
+
+
+def members(family: str) -> dict[str, type[Any]]:
+    """Classes of a family of pcgraph by name, those that need no argument: MumfordShahLinkage is mumford-shah.
+
+    Parameters
+    ----------
+    family : "Linkage" or "SupervoxelMethod"
+    """
+    for name in dir(pcgraph):
+        getattr(pcgraph, name)  # a class is known once it is loaded
+    waiting, found = [getattr(pcgraph, family)], {}
+    while waiting:
+        kind = waiting.pop()
+        waiting += kind.__subclasses__()
+        needed = [p for p in inspect.signature(kind).parameters.values() if p.default is p.empty]
+        if not inspect.isabstract(kind) and not needed:
+            found[re.sub("(?<=.)([A-Z])", r"-\1", kind.__name__.removesuffix(family)).lower()] = kind
+    return dict(sorted(found.items()))
+
+
+def member(family: str, name: str) -> Any:
+    """A member of a family: by name, by a beginning of it that fits no other, or as FILE.py:NAME.
+
+    NAME is a class of the family, or an object of one, in a Python file; a relative FILE counts from the current
+    folder. Loading a file runs it, so only name files that you trust.
+
+    Raises
+    ------
+    ValueError
+        There is none of that name.
+    PcgraphError
+        The file is missing or fails, or NAME is no member of the family.
+    """
+    if _SEPARATOR in name:
+        path, _, attribute = name.rpartition(":")
+        return _member_in(family, Path(path).resolve(), attribute)
+    known = members(family)
+    fitting = [name] if name in known else [one for one in known if name and one.startswith(name)]
+    if len(fitting) != 1:
+        raise ValueError(f"expected one of {', '.join(known)}, or FILE.py:NAME, got {ascii(name)[:100]}")
+    return known[fitting[0]]()
+
+
+def refusal(argument: str, family: str, given: object) -> str:
+    """What to say of an argument that is no member of its family: which classes there are, and which may be meant."""
+    known = members(family)
+    own = {name: kind for name, kind in known.items() if kind.__module__.startswith("pcgraph.")}
+    classes = ", ".join(f"pcgraph.{kind.__name__}()" for kind in own.values())
+    near = get_close_matches(given.lower(), own, 1) if isinstance(given, str) else []
+    hint = f"; did you mean pcgraph.{own[near[0]].__name__}()?" if near else ""
+    return f"expected a {argument} such as {classes}, got {ascii(given)[:100]}{hint}"
+
+
+def _member_in(family: str, path: Path, attribute: str) -> Any:
+    base = getattr(pcgraph, family)
+    found = getattr(_module(path), attribute, None)
+    if isinstance(found, type) and issubclass(found, base):
+        try:
+            found = found()
+        except Exception as error:  # whatever a class of somebody's raises
+            raise PcgraphError(f"{path}: {attribute}: {type(error).__name__}: {_brief(error)}") from error
+    if not isinstance(found, base):
+        raise PcgraphError(f"{path}: expected {attribute} to be a {family} or a class of them, got {_brief(found)}")
+    return found
+
+
+def _module(path: Path) -> ModuleType:
+    """The module of a Python file, which runs."""
+    if not path.is_file():
+        raise PcgraphError(f"{path} does not exist; expected a Python file")
+    name = f"_pcgraph_file_{path.stem}_{crc32(bytes(path)):x}"
+    spec = spec_from_file_location(name, path)
+    assert spec is not None, path  # a .py file has one
+    assert spec.loader is not None, path
+    module = module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their own module up
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        raise PcgraphError(f"{path} fails: {type(error).__name__}: {_brief(error)}") from error
+    return module
+
+
+def _brief(thing: object) -> str:
+    """A few words in place of what somebody's file holds or says."""
+    return " ".join(ascii(str(thing))[1:-1].split())[:200]

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warnings about clouds that cannot be right, or results that cannot be what was wanted: one sentence each."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pcgraph.voxels.grid import VoxelGrid
+from pcgraph.voxels.spacing import bounding_box
+from pcgraph.voxels.visibility import seen_from
+
+_STEPS_PER_SPACING = 4.0  # of floating-point numbers: fewer, and points lie on a lattice of rounding
+_LEAST_SPACING = 1e-7  # of the extent
+_MIN_SUPERVOXELS = 500  # of fewer, many objects are no surprise
+_OBJECTS_PER_SUPERVOXEL = 0.1
+_LEAST_SEEN = 0.1  # of the voxels, from a viewpoint
+
+
+class CloudWarning(UserWarning):
+    """Something about a cloud, or about what became of it, that cannot be right."""
+
+
+def warn_of_rounding(given: ArrayLike, points: NDArray[np.float64], spacing: float) -> None:
+    """Warn where float32 cannot tell neighbours apart, so far from the origin are they.
+
+    Parameters
+    ----------
+    given : array
+        Points as they came in.
+    points : (n, 3) float64, metres
+        The finite ones.
+    spacing : float, metres
+    """
+    dtype = getattr(given, "dtype", None)
+    if dtype is None or dtype.kind != "f" or dtype.itemsize > 4:
+        return
+    farthest = float(np.abs(bounding_box(points)).max())
+    step = float(np.spacing(np.asarray(farthest, dtype)))
+    if _STEPS_PER_SPACING * step > spacing:
+        _warn(
+            f"expected coordinates finer than the spacing of points, but {dtype} comes in steps of {step:.2g} m at "
+            f"{farthest:.4g} m, and points lie {spacing:.2g} m apart; subtract an offset before you make them {dtype}"
+        )
+
+
+def warn_of_duplicates(points: NDArray[np.float64], spacing: float) -> None:
+    """Warn where points lie so close together that they are likely to be copies of each other."""
+    low, high = bounding_box(points)
+    extent = float((high - low).max())
+    if 0.0 < spacing < _LEAST_SPACING * extent:
+        _warn(
+            f"expected points apart from each other, but most have another within {spacing:.2g} m in a cloud of "
+            f"{extent:.3g} m, as copies of a scan do; give voxel_size, or leave copies out"
+        )
+
+
+def warn_of_dust(n_objects: int, n_supervoxels: int, voxel_size: float) -> None:
+    """Warn where the default cut leaves more objects than a tenth of the supervoxels."""
+    if n_supervoxels >= _MIN_SUPERVOXELS and n_objects > _OBJECTS_PER_SUPERVOXEL * n_supervoxels:
+        _warn(
+            f"expected far fewer objects than supervoxels, got {n_objects} and {n_supervoxels}: voxels of "
+            f"{voxel_size:.3g} m may be too small for the cloud; give voxel_size, or cut the tree at another altitude"
+        )
+
+
+def warn_of_viewpoint(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> None:
+    """Warn where a viewpoint, (3,), sees nearly nothing, as from inside or under a surface."""
+    middle = (np.add(*bounding_box(grid.centroids))) / 2.0
+    reach = max(float(np.abs(grid.centroids - middle).max()), float(np.abs(viewpoint - middle).max()))
+    if not reach > 0.0:
+        return
+    place = (viewpoint - middle)[None] / reach
+    seen = float(seen_from(place, (grid.centroids - middle) / reach, grid.edge_lengths / reach).mean())
+    if seen < _LEAST_SEEN:
+        _warn(
+            f"expected a viewpoint that sees the cloud, but from {np.round(viewpoint, 3).tolist()} m only "
+            f"{100.0 * seen:.0f} % of it is visible; it may lie inside or under a surface, or be of another frame"
+        )
+
+
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, CloudWarning, stacklevel=4)  # where `segment` was called

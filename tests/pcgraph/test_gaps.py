@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gaps: which supervoxels nearly touch, and merges across them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pcgraph
+from pcgraph.graph.gaps import gaps
+
+VOXEL = 0.05
+
+
+def sheet(start: float, stop: float, z: float = 0.0) -> np.ndarray:
+    """Points of a level sheet over x in start..stop and y in 0..1, one per voxel of VOXEL at its centre."""
+    x, y = np.meshgrid(np.arange(start + VOXEL / 2, stop, VOXEL), np.arange(VOXEL / 2, 1.0, VOXEL))
+    return np.stack((x.ravel(), y.ravel(), np.full(x.size, z)), axis=1)
+
+
+def two_sheets(empty: int, **settings) -> pcgraph.Segmentation:
+    """Two sheets in one plane with so many empty voxels between them."""
+    points = np.concatenate((sheet(0.0, 1.0), sheet(1.0 + empty * VOXEL, 2.0 + empty * VOXEL)))
+    return pcgraph.segment(points, voxel_size=VOXEL, viewpoint=(1.0, 0.5, 5.0), range_growth=0.0, **settings)
+
+
+@pytest.mark.parametrize(("empty", "joined"), [(0, True), (1, True), (2, True), (3, False), (6, False)])
+def test_what_lies_in_one_plane_merges_across_gaps_of_up_to_three_voxel_edges(empty, joined):
+    result = two_sheets(empty)
+    assert result.labels.max() + 1 == (1 if joined else 2)
+    assert bool(len(result.graph.gaps.edges)) == (0 < empty < 3)
+
+
+def test_a_linkage_of_contacts_alone_merges_across_no_gap():
+    assert two_sheets(1, linkage=pcgraph.ConvexityLinkage()).labels.max() + 1 == 2
+
+
+def test_gaps_are_those_of_a_search_of_all_pairs():
+    rng = np.random.default_rng(2)
+    points = np.concatenate((sheet(0.0, 1.0), sheet(1.1, 1.6), sheet(0.3, 0.9, 0.12), rng.uniform(0, 1.5, (40, 3))))
+    result = pcgraph.segment(points, voxel_size=VOXEL, viewpoint=(1.0, 0.5, 5.0), range_growth=0.0)
+    grid, labels = result.surface.grid, result.surface.supervoxels
+    found = gaps(grid, result.surface.normals, labels, result.graph.node_features, result.graph.edges)
+    touching = {tuple(pair) for pair in result.graph.edges.tolist()}
+    degree = np.diff(grid.indptr)
+    expected: dict[tuple[int, int], float] = {}
+    for i in range(grid.n_voxels):
+        for j in range(i):
+            pair = tuple(sorted((int(labels[i]), int(labels[j]))))
+            width = float(np.linalg.norm(grid.warped[i] - grid.warped[j]) / grid.size)
+            if pair[0] != pair[1] and pair not in touching and width <= 3.0 and max(degree[i], degree[j]) < 8:
+                expected[pair] = min(width, expected.get(pair, np.inf))
+    assert [tuple(pair) for pair in found.edges.tolist()] == sorted(expected)
+    assert found.widths == pytest.approx([expected[pair] for pair in sorted(expected)])
+    assert len(expected) > 5
+    assert (found.weights > 0.0).all()
+
+
+def test_a_cloud_of_one_voxel_has_no_gaps():
+    result = pcgraph.segment(np.zeros((5, 3)), voxel_size=1.0)
+    assert result.graph.gaps is not None
+    assert result.graph.gaps.edges.shape == (0, 2)

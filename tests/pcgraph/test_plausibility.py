@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warnings about clouds that cannot be right; silence about those that can (warnings are errors in all other tests)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clouds import two_boxes_on_a_plane
+
+import pcgraph
+from pcgraph import CloudWarning
+
+POINTS, _, VIEWPOINT = two_boxes_on_a_plane()
+
+
+def test_float32_far_from_the_origin_is_noticed():
+    far = (POINTS + np.array([4.5e5, 5.4e6, 300.0])).astype(np.float32)  # as of a map projection
+    with pytest.warns(CloudWarning, match="float32 comes in steps of 0.5 m"):
+        pcgraph.segment(far, voxel_size=1.0)
+    pcgraph.segment(POINTS.astype(np.float32))
+    pcgraph.segment(POINTS + np.array([4.5e5, 5.4e6, 300.0]))
+
+
+@pytest.mark.parametrize("apart", [1e-9, 1e-5])
+def test_a_dozen_copies_of_a_scan_are_one_scan(apart):
+    rng = np.random.default_rng(0)
+    copies = np.concatenate([POINTS + rng.normal(0.0, apart, POINTS.shape) for _ in range(12)])
+    one, many = pcgraph.segment(POINTS), pcgraph.segment(copies)
+    assert one.voxel_size / 4 < many.voxel_size < one.voxel_size * 2
+    assert many.labels.max() == one.labels.max()
+
+
+def test_a_spacing_of_nearly_nothing_is_noticed():
+    rng = np.random.default_rng(0)
+    line = np.cumsum(rng.uniform(0.5, 1.5, 4000))[:, None] * [1e-9, 0, 0]
+    with pytest.warns(CloudWarning, match="most have another within .* as copies of a scan do"):
+        pcgraph.segment(np.concatenate((line, [[0.0, 0.0, 1.0]] * 3, line[-9:] + 0.5)))
+
+
+def test_two_scans_laid_on_each_other_have_the_spacing_of_one():
+    twice = np.concatenate((POINTS, POINTS + np.random.default_rng(0).normal(0.0, 1e-6, POINTS.shape)))
+    one, two = pcgraph.segment(POINTS), pcgraph.segment(twice)
+    assert one.voxel_size / 4 < two.voxel_size < one.voxel_size * 2
+    assert two.labels.max() == one.labels.max()
+
+
+def test_more_objects_than_there_can_be_are_noticed():
+    dust = np.random.default_rng(1).uniform(0.0, 1.0, (900, 3))
+    with pytest.warns(CloudWarning, match="expected far fewer objects than supervoxels"):
+        pcgraph.segment(dust, voxel_size=0.002)
+
+
+def test_a_viewpoint_that_sees_nothing_is_noticed():
+    with pytest.warns(CloudWarning, match="expected a viewpoint that sees the cloud"):
+        pcgraph.segment(POINTS, viewpoint=(0.8, 0.6, -1e-3))  # just under the plane
+    pcgraph.segment(POINTS, viewpoint=VIEWPOINT)
