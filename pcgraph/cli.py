@@ -85,6 +85,10 @@ def segment(
         ),
     ] = None,
     color: Annotated[bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")] = True,
+    features: Annotated[
+        list[str] | None,
+        typer.Option(help="A further column of the file that shapes the supervoxels, such as intensity; any number."),
+    ] = None,
     viewpoint: Annotated[
         tuple[float, float, float] | None,
         typer.Option(help="Sensor position x y z in metres. Default: the file's, else found from the cloud."),
@@ -107,6 +111,7 @@ def segment(
             cloud,
             read,
             viewpoint=viewpoint,
+            features=features or None,
             voxel_size=voxel_size,
             seed_size=seed_size,
             range_growth=range_growth,

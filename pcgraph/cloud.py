@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,9 @@ class Cloud(ShortRepr):
         The file's own ``label`` or ``labels`` field, for example ground truth.
     viewpoint : (3,) float64, metres, or None
         Where the sensor stood, from the PCD header; None if the format does not say.
+    columns : dict of name to array of the same leading shape, or that + (c,), of any dtype of numbers
+        All else that the file says of each point, as stored: intensity, ring, time, classification and the like.
+        `pcgraph.segment` takes them as `features` by name; `write_segmentation` writes them back.
     """
 
     points: NDArray[np.floating]
@@ -42,6 +45,7 @@ class Cloud(ShortRepr):
     normals: NDArray[np.floating] | None = None
     labels: NDArray[np.int32] | None = None
     viewpoint: NDArray[np.float64] | None = None
+    columns: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
     @property
     def organised(self) -> bool:
@@ -54,10 +58,11 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
 
     Parameters
     ----------
-    columns : mapping of field name to (n,) array
+    columns : mapping of field name to (n,) or (n, c) array
         Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``),
-        normals and labels are picked up under the names that PCL, Open3D and MeshLab write. Colours run to
-        65535 in unsigned 16 bits, to 1 in floats none of which is larger, else to 255.
+        normals and labels are picked up under the names that PCL, Open3D and MeshLab write, in upper or lower case.
+        Colours run to 65535 in unsigned 16 bits, to 1 in floats none of which is larger, else to 255. The others are
+        kept as they are, but for ``_``, the name of padding in PCD files.
     shape : (n,) or (h, w)
         Leading shape of the result.
     viewpoint : (3,) float64, metres, optional
@@ -67,17 +72,22 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     CloudReadError
         A coordinate is missing or is not a floating-point or integer number.
     """
+    stored, names = columns, _names_by_lower_case(columns)
+    columns = {lower: _first_numbers(stored[name]) for lower, name in names.items()}
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise CloudReadError(
             f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)[:200]}"
         )
+    of_colors, of_normals, of_labels = _color_names(columns), _normal_names(columns), _label_name(columns)
+    used = {"_", *(names[lower] for lower in ("x", "y", "z", *of_colors, *of_normals, *of_labels))}
     return Cloud(
         points=_stack(columns, ("x", "y", "z"), shape),
-        colors=_colors(columns, shape),
-        normals=_normals(columns, shape),
-        labels=_labels(columns, shape),
+        colors=_colors(columns, of_colors, shape),
+        normals=_stack(columns, of_normals, shape) if of_normals else None,
+        labels=columns[of_labels[0]].astype(np.int32).reshape(shape) if of_labels else None,
         viewpoint=viewpoint,
+        columns={name: _kept(column, shape) for name, column in stored.items() if name not in used},
     )
 
 
@@ -91,16 +101,22 @@ def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> 
     return stacked
 
 
-def _colors(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
+def _color_names(columns: Columns) -> tuple[str, ...]:
     for name in ("rgb", "rgba"):
-        packed = columns.get(name)
-        if packed is not None and packed.dtype.itemsize == 4:
-            bits = np.ascontiguousarray(packed).view(np.uint32)
-            channels = [(bits >> shift) & 0xFF for shift in (16, 8, 0)]
-            return np.stack(channels, axis=-1).astype(np.uint8).reshape(*shape, 3)
-    if not all(name in columns for name in ("red", "green", "blue")):
+        if name in columns and columns[name].dtype.itemsize == 4:
+            return (name,)
+    names = ("red", "green", "blue")
+    return names if all(name in columns for name in names) else ()
+
+
+def _colors(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
+    if len(names) == 1:
+        bits = np.ascontiguousarray(columns[names[0]]).view(np.uint32)
+        channels = [(bits >> shift) & 0xFF for shift in (16, 8, 0)]
+        return np.stack(channels, axis=-1).astype(np.uint8).reshape(*shape, 3)
+    if not names:
         return None
-    stored = [columns[name] for name in ("red", "green", "blue")]
+    stored = [columns[name] for name in names]
     if all(channel.dtype == np.uint8 for channel in stored):
         return np.stack(stored, axis=-1).astype(np.uint8).reshape(*shape, 3)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -117,18 +133,29 @@ def _white(stored: list[NDArray[np.generic]], values: NDArray[np.float64]) -> fl
     return 1.0 if floats and values.max(initial=0.0, where=np.isfinite(values)) <= 1.0 else 255.0
 
 
-def _normals(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.floating] | None:
-    for names in _NORMAL_NAMES:
-        if all(name in columns for name in names):
-            return _stack(columns, names, shape)
-    return None
+def _normal_names(columns: Columns) -> tuple[str, ...]:
+    return next((names for names in _NORMAL_NAMES if all(name in columns for name in names)), ())
 
 
-def _labels(columns: Columns, shape: tuple[int, ...]) -> NDArray[np.int32] | None:
-    for name in _LABEL_NAMES:
-        if name in columns and columns[name].dtype.kind in "iu":
-            return columns[name].astype(np.int32).reshape(shape)
-    return None
+def _label_name(columns: Columns) -> tuple[str, ...]:
+    return tuple(name for name in _LABEL_NAMES if name in columns and columns[name].dtype.kind in "iu")[:1]
+
+
+def _names_by_lower_case(columns: Columns) -> dict[str, str]:
+    """The name of each column by that name in lower case; of two, the one that is written so."""
+    found: dict[str, str] = {}
+    for name in sorted(columns, key=lambda name: name != name.lower()):
+        found.setdefault(name.lower(), name)
+    return found
+
+
+def _first_numbers(column: NDArray[np.generic]) -> NDArray[np.generic]:
+    return column if column.ndim == 1 else column[:, 0]
+
+
+def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:
+    """A copy of its own, so that the file's bytes need not stay in memory."""
+    return column.reshape(*shape, *column.shape[1:]).copy()
 
 
 def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.float64]:

@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.cloud import Cloud
+from pcgraph.columns import RobustScaling
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.spacing import bounding_box
 
@@ -22,31 +24,82 @@ Points = ArrayLike | Cloud | PathLike[str]
 """What `pcgraph.segment` takes: an array of points, a cloud, or the name of a file."""
 
 
+Features = ArrayLike | str | Sequence[str] | None
+"""What `pcgraph.segment` takes as features: numbers, or names of a cloud's columns."""
+
+
+class Arrays(NamedTuple):
+    """Points and what is known of each."""
+
+    points: ArrayLike
+    colors: ArrayLike | None
+    normals: ArrayLike | None
+    viewpoint: ArrayLike | None
+    features: ArrayLike | None
+
+
 def as_arrays(
-    points: Points, colors: ArrayLike | None, normals: ArrayLike | None, viewpoint: ArrayLike | None
-) -> tuple[ArrayLike, ArrayLike | None, ArrayLike | None, ArrayLike | None]:
+    points: Points,
+    colors: ArrayLike | None,
+    normals: ArrayLike | None,
+    viewpoint: ArrayLike | None,
+    features: Features = None,
+) -> Arrays:
     """Points, colours, normals and viewpoint as they are, or those of a cloud or a file where none are given beside it.
+
+    Features are what is given, or the columns of the cloud that they name.
 
     Raises
     ------
     CloudReadError
         `points` names a file that cannot be read as a cloud.
+    ValueError
+        Features name a column that is not there, or one of another shape.
     """
     if isinstance(points, (str, PathLike)):
         from pcgraph.io import read_cloud
 
         points = read_cloud(points)
+    names = _names(features)
     if not isinstance(points, Cloud):
-        return points, colors, normals, viewpoint
+        if names:
+            raise ValueError(
+                "expected features as numbers beside an array of points; names are those of a Cloud's columns"
+            )
+        return Arrays(points, colors, normals, viewpoint, features)
     stored = points.viewpoint
     if stored is not None and not stored.any():
         stored = None  # PCD writers put zeros where they know nothing
-    return (
+    return Arrays(
         points.points,
         points.colors if colors is None else colors,
         points.normals if normals is None else normals,
         stored if viewpoint is None else viewpoint,
+        _columns(points, names) if names else features,
     )
+
+
+def _names(features: Features) -> list[str]:
+    """The names, if features are such."""
+    if isinstance(features, str):
+        return [features]
+    return list(features) if isinstance(features, (list, tuple)) and all(isinstance(f, str) for f in features) else []
+
+
+def _columns(cloud: Cloud, names: list[str]) -> NDArray[np.float64]:
+    """The columns of these names, of vectors one per element, side by side: points' leading shape + (d,)."""
+    shape = np.shape(cloud.points)[:-1]
+    columns = []
+    for name in names:
+        if name not in cloud.columns:
+            known = ", ".join(cloud.columns)[:200] or "none"
+            raise ValueError(f"expected features to name columns of the cloud, got {name!r}; there are: {known}")
+        column = _numbers(f"the column {name!r}", cloud.columns[name])
+        if column.shape[: len(shape)] != shape or column.ndim > len(shape) + 1:
+            raise ValueError(f"expected the column {name!r} in the points' shape {shape}, got {column.shape}")
+        with np.errstate(over="ignore"):
+            columns.append(column.reshape(*shape, -1).astype(np.float64))
+    return np.concatenate(columns, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +117,10 @@ class CleanCloud(ShortRepr):
         Flat indices of those points.
     outliers : (o,) int64
         Flat indices of finite points that were left out as outliers.
+    features : (n, d) float32, -4..4, or None
+        Scaled.
+    scaling : RobustScaling of d columns, or None
+        By which they were.
     """
 
     points: NDArray[np.float64]
@@ -72,6 +129,8 @@ class CleanCloud(ShortRepr):
     shape: tuple[int, ...]
     kept: NDArray[np.int64]
     outliers: NDArray[np.int64]
+    features: NDArray[np.float32] | None = None
+    scaling: RobustScaling | None = None
 
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""
@@ -82,14 +141,25 @@ class CleanCloud(ShortRepr):
 
     def without(self, outliers: NDArray[np.bool_]) -> CleanCloud:
         """The points but for some, (n,) bool."""
-        colors = None if self.colors is None else self.colors[~outliers]
-        normals = None if self.normals is None else self.normals[~outliers]
-        gone = np.sort(np.concatenate((self.outliers, self.kept[outliers])))
-        return CleanCloud(self.points[~outliers], colors, normals, self.shape, self.kept[~outliers], gone)
+        return replace(
+            self,
+            points=self.points[~outliers],
+            colors=None if self.colors is None else self.colors[~outliers],
+            normals=None if self.normals is None else self.normals[~outliers],
+            kept=self.kept[~outliers],
+            outliers=np.sort(np.concatenate((self.outliers, self.kept[outliers]))),
+            features=None if self.features is None else self.features[~outliers],
+        )
 
 
-def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike | None) -> CleanCloud:
-    """Finite points with their colours and normals.
+def clean_cloud(
+    points: ArrayLike,
+    colors: ArrayLike | None,
+    normals: ArrayLike | None,
+    features: ArrayLike | None = None,
+    scaling: RobustScaling | None = None,
+) -> CleanCloud:
+    """Finite points with their colours, normals and features, these scaled as told or else by what they are.
 
     Raises
     ------
@@ -115,7 +185,15 @@ def clean_cloud(points: ArrayLike, colors: ArrayLike | None, normals: ArrayLike 
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
     none = np.empty(0, np.int64)
-    return CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
+    clean = CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
+    if features is None:
+        return clean
+    numbers = _features(features, shape, kept)
+    scaling = RobustScaling.of(numbers) if scaling is None else scaling
+    if len(scaling) != numbers.shape[1]:
+        expected = f"{len(scaling)} columns of features as in the earlier scan"
+        raise ValueError(f"expected {expected}, got {numbers.shape[1]}")
+    return replace(clean, features=scaling.scaled(numbers), scaling=scaling)
 
 
 def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64] | None:
@@ -211,3 +289,16 @@ def _normals(normals: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np
     array[~np.isfinite(array).all(axis=1)] = 0.0
     array /= np.maximum(np.abs(array).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
     return array / np.maximum(np.linalg.norm(array, axis=1, keepdims=True), 1e-300)
+
+
+def _features(features: ArrayLike, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The columns at finite points, (n, d)."""
+    array = _numbers("features", features)
+    if array.shape[: len(shape)] != shape or array.ndim > len(shape) + 1 or array.shape[len(shape) :] == (0,):
+        wanted = f"{shape} or {shape} + (d,)"
+        raise ValueError(f"expected features of the points' leading shape, {wanted}, got {array.shape}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        numbers = array.reshape(int(np.prod(shape)), -1).take(kept, axis=0).astype(np.float64)
+    if np.isinf(numbers).any():
+        raise ValueError("expected finite features at finite points, or NaN where unknown, got infinite ones")
+    return numbers

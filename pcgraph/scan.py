@@ -16,7 +16,17 @@ from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.gaps import gaps
-from pcgraph.inputs import CleanCloud, Points, as_arrays, clean_cloud, clean_viewpoint, fraction, non_negative, positive
+from pcgraph.inputs import (
+    CleanCloud,
+    Features,
+    Points,
+    as_arrays,
+    clean_cloud,
+    clean_viewpoint,
+    fraction,
+    non_negative,
+    positive,
+)
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint
 from pcgraph.segmentation import Segmentation
@@ -47,6 +57,7 @@ def segment(
     normals: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
     *,
+    features: Features = None,
     voxel_size: float | None = None,
     seed_size: float | None = None,
     camera: bool | None = None,
@@ -73,6 +84,9 @@ def segment(
         depends on that. Default: the origin for organised clouds. A list of points whose spacing grows with range
         from one place (`pcgraph.voxels.spacing.spacing_law`) was seen from there; of any other, the outside is found
         from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
+    features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
+        What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
+        median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
     voxel_size : float, metres, optional
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
     seed_size : float, metres, optional
@@ -110,20 +124,20 @@ def segment(
     -----
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
-    points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
+    points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
     settings = Settings.of(method or SurfaceGrowth(), linkage or RegionLinkage(), object_altitude)
-    cloud = clean_cloud(points, colors, normals)
+    cloud = clean_cloud(points, colors, normals, features)
     place = clean_viewpoint(viewpoint, cloud)
     voxel, seed = _sizes(cloud, voxel_size, seed_size)
     compile_in_two_processes()
     position, warp = _place_and_warp(cloud, place, camera, range_growth)
-    grid = voxel_grid(cloud.points, cloud.colors, voxel, warp)
+    grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
     n_points = len(cloud.points)
     cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
     if len(cloud.points) < _FEW_OUTLIERS * n_points:  # spacing and place were those of noise, to a good part
         voxel, seed = _sizes(cloud, voxel_size, seed_size)
         position, warp = _place_and_warp(cloud, place, camera, range_growth)
-        grid = voxel_grid(cloud.points, cloud.colors, voxel, warp)
+        grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
     _warn_of_input(points, cloud, voxel_size, voxel)
     if voxel_size is None:
@@ -145,6 +159,7 @@ def update(
     normals: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
     *,
+    features: Features = None,
     method: SupervoxelMethod | None = None,
     linkage: Linkage | None = None,
     object_altitude: float | None = None,
@@ -160,8 +175,8 @@ def update(
     ----------
     earlier : Segmentation
         Of the scans so far; its voxel size, seed size and grid are used again.
-    points, colors, normals, viewpoint
-        The new scan in the same frame; as for `pcgraph.segment`.
+    points, colors, normals, viewpoint, features
+        The new scan in the same frame; as for `pcgraph.segment`. Features are scaled as those of the first scan.
     method, linkage, object_altitude
         As for `pcgraph.segment`; default: those of the earlier scan.
 
@@ -176,8 +191,8 @@ def update(
     ------
     ValueError
         As for `pcgraph.segment`; or the earlier scan's voxels grow with a camera's depth and a new point does not
-        lie in front of that camera (segment the first scan with ``camera=False``); or one scan has colours and
-        the other none.
+        lie in front of that camera (segment the first scan with ``camera=False``); or one scan has colours or
+        features and the other none.
 
     Notes
     -----
@@ -185,16 +200,16 @@ def update(
     """
     if not isinstance(earlier, Segmentation):
         raise ValueError(f"expected the Segmentation of the scans so far, got {type(earlier).__name__}")
-    points, colors, normals, viewpoint = as_arrays(points, colors, normals, viewpoint)
+    points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
     if object_altitude is None and linkage is None:
         object_altitude = earlier.object_altitude
     settings = Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
-    cloud = clean_cloud(points, colors, normals)
+    cloud = clean_cloud(points, colors, normals, features, earlier.feature_scaling)
     position = clean_viewpoint(viewpoint, cloud)
     compile_in_two_processes()
     before = earlier.surface
     before.grid.warp.check(cloud.points)
-    seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp)
+    seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp, cloud.features)
     lonely = outlier_voxels(seen) & ~is_near(seen, before.grid)
     cloud, seen, position = _without(lonely, cloud, seen, position)
     union = grid_union(before.grid, seen)
@@ -287,6 +302,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         surface=surface,
         seed_size=scan.seed_size,
         viewpoint=scan.viewpoint,
+        feature_scaling=cloud.scaling,
         **vars(settings),
     )
 
@@ -297,10 +313,10 @@ def _leaves(
     """Moments of the supervoxels' points, with those of earlier scans."""
     n_leaves = int(surface.supervoxels.max()) + 1
     if earlier is None:
-        leaves = moments_of_groups(cloud.points, cloud.colors, leaf_of_point, n_leaves)
+        leaves = moments_of_groups(cloud.points, cloud.colors, leaf_of_point, n_leaves, cloud.features)
     else:
         found, group = np.unique(leaf_of_point, return_inverse=True)
-        gained = moments_of_groups(cloud.points, cloud.colors, group.astype(np.int32), len(found))
+        gained = moments_of_groups(cloud.points, cloud.colors, group.astype(np.int32), len(found), cloud.features)
         leaves = joined_moments(replace(earlier.leaves, normals=None), gained, found, n_leaves)
     return replace(leaves, normals=surface.mean_normals(n_leaves))
 
@@ -383,7 +399,7 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, seed_size: float) -> Voxel
     """
     joined = _joined(grid)
     while joined < _MIN_JOINED and grid.size < seed_size:
-        larger = voxel_grid(cloud.points, cloud.colors, 2.0 * grid.size, grid.warp)
+        larger = voxel_grid(cloud.points, cloud.colors, 2.0 * grid.size, grid.warp, cloud.features)
         if _joined(larger) < joined + _MIN_GAIN:
             break  # a line stays a line
         grid, joined = larger, _joined(larger)

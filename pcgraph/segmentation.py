@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.columns import RobustScaling
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.supervoxels.method import SupervoxelMethod
@@ -49,6 +50,8 @@ class Segmentation:
         What was used.
     viewpoint : (3,) or (n, 3) float64, metres, the points' frame
         What was used, given or derived; one per point that has a supervoxel if so given.
+    feature_scaling : RobustScaling, or None
+        Center and spread of each column of the features; None if none were given.
     """
 
     labels: NDArray[np.int32]
@@ -62,6 +65,7 @@ class Segmentation:
     linkage: Linkage
     object_altitude: float
     viewpoint: NDArray[np.float64]
+    feature_scaling: RobustScaling | None = None
 
     def __repr__(self) -> str:
         """What there is, in one line."""

@@ -12,6 +12,7 @@ import numpy as np
 
 MAX_LINES = 5
 MAX_COLUMNS = 100
+MAX_ENTRIES = 3
 SHORT = reprlib.Repr()
 """`repr` of plain values, cut to a readable length."""
 SHORT.maxstring = SHORT.maxother = 100
@@ -48,7 +49,10 @@ def in_short(value: Any) -> str:
     if isinstance(value, ShortRepr):
         return f"{type(value).__name__}(...)"
     if isinstance(value, Mapping) and any(isinstance(v, np.ndarray) for v in value.values()):
-        return "{" + ", ".join(f"{type(k).__name__}: {in_short(v)}" for k, v in value.items()) + "}"
+        shown = [f"{str(k)[:20]}: {in_short(v)}" for k, v in list(value.items())[:MAX_ENTRIES]]
+        return (
+            "{" + ", ".join(shown) + (f" and {len(value) - len(shown)} more" if len(value) > len(shown) else "") + "}"
+        )
     many = isinstance(value, (tuple, list)) and (len(value) > 3 or any(isinstance(v, np.ndarray) for v in value))
     if many and value:
         return f"{len(value)} of {type(value[0]).__name__}"

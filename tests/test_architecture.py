@@ -50,6 +50,7 @@ STOREYS = [
     "plain_files",
     "output",
     "cloud",
+    "columns",
     "parallel",
     "disjoint_sets",
     "hierarchy",

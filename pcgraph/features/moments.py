@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.columns import group_means
 from pcgraph.parallel import kernel, routine
 from pcgraph.short_repr import ShortRepr
 
@@ -33,6 +34,8 @@ class Moments(ShortRepr):
         Sum over the points of (c - mean colour)(c - mean colour)^T.
     normals : (k, 3) float64, or None
         Mean of the unit normals of the surface, on its outer side; short where they point in many directions.
+    features : (k, d) float64, -4..4, or None
+        Means of the points' features, scaled (`pcgraph.columns.RobustScaling`).
     """
 
     counts: NDArray[np.int64]
@@ -41,6 +44,7 @@ class Moments(ShortRepr):
     colors: NDArray[np.float64] | None
     color_scatters: NDArray[np.float64] | None = None
     normals: NDArray[np.float64] | None = None
+    features: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         """Number of groups."""
@@ -67,7 +71,11 @@ class Moments(ShortRepr):
 
 
 def moments_of_groups(
-    points: NDArray[np.float64], colors: NDArray[np.float64] | None, groups: NDArray[np.int32], n_groups: int
+    points: NDArray[np.float64],
+    colors: NDArray[np.float64] | None,
+    groups: NDArray[np.int32],
+    n_groups: int,
+    features: NDArray[np.float32] | None = None,
 ) -> Moments:
     """Moments of points by group.
 
@@ -78,12 +86,14 @@ def moments_of_groups(
     groups : (n,) int32, 0..n_groups - 1
         Every group has a point at least.
     n_groups : int
+    features : (n, d) float32, scaled, or None
     """
     counts, centroids, scatters = _mean_and_scatter(points, groups, n_groups, about_first=True)
+    of_features = None if features is None else group_means(features, groups, n_groups)
     if colors is None:
-        return Moments(counts, centroids, scatters, None)
+        return Moments(counts, centroids, scatters, None, features=of_features)
     _, means, color_scatters = _mean_and_scatter(colors, groups, n_groups, about_first=False)
-    return Moments(counts, centroids, scatters, means, color_scatters)
+    return Moments(counts, centroids, scatters, means, color_scatters, features=of_features)
 
 
 def _mean_and_scatter(
@@ -137,7 +147,7 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     counts = _with_room(leaves.counts, len(parents))
     centroids, scatters = _with_room(leaves.centroids, len(parents)), _with_room(leaves.scatters, len(parents))
     accumulate_moments(parents, counts, centroids, scatters)
-    colors = color_scatters = normals = None
+    colors = color_scatters = normals = features = None
     if leaves.colors is not None:
         again, colors = _with_room(leaves.counts, len(parents)), _with_room(leaves.colors, len(parents))
         spread = np.zeros((len(leaves), 3, 3)) if leaves.color_scatters is None else leaves.color_scatters
@@ -147,7 +157,10 @@ def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
     if leaves.normals is not None:
         normals = _with_room(leaves.normals, len(parents))
         accumulate_means(parents, counts, len(leaves), normals)
-    return Moments(counts, centroids, scatters, colors, color_scatters, normals)
+    if leaves.features is not None:
+        features = _with_room(leaves.features, len(parents))
+        accumulate_means(parents, counts, len(leaves), features)
+    return Moments(counts, centroids, scatters, colors, color_scatters, normals, features)
 
 
 def joined_moments(first: Moments, second: Moments, groups: NDArray[np.integer], n_groups: int) -> Moments:
@@ -157,7 +170,7 @@ def joined_moments(first: Moments, second: Moments, groups: NDArray[np.integer],
     ----------
     first : Moments of k groups, k <= n_groups
     second : Moments of q groups
-        With colours and normals as the first has them.
+        With colours, normals and features as the first has them.
     groups : (q,) int
         Distinct; numbers from k on are new groups. All n_groups occur in one of the two.
     """

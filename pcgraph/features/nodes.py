@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +40,9 @@ class NodeFeatures(ShortRepr):
         Covariance of the points' colours; NaN if the cloud has none.
     deviations : (k, 3) float64, metres
         s3, s2 and s1: square roots of the covariance's eigenvalues, ascending. No column of its own.
+    features : (k, d) float64, -4..4
+        Means of the columns given as `features`, in robust spreads from their medians; d = 0 if there are none, and
+        no column then.
     """
 
     size: NDArray[np.int64]
@@ -53,10 +56,12 @@ class NodeFeatures(ShortRepr):
     color: NDArray[np.float64]
     color_covariance: NDArray[np.float64]
     deviations: NDArray[np.float64]
+    features: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """All features by name, in the order of the attributes."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "deviations"}
+        names = [column.name for column in fields(self) if column.name != "deviations"]
+        return {name: getattr(self, name) for name in names if name != "features" or self.features.size}
 
     def verticality(self, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
         """How steep each node's plane stands, (k,) float64: 0 a floor, 1 a wall, 1 - |normal . up|.
@@ -118,6 +123,7 @@ def node_features(moments: Moments) -> NodeFeatures:
         color=np.full((k, 3), np.nan) if colors is None else colors,
         color_covariance=np.full((k, 3, 3), np.nan) if spreads is None else spreads,
         deviations=deviations,
+        features=np.empty((k, 0)) if moments.features is None else moments.features,
     )
 
 
@@ -190,13 +196,16 @@ def rows(columns: dict[str, NDArray[np.generic]] | dict[str, NDArray[np.float64]
 def scalar_columns(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
     """The same table with one column per number: vectors split into x, y, z, colours into r, g, b, matrices too.
 
-    Symmetric matrices keep their upper triangle. Columns of NaN, which the cloud knows nothing of, are left out.
+    Features are numbered: feature_0, feature_1 and so on. Symmetric matrices keep their upper triangle. Columns of
+    NaN, which the cloud knows nothing of, are left out.
     """
     split: dict[str, NDArray[np.generic]] = {}
     for name, column in columns.items():
         axes = "rgb" if name.startswith("color") else "xyz"
         if column.ndim == 1:
             split[name] = column
+        elif name == "features":
+            split |= {f"feature_{i}": column[:, i] for i in range(column.shape[1])}
         elif column.ndim == 2:
             split |= {f"{name}_{axes[i]}": column[:, i] for i in range(3)}
         else:

@@ -90,7 +90,7 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
 
 
 def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
-    names = tuple(name.lower() for name in entries["FIELDS"])
+    names = tuple(entries["FIELDS"])
     counts = _integers(entries, "COUNT", default=[1] * len(names))
     sizes = _integers(entries, "SIZE")
     kinds = [kind.upper() for kind in entries["TYPE"]]
@@ -140,7 +140,9 @@ def _ascii_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.gener
     first = 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
         with np.errstate(over="ignore", invalid="ignore"):
-            columns[name] = table[:, first].astype(dtype)
+            columns[name] = _without_axis(table[:, first : first + count].astype(dtype))
+        if dtype.itemsize == 8 and dtype.kind in "iu":
+            columns[name] = _exact(columns[name], body, (first, first + count, sum(header.counts)))
         first += count
     return columns
 
@@ -150,7 +152,7 @@ def _binary_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.gene
     record = np.dtype([(f"f{i}", dtype, (count,)) for i, (dtype, count) in enumerate(fields)])
     _check_length(len(body), header.n_points * record.itemsize, header)
     rows = np.frombuffer(body, record, count=header.n_points)
-    return {name: rows[f"f{i}"][:, 0] for i, name in enumerate(header.names)}
+    return {name: _without_axis(rows[f"f{i}"]) for i, name in enumerate(header.names)}
 
 
 def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
@@ -169,9 +171,33 @@ def _compressed_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.
     start = 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
         end = start + header.n_points * dtype.itemsize * count
-        columns[name] = target[start:end].view(dtype).reshape(header.n_points, count)[:, 0]
+        columns[name] = _without_axis(target[start:end].view(dtype).reshape(header.n_points, count))
         start = end
     return columns
+
+
+def _without_axis(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Columns (n, c) of a field, (n,) where it has but one element."""
+    return values[:, 0] if values.shape[1] == 1 else values
+
+
+def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]) -> NDArray[np.generic]:
+    """Whole numbers of 64 bits as the text has them, where doubles have rounded them.
+
+    Parameters
+    ----------
+    values : (n,) or (n, c) int64 or uint64
+        Rounded.
+    body : the text
+    place : first column, column after the last, columns
+    """
+    first, end, width = place
+    words = body.split(None, len(values) * width)[: len(values) * width]
+    rows = [words[row + first : row + end] for row in range(0, len(words), width)]
+    try:
+        return np.array([[int(word) for word in row] for row in rows], values.dtype).reshape(values.shape)
+    except (ValueError, OverflowError):
+        return values  # nan, or a decimal point
 
 
 def _check_length(available: int, needed: int, header: PcdHeader) -> None:

@@ -16,7 +16,7 @@ _TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_NAMES = {"i4": "int", "u1": "uchar", "f4": "float", "f8": "double"}
+_NAMES = {kind: name for name, kind in _TYPES.items() if not name[-1].isdecimal()}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _MAX_HEADER_BYTES = 1 << 16
 
@@ -60,7 +60,8 @@ def encode_ply(columns: dict[str, NDArray[np.generic]], comment: str = "") -> by
 
     Parameters
     ----------
-    columns : mapping of property name to (n,) array of int32, uint8, float32 or float64
+    columns : mapping of property name, a word of Latin-1, to (n,) array of a type that PLY has: integers of up to 32
+        bits, float32 or float64
     comment : one line of the header; empty for none
     """
     record = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
@@ -75,7 +76,7 @@ def encode_ply(columns: dict[str, NDArray[np.generic]], comment: str = "") -> by
     for name, column in columns.items():
         rows[name] = column
         lines.append(f"property {_NAMES[column.dtype.str[1:]]} {name}")
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.tobytes()
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("latin-1") + rows.tobytes()
 
 
 def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
@@ -104,7 +105,7 @@ def _add_property(element: PlyElement, words: list[str]) -> None:
     if len(words) == 5 and words[1] == "list":
         element.has_list = True
     elif len(words) == 3 and words[1] in _TYPES:
-        element.properties.append((words[2].lower(), _TYPES[words[1]]))
+        element.properties.append((words[2], _TYPES[words[1]]))
     else:
         raise CloudReadError(f"PLY property not understood: {' '.join(words)[:80]!r}")
 

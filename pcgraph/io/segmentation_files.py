@@ -7,6 +7,7 @@ import hashlib
 import io
 import os
 import re
+import warnings
 import zipfile
 from os import PathLike
 from pathlib import Path
@@ -32,6 +33,7 @@ The sum is that of the file with zeros in place of the sum. Who corrects labels 
 _SEAL = re.compile(rf"{FORMAT} sha256 (?P<sum>[0-9a-f]{{64}})(?:\n|\Z)".encode())
 _UNSEALED = f"{FORMAT} sha256 {'0' * 64}"
 _BLOCK = 1 << 20
+_INSTEAD = {"i8": "f8", "u8": "f8", "f2": "f4", "f16": "f8", "b1": "u1"}  # of types that PLY has not
 
 
 def is_segmentation(path: Path) -> bool:
@@ -70,12 +72,13 @@ def write_segmentation(
     Parameters
     ----------
     path : str or path
-        ``.ply``: the finite points, in input order, with a colour per label and the properties ``labels`` and
-        ``supervoxels`` (int32). ``.npz``: everything, in the input's shape: ``format``, ``labels``, ``supervoxels``;
-        ``edges`` and ``edge_<feature>``; ``node_<feature>``; ``tree_parents``, ``tree_altitudes``;
-        ``voxel_size``, ``seed_size``, ``viewpoint``.
+        ``.ply``: the finite points, in input order, with a colour per label, the properties ``labels`` and
+        ``supervoxels`` (int32), and the cloud's further columns, vectors as ``name_0``, ``name_1`` and so on; PLY has
+        no integers of 64 bits, so those become doubles. ``.npz``: everything, in the input's shape: ``format``,
+        ``labels``, ``supervoxels``; ``edges`` and ``edge_<feature>``; ``node_<feature>``; ``tree_parents``,
+        ``tree_altitudes``; ``voxel_size``, ``seed_size``, ``viewpoint``; ``column_<name>``, the further columns.
     cloud : Cloud
-        What was segmented.
+        What was segmented. A column of a name that the result itself has, such as ``supervoxels``, is left out.
     segmentation : Segmentation
     labels : the points' leading shape, int32, optional
         Labels to write instead of the default cut.
@@ -83,7 +86,8 @@ def write_segmentation(
     Raises
     ------
     CloudWriteError
-        Another extension, or the place cannot be written.
+        Another extension, or the place cannot be written; or a column is not of the points' shape, not of numbers, or
+        has a name that is not one word.
     """
     path = Path(path)
     write_file(path, encode_segmentation(path.name, cloud, segmentation, labels), CloudWriteError)
@@ -118,6 +122,12 @@ def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     columns: dict[str, NDArray[np.generic]] = {name: points[:, i] for i, name in enumerate("xyz")}
     columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
     columns |= {"labels": kept, "supervoxels": segmentation.supervoxels.reshape(-1)[finite]}
+    ours = set(columns)
+    for name, stored in _further_columns(cloud).items():
+        rows = _for_ply(name, stored.reshape(len(finite), -1)[finite])
+        vector = stored.ndim > cloud.points.ndim - 1
+        parts = {f"{name}_{i}" if vector else name: rows[:, i] for i in range(rows.shape[1])}
+        columns |= {part: values for part, values in parts.items() if part.lower() not in ours and part not in columns}
     return _sealed(encode_ply(columns, _UNSEALED), 0)
 
 
@@ -132,9 +142,39 @@ def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     arrays["voxel_size"] = np.array(segmentation.voxel_size)
     arrays["seed_size"] = np.array(segmentation.seed_size)
     arrays["viewpoint"] = segmentation.viewpoint
+    arrays |= {f"column_{name}": column for name, column in _further_columns(cloud).items()}
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
     with zipfile.ZipFile(stream, "a") as archive:
         archive.comment = _UNSEALED.encode()
     content = stream.getvalue()
     return _sealed(content, len(content) - len(_UNSEALED))
+
+
+def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
+    """The cloud's columns, checked."""
+    shape = cloud.points.shape[:-1]
+    for name, column in cloud.columns.items():
+        if not (isinstance(name, str) and name.split() == [name] and all(0 < ord(letter) < 256 for letter in name)):
+            raise CloudWriteError(f"expected names of columns as one word of Latin letters, got {ascii(name)[:80]}")
+        if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub":
+            kind = column.dtype if isinstance(column, np.ndarray) else type(column).__name__
+            raise CloudWriteError(f"expected the column {name!r} as an array of numbers, got {kind}")
+        if column.shape[: len(shape)] != shape or column.ndim > len(shape) + 1:
+            raise CloudWriteError(f"expected the column {name!r} in the points' shape {shape}, got {column.shape}")
+    return cloud.columns
+
+
+def _for_ply(name: str, values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """The values in a type that PLY has, whose numbers are the same but for whole numbers beyond 2**53."""
+    instead = _INSTEAD.get(values.dtype.str[1:])
+    if instead is None:
+        return values
+    with np.errstate(over="ignore"):
+        written = values.astype(instead)
+    if values.dtype.kind in "iu" and int(np.abs(written).max(initial=0)) > 1 << 53:
+        warnings.warn(
+            f"the .ply rounds the column {name!r} to doubles, as PLY has no integers of 64 bits; the .npz keeps them",
+            stacklevel=2,
+        )
+    return written

@@ -19,13 +19,14 @@ from pcgraph.voxels.grid import VoxelGrid, cell_keys, sorted_keys
 EARLY_SWEEPS = 1.8
 """Times seed size over voxel size: sweeps in which PCL's supervoxels take voxels from each other."""
 _REFINEMENTS = 2
+_NOISE = 0.1  # autocorrelation of a column that says nothing, at most
 
 
 # --- the distance of a voxel to a supervoxel ---
 
 
 class Metric(NamedTuple):
-    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'|, with |n . n'| where `two_sided`.
+    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + feature |f - f'|, with |n . n'| where `two_sided`.
 
     Attributes
     ----------
@@ -33,12 +34,15 @@ class Metric(NamedTuple):
     normal, color : float
     two_sided : bool
         Whether opposite normals are the same.
+    feature : float or None
+        None where no features were given.
     """
 
     spatial: float
     normal: float
     color: float
     two_sided: bool
+    feature: float | None = None
 
 
 class VoxelGraph(NamedTuple):
@@ -46,8 +50,8 @@ class VoxelGraph(NamedTuple):
 
     Attributes
     ----------
-    features : (v, 9) float64
-        Rows (place in the warped space, unit normal, colour).
+    features : (v, 9 + d) float64
+        Rows (place in the warped space, unit normal, colour, and the features that were given, if any).
     indptr : (v + 1,) int64
     neighbours : (e,) int32
         The voxels around each; see `pcgraph.voxels.grid.Neighbourhood`.
@@ -61,11 +65,19 @@ class VoxelGraph(NamedTuple):
 
 
 def voxel_graph(grid: VoxelGrid, normals: NDArray[np.float64], metric: Metric) -> VoxelGraph:
-    """The voxels of a grid as the steps take them, given their unit normals, (v, 3) float64."""
-    features = np.zeros((grid.n_voxels, 9))
+    """The voxels of a grid as the steps take them, given their unit normals, (v, 3) float64.
+
+    Each given feature counts as much as it is spatially autocorrelated: noise counts for nothing.
+    """
+    n_given = 0 if grid.features is None else grid.features.shape[1]
+    metric = metric._replace(feature=metric.feature if n_given else None)
+    features = np.zeros((grid.n_voxels, 9 + n_given))
     features[:, :3], features[:, 3:6] = grid.warped, normals
     if grid.colors is not None:
-        features[:, 6:] = grid.colors
+        features[:, 6:9] = grid.colors
+    if grid.features is not None:
+        signal = np.maximum(autocorrelation(grid.features, grid) - _NOISE, 0.0) / (1.0 - _NOISE)
+        features[:, 9:] = grid.features * signal
     return VoxelGraph(features, grid.indptr, grid.neighbours, metric)
 
 
@@ -78,13 +90,57 @@ def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], 
     if metric.two_sided:
         cosine = abs(cosine)
     away, tint = np.sqrt(x * x + y * y + z * z), np.sqrt(r * r + g * g + b * b)
-    return metric.spatial * away + metric.normal * (1.0 - cosine) + metric.color * tint
+    total = metric.spatial * away + metric.normal * (1.0 - cosine) + metric.color * tint
+    return total + _contrast(features, i, means, s, metric.feature)
+
+
+@routine
+def _contrast(features: NDArray[np.float64], i: int, means: NDArray[np.float64], s: int, weight: float | None) -> float:
+    """What voxel i and supervoxel s differ in the features that were given."""
+    if weight is None:  # known to the compiler, so that clouds without features do not pay for them
+        return 0.0
+    squares = 0.0
+    for column in range(9, features.shape[1]):
+        squares += (features[i, column] - means[s, column]) ** 2
+    return weight * np.sqrt(squares)
+
+
+def autocorrelation(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
+    """How alike touching voxels are in each of d columns, (v, d), (d,) float64: 0 for noise, near 1 for a smooth field.
+
+    Notes
+    -----
+    1 - C, no less than 0, where C is the mean square difference of touching voxels over twice the variance of all
+    (Geary 1954); 0 where all are equal.
+    """
+    squares = _sums_of_squares(values, values.mean(axis=0), grid.indptr, grid.neighbours)
+    pairs = max(len(grid.neighbours), 1)
+    twice = 2.0 * squares[1] / max(grid.n_voxels - 1, 1)
+    ratio = np.divide(squares[0] / pairs, twice, out=np.ones_like(twice), where=twice > 0.0)
+    return np.maximum(1.0 - ratio, 0.0) if len(grid.neighbours) else np.zeros_like(twice)
+
+
+@kernel
+def _sums_of_squares(
+    values: NDArray[np.float64], means: NDArray[np.float64], indptr: NDArray[np.int64], neighbours: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """Sums of squared differences of touching voxels, and of squared distances to the mean, (2, d)."""
+    sums = np.zeros((2, values.shape[1]))
+    for i in range(len(values)):
+        for column in range(values.shape[1]):
+            sums[1, column] += (values[i, column] - means[column]) ** 2
+            for a in range(indptr[i], indptr[i + 1]):
+                sums[0, column] += (values[i, column] - values[neighbours[a], column]) ** 2
+    return sums
 
 
 @routine
 def sum_features(features: NDArray[np.float64], labels: NDArray[np.int32], n_labels: int) -> NDArray[np.float64]:
-    """Sums of the features of each supervoxel's voxels, and their number, (n_labels, 10) float64, in voxel order."""
-    sums = np.zeros((n_labels, 10))
+    """Sums of the features of each supervoxel's voxels, (n_labels, 10 + d) float64, in voxel order.
+
+    Column 9 is their number.
+    """
+    sums = np.zeros((n_labels, features.shape[1] + 1))
     for i in range(len(labels)):
         if labels[i] >= 0:
             add_features(features, i, sums, labels[i], 1.0)
@@ -97,16 +153,20 @@ def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64
     for column in range(9):
         sums[s, column] += sign * features[i, column]
     sums[s, 9] += sign
+    for column in range(9, features.shape[1]):
+        sums[s, column + 1] += sign * features[i, column]
 
 
 @routine
 def set_means(sums: NDArray[np.float64], means: NDArray[np.float64]) -> None:
-    """Set `means`, (k, 9), to the supervoxels' mean rows, normals at unit length; rows of empty ones stay."""
+    """Set `means`, (k, 9 + d), to the supervoxels' mean rows, normals at unit length; rows of empty ones stay."""
     for s in range(len(sums)):
         if sums[s, 9] > 0.0:
             length = max(np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2), 1e-12)
             for column in range(9):
                 means[s, column] = sums[s, column] / (length if 3 <= column < 6 else sums[s, 9])
+            for column in range(9, means.shape[1]):
+                means[s, column] = sums[s, column + 1] / sums[s, 9]
 
 
 # --- where supervoxels start ---
@@ -238,7 +298,7 @@ def _expand(
     features, indptr, neighbours, metric = voxels
     n = len(features)
     claim, best = np.full(n, -1, np.int32), np.full(n, np.inf)
-    sums, means = sum_features(features, labels, n_labels), np.zeros((n_labels, 9))
+    sums, means = sum_features(features, labels, n_labels), np.zeros((n_labels, features.shape[1]))
     frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
     n_frontier, sweep = 0, 0
     for i in range(n):
@@ -334,7 +394,7 @@ def _boundary(  # type: ignore[no-untyped-def]
                 found[used] = i
                 used += 1
                 break
-    sums, means = sum_features(features, labels, n_labels), np.empty((n_labels, 9))
+    sums, means = sum_features(features, labels, n_labels), np.empty((n_labels, features.shape[1]))
     set_means(sums, means)
     return found[:used], sums, means
 
@@ -488,7 +548,7 @@ def _adopt(
 ) -> None:
     """Give every voxel without a label, ring by ring, the nearest label around it."""
     features, indptr, neighbours, metric = voxels
-    means = np.zeros((n_supervoxels, 9))
+    means = np.zeros((n_supervoxels, features.shape[1]))
     set_means(sum_features(features, labels, n_supervoxels), means)
     waiting, adopted = np.empty(len(labels), np.int32), np.empty(len(labels), np.int32)
     n_waiting = 0

@@ -36,6 +36,9 @@ class SurfaceGrowth(SupervoxelMethod):
     color_weight, spatial_weight, normal_weight : float, >= 0
         What counts in the distance of a voxel to a supervoxel: colours in 0..1, metres over the seed size, and one
         minus the cosine of normals; w_c, w_s and w_n of Papon et al. 2013, equation 7.
+    feature_weight : float, >= 0
+        The same for the features given to `pcgraph.segment`, in robust spreads: what one spread counts, if touching
+        voxels are alike in it; noise counts for nothing (`pcgraph.supervoxels.clustering.autocorrelation`).
 
     Notes
     -----
@@ -48,6 +51,7 @@ class SurfaceGrowth(SupervoxelMethod):
     color_weight: float = 0.1
     spatial_weight: float = 0.2
     normal_weight: float = 1.0
+    feature_weight: float = 0.1
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -61,7 +65,8 @@ class SurfaceGrowth(SupervoxelMethod):
         self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, initial: NDArray[np.int32]
     ) -> NDArray[np.int32]:
         """Supervoxels by expansion and k-means sweeps along their boundaries."""
-        metric = Metric(self.spatial_weight / seed_size, self.normal_weight, self.color_weight, two_sided=False)
+        weights = self.spatial_weight / seed_size, self.normal_weight, self.color_weight
+        metric = Metric(*weights, two_sided=False, feature=self.feature_weight)
         voxels = voxel_graph(grid, normals, metric)
         seeds = seed_voxels(grid, normals, seed_size, two_sided=False)
         labels = expand(voxels, seeds, EARLY_SWEEPS * seed_size / grid.size, initial)

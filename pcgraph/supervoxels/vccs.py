@@ -24,6 +24,8 @@ class Vccs(SupervoxelMethod):
     color_weight, spatial_weight, normal_weight : float, >= 0
         What counts in the distance of a voxel to a supervoxel: their w_c (colours in 0..1), w_s (metres over the
         seed size) and w_n (one minus the cosine), equation 7.
+    feature_weight : float, >= 0
+        The same for the features given to `pcgraph.segment`, which PCL does not know, as in `SurfaceGrowth`.
 
     Notes
     -----
@@ -36,6 +38,7 @@ class Vccs(SupervoxelMethod):
     color_weight: float = 0.1
     spatial_weight: float = 0.4
     normal_weight: float = 1.0
+    feature_weight: float = 0.1
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -49,7 +52,8 @@ class Vccs(SupervoxelMethod):
         self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, initial: NDArray[np.int32]
     ) -> NDArray[np.int32]:
         """Supervoxels by expansion from seeds."""
-        metric = Metric(self.spatial_weight / seed_size, self.normal_weight, self.color_weight, two_sided=True)
+        weights = self.spatial_weight / seed_size, self.normal_weight, self.color_weight
+        metric = Metric(*weights, two_sided=True, feature=self.feature_weight)
         voxels = voxel_graph(grid, normals, metric)
         seeds = seed_voxels(grid, normals, seed_size, two_sided=True)
         labels = expand(voxels, seeds, EARLY_SWEEPS * seed_size / grid.size, initial)

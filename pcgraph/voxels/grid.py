@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.spacing import bounding_box
@@ -67,6 +68,8 @@ class VoxelGrid(ShortRepr):
     indptr : (v + 1,) int64
     neighbours : (e,) int32
         Which voxels touch; see `Neighbourhood`.
+    features : (v, d) float64, -4..4, or None
+        Means of the voxel's points' features, scaled.
     """
 
     size: float
@@ -82,6 +85,7 @@ class VoxelGrid(ShortRepr):
     colors: NDArray[np.float64] | None
     indptr: NDArray[np.int64]
     neighbours: NDArray[np.int32]
+    features: NDArray[np.float64] | None = None
 
     @property
     def n_voxels(self) -> int:
@@ -116,10 +120,17 @@ def grid_without(grid: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
         colors=None if grid.colors is None else grid.colors[stays],
         indptr=np.concatenate(([0], np.cumsum(degrees))),
         neighbours=number[grid.neighbours[pairs]],
+        features=None if grid.features is None else grid.features[stays],
     )
 
 
-def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, size: float, warp: Warp) -> VoxelGrid:
+def voxel_grid(
+    points: NDArray[np.float64],
+    colors: NDArray[np.float64] | None,
+    size: float,
+    warp: Warp,
+    features: NDArray[np.float32] | None = None,
+) -> VoxelGrid:
     """Voxel grid over finite points.
 
     Parameters
@@ -131,6 +142,7 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
         Voxel edge length, > 0.
     warp : Warp
         To the space in which voxels are cubes of this size.
+    features : (n, d) float32, scaled, or None
 
     Raises
     ------
@@ -164,6 +176,7 @@ def voxel_grid(points: NDArray[np.float64], colors: NDArray[np.float64] | None, 
         colors=colors,
         indptr=indptr,
         neighbours=neighbours,
+        features=None if features is None else group_means(features, voxel_of_point, n_voxels),
     )
 
 
@@ -402,10 +415,12 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
     Raises
     ------
     ValueError
-        One grid has colours and the other has none.
+        One grid has colours or features and the other has none.
     """
     if (a.colors is None) != (b.colors is None):
         raise ValueError("expected colours with both scans or with neither, got them with one")
+    if (a.features is None) != (b.features is None):
+        raise ValueError("expected features with both scans or with neither, got them with one")
     cells = np.vstack((a.cells, b.cells))
     keys, pitch = cell_keys(cells, a.size)
     unique_keys, at, voxel = np.unique(keys, return_index=True, return_inverse=True)
@@ -415,7 +430,7 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
     counts[second] += b.counts
 
     def blend(of_a: NDArray[np.float64], of_b: NDArray[np.float64]) -> NDArray[np.float64]:
-        mean = np.zeros((len(counts), 3))
+        mean = np.zeros((len(counts), of_a.shape[1]))
         mean[first] = of_a
         fraction = (b.counts / counts[second])[:, None]
         mean[second] += fraction * (of_b - mean[second])
@@ -423,6 +438,7 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
 
     warped = blend(a.warped, b.warped)
     colors = None if a.colors is None or b.colors is None else blend(a.colors, b.colors)
+    features = None if a.features is None or b.features is None else blend(a.features, b.features)
     centroids = a.warp.backward(warped)
     points_of_b = np.zeros(len(counts) + 1, np.int64)
     points_of_b[second + 1] = b.counts
@@ -441,5 +457,6 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
         colors=colors,
         indptr=indptr,
         neighbours=neighbours,
+        features=features,
     )
     return GridUnion(grid, first, second)

@@ -246,6 +246,28 @@ def test_version():
     assert pcgraph.__version__ == project["version"]
 
 
+def test_features_by_name_and_columns_from_end_to_end(tmp_path):
+    points, truth, _ = two_boxes_on_a_plane()
+    columns = {"Intensity": (900 + 70 * truth).astype(np.uint16), "time": 1.7e9 + np.arange(len(points)) * 1e-6}
+    stored = {name: points[:, i] for i, name in enumerate("xyz")} | columns
+    (tmp_path / "a.ply").write_bytes(encode_ply(stored))
+    done = run(tmp_path / "a.ply", "--out", tmp_path, "--features", "Intensity", "--features", "time", *VIEW)
+    assert done.exit_code == 0, done.output
+    expected = pcgraph.segment(points, viewpoint=(0.8, -1, 3), features=np.stack([*columns.values()], axis=1))
+    read = pcgraph.read_cloud(tmp_path / "a.segments.ply")
+    assert np.array_equal(read.columns.pop("supervoxels"), expected.supervoxels)
+    with np.load(tmp_path / "a.segments.npz") as arrays:
+        assert arrays["node_features"].shape == (expected.graph.n_nodes, 2)
+        for name, column in columns.items():
+            for written in (read.columns[name], arrays[f"column_{name}"]):
+                assert written.dtype == column.dtype
+                assert np.array_equal(written, column)
+    (tmp_path / "a.segments.ply").unlink()
+    (tmp_path / "a.segments.npz").unlink()
+    done = run(tmp_path / "a.ply", "--out", tmp_path / "b.ply", "--features", "rings")
+    assert_refused(done, "got 'rings'; there are: Intensity, time", tmp_path, ["a.ply"])
+
+
 def test_warnings_are_a_line_on_stderr(tmp_path):
     points = np.random.default_rng(0).uniform(0, 1, (900, 3))
     pcgraph.write_segmentation(tmp_path / "a.ply", pcgraph.Cloud(points), pcgraph.segment(points, voxel_size=0.3))

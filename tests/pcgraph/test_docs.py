@@ -14,10 +14,10 @@ from pcgraph.metrics import level_curves
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 HEADER = """VERSION 0.7
-FIELDS x y z rgb label
-SIZE 4 4 4 4 4
-TYPE F F F U U
-COUNT 1 1 1 1 1
+FIELDS x y z rgb label intensity
+SIZE 4 4 4 4 4 2
+TYPE F F F U U U
+COUNT 1 1 1 1 1 1
 WIDTH 80
 HEIGHT 60
 VIEWPOINT 0 0 0 1 0 0 0
@@ -40,7 +40,7 @@ def table_with_a_box() -> str:
     labels = np.where(np.isnan(points[..., 0]), 0, np.where(hit, 20, 1)).ravel()
     shades = np.where(hit, 0xC05020, 0x808890).ravel()
     lines = (
-        f"{x:.6g} {y:.6g} {z:.6g} {shade} {label}"
+        f"{x:.6g} {y:.6g} {z:.6g} {shade} {label} {900 + 40 * label}"
         for (x, y, z), shade, label in zip(points.reshape(-1, 3), shades, labels, strict=True)
     )
     return HEADER + "\n".join(lines) + "\n"

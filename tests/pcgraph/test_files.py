@@ -222,3 +222,162 @@ def test_damaged_files_never_crash(data):
     except CloudReadError:
         return
     assert cloud.points.shape[-1] == 3
+
+
+# --- further columns --------------------------------------------------------------------------------------------------
+
+COLUMNS = {
+    "intensity": np.array([0.1, np.nan, -3.5, 1e30], np.float32),
+    "GpsTime": np.array([1.6e9 + 1e-6, 0.0, -1.0, 2.0]),
+    "ring": np.array([0, 127, 65535, 9], np.uint16),
+    "echo": np.array([-128, 0, 1, 127], np.int8),
+    "beam": np.array([-32768, 0, 1, 32767], np.int16),
+    "classification": np.array([0, 2, 6, 255], np.uint8),
+    "row": np.array([-(2**31), 0, 1, 2**31 - 1], np.int32),
+    "id": np.array([0, 1, 2, 2**32 - 1], np.uint32),
+}
+OF_PCD = {
+    "stamp": np.array([-(2**63), 0, 2**53 + 1, 2**63 - 1], np.int64),
+    "hash": np.array([0, 1, 2**53 + 1, 2**64 - 1], np.uint64),
+    "spectrum": np.arange(12, dtype=np.float32).reshape(4, 3),
+}
+
+
+def table_of(columns, order="<"):
+    """Rows of x, y, z and these columns."""
+    fields = [(name, column.dtype.newbyteorder(order), column.shape[1:]) for name, column in columns.items()]
+    rows = np.empty(4, np.dtype([(axis, order + "f4") for axis in "xyz"] + fields))
+    for i, axis in enumerate("xyz"):
+        rows[axis] = XYZ[:, i]
+    for name, column in columns.items():
+        rows[name] = column
+    return rows
+
+
+def words_of(row) -> str:
+    return " ".join(repr(number) for value in row.tolist() for number in np.ravel(np.asarray(value, object)))
+
+
+def pcd_of(columns, data: str) -> bytes:
+    rows = table_of(columns)
+    kinds = [rows.dtype[name] for name in rows.dtype.names]
+    counts = [int(np.prod(kind.shape)) for kind in kinds]
+    header = (
+        f"VERSION 0.7\nFIELDS {' '.join(rows.dtype.names)}\nSIZE {' '.join(str(k.base.itemsize) for k in kinds)}\n"
+        f"TYPE {' '.join(k.base.kind.upper() for k in kinds)}\nCOUNT {' '.join(map(str, counts))}\n"
+        f"WIDTH 2\nHEIGHT 2\nDATA {data}\n"
+    ).encode()
+    if data == "ascii":
+        return header + "\n".join(words_of(row) for row in rows).encode()
+    if data == "binary":
+        return header + rows.tobytes()
+    plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names)
+    literals = b"".join(bytes([len(plain[i : i + 32]) - 1]) + plain[i : i + 32] for i in range(0, len(plain), 32))
+    return header + struct.pack("<II", len(literals), len(plain)) + literals
+
+
+def ply_of(columns, code: str) -> bytes:
+    rows = table_of(columns, ">" if "big" in code else "<")
+    kinds = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "i2": "short", "u2": "ushort", "i4": "int"}
+    kinds["u4"] = "uint32"
+    lines = [f"property {kinds[rows.dtype[name].str[1:]]} {name}" for name in rows.dtype.names]
+    header = "\n".join(["ply", f"format {code} 1.0", "element vertex 4", *lines, "end_header"]) + "\n"
+    return header.encode() + ("\n".join(map(words_of, rows)).encode() if code == "ascii" else rows.tobytes())
+
+
+def assert_same_columns(found, expected):
+    assert list(found) == list(expected)
+    for name, column in expected.items():
+        assert found[name].dtype == column.dtype, name
+        assert found[name].dtype.isnative
+        assert np.array_equal(found[name].reshape(column.shape), column, equal_nan=column.dtype.kind == "f"), name
+
+
+@pytest.mark.parametrize("data", BODIES)
+def test_pcd_columns_come_as_they_are_stored(data):
+    columns = COLUMNS | OF_PCD
+    cloud = read_pcd(pcd_of(columns, data))
+    assert cloud.organised
+    assert cloud.columns["ring"].shape == (2, 2)
+    assert cloud.columns["spectrum"].shape == (2, 2, 3)
+    assert_same_columns(cloud.columns, columns)
+
+
+@pytest.mark.parametrize("code", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply_columns_come_as_they_are_stored(code):
+    assert_same_columns(read_ply(ply_of(COLUMNS, code)).columns, COLUMNS)
+
+
+def test_names_in_any_case_and_padding_as_pcl_writes_it():
+    columns = {"Red": np.uint8([1, 2, 3, 4]), "GREEN": np.uint8([5, 6, 7, 8]), "blue": np.uint8([0, 0, 0, 9])}
+    columns |= {"_": np.zeros((4, 3), np.uint8), "Label": np.int32([1, 2, 3, 4]), "rgb": np.float64([0, 0, 0, 0])}
+    cloud = read_pcd(pcd_of(columns, "binary"))
+    assert cloud.colors[1, 1].tolist() == [4, 8, 9]
+    assert cloud.labels.tolist() == [[1, 2], [3, 4]]
+    assert list(cloud.columns) == ["rgb"]  # not of four bytes, so no packed colour
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A plane with a NaN, noise around it, and columns of every type."""
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(np.arange(50) * 0.1, np.arange(50) * 0.1)
+    plane = np.stack((x, y, np.zeros_like(x)), axis=-1).reshape(-1, 3)
+    points = np.concatenate((plane, rng.uniform((0, 0, 0.5), (5, 5, 5), (300, 3))))
+    points[7] = np.nan
+    n = len(points)
+    columns = {name: np.resize(column, (n, *column.shape[1:])) for name, column in (COLUMNS | OF_PCD).items()}
+    columns |= {"noise": rng.standard_normal(n), "small": rng.random(n).astype(np.float16)}
+    columns |= {"seen": rng.random(n) < 0.5, "labels": np.arange(n, dtype=np.int32)}
+    cloud = pcgraph.Cloud(points, columns=columns)
+    return cloud, pcgraph.segment(cloud, viewpoint=(2.5, 2.5, 9.0), voxel_size=0.35)
+
+
+def test_columns_are_written_back(scene, tmp_path):
+    cloud, result = scene
+    assert result.outliers.sum() > 50
+    with pytest.warns(UserWarning, match=r"the column '(stamp|hash)' to doubles"):
+        pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
+    finite = np.isfinite(cloud.points[:, 0])
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert_same_columns({n: read.columns[n] for n in COLUMNS}, {n: cloud.columns[n][finite] for n in COLUMNS})
+    assert np.array_equal(read.columns["noise"], cloud.columns["noise"][finite])
+    assert np.array_equal(read.columns["small"], cloud.columns["small"][finite].astype(np.float32))
+    assert np.array_equal(read.columns["seen"], cloud.columns["seen"][finite])
+    assert np.array_equal(read.columns["spectrum_2"], cloud.columns["spectrum"][finite, 2])
+    assert np.array_equal(read.columns["stamp"], cloud.columns["stamp"][finite].astype(float))
+    assert np.array_equal(read.labels, result.labels[finite])  # the result's own, not the column of that name
+    pcgraph.write_segmentation(tmp_path / "a.npz", cloud, result)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert_same_columns({name: arrays[f"column_{name}"] for name in cloud.columns}, cloud.columns)
+        assert np.array_equal(arrays["labels"], result.labels)
+
+
+def test_a_result_is_read_and_written_again(scene, tmp_path):
+    cloud, result = scene
+    cloud = pcgraph.Cloud(cloud.points, columns={n: cloud.columns[n] for n in COLUMNS})
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
+    again = pcgraph.read_cloud(tmp_path / "a.ply")
+    pcgraph.write_segmentation(tmp_path / "b.ply", again, pcgraph.segment(again, voxel_size=0.35))
+    twice = pcgraph.read_cloud(tmp_path / "b.ply")
+    assert_same_columns({n: twice.columns[n] for n in COLUMNS}, {n: again.columns[n] for n in COLUMNS})
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "message"),
+    [
+        ("two words", np.zeros(2800), "one word of Latin letters, got 'two words'"),
+        ("", np.zeros(2800), "one word of Latin letters"),
+        ("∂", np.zeros(2800), "one word of Latin letters"),
+        (3, np.zeros(2800), "one word of Latin letters, got 3"),
+        ("a", np.zeros(2799), r"the column 'a' in the points' shape \(2800,\), got \(2799,\)"),
+        ("a", np.zeros((2800, 1, 1)), "the column 'a' in the points' shape"),
+        ("a", np.full(2800, "x"), "the column 'a' as an array of numbers"),
+        ("a", [0] * 2800, "the column 'a' as an array of numbers, got list"),
+    ],
+)
+@pytest.mark.parametrize("file", ["a.ply", "a.npz"])
+def test_columns_that_cannot_be_written(name, column, message, file, scene, tmp_path):
+    with pytest.raises(pcgraph.CloudWriteError, match=message):
+        pcgraph.write_segmentation(tmp_path / file, pcgraph.Cloud(scene[0].points, columns={name: column}), scene[1])
+    assert not list(tmp_path.iterdir())

@@ -43,7 +43,8 @@ def test_results_print_in_five_lines(boxes):
     graph = metrics.NeighbourGraph.of(points)
     curve = metrics.level_curve(result.tree, result.supervoxels, truth)
     things = [
-        *(pcgraph.Cloud(points), result, result.graph, result.graph.edge_features, result.graph.node_features),
+        *(pcgraph.Cloud(points), pcgraph.Cloud(points, columns={"x" * 99 + str(i): points for i in range(40)})),
+        *(result, result.graph, result.graph.edge_features, result.graph.node_features),
         *(result.tree, result.tree.moments, result.tree.features(), result.surface, result.surface.grid),
         *(result.primitives(), result.occlusions(), pcgraph.plane_energy(result.tree, result.graph), planes),
         *(*detection.objects_on(result, planes), graph, curve, metrics.best_scales([curve])),
