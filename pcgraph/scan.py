@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,7 +49,8 @@ SEEDS_PER_VOXEL = 6.0
 RANGE_GROWTH = 0.5
 _FEW_OUTLIERS = 0.95  # of the points are left
 _MIN_JOINED = 0.5  # of the voxels
-_MIN_GAIN = 0.1
+_DOUBLINGS = 5
+_MIN_VOXELS = 500
 
 
 def segment(
@@ -141,7 +143,7 @@ def segment(
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
     _warn_of_input(points, cloud, voxel_size, voxel)
     if voxel_size is None:
-        grid = _without_dust(cloud, grid, seed)
+        grid = _without_dust(cloud, grid, math.inf if seed_size is None else seed)
         seed = SEEDS_PER_VOXEL * grid.size if seed_size is None else seed
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     if place is not None and place.ndim == 1 and viewpoint is not None:
@@ -392,17 +394,22 @@ def _warn_of_input(points: Points, cloud: CleanCloud, given_size: float | None, 
         warn_of_duplicates(cloud.points, spacing)
 
 
-def _without_dust(cloud: CleanCloud, grid: VoxelGrid, seed_size: float) -> VoxelGrid:
-    """The grid, or one of voxels twice or four times as large where that makes a surface of what falls apart.
+def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
+    """The grid, or one of larger voxels, by powers of two, where that makes a surface of what falls apart.
 
-    On a surface most voxels have at least five others around them.
+    On a surface most voxels have at least five others around them. What is no surface at any size, as a line, stays.
     """
-    joined = _joined(grid)
-    while joined < _MIN_JOINED and grid.size < seed_size:
-        larger = voxel_grid(cloud.points, cloud.colors, 2.0 * grid.size, grid.warp, cloud.features)
-        if _joined(larger) < joined + _MIN_GAIN:
-            break  # a line stays a line
-        grid, joined = larger, _joined(larger)
+    if _joined(grid) >= _MIN_JOINED:
+        return grid
+    larger = grid
+    for _ in range(_DOUBLINGS):
+        if 2.0 * larger.size > largest:
+            break
+        larger = voxel_grid(cloud.points, cloud.colors, 2.0 * larger.size, grid.warp, cloud.features)
+        if larger.n_voxels < _MIN_VOXELS:
+            break
+        if _joined(larger) >= _MIN_JOINED:
+            return larger
     return grid
 
 

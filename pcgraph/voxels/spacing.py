@@ -15,7 +15,7 @@ from pcgraph.short_repr import ShortRepr
 
 _SAMPLE = 4096  # points whose nearest neighbour is sought
 _CROWD = 1 << 16  # points among which it is sought, about
-_BLOCKS = 16  # of space, along each axis
+_BLOCKS = 32  # of space, along each axis
 _NO_SPACING_M = 0.01
 _THIN = 0.01  # of its extent: a cloud whose points, at their spacing, cover so little
 _THINNED = 1 << 14  # points among which the law of spacing is looked for,
@@ -112,7 +112,11 @@ def _some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The points of as many blocks of space as it takes for a crowd, the blocks by their hashes."""
+    """The points of as many blocks of space as it takes for a crowd, the blocks by their hashes.
+
+    A block is as likely as it holds points (Efraimidis and Spirakis 2006): the crowd is as dense as the cloud, however
+    that lies to the axes.
+    """
     low, high = bounding_box(points)
     edge = float((high - low).max()) / _BLOCKS
     if not edge > 0.0:
@@ -121,7 +125,8 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     in_blocks(_find_block, len(points), points, low, edge, block)
     counts = np.bincount(block, minlength=_BLOCKS**3)
     numbers: NDArray[np.uint64] = np.arange(_BLOCKS**3, dtype=np.uint64)
-    order = np.argsort(_mixed(numbers), kind="stable")
+    chances = (_mixed(numbers) >> np.uint64(11)).astype(np.float64) * 2.0**-53 + 2.0**-54  # 0..1, without both
+    order = np.argsort(-np.log(chances) / np.maximum(counts, 1e-9), kind="stable")
     taken = np.zeros(_BLOCKS**3, bool)
     taken[order] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
     return points[np.flatnonzero(taken[block])]
