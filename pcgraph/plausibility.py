@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.voxels.grid import VoxelGrid
-from pcgraph.voxels.spacing import bounding_box
+from pcgraph.voxels.spacing import bounding_box, median_spacing
 from pcgraph.voxels.visibility import seen_from
 
 _STEPS_PER_SPACING = 4.0  # of floating-point numbers: fewer, and points lie on a lattice of rounding
@@ -23,7 +23,7 @@ class CloudWarning(UserWarning):
     """Something about a cloud, or about what became of it, that cannot be right."""
 
 
-def warn_of_rounding(given: ArrayLike, points: NDArray[np.float64], spacing: float) -> None:
+def warn_of_rounding(given: ArrayLike, points: NDArray[np.float64], spacing: float | None) -> None:
     """Warn where float32 cannot tell neighbours apart, so far from the origin are they.
 
     Parameters
@@ -32,11 +32,13 @@ def warn_of_rounding(given: ArrayLike, points: NDArray[np.float64], spacing: flo
         Points as they came in.
     points : (n, 3) float64, metres
         The finite ones.
-    spacing : float, metres
+    spacing : float, metres, optional
+        If it is known; else it is read where it matters.
     """
     dtype = getattr(given, "dtype", None)
     if dtype is None or dtype.kind != "f" or dtype.itemsize > 4:
         return
+    spacing = median_spacing(points) if spacing is None else spacing
     farthest = float(np.abs(bounding_box(points)).max())
     step = float(np.spacing(np.asarray(farthest, dtype)))
     if _STEPS_PER_SPACING * step > spacing:

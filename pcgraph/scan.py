@@ -141,8 +141,10 @@ def segment(
         position, warp = _place_and_warp(cloud, place, camera, range_growth)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-    _warn_of_input(points, cloud, voxel_size, voxel)
-    if voxel_size is None:
+    spacing = voxel / VOXELS_PER_SPACING if voxel_size is None else None
+    warn_of_rounding(points, cloud.points, spacing)  # type: ignore[arg-type]
+    if spacing is not None:
+        warn_of_duplicates(cloud.points, spacing)
         grid = _without_dust(cloud, grid, math.inf if seed_size is None else seed)
         seed = SEEDS_PER_VOXEL * grid.size if seed_size is None else seed
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
@@ -385,13 +387,6 @@ def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
     return voxel, seed
-
-
-def _warn_of_input(points: Points, cloud: CleanCloud, given_size: float | None, voxel: float) -> None:
-    spacing = voxel / VOXELS_PER_SPACING if given_size is None else median_spacing(cloud.points)
-    warn_of_rounding(points, cloud.points, spacing)  # type: ignore[arg-type]
-    if given_size is None:
-        warn_of_duplicates(cloud.points, spacing)
 
 
 def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:

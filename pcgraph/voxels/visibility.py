@@ -85,24 +85,17 @@ def visible_sides(grid: VoxelGrid) -> VisibleSides:
     return VisibleSides(middle + reach * places[0], grid.centroids + towards * (_FAR * grid.edge_lengths)[:, None])
 
 
-def visible_from(
-    place: NDArray[np.float64], centres: NDArray[np.float64], widths: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Whether each of n squares is visible from a place, (n,) bool: none is in front of it by more than its own depth.
-
-    Parameters
-    ----------
-    place : (3,) float64, metres
-    centres : (n, 3) float64, metres
-    widths : (n,) float64, metres
-    """
-    return seen_from(place[None], centres, widths)[0]
-
-
 def seen_from(
     places: NDArray[np.float64], centres: NDArray[np.float64], widths: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether each of n squares is visible from each of k places, (k, n) bool; see `visible_from`."""
+    """Whether each of n squares is visible from each of k places, (k, n) bool: none is in front by more than its depth.
+
+    Parameters
+    ----------
+    places : (k, 3) float64, metres
+    centres : (n, 3) float64, metres
+    widths : (n,) float64, metres
+    """
     seen = np.empty((len(places), len(centres)), np.bool_)
     some = slice(None, None, max(1, len(centres) // 1000))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)

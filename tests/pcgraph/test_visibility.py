@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import pcgraph
 from pcgraph.voxels.spacing import spacing_law
-from pcgraph.voxels.visibility import visible_from
+from pcgraph.voxels.visibility import seen_from
 
 
 def faces(low, high, spacing, sides="-x +x -y +y -z +z"):
@@ -70,7 +70,7 @@ def test_things_on_the_ground_are_seen_from_above():
 
 def test_a_square_in_front_hides_one_behind():
     near, behind, beside = [0.0, 0.0, 1.0], [0.02, 0.0, 3.0], [1.0, 0.0, 3.0]
-    seen = visible_from(np.zeros(3), np.array([near, behind, beside]), np.full(3, 0.2))
+    seen = seen_from(np.zeros((1, 3)), np.array([near, behind, beside]), np.full(3, 0.2))[0]
     assert seen.tolist() == [True, False, True]
 
 
