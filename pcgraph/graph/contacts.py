@@ -57,8 +57,30 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
     edge_of_pair[order] = np.arange(len(keys))
     edges = np.stack((keys[order] >> 32, keys[order] & 0xFFFFFFFF), axis=1).astype(np.int32)
     edge = edge_of_pair[pair]
-    side = 2 * edge + (supervoxels[voxel] > other)
-    n_sides = 2 * len(keys)
+    return facing_sides(grid, normals, edges, voxel, 2 * edge + (supervoxels[voxel] > other))
+
+
+def facing_sides(
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    edges: NDArray[np.int32],
+    voxel: NDArray[np.integer],
+    side: NDArray[np.int64],
+) -> Contacts:
+    """Contacts from the voxels on either side of them.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    normals : (v, 3) float64
+        Unit normals of the voxels.
+    edges : (m, 2) int32
+    voxel : (b,) int
+        A voxel that faces the other side, once per side of a contact.
+    side : (b,) int64
+        2 e of edge e where it lies on the side of the smaller supervoxel, else 2 e + 1.
+    """
+    n_sides = 2 * len(edges)
     voxels = np.bincount(side, minlength=n_sides)
 
     def sums(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -68,12 +90,13 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
     directions = sums(normals)
     x, y, z = directions.T
     norms = np.sqrt(x * x + y * y + z * z)
+    lengths = np.bincount(side >> 1, 0.5 * grid.edge_lengths[voxel], len(edges))
     return Contacts(
         edges=edges,
         voxels=voxels.reshape(-1, 2),
         positions=(sums(grid.centroids) / voxels[:, None]).reshape(-1, 2, 3),
         normals=(directions / np.maximum(norms, 1e-12)[:, None]).reshape(-1, 2, 3),
-        lengths=np.bincount(edge, 0.5 * grid.edge_lengths[voxel], len(keys)).astype(np.float64),  # int64 if m is 0
+        lengths=lengths.astype(np.float64),  # int64 if there is none
     )
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
-from pcgraph.graph.contacts import Contacts, edge_features
+from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.voxels.grid import VoxelGrid
 
 _WIDTH = 3.0  # voxel edges between centroids, at most
@@ -60,23 +60,8 @@ def gaps(
     voxel, own, other, width, key = voxel[first], own[first], other[first], width[first], key[first]
     keys, edge = np.unique(key, return_inverse=True)
     edges = np.stack((keys // k, keys % k), axis=1).astype(np.int32)
-    n = len(edges)
-    side = 2 * edge + (own > other)
-    voxels = np.bincount(side, minlength=2 * n)
-
-    def sums(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack([np.bincount(side, rows[:, axis], 2 * n) for axis in range(3)], axis=1).astype(np.float64)
-
-    directions = sums(normals[voxel])
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    shortest = np.full(n, np.inf)
+    facing = facing_sides(grid, normals, edges, voxel, 2 * edge + (own > other))
+    shortest = np.full(len(edges), np.inf)
     np.minimum.at(shortest, edge, width)
-    facing = Contacts(
-        edges=edges,
-        voxels=voxels.reshape(-1, 2),
-        positions=(sums(grid.centroids[voxel]) / np.maximum(voxels, 1)[:, None]).reshape(-1, 2, 3),
-        normals=directions.reshape(-1, 2, 3),
-        lengths=np.bincount(edge, 0.5 * grid.edge_lengths[voxel], n).astype(np.float64),
-    )
-    weights = np.bincount(edge, np.exp(1.0 - width), n).astype(np.float64)
+    weights = np.bincount(edge, np.exp(1.0 - width), len(edges)).astype(np.float64)
     return Gaps(edges, edge_features(nodes, facing), shortest, weights)
