@@ -23,16 +23,22 @@ from pcgraph.voxels.warp import Warp
 _CELLS = 3000  # of the coarse grid on which places are compared, about
 _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
-_INSIDE = 48  # free places within the bounding box, of a lattice of
-_LATTICE = 8  # along each side
-_CLEARANCE = 2.5  # cells between a free place and the next surface
+_INSIDE = 64  # free places within the bounding box, of a lattice of
+_LATTICE = 12  # along each side
+_CLEARANCE = 2.0  # cells between a free place and the next surface
+_AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
+_SPREAD = 0.75  # of the free places lie far from each other, the others far from surfaces
 _ROUNDS = 12  # of agreement between places and orientations
+_HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, and from
+_LEADERS = 6  # single places
+_WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
+_DECIDED, _OUTSIDE_IN, _LIKELY = 0.05, 0.006, 0.004  # what counts where as much is seen
+_WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y
 _VIEWS = 12  # places that the voxels themselves are looked at from
-_CLOSED = 0.95  # of all directions hit by something: a hollow seen from within,
-_OPEN = 0.99  # of the voxels visible from outside: there is nothing in it
 _FILLING = 4  # rounds of orientation by the voxels around, of those that are seen from nowhere
 _BINS_PER_RADIAN = 0.282  # of the octahedral map, over its width
 
+_TINY = 1e-12
 _FAR = 1e3  # voxel edges from a voxel to its orientation point
 
 
@@ -62,18 +68,21 @@ def visible_sides(grid: VoxelGrid) -> VisibleSides:
     Notes
     -----
     Places all around the cloud, and free places within its bounding box, see the cells of a coarse copy of the grid,
-    by a depth buffer over directions. The place that sees most says which side of what it sees is the outside. Others
-    count as far as they agree with this, so a place under the floor, which sees it from below, counts nothing. The
+    by a depth buffer over directions. A place counts as far as it agrees with others which side of what it sees is the
+    outside; so if those above the floor are right, one under it, which sees it from below, counts nothing. There are
+    several such agreements: within a room, around it, above it, below. All that was measured was seen from somewhere,
+    so the right one is that whose places see all of the surface, where others have furniture hidden by walls. Where
+    two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
+    sides, then how much of what is seen from outside has its outside there, and how much of what is seen from the
+    upper half of these places, or from the origin if all lies before it as before a camera that looks along z. The
     voxels then take the mean direction to the places that see them, those that none sees from the voxels around.
-    What stands on a ground or a table hides nothing from below, either, so the first place is not one below (-z).
-    A hollow closed all around, with nothing in it, is an object seen from outside, not a room.
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
     low, high = bounding_box(grid.centroids)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()) / 2.0, float(grid.edge_lengths.min()))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
-    places, weights = _telling_places(centres, widths)
+    places, weights = _telling_places(centres, widths, -middle / reach)
     towards = np.empty((grid.n_voxels, 3))
     in_blocks(_look_around, grid.n_voxels, places, weights, seen_from(places, centres, widths), centres, towards)
     filled = np.empty_like(towards)
@@ -107,11 +116,11 @@ def seen_from(
 
 def _lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lengths of rows, (n,), of the order of 1; of zeros nearly nothing."""
-    return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), 1e-12)
+    return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
 
 
 def _telling_places(
-    centres: NDArray[np.float64], widths: NDArray[np.float64]
+    centres: NDArray[np.float64], widths: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (k, 3) from which the outside is seen, and how much each counts, (k,), the first most."""
     coarse = _coarse(centres, float(np.median(widths)))
@@ -120,21 +129,79 @@ def _telling_places(
     outside = (low + high) / 2.0 + _DISTANCE * _lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
-    places = np.concatenate((outside, inside))
+    from_origin = coarse.centroids - origin
+    is_camera = bool((np.abs(from_origin[:, :2]).max(axis=1) < _WIDE * from_origin[:, 2]).all())
+    places = np.concatenate((outside, inside, origin[None] if is_camera else outside[:0]))
+    likely = np.arange(len(places)) == len(places) - 1 if is_camera else np.arange(len(places)) < _OUTSIDE // 2
     upwards = np.zeros((coarse.n_voxels, 3))
     upwards[:, 2] = 1.0
     normals = fitted_windows(coarse, upwards).normals
-    sides = np.where(seen_from(places, coarse.centroids, coarse.edge_lengths), 1.0, 0.0)
+    sides = np.where(seen_from(places, coarse.centroids, coarse.edge_lengths), np.float32(1.0), np.float32(0.0))
     for k, place in enumerate(places):
         rays = place - coarse.centroids
         sides[k] *= np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
-    is_closed = np.array([_hit_directions(coarse.centroids - place) > _CLOSED for place in inside], bool)
-    if is_closed.any() and seen_from(outside, centres, widths).any(axis=0).mean() > _OPEN:
-        chosen = _spread_choice(sides[: len(outside)] != 0.0, np.ones(len(outside)))
-        return outside[chosen], np.ones(len(chosen))
-    weights = _agreement(sides, places[:, 2] >= low[2])
+    weights = _most_telling(_agreements(sides, _starts(sides, outside, likely)), sides, coarse, likely)
     chosen = _spread_choice(sides != 0.0, weights)
     return places[chosen], weights[chosen]
+
+
+def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Weights of the places, (s, k), from which agreement may start: first opinions as different as there are."""
+    starts = np.zeros((_HALVES + 3 + _LEADERS, len(sides)), np.float32)
+    starts[:_HALVES, :_OUTSIDE] = sphere_directions(_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
+    starts[_HALVES, :_OUTSIDE] = 1.0
+    starts[_HALVES + 1, _OUTSIDE:] = 1.0
+    starts[_HALVES + 2] = likely
+    unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
+    for start in starts[_HALVES + 3 :]:
+        news = np.maximum(sides, 0.0) @ unseen[0] + np.maximum(-sides, 0.0) @ unseen[1]
+        leader = int(np.argmax(news))
+        start[leader] = 1.0
+        unseen[0, sides[leader] > 0.0] = 0.0
+        unseen[1, sides[leader] < 0.0] = 0.0
+    return starts[starts.any(axis=1)]
+
+
+def _agreements(sides: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """How much each place counts, (s, k), >= 0, in each of the agreements that s first opinions, (s, k), come to.
+
+    Given the sides that each place sees, (k, n): signed cosines, 0 hidden. What is found, by turns, is nearly a pair of
+    singular vectors, but no place counts against what it sees.
+    """
+    visible = np.abs(sides)
+    for _ in range(_ROUNDS):
+        outward = np.sign(weights @ sides)
+        agreed = np.maximum(outward @ sides.T, 0.0)
+        weights = np.sqrt(agreed) * (agreed / np.maximum(np.abs(outward) @ visible.T, _TINY)) ** 4
+        weights /= np.maximum(weights.max(axis=1, keepdims=True), _TINY)
+    return weights
+
+
+def _most_telling(
+    agreements: NDArray[np.float32],
+    sides: NDArray[np.float32],
+    coarse: VoxelGrid,
+    likely: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Weights of the places, (k,) float64, in the agreement that shows most of the surface."""
+    cells = np.repeat(np.arange(coarse.n_voxels), np.diff(coarse.indptr))
+    all_sides = np.abs(sides).sum(axis=1)
+    most, best = -np.inf, agreements[0]
+    for weights in agreements:
+        outward = np.sign(weights @ sides)
+        right = np.maximum(sides * outward, 0.0)
+        shown = np.minimum(weights @ right / _WELL_SEEN, 1.0)
+        around = shown.copy()  # a crease is hidden by what is beside it
+        np.maximum.at(around, cells, shown[coarse.neighbours])
+        agreed = right.sum(axis=1)
+        known = np.abs(sides) @ np.abs(outward)
+        decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
+        score = float(around.mean()) + _DECIDED * float(decided[all_sides > 0.0].mean())
+        for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, _LIKELY)):
+            score += counts * float(agreed[some].sum() / max(float(all_sides[some].sum()), _TINY))
+        if score > most:
+            most, best = score, weights
+    return best.astype(np.float64)
 
 
 def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -147,24 +214,6 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
         interest[seen[best]] *= 0.5
         left[best] = 0.0
     return np.array(chosen)
-
-
-def _agreement(sides: NDArray[np.float64], leaders: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """How much each place counts, (k,) float64, >= 0, given the sides that it sees, (k, n): signed cosines, 0 hidden.
-
-    Of the places `leaders`, (k,) bool, the one that sees most is right. What is found, by turns, is nearly the leading
-    pair of singular vectors, but no place counts against what it sees.
-    """
-    weights = np.zeros(len(sides))
-    covered = np.where(leaders, (sides != 0.0).sum(axis=1), -1)
-    weights[int(np.argmax(covered))] = 1.0
-    for _ in range(_ROUNDS):
-        outward = np.sign(weights @ sides)
-        agreed = np.maximum(sides @ outward, 0.0)
-        known = np.abs(sides) @ np.abs(outward)
-        weights = agreed * (agreed / np.maximum(known, np.finfo(np.float64).tiny)) ** 4
-        weights /= max(float(weights.max()), np.finfo(np.float64).tiny)
-    return weights
 
 
 def _coarse(centres: NDArray[np.float64], width: float) -> VoxelGrid:
@@ -183,16 +232,20 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     places = low + lattice * (high - low)
     clearance = cKDTree(coarse.centroids).query(places)[0] / coarse.size
-    order = np.argsort(-clearance, kind="stable")[:_INSIDE]
-    return places[order[clearance[order] > _CLEARANCE]]
-
-
-def _hit_directions(rays: NDArray[np.float64]) -> float:
-    """Fraction of the directions in which there is something, on a map of 12 x 12 bins."""
-    bins = 12
-    hit = np.zeros((bins, bins), np.bool_)
-    _mark(rays, hit)
-    return float(hit.mean())
+    free = np.flatnonzero(clearance > _CLEARANCE)
+    if not len(free):
+        return places[:0]
+    places, clearance, hits = places[free], clearance[free], np.empty(len(free))
+    in_blocks(_count_hits, len(free), places, coarse.centroids, hits)
+    among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
+    chosen = [among[np.argmax(clearance[among])]]
+    nearest = np.full(len(among), np.inf)
+    while len(chosen) < min(int(_SPREAD * _INSIDE), len(among)):
+        nearest = np.minimum(nearest, _lengths(places[among] - places[chosen[-1]]))
+        chosen.append(among[np.argmax(nearest)])
+    order = np.argsort(-clearance, kind="stable")
+    rest = order[~np.isin(order, chosen)][: _INSIDE - len(chosen)]
+    return places[np.concatenate((chosen, rest))]
 
 
 # --- depth buffers over directions ------------------------------------------------------------------------------------
@@ -209,12 +262,18 @@ def _bin_of(x: float, y: float, z: float, bins: int) -> tuple[float, float]:
 
 
 @kernel
-def _mark(rays: NDArray[np.float64], hit: NDArray[np.bool_]) -> None:
-    bins = len(hit)
-    for i in range(len(rays)):
-        if rays[i, 0] != 0.0 or rays[i, 1] != 0.0 or rays[i, 2] != 0.0:
-            u, v = _bin_of(rays[i, 0], rays[i, 1], rays[i, 2], bins)
+def _count_hits(
+    start: int, stop: int, places: NDArray[np.float64], centres: NDArray[np.float64], hits: NDArray[np.float64]
+) -> None:
+    """Set the fraction of directions in which there is something, from each place, on a map of 12 x 12 bins."""
+    bins = 12
+    for k in range(start, stop):
+        hit = np.zeros((bins, bins), np.bool_)
+        for i in range(len(centres)):
+            x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
+            u, v = _bin_of(x, y, z, bins)
             hit[min(int(u), bins - 1), min(int(v), bins - 1)] = True
+        hits[k] = hit.mean()
 
 
 @kernel
@@ -242,14 +301,14 @@ def _look(
                 continue
             u, v = _bin_of(x, y, z, bins)
             at[i] = min(int(u), bins - 1) * bins + min(int(v), bins - 1)
-            half = min(0.5 * widths[i] / ranges[i] * per_radian, 8.0)
+            half = min(0.85 * widths[i] / ranges[i] * per_radian, 24.0)
             for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
                 for q in range(max(int(v - half), 0), min(int(v + half), bins - 1) + 1):
                     if ranges[i] < nearest[p * bins + q]:
                         nearest[p * bins + q] = ranges[i]
         for i in range(n):
             # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-            depth = widths[i] + ranges[i] / per_radian
+            depth = 1.25 * widths[i] + ranges[i] / per_radian
             seen[k, i] = at[i] >= 0 and ranges[i] <= nearest[at[i]] + depth
 
 
