@@ -37,7 +37,7 @@ from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means
-from pcgraph.voxels.outliers import OUTLIER, is_near, outlier_voxels
+from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import bounding_box, median_spacing, spacing_law
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_sides
@@ -48,8 +48,8 @@ VOXELS_PER_SPACING = 3.5
 SEEDS_PER_VOXEL = 6.0
 RANGE_GROWTH = 0.5
 _FEW_OUTLIERS = 0.95  # of the points are left
-_MIN_JOINED = 0.5  # of the voxels
-_DOUBLINGS = 5
+_MIN_JOINED = 0.75  # of the voxels
+_ENLARGEMENTS = 10
 _MIN_VOXELS = 500
 
 
@@ -130,23 +130,22 @@ def segment(
     settings = Settings.of(method or SurfaceGrowth(), linkage or RegionLinkage(), object_altitude)
     cloud = clean_cloud(points, colors, normals, features)
     place = clean_viewpoint(viewpoint, cloud)
-    voxel, seed = _sizes(cloud, voxel_size, seed_size)
     compile_in_two_processes()
-    position, warp = _place_and_warp(cloud, place, camera, range_growth)
-    grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
     n_points = len(cloud.points)
-    cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-    if len(cloud.points) < _FEW_OUTLIERS * n_points:  # spacing and place were those of noise, to a good part
+    for _ in range(2):
         voxel, seed = _sizes(cloud, voxel_size, seed_size)
         position, warp = _place_and_warp(cloud, place, camera, range_growth)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
+        if len(cloud.points) >= _FEW_OUTLIERS * n_points:
+            break  # else spacing and place were those of noise, to a good part
     spacing = voxel / VOXELS_PER_SPACING if voxel_size is None else None
     warn_of_rounding(points, cloud.points, spacing)  # type: ignore[arg-type]
     if spacing is not None:
         warn_of_duplicates(cloud.points, spacing)
         grid = _without_dust(cloud, grid, math.inf if seed_size is None else seed)
         seed = SEEDS_PER_VOXEL * grid.size if seed_size is None else seed
+    cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
@@ -214,7 +213,7 @@ def update(
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp, cloud.features)
-    lonely = outlier_voxels(seen) & ~is_near(seen, before.grid)
+    lonely = (outlier_voxels(seen) | detached_voxels(seen)) & ~is_near(seen, before.grid)
     cloud, seen, position = _without(lonely, cloud, seen, position)
     union = grid_union(before.grid, seen)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
@@ -390,17 +389,17 @@ def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None)
 
 
 def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
-    """The grid, or one of larger voxels, by powers of two, where that makes a surface of what falls apart.
+    """The grid, or one of larger voxels, by steps of half a power of two, where that joins what falls apart.
 
     On a surface most voxels have at least five others around them. What is no surface at any size, as a line, stays.
     """
     if _joined(grid) >= _MIN_JOINED:
         return grid
     larger = grid
-    for _ in range(_DOUBLINGS):
-        if 2.0 * larger.size > largest:
+    for _ in range(_ENLARGEMENTS):
+        if math.sqrt(2.0) * larger.size > largest:
             break
-        larger = voxel_grid(cloud.points, cloud.colors, 2.0 * larger.size, grid.warp, cloud.features)
+        larger = voxel_grid(cloud.points, cloud.colors, math.sqrt(2.0) * larger.size, grid.warp, cloud.features)
         if larger.n_voxels < _MIN_VOXELS:
             break
         if _joined(larger) >= _MIN_JOINED:

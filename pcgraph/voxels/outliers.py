@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
 from pcgraph.parallel import in_blocks, kernel
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid, voxel_grid
 from pcgraph.voxels.spacing import bounding_box
+from pcgraph.voxels.warp import Warp
 
 OUTLIER = -2
 """Label of a point that belongs to nothing."""
@@ -24,6 +27,11 @@ _MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
 _REACH = 3.0  # voxel edges, as far as gaps are bridged
 _VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * _REACH**3
 _MAX_FRACTION = 2.0 / 3.0
+_CONCENTRATED = 6.0  # times the mean density, as noise in voxels that grow with range is not
+_PIECE = 5  # points: fewer, all alone, are no object
+_BOUNDARY = 8  # voxels around one amid a surface, as for gaps
+_OF_SURFACE = 5  # voxels around one that lies on a surface, and more
+_DOUBLINGS = 3  # of voxels, at which what may be an outlier is looked at alone
 
 
 def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
@@ -39,8 +47,9 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     of this density had, with a chance of more than 1 in 10 000, as many points in the voxels around it. Where noise is
     so thin that a reach of three voxel edges is nearly empty of it, there must be as few points within that reach, too,
     so that the thin far end of a scan is not taken for noise. Where many are outliers, so are the few points of voxels
-    beside full ones. Clouds of fewer than 1000 points, and those of which more
-    than two thirds would be outliers, have none.
+    beside full ones. What has been found is then looked at alone, in voxels of two, four and eight times the size: a
+    coarse scan beside a fine one is a surface there, and no outlier. Clouds of fewer than 1000 points, and those of
+    which more than two thirds would be outliers, have none.
     """
     nothing = np.zeros(grid.n_voxels, np.bool_)
     n_points = int(grid.counts.sum())
@@ -68,7 +77,65 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     if grid.counts[outlier].sum() > _MUCH_NOISE * n_points:  # then some lies beside surfaces, in voxels of its own
         degrees = np.maximum(np.diff(grid.indptr), 1)
         outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _FAINT * others / degrees)
+    outlier &= ~_surfaces_among(outlier, grid)
     return outlier if grid.counts[outlier].sum() <= _MAX_FRACTION * n_points else nothing
+
+
+def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bool_]:
+    """Which of some voxels, (v,) bool, lie, in larger voxels of those alone, denser than noise through the volume."""
+    found = np.zeros(len(voxels), np.bool_)
+    low, high = bounding_box(grid.cells)
+    for doubling in range(1, _DOUBLINGS + 1):
+        alone = np.flatnonzero(voxels & ~found)
+        if not len(alone):
+            break
+        size = 2.0**doubling
+        larger = voxel_grid(grid.warped[alone] / grid.size, None, size, Warp())
+        counts = np.bincount(larger.voxel_of_point, grid.counts[alone], larger.n_voxels).astype(np.int64)
+        around = np.empty(larger.n_voxels, np.int64)
+        in_blocks(_count_around, larger.n_voxels, larger.indptr, larger.neighbours, counts, around)
+        volume = float(np.prod(np.maximum((high - low + 1.0) / size, _MIN_EXTENT / size)))
+        expected = float(counts.sum()) / volume * (MAX_NEIGHBOURS + 1)
+        dense = around >= max(_least_significant(expected), _CONCENTRATED * expected)
+        dense &= np.diff(larger.indptr) >= _OF_SURFACE
+        found[alone[dense[larger.voxel_of_point]]] = True
+    return found
+
+
+def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
+    """Voxels of pieces of at most four points that have nothing else within three voxel edges, (v,) bool.
+
+    No contact and no gap (`pcgraph.graph.gaps.gaps`) joins such a piece to anything. Clouds of fewer than 1000 points
+    have none.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    """
+    detached, degrees = np.zeros(grid.n_voxels, np.bool_), np.diff(grid.indptr)
+    few = np.flatnonzero((degrees < _PIECE) & (grid.counts < _PIECE))
+    if not len(few) or int(grid.counts.sum()) < _MIN_POINTS:
+        return detached
+    boundary = np.flatnonzero(degrees < _BOUNDARY)
+    places = grid.warped / grid.size
+    within = cKDTree(places[boundary], balanced_tree=False).query_ball_point(places[few], _REACH)
+    near = [boundary[np.concatenate(within).astype(np.int64)]]
+    source = [np.repeat(few, [len(voxels) for voxels in within])]
+    for slot in range(_PIECE - 1):  # touching voxels may have centroids farther apart
+        some = few[degrees[few] > slot]
+        near.append(grid.neighbours[grid.indptr[some] + slot].astype(np.int64))
+        source.append(some)
+    of, to = np.concatenate(source), np.concatenate(near)
+    number = np.full(grid.n_voxels, -1)
+    number[few] = np.arange(len(few))
+    inner = number[to] >= 0
+    ones = np.ones(int(inner.sum()), np.bool_)
+    joined = coo_array((ones, (number[of[inner]], number[to[inner]])), shape=(len(few), len(few)))
+    n_pieces, piece = connected_components(joined, directed=False)
+    held = np.bincount(piece, grid.counts[few], n_pieces)
+    held[piece[number[of[~inner]]]] = _PIECE
+    detached[few[held[piece] < _PIECE]] = True
+    return detached
 
 
 def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:

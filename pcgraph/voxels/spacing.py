@@ -27,6 +27,8 @@ _TINY = float(np.finfo(np.float64).tiny)
 _MIN_EXPLAINED = 0.5
 _MIN_EXPONENT = 0.5
 _MAX_EXPONENT = 1.5
+_WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
+_MIN_EXPONENT_OF_HALF = 0.3
 _OWN_ORIGIN = 0.1  # explained variance by which another place must beat the frame's origin
 
 
@@ -165,16 +167,21 @@ class SpacingLaw(ShortRepr):
         About 1 for a beam of constant angle, more where noise grows with range as well.
     explained : float, 0..1
         Fraction of the variance of the spacing's logarithm that the law explains.
+    in_halves : float
+        The lesser of the exponents in the near and in the far half of the readings, where ranges differ enough to tell;
+        else `exponent`. About 0 where a fine scan of a thing lies within a coarse one of its surroundings.
     """
 
     viewpoint: NDArray[np.float64]
     exponent: float
     explained: float
+    in_halves: float
 
     @property
     def holds(self) -> bool:
-        """Whether the law says more than chance would."""
-        return self.explained >= _MIN_EXPLAINED and self.exponent >= _MIN_EXPONENT
+        """Whether the law says more than chance would, near and far."""
+        told = self.explained >= _MIN_EXPLAINED and self.exponent >= _MIN_EXPONENT
+        return told and self.in_halves >= _MIN_EXPONENT_OF_HALF
 
 
 def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None) -> SpacingLaw:
@@ -193,7 +200,7 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
     around and within the cloud are tried, then moved by ever smaller steps; readings far off the line, such as noise,
     are left out.
     """
-    nowhere = SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0)
+    nowhere = SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0)
     places, spacing = _readings(points)
     if len(places) < _MIN_READINGS:
         return nowhere
@@ -213,8 +220,10 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
     if viewpoint is None:
         of_origin, exponent_of_origin = _regressions(places[kept], logs[kept], origin[None])
         if of_origin[0] >= explained[0] - _OWN_ORIGIN:
-            return SpacingLaw(np.zeros(3), float(exponent_of_origin[0]), float(of_origin[0]))
-    return SpacingLaw(middle + reach * found, float(exponent[0]), float(explained[0]))
+            in_halves = _least_exponent(places, logs, origin, float(exponent_of_origin[0]))
+            return SpacingLaw(np.zeros(3), float(exponent_of_origin[0]), float(of_origin[0]), in_halves)
+    in_halves = _least_exponent(places, logs, found, float(exponent[0]))
+    return SpacingLaw(middle + reach * found, float(exponent[0]), float(explained[0]), in_halves)
 
 
 def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -250,6 +259,23 @@ def _regressions(
     slope = np.clip((x @ y) / np.maximum(squares, _TINY), 0.0, _MAX_EXPONENT)
     left = ((y - slope[:, None] * x) ** 2).sum(axis=1)
     return 1.0 - left / max(variance, _TINY), slope
+
+
+def _least_exponent(
+    places: NDArray[np.float64], logs: NDArray[np.float64], viewpoint: NDArray[np.float64], exponent: float
+) -> float:
+    """The lesser of the exponents in the near and the far half, by medians; `exponent` where the span is small."""
+    x = np.log(_ranges(places, viewpoint))
+    order = np.argsort(x, kind="stable")
+    if x[order[len(x) * 9 // 10]] - x[order[len(x) // 10]] < math.log(_WIDE_SPAN):
+        return exponent
+    slopes = []
+    for half in np.array_split(order, 2):
+        third = len(half) // 3
+        near, far = half[:third], half[-third:]
+        rise = float(np.median(logs[far]) - np.median(logs[near]))
+        slopes.append(rise / max(float(np.median(x[far]) - np.median(x[near])), _TINY))
+    return min(slopes)
 
 
 def _most_telling_place(places: NDArray[np.float64], logs: NDArray[np.float64]) -> NDArray[np.float64]:

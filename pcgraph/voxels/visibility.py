@@ -209,9 +209,9 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
     interest, left = np.ones(seen.shape[1]), weights.copy()
     chosen: list[int] = []
     while len(chosen) < _VIEWS and left.any():
-        best = int(np.argmax(left**2 * (seen @ interest)))
+        best = int(np.argmax(left * (seen @ interest)))
         chosen.append(best)
-        interest[seen[best]] *= 0.5
+        interest[seen[best]] *= 0.25
         left[best] = 0.0
     return np.array(chosen)
 
