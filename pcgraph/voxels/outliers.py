@@ -11,9 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
 from pcgraph.parallel import in_blocks, kernel
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid, voxel_grid
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 from pcgraph.voxels.spacing import bounding_box
-from pcgraph.voxels.warp import Warp
 
 OUTLIER = -2
 """Label of a point that belongs to nothing."""
@@ -27,11 +26,10 @@ _MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
 _REACH = 3.0  # voxel edges, as far as gaps are bridged
 _VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * _REACH**3
 _MAX_FRACTION = 2.0 / 3.0
-_CONCENTRATED = 6.0  # times the mean density, as noise in voxels that grow with range is not
 _PIECE = 5  # points: fewer, all alone, are no object
 _BOUNDARY = 8  # voxels around one amid a surface, as for gaps
-_OF_SURFACE = 5  # voxels around one that lies on a surface, and more
-_DOUBLINGS = 3  # of voxels, at which what may be an outlier is looked at alone
+_NEAREST = 16  # voxels of which
+_FLAT = 0.05  # of the variance is at most across a surface; of noise 0.2
 
 
 def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
@@ -47,8 +45,9 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     of this density had, with a chance of more than 1 in 10 000, as many points in the voxels around it. Where noise is
     so thin that a reach of three voxel edges is nearly empty of it, there must be as few points within that reach, too,
     so that the thin far end of a scan is not taken for noise. Where many are outliers, so are the few points of voxels
-    beside full ones. What has been found is then looked at alone, in voxels of two, four and eight times the size: a
-    coarse scan beside a fine one is a surface there, and no outlier. Clouds of fewer than 1000 points, and those of
+    beside full ones. What has been found is then looked at alone: where
+    most of the 16 nearest of it lie about a plane or a line, they are a coarse scan beside a fine one, and stay.
+    Clouds of fewer than 1000 points, and those of
     which more than two thirds would be outliers, have none.
     """
     nothing = np.zeros(grid.n_voxels, np.bool_)
@@ -82,31 +81,25 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 
 
 def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bool_]:
-    """Which of some voxels, (v,) bool, lie, in larger voxels of those alone, denser than noise through the volume."""
+    """Which of some voxels, (v,) bool, lie on a surface of those alone: flat about most of their nearest ones."""
     found = np.zeros(len(voxels), np.bool_)
-    low, high = bounding_box(grid.cells)
-    for doubling in range(1, _DOUBLINGS + 1):
-        alone = np.flatnonzero(voxels & ~found)
-        if not len(alone):
-            break
-        size = 2.0**doubling
-        larger = voxel_grid(grid.warped[alone] / grid.size, None, size, Warp())
-        counts = np.bincount(larger.voxel_of_point, grid.counts[alone], larger.n_voxels).astype(np.int64)
-        around = np.empty(larger.n_voxels, np.int64)
-        in_blocks(_count_around, larger.n_voxels, larger.indptr, larger.neighbours, counts, around)
-        volume = float(np.prod(np.maximum((high - low + 1.0) / size, _MIN_EXTENT / size)))
-        expected = float(counts.sum()) / volume * (MAX_NEIGHBOURS + 1)
-        dense = around >= max(_least_significant(expected), _CONCENTRATED * expected)
-        dense &= np.diff(larger.indptr) >= _OF_SURFACE
-        found[alone[dense[larger.voxel_of_point]]] = True
+    alone = np.flatnonzero(voxels)
+    if len(alone) < 2 * _NEAREST:
+        return found
+    places = grid.warped[alone] / grid.size
+    near = cKDTree(places, balanced_tree=False).query(places, _NEAREST)[1]
+    spread = places[near] - places[near].mean(axis=1, keepdims=True)
+    variances = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", spread, spread))
+    flat = variances[:, 0] < _FLAT * variances.sum(axis=1)
+    found[alone] = flat[near].mean(axis=1) >= 0.5
     return found
 
 
 def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     """Voxels of pieces of at most four points that have nothing else within three voxel edges, (v,) bool.
 
-    No contact and no gap (`pcgraph.graph.gaps.gaps`) joins such a piece to anything. Clouds of fewer than 1000 points
-    have none.
+    No contact and no gap (`pcgraph.graph.gaps.gaps`) joins such a piece to anything. Clouds of fewer than 1000 points,
+    and those that are such pieces to more than two thirds, have none.
 
     Parameters
     ----------
@@ -135,7 +128,7 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     held = np.bincount(piece, grid.counts[few], n_pieces)
     held[piece[number[of[~inner]]]] = _PIECE
     detached[few[held[piece] < _PIECE]] = True
-    return detached
+    return detached if grid.counts[detached].sum() <= _MAX_FRACTION * grid.counts.sum() else np.zeros_like(detached)
 
 
 def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:

@@ -198,6 +198,7 @@ def test_degenerate_clouds_hide_nothing(points):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(-6.0, 6.0), st.floats(0.01, 0.5), st.booleans())
 @settings(max_examples=40, deadline=None)
+@pytest.mark.filterwarnings("ignore::pcgraph.CloudWarning")  # a place may lie within a voxel
 def test_any_cloud_from_anywhere(seed, n, exponent, voxel, inside):
     rng = np.random.default_rng(seed)
     scale = 10.0**exponent

@@ -9,7 +9,7 @@ from clouds import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.voxels.grid import grid_without, voxel_grid
-from pcgraph.voxels.outliers import OUTLIER, outlier_voxels
+from pcgraph.voxels.outliers import OUTLIER, detached_voxels, outlier_voxels
 from pcgraph.voxels.warp import Warp
 
 
@@ -52,6 +52,31 @@ def test_few_points_are_never_outliers():
 def test_a_cloud_without_any_surface_is_not_all_outliers():
     points = np.random.default_rng(0).uniform(0, 1, (5000, 3))
     assert (pcgraph.segment(points).labels >= 0).mean() > 1 / 3
+
+
+def plane(spacing, size=2.0, height=0.0):
+    x, y = np.meshgrid(np.arange(0.5 * spacing, size, spacing), np.arange(0.5 * spacing, size, spacing))
+    return np.stack((x, y, np.full_like(x, height)), axis=-1).reshape(-1, 3)
+
+
+def test_a_coarse_scan_beside_a_fine_one_is_no_outlier():
+    fine, coarse = plane(0.004, 0.6, 0.8), plane(0.06, 6.0)
+    result = pcgraph.segment(np.concatenate((fine, coarse)))
+    assert not result.outliers.any()
+    assert result.labels.max() < 20
+
+
+@pytest.mark.parametrize(("n", "gap", "is_object"), [(4, 0.5, False), (5, 0.5, True), (4, 0.1, True)])
+def test_a_piece_of_few_points_away_from_all_else_is_no_object(n, gap, is_object):
+    piece = np.array([[1.0, 1.0, 0.0]]) + np.outer(np.arange(n), [0.01, 0.01, 0.0]) + [0.0, 0.0, gap]
+    result = pcgraph.segment(np.concatenate((plane(0.02), piece)), viewpoint=(1, 1, 9), voxel_size=0.07)
+    assert not result.outliers[:-n].any()
+    assert (result.labels[-n:] >= 0).tolist() == [is_object] * n
+
+
+def test_dust_alone_is_not_all_outliers():
+    points = np.random.default_rng(0).uniform(0, 1, (2000, 3))
+    assert not detached_voxels(voxel_grid(points, None, 1e-5, Warp())).any()
 
 
 def test_a_grid_without_some_voxels_is_that_of_the_other_points():

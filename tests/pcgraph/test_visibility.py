@@ -40,9 +40,30 @@ ROOM = faces((0, 0, 0), (4, 3, 2.5), 0.04)
 THING = faces((1.5, 1.0, 0.02), (2.3, 1.8, 0.9), 0.04, "-x +x -y +y +z")
 
 
-def test_a_room_is_seen_from_within():
-    points = np.concatenate((ROOM[0], THING[0]))
-    assert fraction_outward(points, np.concatenate((-ROOM[1], THING[1]))) > 0.96
+TURNS = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.5), (np.pi, 0.0, 0.0), (0.3, -1.1, 2.0)]
+
+
+def turned(cloud, turn):
+    """Points and normals, turned by a rotation vector."""
+    return (vectors @ Rotation.from_rotvec(turn).as_matrix().T for vectors in cloud)
+
+
+def joined(*clouds):
+    return tuple(np.concatenate(columns) for columns in zip(*clouds, strict=True))
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_room_is_seen_from_within(turn):
+    assert fraction_outward(*turned(joined((ROOM[0], -ROOM[1]), THING), turn)) > 0.96
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_things_open_below_are_seen_from_outside(turn):
+    """A box on a box, open where they stand: hollow, and as visible from within."""
+    lower = faces((0, 0, 0), (2, 2, 0.5), 0.03, "-x +x -y +y +z")
+    lower = tuple(column[(np.abs(lower[0][:, :2] - 1).max(axis=1) > 0.5) | (lower[0][:, 2] < 0.5)] for column in lower)
+    upper = faces((0.5, 0.5, 0.5), (1.5, 1.5, 1.8), 0.03, "-x +x -y +y +z")
+    assert fraction_outward(*turned(joined(lower, upper), turn)) > 0.96
 
 
 def test_a_room_without_a_ceiling_is_one_too():
@@ -66,6 +87,14 @@ def test_things_on_the_ground_are_seen_from_above():
         inside = (points[:, 0] > x) & (points[:, 0] < x + 0.6) & (points[:, 1] > y) & (points[:, 1] < y + 0.7)
         hidden |= inside & (points[:, 2] == 0.0)
     assert fraction_outward(points[~hidden], normals[~hidden]) > 0.97
+
+
+def test_what_lies_before_a_camera_is_seen_from_there():
+    """Thinned, so that no law of spacing tells where the camera was."""
+    wall = faces((-1.5, -1.0, 2.0), (1.5, 1.0, 2.1), 0.03, "-z")
+    box = faces((-0.4, -0.3, 1.5), (0.4, 0.5, 2.0), 0.03, "-x +x -y +y -z")
+    hidden = (np.abs(wall[0][:, 0]) < 0.53) & (wall[0][:, 1] > -0.4) & (wall[0][:, 1] < 0.67)
+    assert fraction_outward(*joined(tuple(column[~hidden] for column in wall), box)) > 0.96
 
 
 def test_a_square_in_front_hides_one_behind():
@@ -110,6 +139,14 @@ def test_even_spacing_follows_no_law():
     assert not spacing_law(points + np.random.default_rng(0).normal(0, 1e-3, points.shape)).holds
     assert not spacing_law(np.zeros((2000, 3))).holds
     assert not spacing_law(scanned_scene()[:200]).holds  # too few to say
+
+
+def test_a_fine_scan_within_a_coarse_one_follows_no_law():
+    fine = faces((1.6, 1.1, 0.7), (2.4, 1.9, 1.1), 0.005)[0]
+    law = spacing_law(np.concatenate((ROOM[0], fine)) - (2.0, 1.5, 0.0))
+    assert law.explained > 0.5
+    assert law.in_halves < 0.3
+    assert not law.holds
 
 
 def test_a_law_is_free_of_order_and_of_duplicates():
