@@ -26,6 +26,7 @@ _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its b
 _INSIDE = 64  # free places within the bounding box, of a lattice of
 _LATTICE = 12  # along each side
 _CLEARANCE = 2.0  # cells between a free place and the next surface
+_SOME = 1500  # cells are looked for in all directions from a place, about
 _AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
 _SPREAD = 0.75  # of the free places lie far from each other, the others far from surfaces
 _ROUNDS = 12  # of agreement between places and orientations
@@ -37,6 +38,7 @@ _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still
 _VIEWS = 12  # places that the voxels themselves are looked at from
 _FILLING = 4  # rounds of orientation by the voxels around, of those that are seen from nowhere
 _BINS_PER_RADIAN = 0.282  # of the octahedral map, over its width
+_MAX_BINS = 512  # along each side: a map that stays in the cache
 
 _TINY = 1e-12
 _FAR = 1e3  # voxel edges from a voxel to its orientation point
@@ -109,7 +111,7 @@ def seen_from(
     some = slice(None, None, max(1, len(centres) // 1000))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
-    bins = np.clip(1.5 / (_BINS_PER_RADIAN * typical), 64, 1024).astype(np.int64)
+    bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
     in_blocks(_look, len(places), places, bins, centres, widths, seen, smallest=1)
     return seen
 
@@ -187,8 +189,9 @@ def _most_telling(
     cells = np.repeat(np.arange(coarse.n_voxels), np.diff(coarse.indptr))
     all_sides = np.abs(sides).sum(axis=1)
     most, best = -np.inf, agreements[0]
-    for weights in agreements:
-        outward = np.sign(weights @ sides)
+    outwards = {outward.tobytes(): s for s, outward in enumerate(np.sign(agreements @ sides).astype(np.int8))}
+    for s in outwards.values():
+        weights, outward = agreements[s], np.sign(agreements[s] @ sides)
         right = np.maximum(sides * outward, 0.0)
         shown = np.minimum(weights @ right / _WELL_SEEN, 1.0)
         around = shown.copy()  # a crease is hidden by what is beside it
@@ -236,7 +239,7 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
     if not len(free):
         return places[:0]
     places, clearance, hits = places[free], clearance[free], np.empty(len(free))
-    in_blocks(_count_hits, len(free), places, coarse.centroids, hits)
+    in_blocks(_count_hits, len(free), places, coarse.centroids[:: max(1, coarse.n_voxels // _SOME)], hits)
     among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
     chosen = [among[np.argmax(clearance[among])]]
     nearest = np.full(len(among), np.inf)
