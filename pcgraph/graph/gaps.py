@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
-from pcgraph.voxels.grid import VoxelGrid
+from pcgraph.voxels.grid import VoxelGrid, voxels_within
 
 _WIDTH = 3.0  # voxel edges between centroids, at most
 _RIM = 8  # voxels around one amid a surface; a voxel with fewer lies where a surface ends
@@ -41,16 +40,15 @@ def gaps(
     Only voxels with fewer than eight around them are looked at: those at the ends of surfaces.
     """
     k = np.int64(len(nodes.size))
-    rim = np.flatnonzero(np.diff(grid.indptr) < _RIM)
-    pairs = np.empty((0, 2), np.int64)
-    places = grid.warped[rim] / grid.size
-    if len(rim) > 1:
-        pairs = cKDTree(places, balanced_tree=False).query_pairs(_WIDTH, p=np.inf, output_type="ndarray")
-    pairs = pairs[supervoxels[rim[pairs[:, 0]]] != supervoxels[rim[pairs[:, 1]]]]
-    width = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    pairs, width = pairs[width <= _WIDTH], width[width <= _WIDTH]
-    voxel = rim[pairs.T.ravel()]  # each side of each pair
-    other = supervoxels[rim[pairs[:, ::-1].T.ravel()]].astype(np.int64)
+    ends = np.diff(grid.indptr) < _RIM
+    rim = np.flatnonzero(ends)
+    near = voxels_within(grid, rim, _WIDTH, ends)
+    source, target = np.repeat(rim, np.diff(near.indptr)), near.neighbours.astype(np.int64)
+    pairs: NDArray[np.int64] = np.stack((source, target), axis=1)
+    pairs = pairs[(pairs[:, 0] < pairs[:, 1]) & (supervoxels[pairs[:, 0]] != supervoxels[pairs[:, 1]])]
+    width = np.linalg.norm((grid.warped[pairs[:, 0]] - grid.warped[pairs[:, 1]]) / grid.size, axis=1)
+    voxel = pairs.T.ravel()  # each side of each pair
+    other = supervoxels[pairs[:, ::-1].T.ravel()].astype(np.int64)
     own, width = supervoxels[voxel].astype(np.int64), np.tile(width, 2)
     key = np.minimum(own, other) * k + np.maximum(own, other)
     new = ~np.isin(key, touching[:, 0].astype(np.int64) * k + touching[:, 1])

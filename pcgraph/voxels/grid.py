@@ -388,6 +388,80 @@ def _pack(
             neighbours[first + q] = room[i, q]
 
 
+# --- which voxels lie near each other ---
+
+
+def voxels_within(
+    grid: VoxelGrid, voxels: NDArray[np.int64], reach: float, among: NDArray[np.bool_] | None = None
+) -> Neighbourhood:
+    """The voxels whose points' mean lies within some voxel edges of that of each of m voxels, without itself.
+
+    Parameters
+    ----------
+    grid : VoxelGrid of v voxels
+    voxels : (m,) int64
+        Ascending.
+    reach : float, voxel edges
+    among : (v,) bool, optional
+        Which voxels may be found. Default: all.
+    """
+    among = np.ones(grid.n_voxels, np.bool_) if among is None else among
+    keys, pitch = cell_keys(grid.cells, grid.size)
+    places, counts = grid.warped / grid.size, np.zeros(len(voxels), np.int64)
+    nothing: NDArray[np.int32] = np.empty(0, np.int32)
+    in_blocks(_within, len(voxels), voxels, keys, pitch, places, reach, among, counts, counts, nothing)
+    indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
+    found = np.empty(indptr[-1], np.int32)
+    if len(found):
+        in_blocks(_within, len(voxels), voxels, keys, pitch, places, reach, among, counts, indptr, found)
+    return Neighbourhood(indptr, found)
+
+
+@kernel
+def _within(
+    start: int,
+    stop: int,
+    voxels: NDArray[np.int64],
+    keys: NDArray[np.int64],
+    pitch: tuple[int, int],
+    places: NDArray[np.float64],
+    reach: float,
+    among: NDArray[np.bool_],
+    counts: NDArray[np.int64],
+    indptr: NDArray[np.int64],
+    found: NDArray[np.int32],
+) -> None:
+    """Count the voxels around, or list them where there is room: pointers gallop along the sorted keys, one per row."""
+    n, cells = len(keys), int(np.ceil(reach))
+    rows = 2 * cells + 1
+    pointers = np.zeros(rows * rows, np.int64)
+    for v in range(start, stop):
+        i, count = voxels[v], 0
+        for row in range(rows * rows):
+            first = keys[i] + (row // rows - cells) * pitch[0] + (row % rows - cells) * pitch[1] - cells
+            at, step = pointers[row], 1
+            while at + step < n and keys[at + step] < first:
+                at += step
+                step *= 2
+            while step > 0:
+                if at + step < n and keys[at + step] < first:
+                    at += step
+                step //= 2
+            if at < n and keys[at] < first:
+                at += 1
+            pointers[row] = at
+            while at < n and keys[at] <= first + 2 * cells:
+                if at != i and among[at]:
+                    x, y = places[at, 0] - places[i, 0], places[at, 1] - places[i, 1]
+                    z = places[at, 2] - places[i, 2]
+                    if x * x + y * y + z * z <= reach * reach:
+                        if len(found):
+                            found[indptr[v] + count] = at
+                        count += 1
+                at += 1
+        counts[v] = count
+
+
 # --- two scans of one scene in one grid ---
 
 

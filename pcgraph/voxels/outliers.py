@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
 from pcgraph.parallel import in_blocks, kernel
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid, voxels_within
 from pcgraph.voxels.spacing import bounding_box
 
 OUTLIER = -2
@@ -69,9 +69,10 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     background = density * _VOLUME_OF_REACH
     if background < 1.0 and outlier.any():
         alone = np.flatnonzero(outlier)
-        places = grid.warped / grid.size
-        near = cKDTree(places).query_ball_point(places[alone], _REACH, return_length=False)
-        held = np.array([grid.counts[voxels].sum() for voxels in near]) - grid.counts[alone]
+        near = voxels_within(grid, alone, _REACH)
+        held = np.bincount(
+            np.repeat(np.arange(len(alone)), np.diff(near.indptr)), grid.counts[near.neighbours], len(alone)
+        )
         outlier[alone] = held < _least_significant(background)
     if grid.counts[outlier].sum() > _MUCH_NOISE * n_points:  # then some lies beside surfaces, in voxels of its own
         degrees = np.maximum(np.diff(grid.indptr), 1)
@@ -109,24 +110,21 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     few = np.flatnonzero((degrees < _PIECE) & (grid.counts < _PIECE))
     if not len(few) or int(grid.counts.sum()) < _MIN_POINTS:
         return detached
-    boundary = np.flatnonzero(degrees < _BOUNDARY)
-    places = grid.warped / grid.size
-    within = cKDTree(places[boundary], balanced_tree=False).query_ball_point(places[few], _REACH)
-    near = [boundary[np.concatenate(within).astype(np.int64)]]
-    source = [np.repeat(few, [len(voxels) for voxels in within])]
+    near = voxels_within(grid, few, _REACH, degrees < _BOUNDARY)
+    of, to = [np.repeat(few, np.diff(near.indptr))], [near.neighbours]
     for slot in range(_PIECE - 1):  # touching voxels may have centroids farther apart
         some = few[degrees[few] > slot]
-        near.append(grid.neighbours[grid.indptr[some] + slot].astype(np.int64))
-        source.append(some)
-    of, to = np.concatenate(source), np.concatenate(near)
+        of.append(some)
+        to.append(grid.neighbours[grid.indptr[some] + slot])
+    source, target = np.concatenate(of), np.concatenate(to)
     number = np.full(grid.n_voxels, -1)
     number[few] = np.arange(len(few))
-    inner = number[to] >= 0
+    inner = number[target] >= 0
     ones = np.ones(int(inner.sum()), np.bool_)
-    joined = coo_array((ones, (number[of[inner]], number[to[inner]])), shape=(len(few), len(few)))
+    joined = coo_array((ones, (number[source[inner]], number[target[inner]])), shape=(len(few), len(few)))
     n_pieces, piece = connected_components(joined, directed=False)
     held = np.bincount(piece, grid.counts[few], n_pieces)
-    held[piece[number[of[~inner]]]] = _PIECE
+    held[piece[number[source[~inner]]]] = _PIECE
     detached[few[held[piece] < _PIECE]] = True
     return detached if grid.counts[detached].sum() <= _MAX_FRACTION * grid.counts.sum() else np.zeros_like(detached)
 
