@@ -94,8 +94,13 @@ def _median_spacing(crowd: NDArray[np.float64], hashes: NDArray[np.uint64]) -> f
 
 def _each_place_once(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint64]]:
     """One point per place, in the order of their hashes, and these."""
-    hashes, first = np.unique(_hashes(points), return_index=True)
-    return points[first], hashes
+    hashes, bits = _hashes(points), max(int(len(points) - 1).bit_length(), 1)
+    low = np.uint64((1 << bits) - 1)
+    order = np.sort((hashes & ~low) | np.arange(len(points), dtype=np.uint64)) & low  # faster than to sort indices
+    order = order.astype(np.int64)
+    hashes = hashes[order]
+    first = np.concatenate(([True], hashes[1:] != hashes[:-1]))
+    return points[order[first]], hashes[first]
 
 
 def _hashes(points: NDArray[np.float64]) -> NDArray[np.uint64]:
@@ -245,7 +250,8 @@ def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
 
 def _ranges(places: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distances from a viewpoint, (m,), none so near that its logarithm outweighs all others."""
-    return np.sqrt(((places - viewpoint) ** 2).sum(axis=-1)) + 1e-3
+    rays = places - viewpoint
+    return np.sqrt(np.einsum("...i,...i->...", rays, rays)) + 1e-3
 
 
 def _regressions(
@@ -287,6 +293,7 @@ def _most_telling_place(places: NDArray[np.float64], logs: NDArray[np.float64]) 
     outside = [(low + high) / 2.0 + far * reach * sphere_directions(40) for far in (1.2, 2.0)]
     candidates, some = np.concatenate((inside, *outside)), slice(None, None, 4)
     place = candidates[int(np.argmax(_regressions(places[some], logs[some], candidates)[0]))]
+    places, logs = places[::2], logs[::2]
     best = _regressions(places, logs, place[None])[0][0]
     moves, step = np.concatenate((np.eye(3), -np.eye(3), sphere_directions(8))), 0.3 * reach
     for _ in range(14):

@@ -36,7 +36,8 @@ _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _DECIDED, _OUTSIDE_IN, _LIKELY = 0.05, 0.006, 0.004  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y
 _VIEWS = 12  # places that the voxels themselves are looked at from
-_FILLING = 4  # rounds of orientation by the voxels around, of those that are seen from nowhere
+_SMOOTHING = 4  # rounds of votes by the voxels around
+_SAME = 0.8  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.282  # of the octahedral map, over its width
 _MAX_BINS = 512  # along each side: a map that stays in the cache
 
@@ -87,12 +88,13 @@ def visible_sides(grid: VoxelGrid) -> VisibleSides:
     places, weights = _telling_places(centres, widths, -middle / reach)
     towards = np.empty((grid.n_voxels, 3))
     in_blocks(_look_around, grid.n_voxels, places, weights, seen_from(places, centres, widths), centres, towards)
-    filled = np.empty_like(towards)
-    for _ in range(_FILLING):
-        in_blocks(_fill, grid.n_voxels, grid.indptr, grid.neighbours, towards, filled)
-        towards, filled = filled, towards
-    towards[~towards.any(axis=1)] = (0.0, 0.0, 1.0)
-    towards /= _lengths(towards)[:, None]
+    normals = _either_normals(grid)
+    votes = np.einsum("ij,ij->i", towards, normals)
+    smoothed = np.empty_like(votes)
+    for _ in range(_SMOOTHING):
+        in_blocks(_vote_along, grid.n_voxels, grid.indptr, grid.neighbours, normals, votes, smoothed)
+        votes, smoothed = smoothed, votes
+    towards = np.where(votes < 0.0, -1.0, 1.0)[:, None] * normals
     return VisibleSides(middle + reach * places[0], grid.centroids + towards * (_FAR * grid.edge_lengths)[:, None])
 
 
@@ -116,6 +118,13 @@ def seen_from(
     return seen
 
 
+def _either_normals(grid: VoxelGrid) -> NDArray[np.float64]:
+    """Unit normals of the surface at each voxel, (v, 3), towards either side."""
+    upwards = np.zeros((grid.n_voxels, 3))
+    upwards[:, 2] = 1.0
+    return fitted_windows(grid, upwards).normals
+
+
 def _lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lengths of rows, (n,), of the order of 1; of zeros nearly nothing."""
     return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
@@ -135,9 +144,7 @@ def _telling_places(
     is_camera = bool((np.abs(from_origin[:, :2]).max(axis=1) < _WIDE * from_origin[:, 2]).all())
     places = np.concatenate((outside, inside, origin[None] if is_camera else outside[:0]))
     likely = np.arange(len(places)) == len(places) - 1 if is_camera else np.arange(len(places)) < _OUTSIDE // 2
-    upwards = np.zeros((coarse.n_voxels, 3))
-    upwards[:, 2] = 1.0
-    normals = fitted_windows(coarse, upwards).normals
+    normals = _either_normals(coarse)
     sides = np.where(seen_from(places, coarse.centroids, coarse.edge_lengths), np.float32(1.0), np.float32(0.0))
     for k, place in enumerate(places):
         rays = place - coarse.centroids
@@ -304,14 +311,14 @@ def _look(
                 continue
             u, v = _bin_of(x, y, z, bins)
             at[i] = min(int(u), bins - 1) * bins + min(int(v), bins - 1)
-            half = min(0.85 * widths[i] / ranges[i] * per_radian, 24.0)
+            half = min(0.6 * widths[i] / ranges[i] * per_radian, 24.0)
             for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
                 for q in range(max(int(v - half), 0), min(int(v + half), bins - 1) + 1):
                     if ranges[i] < nearest[p * bins + q]:
                         nearest[p * bins + q] = ranges[i]
         for i in range(n):
             # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-            depth = 1.25 * widths[i] + ranges[i] / per_radian
+            depth = widths[i] + 0.5 * ranges[i] / per_radian
             seen[k, i] = at[i] >= 0 and ranges[i] <= nearest[at[i]] + depth
 
 
@@ -338,19 +345,21 @@ def _look_around(
 
 
 @kernel
-def _fill(
+def _vote_along(
     start: int,
     stop: int,
     indptr: NDArray[np.int64],
     neighbours: NDArray[np.int32],
-    towards: NDArray[np.float64],
-    filled: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    votes: NDArray[np.float64],
+    smoothed: NDArray[np.float64],
 ) -> None:
-    """Give voxels without a direction the sum of those around."""
+    """Set the votes for the side of each voxel's normal, with those of the voxels around on the same surface."""
     for i in range(start, stop):
-        for axis in range(3):
-            filled[i, axis] = towards[i, axis]
-        if towards[i, 0] == 0.0 and towards[i, 1] == 0.0 and towards[i, 2] == 0.0:
-            for a in range(indptr[i], indptr[i + 1]):
-                for axis in range(3):
-                    filled[i, axis] += towards[neighbours[a], axis]
+        total = votes[i]
+        for a in range(indptr[i], indptr[i + 1]):
+            j = neighbours[a]
+            cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            if abs(cosine) > _SAME:
+                total += math.copysign(votes[j], votes[j] * cosine)
+        smoothed[i] = total / (indptr[i + 1] - indptr[i] + 1)
