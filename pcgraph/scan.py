@@ -134,7 +134,7 @@ def segment(
     n_points = len(cloud.points)
     for _ in range(2):
         voxel, seed = _sizes(cloud, voxel_size, seed_size)
-        position, warp = _place_and_warp(cloud, place, camera, range_growth)
+        found, warp = _place_and_warp(cloud, place, camera, range_growth)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
@@ -149,7 +149,7 @@ def segment(
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
-    position, orientation = _orientation(grid, place if place is not None and place.ndim > 1 else position)
+    position, orientation = _orientation(grid, found, place)
     result = segment_scan(Scan(cloud, position, grid, orientation, initial_labels, seed), None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
@@ -208,18 +208,18 @@ def update(
         object_altitude = earlier.object_altitude
     settings = Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals, features, earlier.feature_scaling)
-    position = clean_viewpoint(viewpoint, cloud)
+    place = clean_viewpoint(viewpoint, cloud)
     compile_in_two_processes()
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp, cloud.features)
     lonely = (outlier_voxels(seen) | detached_voxels(seen)) & ~is_near(seen, before.grid)
-    cloud, seen, position = _without(lonely, cloud, seen, position)
+    cloud, seen, place = _without(lonely, cloud, seen, place)
     union = grid_union(before.grid, seen)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
     orientation = np.empty((union.grid.n_voxels, 3))
-    position, orientation[union.second] = _orientation(seen, position)
+    position, orientation[union.second] = _orientation(seen, None, place)
     orientation[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
     scan = Scan(cloud, position, union.grid, orientation, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
@@ -361,20 +361,21 @@ def _without(
 
 
 def _orientation(
-    grid: VoxelGrid, position: NDArray[np.float64] | None
+    grid: VoxelGrid, found: NDArray[np.float64] | None, given: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """From where the cloud was seen, and a place on the outer side of each voxel, (3,) or (v, 3).
 
-    Voxels of points that were seen from several places take the mean of those.
+    A viewpoint that was given counts before one that the spacing tells. Voxels of points that were seen from several
+    places take the mean of those.
     """
-    if position is None:
-        sides = visible_sides(grid)
+    if given is None:
+        sides = visible_sides(grid, found)
         return sides.viewpoint, sides.outside
-    if position.ndim == 1:
-        return position, position
-    low, high = bounding_box(position)
+    if given.ndim == 1:
+        return given, given
+    low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
-    return position, middle + reach * voxel_means((position - middle) / reach, grid)
+    return given, middle + reach * voxel_means((given - middle) / reach, grid)
 
 
 def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> tuple[float, float]:

@@ -33,6 +33,8 @@ _ROUNDS = 12  # of agreement between places and orientations
 _HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, and from
 _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
+_EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
+_TOLD = 40.0  # votes of the viewpoint for one of the places
 _DECIDED, _OUTSIDE_IN, _LIKELY = 0.05, 0.006, 0.004  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y
 _VIEWS = 12  # places that the voxels themselves are looked at from
@@ -61,12 +63,15 @@ class VisibleSides(ShortRepr):
     outside: NDArray[np.float64]
 
 
-def visible_sides(grid: VoxelGrid) -> VisibleSides:
+def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> VisibleSides:
     """The outer side of the surface at each voxel, found from what is visible.
 
     Parameters
     ----------
     grid : VoxelGrid of v voxels
+    viewpoint : (3,) float64, metres, optional
+        About where all was seen from. What lies edge-on from there, as ground does from a place on it, is decided by
+        what is visible; if little does, nothing else is asked.
 
     Notes
     -----
@@ -85,17 +90,25 @@ def visible_sides(grid: VoxelGrid) -> VisibleSides:
     low, high = bounding_box(grid.centroids)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()) / 2.0, float(grid.edge_lengths.min()))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
-    places, weights = _telling_places(centres, widths, -middle / reach)
+    normals = _either_normals(grid)
+    told, likely = np.zeros(grid.n_voxels), None
+    if viewpoint is not None:
+        likely = (viewpoint - middle) / reach
+        rays = likely - centres
+        told = np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
+        if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
+            return VisibleSides(viewpoint, np.tile(viewpoint, (grid.n_voxels, 1)))
+    places, weights = _telling_places(centres, widths, -middle / reach, likely)
     towards = np.empty((grid.n_voxels, 3))
     in_blocks(_look_around, grid.n_voxels, places, weights, seen_from(places, centres, widths), centres, towards)
-    normals = _either_normals(grid)
-    votes = np.einsum("ij,ij->i", towards, normals)
+    votes = np.einsum("ij,ij->i", towards, normals) / _lengths(towards) + _TOLD * told
     smoothed = np.empty_like(votes)
     for _ in range(_SMOOTHING):
         in_blocks(_vote_along, grid.n_voxels, grid.indptr, grid.neighbours, normals, votes, smoothed)
         votes, smoothed = smoothed, votes
     towards = np.where(votes < 0.0, -1.0, 1.0)[:, None] * normals
-    return VisibleSides(middle + reach * places[0], grid.centroids + towards * (_FAR * grid.edge_lengths)[:, None])
+    seen_most = middle + reach * places[0] if viewpoint is None else viewpoint
+    return VisibleSides(seen_most, grid.centroids + towards * (_FAR * grid.edge_lengths)[:, None])
 
 
 def seen_from(
@@ -131,7 +144,10 @@ def _lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _telling_places(
-    centres: NDArray[np.float64], widths: NDArray[np.float64], origin: NDArray[np.float64]
+    centres: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    viewpoint: NDArray[np.float64] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (k, 3) from which the outside is seen, and how much each counts, (k,), the first most."""
     coarse = _coarse(centres, float(np.median(widths)))
@@ -141,9 +157,11 @@ def _telling_places(
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
     from_origin = coarse.centroids - origin
-    is_camera = bool((np.abs(from_origin[:, :2]).max(axis=1) < _WIDE * from_origin[:, 2]).all())
-    places = np.concatenate((outside, inside, origin[None] if is_camera else outside[:0]))
-    likely = np.arange(len(places)) == len(places) - 1 if is_camera else np.arange(len(places)) < _OUTSIDE // 2
+    if viewpoint is None and (np.abs(from_origin[:, :2]).max(axis=1) < _WIDE * from_origin[:, 2]).all():
+        viewpoint = origin  # of a camera
+    places = np.concatenate((outside, inside, outside[:0] if viewpoint is None else viewpoint[None]))
+    upper = np.arange(len(places)) < _OUTSIDE // 2
+    likely = upper if viewpoint is None else np.arange(len(places)) == len(places) - 1
     normals = _either_normals(coarse)
     sides = np.where(seen_from(places, coarse.centroids, coarse.edge_lengths), np.float32(1.0), np.float32(0.0))
     for k, place in enumerate(places):

@@ -163,3 +163,14 @@ def test_voxels_of_one_scan_grow_with_range_unless_told():
     assert np.ptp(pcgraph.segment(points).surface.grid.edge_lengths) > 0
     assert np.ptp(pcgraph.segment(points, range_growth=0.0).surface.grid.edge_lengths) == 0
     assert np.ptp(pcgraph.segment(points, viewpoint=(0, 0, 0)).surface.grid.edge_lengths) > 0
+
+
+def test_a_scan_whose_frame_lies_on_the_ground_is_seen_from_above_it():
+    """The law cannot tell the scanner's height: what lies edge-on from the frame's origin is decided by visibility."""
+    points = scanned_scene() + (0.0, 0.0, 1.5)
+    result = pcgraph.segment(points)
+    assert result.viewpoint.tolist() == [0, 0, 0]
+    normals = result.surface.normals[result.surface.grid.voxel_of_point]
+    ground = np.abs(normals[:, 2]) > 0.7
+    assert ground.mean() > 0.4
+    assert (normals[ground, 2] > 0).mean() > 0.97
