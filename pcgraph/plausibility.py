@@ -16,6 +16,8 @@ _STEPS_PER_SPACING = 4.0  # of floating-point numbers: fewer, and points lie on 
 _LEAST_SPACING = 1e-7  # of the extent
 _MIN_SUPERVOXELS = 500  # of fewer, many objects are no surprise
 _OBJECTS_PER_SUPERVOXEL = 0.1
+_MIN_VOXELS = 200
+_SOLID = 16.0  # voxels around one; on a surface some 6 to 13
 _LEAST_SEEN = 0.1  # of the voxels, from a viewpoint
 
 
@@ -65,6 +67,15 @@ def warn_of_dust(n_objects: int, n_supervoxels: int, voxel_size: float) -> None:
         _warn(
             f"expected far fewer objects than supervoxels, got {n_objects} and {n_supervoxels}: voxels of "
             f"{voxel_size:.3g} m may be too small for the cloud; give voxel_size, or cut the tree at another altitude"
+        )
+
+
+def warn_of_volume(grid: VoxelGrid) -> None:
+    """Warn where most voxels have others on nearly all sides, as noise that fills a volume has."""
+    if grid.n_voxels >= _MIN_VOXELS and float(np.median(np.diff(grid.indptr))) > _SOLID:
+        _warn(
+            "expected points on surfaces, but they fill a volume as noise does: at most voxels there are others on "
+            f"nearly all sides ({grid.edge_lengths.mean():.3g} m); objects found in it mean little"
         )
 
 

@@ -29,7 +29,7 @@ from pcgraph.inputs import (
     positive,
 )
 from pcgraph.parallel import side_by_side
-from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint
+from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint, warn_of_volume
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod, checked_supervoxels
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
@@ -147,6 +147,7 @@ def segment(
         seed = SEEDS_PER_VOXEL * grid.size if seed_size is None else seed
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
+    warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
     position, orientation = _orientation(grid, found, place)

@@ -54,3 +54,9 @@ def test_a_viewpoint_that_sees_nothing_is_noticed():
     with pytest.warns(CloudWarning, match="expected a viewpoint that sees the cloud"):
         pcgraph.segment(POINTS, viewpoint=(0.8, 0.6, -1e-3))  # just under the plane
     pcgraph.segment(POINTS, viewpoint=VIEWPOINT)
+
+
+def test_noise_alone_is_warned_of():
+    noise = np.random.default_rng(0).random((20000, 3))
+    with pytest.warns(CloudWarning, match="expected points on surfaces, but they fill a volume"):
+        pcgraph.segment(noise)

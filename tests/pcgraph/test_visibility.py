@@ -167,7 +167,7 @@ def test_voxels_of_one_scan_grow_with_range_unless_told():
 
 def test_a_scan_whose_frame_lies_on_the_ground_is_seen_from_above_it():
     """The law cannot tell the scanner's height: what lies edge-on from the frame's origin is decided by visibility."""
-    points = scanned_scene() + (0.0, 0.0, 1.5)
+    points = scanned_scene() + np.array((0.0, 0.0, 1.5))
     result = pcgraph.segment(points)
     assert result.viewpoint.tolist() == [0, 0, 0]
     normals = result.surface.normals[result.surface.grid.voxel_of_point]
