@@ -17,7 +17,7 @@ _LEAST_SPACING = 1e-7  # of the extent
 _MIN_SUPERVOXELS = 500  # of fewer, many objects are no surprise
 _OBJECTS_PER_SUPERVOXEL = 0.1
 _MIN_VOXELS = 200
-_SOLID = 16.0  # voxels around one; on a surface some 6 to 13
+_SOLID = 18.0  # voxels around one; on a surface some 6 to 13, on one as thick as voxels 17
 _LEAST_SEEN = 0.1  # of the voxels, from a viewpoint
 
 
