@@ -54,7 +54,7 @@ def segment(
         typer.Option(help="Voxel edge in metres. Default: 3.5 x the median spacing of the points."),
     ] = None,
     seed_size: Annotated[
-        float | None, typer.Option(help="Distance of supervoxels in metres. Default: 6 x the voxel edge.")
+        float | None, typer.Option(help="Distance of supervoxels in metres. Default: 3 to 6 x the voxel edge.")
     ] = None,
     method: Annotated[
         str,

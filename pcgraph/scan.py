@@ -45,7 +45,10 @@ from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
 VOXELS_PER_SPACING = 3.5
-SEEDS_PER_VOXEL = 6.0
+VOXELS_PER_SEED = 6.0  # voxel edges between seeds, at most,
+_MIN_VOXELS_PER_SEED = 3.0  # and at least
+_MANY_SUPERVOXELS = 800
+_VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 RANGE_GROWTH = 0.5
 _FEW_OUTLIERS = 0.95  # of the points are left
 _MIN_JOINED = 0.75  # of the voxels
@@ -92,7 +95,8 @@ def segment(
     voxel_size : float, metres, optional
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
     seed_size : float, metres, optional
-        Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 6 times `voxel_size`.
+        Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 6 times `voxel_size`, or less, 3 times at
+        least, where that would leave fewer than some 800 supervoxels.
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
         depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, unless
@@ -133,7 +137,7 @@ def segment(
     compile_in_two_processes()
     n_points = len(cloud.points)
     for _ in range(2):
-        voxel, seed = _sizes(cloud, voxel_size, seed_size)
+        voxel = _voxel_size(cloud, voxel_size, seed_size)
         found, warp = _place_and_warp(cloud, place, camera, range_growth)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
@@ -143,14 +147,14 @@ def segment(
     warn_of_rounding(points, cloud.points, spacing)  # type: ignore[arg-type]
     if spacing is not None:
         warn_of_duplicates(cloud.points, spacing)
-        grid = _without_dust(cloud, grid, math.inf if seed_size is None else seed)
-        seed = SEEDS_PER_VOXEL * grid.size if seed_size is None else seed
+        grid = _without_dust(cloud, grid, math.inf if seed_size is None else float(seed_size))
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
     position, orientation = _orientation(grid, found, place)
+    seed = _seed_size(grid) if seed_size is None else float(seed_size)
     result = segment_scan(Scan(cloud, position, grid, orientation, initial_labels, seed), None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
@@ -379,15 +383,21 @@ def _orientation(
     return given, middle + reach * voxel_means((given - middle) / reach, grid)
 
 
-def _sizes(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> tuple[float, float]:
+def _voxel_size(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> float:
+    """The voxel size, given or found, no larger than the seed size; both checked."""
+    seed = math.inf if seed_size is None else positive("seed_size", seed_size)
     if voxel_size is None:
-        spacing = VOXELS_PER_SPACING * median_spacing(cloud.points)
-        voxel_size = spacing if seed_size is None else min(spacing, positive("seed_size", seed_size))
+        return positive("voxel_size", min(VOXELS_PER_SPACING * median_spacing(cloud.points), seed))
     voxel = positive("voxel_size", voxel_size)
-    seed = SEEDS_PER_VOXEL * voxel if seed_size is None else positive("seed_size", seed_size)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
-    return voxel, seed
+    return voxel
+
+
+def _seed_size(grid: VoxelGrid) -> float:
+    """Six voxel edges; less, but three at least, where that leaves few supervoxels."""
+    edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * _MANY_SUPERVOXELS))
+    return grid.size * min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 
 def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:

@@ -21,7 +21,8 @@ def sheet(start: float, stop: float, z: float = 0.0) -> np.ndarray:
 def two_sheets(empty: int, **settings) -> pcgraph.Segmentation:
     """Two sheets in one plane with so many empty voxels between them."""
     points = np.concatenate((sheet(0.0, 1.0), sheet(1.0 + empty * VOXEL, 2.0 + empty * VOXEL)))
-    return pcgraph.segment(points, voxel_size=VOXEL, viewpoint=(1.0, 0.5, 5.0), range_growth=0.0, **settings)
+    settings |= {"voxel_size": VOXEL, "seed_size": 6 * VOXEL, "viewpoint": (1.0, 0.5, 5.0), "range_growth": 0.0}
+    return pcgraph.segment(points, **settings)
 
 
 @pytest.mark.parametrize(("empty", "joined"), [(0, True), (1, True), (2, True), (3, False), (6, False)])
