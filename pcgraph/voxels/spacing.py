@@ -262,7 +262,7 @@ def _regressions(
     x -= x.mean(axis=1, keepdims=True)
     y = logs - logs.mean()
     variance, squares = float(y @ y), np.einsum("ij,ij->i", x, x)
-    slope = np.clip((x @ y) / np.maximum(squares, _TINY), 0.0, _MAX_EXPONENT)
+    slope = np.clip(np.einsum("ij,j->i", x, y) / np.maximum(squares, _TINY), 0.0, _MAX_EXPONENT)
     left = ((y - slope[:, None] * x) ** 2).sum(axis=1)
     return 1.0 - left / max(variance, _TINY), slope
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,7 +182,8 @@ def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: ND
     starts[_HALVES + 2] = likely
     unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
     for start in starts[_HALVES + 3 :]:
-        news = np.maximum(sides, 0.0) @ unseen[0] + np.maximum(-sides, 0.0) @ unseen[1]
+        news = np.einsum("kn,n->k", np.maximum(sides, 0.0), unseen[0])
+        news += np.einsum("kn,n->k", np.maximum(-sides, 0.0), unseen[1])
         leader = int(np.argmax(news))
         start[leader] = 1.0
         unseen[0, sides[leader] > 0.0] = 0.0
@@ -189,44 +191,90 @@ def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: ND
     return starts[starts.any(axis=1)]
 
 
-def _agreements(sides: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """How much each place counts, (s, k), >= 0, in each of the agreements that s first opinions, (s, k), come to.
+class _Agreements(NamedTuple):
+    """What s first opinions come to, of k places about the sides of n cells.
 
-    Given the sides that each place sees, (k, n): signed cosines, 0 hidden. What is found, by turns, is nearly a pair of
-    singular vectors, but no place counts against what it sees.
+    Attributes
+    ----------
+    weights : (s, k) float32, 0..1
+        How much each place counts.
+    outward : (s, n) float32
+        The side on which the outside lies, as seen along the normals: -1, 1, or 0 where no place says.
+    agreed, known : (s, k) float32
+        Sums of the cosines that each place sees on the right side, and on either side of cells whose outside is known.
     """
-    visible = np.abs(sides)
-    for _ in range(_ROUNDS):
-        outward = np.sign(weights @ sides)
-        agreed = np.maximum(outward @ sides.T, 0.0)
-        weights = np.sqrt(agreed) * (agreed / np.maximum(np.abs(outward) @ visible.T, _TINY)) ** 4
-        weights /= np.maximum(weights.max(axis=1, keepdims=True), _TINY)
-    return weights
+
+    weights: NDArray[np.float32]
+    outward: NDArray[np.float32]
+    agreed: NDArray[np.float32]
+    known: NDArray[np.float32]
+
+
+def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agreements:
+    """What first opinions, weights of the places (s, k), come to, given the sides that each sees, (k, n).
+
+    Sides are signed cosines, 0 hidden. What is found, by turns, is nearly a pair of singular vectors, but no place
+    counts against what it sees.
+    """
+    outward = np.empty((len(starts), sides.shape[1]), np.float32)
+    found = _Agreements(starts.copy(), outward, np.empty_like(starts), np.empty_like(starts))
+    in_blocks(_agree, len(starts), sides, found, smallest=1)
+    return found
+
+
+@kernel
+def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements) -> None:
+    """Places that agree decide where the outside lies, and those that see it there count, by turns until it stands."""
+    n_places, n = sides.shape
+    total = np.empty(n, np.float32)
+    for s in range(start, stop):
+        weights, outward = found.weights[s], found.outward[s]
+        outward[:] = 0.0
+        for _ in range(_ROUNDS):
+            total[:] = 0.0
+            for k in range(n_places):
+                if weights[k] > 0.0:
+                    for i in range(n):
+                        total[i] += weights[k] * sides[k, i]
+            changed = False
+            for i in range(n):
+                side = np.float32(1.0 if total[i] > 0.0 else (-1.0 if total[i] < 0.0 else 0.0))
+                changed = changed or side != outward[i]
+                outward[i] = side
+            if not changed:
+                break
+            largest = np.float32(_TINY)
+            for k in range(n_places):
+                right = wrong = np.float32(0.0)
+                for i in range(n):
+                    value = sides[k, i] * outward[i]
+                    right += max(value, np.float32(0.0))
+                    wrong += max(-value, np.float32(0.0))
+                found.agreed[s, k], found.known[s, k] = right, right + wrong
+                net = max(right - wrong, np.float32(0.0))
+                weights[k] = math.sqrt(net) * (net / max(right + wrong, np.float32(_TINY))) ** 4
+                largest = max(largest, weights[k])
+            weights /= largest
 
 
 def _most_telling(
-    agreements: NDArray[np.float32],
-    sides: NDArray[np.float32],
-    coarse: VoxelGrid,
-    likely: NDArray[np.bool_],
+    found: _Agreements, sides: NDArray[np.float32], coarse: VoxelGrid, likely: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface."""
     cells = np.repeat(np.arange(coarse.n_voxels), np.diff(coarse.indptr))
-    all_sides = np.abs(sides).sum(axis=1)
-    most, best = -np.inf, agreements[0]
-    outwards = {outward.tobytes(): s for s, outward in enumerate(np.sign(agreements @ sides).astype(np.int8))}
-    for s in outwards.values():
-        weights, outward = agreements[s], np.sign(agreements[s] @ sides)
-        right = np.maximum(sides * outward, 0.0)
-        shown = np.minimum(weights @ right / _WELL_SEEN, 1.0)
+    visible = np.abs(sides).sum(axis=1)
+    most, best = -np.inf, found.weights[0]
+    different = {outward.tobytes(): s for s, outward in enumerate(found.outward)}
+    for s in different.values():
+        weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
+        shown = np.einsum("k,kn->n", weights, np.maximum(sides * found.outward[s], 0.0))
+        shown = np.minimum(shown / _WELL_SEEN, 1.0)
         around = shown.copy()  # a crease is hidden by what is beside it
         np.maximum.at(around, cells, shown[coarse.neighbours])
-        agreed = right.sum(axis=1)
-        known = np.abs(sides) @ np.abs(outward)
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
-        score = float(around.mean()) + _DECIDED * float(decided[all_sides > 0.0].mean())
+        score = float(around.mean()) + _DECIDED * float(decided[visible > 0.0].mean())
         for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, _LIKELY)):
-            score += counts * float(agreed[some].sum() / max(float(all_sides[some].sum()), _TINY))
+            score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
     return best.astype(np.float64)
