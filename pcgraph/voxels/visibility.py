@@ -217,7 +217,7 @@ def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agr
     counts against what it sees.
     """
     outward = np.empty((len(starts), sides.shape[1]), np.float32)
-    found = _Agreements(starts.copy(), outward, np.empty_like(starts), np.empty_like(starts))
+    found = _Agreements(starts.copy(), outward, np.zeros_like(starts), np.zeros_like(starts))
     in_blocks(_agree, len(starts), sides, found, smallest=1)
     return found
 
