@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.spacing import bounding_box, median_spacing
-from pcgraph.voxels.visibility import seen_from
+from pcgraph.voxels.visibility import visible_fraction
 
 _STEPS_PER_SPACING = 4.0  # of floating-point numbers: fewer, and points lie on a lattice of rounding
 _LEAST_SPACING = 1e-7  # of the extent
@@ -81,12 +81,9 @@ def warn_of_volume(grid: VoxelGrid) -> None:
 
 def warn_of_viewpoint(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> None:
     """Warn where a viewpoint, (3,), sees nearly nothing, as from inside or under a surface."""
-    middle = (np.add(*bounding_box(grid.centroids))) / 2.0
-    reach = max(float(np.abs(grid.centroids - middle).max()), float(np.abs(viewpoint - middle).max()))
-    if not reach > 0.0:
+    if not (grid.centroids != viewpoint).any():
         return
-    place = (viewpoint - middle)[None] / reach
-    seen = float(seen_from(place, (grid.centroids - middle) / reach, grid.edge_lengths / reach).mean())
+    seen = visible_fraction(grid, viewpoint)
     if seen < _LEAST_SEEN:
         _warn(
             f"expected a viewpoint that sees the cloud, but from {np.round(viewpoint, 3).tolist()} m only "

@@ -8,7 +8,7 @@ tried: those from which much of it is visible, always from the same side, tell w
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from pcgraph.voxels.spacing import bounding_box, sphere_directions
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 
-_CELLS = 3000  # of the coarse grid on which places are compared, about
+_CELLS = 5000  # of the coarse grid on which places are compared, about
 _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
 _INSIDE = 64  # free places within the bounding box, of a lattice of
@@ -36,14 +36,18 @@ _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
 _TOLD = 40.0  # votes of the viewpoint for one of the places
-_DECIDED, _OUTSIDE_IN, _LIKELY = 0.05, 0.006, 0.004  # what counts where as much is seen
+_CLOSED = 0.962  # of all directions hit by something, from places inside: all was seen from within, or from around it
+_DECIDED, _OUTSIDE_IN, _UPPER = 0.08, 0.02, 0.002  # what counts where as much is seen,
+_DECIDED_CLOSED, _OUTSIDE_IN_CLOSED = 0.01, 0.002  # and where places inside are closed in
+_FROM_VIEWPOINT = 0.02
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y
 _VIEWS = 12  # places that the voxels themselves are looked at from
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
-_BINS_PER_RADIAN = 0.282  # of the octahedral map, over its width
+_BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
 
+_STEEPEST = 4.0  # of a square that is seen at a slant: tangent of its angle
 _TINY = 1e-12
 _FAR = 1e3  # voxel edges from a voxel to its orientation point
 
@@ -101,7 +105,8 @@ def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None)
             return VisibleSides(viewpoint, np.tile(viewpoint, (grid.n_voxels, 1)))
     places, weights = _telling_places(centres, widths, -middle / reach, likely)
     towards = np.empty((grid.n_voxels, 3))
-    in_blocks(_look_around, grid.n_voxels, places, weights, seen_from(places, centres, widths), centres, towards)
+    seen = seen_from(places, centres, widths, normals)
+    in_blocks(_look_around, grid.n_voxels, places, weights, seen, centres, towards)
     votes = np.einsum("ij,ij->i", towards, normals) / _lengths(towards) + _TOLD * told
     smoothed = np.empty_like(votes)
     for _ in range(_SMOOTHING):
@@ -112,8 +117,19 @@ def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None)
     return VisibleSides(seen_most, grid.centroids + towards * (_FAR * grid.edge_lengths)[:, None])
 
 
+def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
+    """Fraction of the voxels that are visible from a place, (3,) float64, metres."""
+    low, high = bounding_box(np.concatenate((grid.centroids, place[None])))
+    middle, reach = (low + high) / 2.0, max(float((high - low).max()) / 2.0, _TINY * float(grid.edge_lengths.min()))
+    centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
+    return float(seen_from((place - middle)[None] / reach, centres, widths, _either_normals(grid)).mean())
+
+
 def seen_from(
-    places: NDArray[np.float64], centres: NDArray[np.float64], widths: NDArray[np.float64]
+    places: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    normals: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Whether each of n squares is visible from each of k places, (k, n) bool: none is in front by more than its depth.
 
@@ -122,13 +138,15 @@ def seen_from(
     places : (k, 3) float64, metres
     centres : (n, 3) float64, metres
     widths : (n,) float64, metres
+    normals : (n, 3) float64
+        Towards either side. A square that is seen at a slant hides little of what lies beside it on the same surface.
     """
     seen = np.empty((len(places), len(centres)), np.bool_)
     some = slice(None, None, max(1, len(centres) // 1000))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
-    in_blocks(_look, len(places), places, bins, centres, widths, seen, smallest=1)
+    in_blocks(_look, len(places), places, bins, centres, widths, normals, seen, smallest=1)
     return seen
 
 
@@ -164,11 +182,14 @@ def _telling_places(
     upper = np.arange(len(places)) < _OUTSIDE // 2
     likely = upper if viewpoint is None else np.arange(len(places)) == len(places) - 1
     normals = _either_normals(coarse)
-    sides = np.where(seen_from(places, coarse.centroids, coarse.edge_lengths), np.float32(1.0), np.float32(0.0))
+    sides = seen_from(places, coarse.centroids, coarse.edge_lengths, normals).astype(np.float32)
     for k, place in enumerate(places):
         rays = place - coarse.centroids
         sides[k] *= np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
-    weights = _most_telling(_agreements(sides, _starts(sides, outside, likely)), sides, coarse, likely)
+    closed = np.zeros(len(places))
+    in_blocks(_count_hits, len(inside), inside, coarse.centroids, closed[_OUTSIDE : _OUTSIDE + len(inside)])
+    found = _agreements(sides, _starts(sides, outside, likely))
+    weights = _most_telling(found, sides, coarse, closed, likely, _UPPER if viewpoint is None else _FROM_VIEWPOINT)
     chosen = _spread_choice(sides != 0.0, weights)
     return places[chosen], weights[chosen]
 
@@ -258,22 +279,37 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
 
 
 def _most_telling(
-    found: _Agreements, sides: NDArray[np.float32], coarse: VoxelGrid, likely: NDArray[np.bool_]
+    found: _Agreements,
+    sides: NDArray[np.float32],
+    coarse: VoxelGrid,
+    closed: NDArray[np.float64],
+    likely: NDArray[np.bool_],
+    likely_counts: float,
 ) -> NDArray[np.float64]:
-    """Weights of the places, (k,) float64, in the agreement that shows most of the surface."""
+    """Weights of the places, (k,) float64, in the agreement that shows most of the surface.
+
+    A crease is hidden by what is beside it, so cells count as shown beside shown ones. Where an agreement is one of
+    places closed in, as in a room, those alone count half: of a room all but narrow gaps is seen from within.
+    """
     cells = np.repeat(np.arange(coarse.n_voxels), np.diff(coarse.indptr))
     visible = np.abs(sides).sum(axis=1)
+    different = list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values())
+    closed_in = [float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0.0 for s in different]
+    decided_counts, outside_counts = _DECIDED, _OUTSIDE_IN
+    if any(closed_in):
+        decided_counts, outside_counts = _DECIDED_CLOSED, _OUTSIDE_IN_CLOSED
+        likely_counts = likely_counts if likely_counts > _UPPER else 0.0
     most, best = -np.inf, found.weights[0]
-    different = {outward.tobytes(): s for s, outward in enumerate(found.outward)}
-    for s in different.values():
+    for s in different:
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
         shown = np.einsum("k,kn->n", weights, np.maximum(sides * found.outward[s], 0.0))
         shown = np.minimum(shown / _WELL_SEEN, 1.0)
-        around = shown.copy()  # a crease is hidden by what is beside it
+        around = shown.copy()
         np.maximum.at(around, cells, shown[coarse.neighbours])
+        score = float((around + shown).mean()) / 2.0 if any(closed_in) else float(around.mean())
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
-        score = float(around.mean()) + _DECIDED * float(decided[visible > 0.0].mean())
-        for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, _LIKELY)):
+        score += decided_counts * float(decided[visible > 0.0].mean())
+        for some, counts in ((slice(_OUTSIDE), outside_counts), (likely, likely_counts)):
             score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
@@ -293,11 +329,15 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
 
 
 def _coarse(centres: NDArray[np.float64], width: float) -> VoxelGrid:
-    """Voxels in larger ones, as few as still show their shape."""
+    """Voxels in larger ones, as few as still show their shape; the outermost surfaces amid a layer of them."""
     size = width * max(1.0, math.sqrt(len(centres) / (1.5 * _CELLS)))  # as many as a surface would have
-    while (coarse := voxel_grid(centres, None, size, Warp())).n_voxels > 2 * _CELLS:
+    low = bounding_box(centres)[0]
+    while True:
+        shift = 0.5 * size - low
+        coarse = voxel_grid(centres + shift, None, size, Warp())
+        if coarse.n_voxels <= 2 * _CELLS:
+            return replace(coarse, centroids=coarse.centroids - shift)
         size *= 1.4
-    return coarse
 
 
 def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -341,8 +381,8 @@ def _bin_of(x: float, y: float, z: float, bins: int) -> tuple[float, float]:
 def _count_hits(
     start: int, stop: int, places: NDArray[np.float64], centres: NDArray[np.float64], hits: NDArray[np.float64]
 ) -> None:
-    """Set the fraction of directions in which there is something, from each place, on a map of 12 x 12 bins."""
-    bins = 12
+    """Set the fraction of directions in which there is something, from each place, on a map of 8 x 8 bins."""
+    bins = 8
     for k in range(start, stop):
         hit = np.zeros((bins, bins), np.bool_)
         for i in range(len(centres)):
@@ -360,31 +400,36 @@ def _look(
     bins_of: NDArray[np.int64],
     centres: NDArray[np.float64],
     widths: NDArray[np.float64],
+    normals: NDArray[np.float64],
     seen: NDArray[np.bool_],
 ) -> None:
     """Set what is seen from each place, by the least range in each bin of directions that a square may cover."""
     n = len(centres)
-    at, ranges = np.empty(n, np.int32), np.empty(n, np.float32)
+    at, ranges, per_radian = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     for k in range(start, stop):
         bins = bins_of[k]
-        per_radian = _BINS_PER_RADIAN * bins
         nearest = np.full(bins * bins, np.float32(np.inf), np.float32)
         for i in range(n):
             x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
             ranges[i] = math.sqrt(x * x + y * y + z * z)
             if ranges[i] <= 0.0:
-                at[i] = -1
+                at[i], per_radian[i] = -1, 1.0
                 continue
             u, v = _bin_of(x, y, z, bins)
             at[i] = min(int(u), bins - 1) * bins + min(int(v), bins - 1)
-            half = min(0.6 * widths[i] / ranges[i] * per_radian, 24.0)
+            per_radian[i] = 0.5 * bins * ranges[i] / (abs(x) + abs(y) + abs(z))  # at most, of the octahedral map
+            cosine = abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / ranges[i]
+            slope = min(math.sqrt(max(1.0 - cosine * cosine, 0.0)) / max(cosine, _TINY), _STEEPEST) / per_radian[i]
+            half = min(0.6 * widths[i] / ranges[i] * per_radian[i], 24.0)
             for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
                 for q in range(max(int(v - half), 0), min(int(v + half), bins - 1) + 1):
-                    if ranges[i] < nearest[p * bins + q]:
-                        nearest[p * bins + q] = ranges[i]
+                    off = max(abs(p + 0.5 - u), abs(q + 0.5 - v), 0.5) - 0.5  # beside its centre it may be farther
+                    reaches = ranges[i] * np.float32(1.0 + slope * off)
+                    if reaches < nearest[p * bins + q]:
+                        nearest[p * bins + q] = reaches
         for i in range(n):
             # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-            depth = widths[i] + 0.5 * ranges[i] / per_radian
+            depth = widths[i] + 0.5 * ranges[i] / per_radian[i]
             seen[k, i] = at[i] >= 0 and ranges[i] <= nearest[at[i]] + depth
 
 

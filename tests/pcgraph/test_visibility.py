@@ -97,9 +97,30 @@ def test_what_lies_before_a_camera_is_seen_from_there():
     assert fraction_outward(*joined(tuple(column[~hidden] for column in wall), box)) > 0.96
 
 
+@pytest.mark.parametrize("direction", [(0, 0, 1), (1, 0, 0), (1, 1, 1), (1, -2, 0.5), (-1, -1, 0)])
+def test_a_wall_has_no_leaks_in_any_direction(direction):
+    """The map of directions is not even: a wall seen along an axis must be as tight as one along a diagonal."""
+    wall = np.stack(np.meshgrid(*2 * (np.arange(-1, 1, 0.05) + 0.025,), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    turn = Rotation.align_vectors([direction], [(0, 0, 1)])[0].as_matrix()
+    behind = wall[np.abs(wall[:, :2]).max(axis=1) < 0.8]
+    squares = np.concatenate((wall + np.array((0, 0, 1.5)), behind + np.array((0, 0, 2.0)))) @ turn.T
+    seen = seen_from(np.zeros((1, 3)), squares, np.full(len(squares), 0.05), np.tile(turn[:, 2], (len(squares), 1)))[0]
+    assert seen[: len(wall)].mean() > 0.5
+    assert not seen[len(wall) :].any()
+
+
+def test_a_corridor_with_little_in_it_is_seen_from_within():
+    walls = faces((0, 0, 0), (9, 1.8, 2.4), 0.04)
+    cupboard = faces((3.0, 0.02, 0.02), (3.8, 0.5, 1.2), 0.04, "-x +x +y +z")
+    post = faces((6.0, 1.0, 0.02), (6.2, 1.2, 2.38), 0.04, "-x +x -y +y")
+    assert fraction_outward(*joined((walls[0], -walls[1]), cupboard, post)) > 0.96
+
+
 def test_a_square_in_front_hides_one_behind():
     near, behind, beside = [0.0, 0.0, 1.0], [0.02, 0.0, 3.0], [1.0, 0.0, 3.0]
-    seen = seen_from(np.zeros((1, 3)), np.array([near, behind, beside]), np.full(3, 0.2))[0]
+    seen = seen_from(
+        np.zeros((1, 3)), np.array([near, behind, beside]), np.full(3, 0.2), np.tile((0.0, 0.0, 1.0), (3, 1))
+    )[0]
     assert seen.tolist() == [True, False, True]
 
 
