@@ -105,7 +105,7 @@ def test_a_wall_has_no_leaks_in_any_direction(direction):
     behind = wall[np.abs(wall[:, :2]).max(axis=1) < 0.8]
     squares = np.concatenate((wall + np.array((0, 0, 1.5)), behind + np.array((0, 0, 2.0)))) @ turn.T
     seen = seen_from(np.zeros((1, 3)), squares, np.full(len(squares), 0.05), np.tile(turn[:, 2], (len(squares), 1)))[0]
-    assert seen[: len(wall)].mean() > 0.5
+    assert seen[: len(wall)].mean() > 0.95
     assert not seen[len(wall) :].any()
 
 
