@@ -27,6 +27,7 @@ _REACH = 3.0  # voxel edges, as far as gaps are bridged
 _VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * _REACH**3
 _MAX_FRACTION = 2.0 / 3.0
 _PIECE = 5  # points: fewer, all alone, are no object
+_MANY_DETACHED = 0.02  # of the points
 _BOUNDARY = 8  # voxels around one amid a surface, as for gaps
 _NEAREST = 16  # voxels of which
 _FLAT = 0.05  # of the variance is at most across a surface; of noise 0.2
@@ -99,8 +100,9 @@ def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bo
 def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     """Voxels of pieces of at most four points that have nothing else within three voxel edges, (v,) bool.
 
-    No contact and no gap (`pcgraph.graph.gaps.gaps`) joins such a piece to anything. Clouds of fewer than 1000 points,
-    and those that are such pieces to more than two thirds, have none.
+    No contact and no gap (`pcgraph.graph.gaps.gaps`) joins such a piece to anything. Where they hold more than a
+    fiftieth of the points, what lies on surfaces of its own, as a coarse scan beside a fine one, stays. Clouds of fewer
+    than 1000 points, and those that are such pieces to more than two thirds, have none.
 
     Parameters
     ----------
@@ -126,6 +128,8 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     held = np.bincount(piece, grid.counts[few], n_pieces)
     held[piece[number[source[~inner]]]] = _PIECE
     detached[few[held[piece] < _PIECE]] = True
+    if grid.counts[detached].sum() > _MANY_DETACHED * grid.counts.sum():
+        detached &= ~_surfaces_among(detached, grid)
     return detached if grid.counts[detached].sum() <= _MAX_FRACTION * grid.counts.sum() else np.zeros_like(detached)
 
 

@@ -40,7 +40,8 @@ _CLOSED = 0.962  # of all directions hit by something, from places inside: all w
 _DECIDED, _OUTSIDE_IN, _UPPER = 0.08, 0.02, 0.002  # what counts where as much is seen,
 _DECIDED_CLOSED, _OUTSIDE_IN_CLOSED = 0.01, 0.002  # and where places inside are closed in
 _FROM_VIEWPOINT = 0.02
-_WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y
+_WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
+_NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _VIEWS = 12  # places that the voxels themselves are looked at from
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
@@ -176,7 +177,9 @@ def _telling_places(
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
     from_origin = coarse.centroids - origin
-    if viewpoint is None and (np.abs(from_origin[:, :2]).max(axis=1) < _WIDE * from_origin[:, 2]).all():
+    aside = np.abs(from_origin[:, :2]).max(axis=1)
+    is_image = bool((aside < _WIDE * from_origin[:, 2]).all() and np.mean(aside > _NARROW * from_origin[:, 2]) > 0.1)
+    if viewpoint is None and is_image:
         viewpoint = origin  # of a camera
     places = np.concatenate((outside, inside, outside[:0] if viewpoint is None else viewpoint[None]))
     upper = np.arange(len(places)) < _OUTSIDE // 2

@@ -97,6 +97,14 @@ def test_what_lies_before_a_camera_is_seen_from_there():
     assert fraction_outward(*joined(tuple(column[~hidden] for column in wall), box)) > 0.96
 
 
+def test_what_lies_high_above_the_origin_is_not_seen_from_there():
+    """Coordinates centred in x and y, with the elevation kept."""
+    ground = faces((-4, -4, 499), (4, 4, 500), 0.05, "+z")
+    box = faces((-1, -1, 500.03), (1, 1, 501), 0.05, "-x +x -y +y +z")
+    hidden = np.abs(ground[0][:, :2]).max(axis=1) < 1.0
+    assert fraction_outward(*joined(tuple(column[~hidden] for column in ground), box)) > 0.96
+
+
 @pytest.mark.parametrize("direction", [(0, 0, 1), (1, 0, 0), (1, 1, 1), (1, -2, 0.5), (-1, -1, 0)])
 def test_a_wall_has_no_leaks_in_any_direction(direction):
     """The map of directions is not even: a wall seen along an axis must be as tight as one along a diagonal."""
