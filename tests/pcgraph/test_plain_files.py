@@ -82,8 +82,8 @@ def test_a_signal_takes_what_is_half_written_and_its_directories_away(
     tmp_path: Path, held: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As `pcgraph segment --out new/directory` stopped between the making of the directory and the end of its files."""
-    entered, go_on = threading.Event(), threading.Event()
-    real = getattr(os, held)
+    entered, go_on, abandoned = threading.Event(), threading.Event(), threading.Event()
+    real, real_fsync = getattr(os, held), os.fsync
 
     def slow(*arguments: object, **options: object) -> object:
         done = real(*arguments, **options)
@@ -92,17 +92,25 @@ def test_a_signal_takes_what_is_half_written_and_its_directories_away(
             go_on.wait(10)
         return done
 
+    def not_before_all_is_abandoned(handle: int) -> None:
+        if threading.current_thread() is worker:
+            abandoned.wait(10)
+        real_fsync(handle)
+
     def work() -> None:
         with suppress(Refused):
             write_files({tmp_path / "n" / "a": b"1", tmp_path / "n" / "b": b"2"}, Refused, make_parents=True)
 
     worker = threading.Thread(target=work)
     monkeypatch.setattr(os, held, slow)
+    if held == "open":  # under the lock, which is waited for
+        monkeypatch.setattr(os, "fsync", not_before_all_is_abandoned)
+        threading.Timer(0.2, go_on.set).start()
     worker.start()
     assert entered.wait(10)
-    threading.Timer(0.2, go_on.set).start() if held == "open" else None  # held under the lock, which is waited for
     assert plain_files._abandon()
     assert list(tmp_path.iterdir()) == []
+    abandoned.set()
     go_on.set()
     worker.join(10)
     assert list(tmp_path.iterdir()) == []
