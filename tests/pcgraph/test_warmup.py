@@ -82,6 +82,7 @@ def test_where_kernels_are_missing_a_second_process_compiles_those_of_the_tree(t
     The package is a copy with the cache of the tests, less the two kernels that tell whether a cache is filled. That
     the halves forget no other shows in the first process, which then compares what both compile with what a call needs.
     """
+    warmup.compile_kernels()  # where no test has run yet
     source, package = Path(pcgraph.__file__).parent, tmp_path / "pcgraph"
     shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))  # with times, which caches know
     modules = [module for name, module in sys.modules.items() if name.startswith("pcgraph.")]
