@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +13,11 @@ import pytest
 
 from rangesim.environment.llvm import ensure_llvm
 from rangesim.errors import EnvironmentProblem
+
+# Threads of BLAS and of OpenMP spin while they wait for work, and small products wait most of the time: a core's time
+# that other workers need. numba's threads do not spin, and stay as many as there are cores.
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")
 
 with suppress(EnvironmentProblem):  # tests that render say it again; those of decoders need no LLVM
     ensure_llvm()

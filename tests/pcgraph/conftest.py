@@ -16,7 +16,23 @@ from simulated_rooms import room
 import pcgraph
 from pcgraph.detection import find_planes
 
+# Modules that are run before the others: first those whose tests take seconds, lest a worker comes to one when the
+# other has nothing left to do, then those with scikit-learn, which takes a second to import and which one worker
+# imports for all if they are neighbours.
+FIRST = (
+    *("test_warmup", "test_real", "test_surface", "test_learning_classifier", "test_learning_transfer"),
+    *("test_linkage_learned", "test_plain_files", "test_metrics_peers", "test_docs", "test_short_repr"),
+    *("test_detection_objects", "test_detection_planes", "test_plausibility", "test_benchmarks", "test_files"),
+    *("test_properties", "test_output"),
+)
+HERE = Path(__file__).parent
 REAL_CLOUDS = Path(__file__).resolve().parents[3] / "shared" / "data" / "mosd"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the modules of `FIRST` before all others, each with its tests in their order."""
+    rank = {name: number for number, name in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)) if item.path.parent == HERE else len(rank))
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import cache
 
 import numpy as np
 import pytest
@@ -22,9 +23,21 @@ from pcgraph.voxels.warp import Warp
 
 SQUARE = patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0))
 HALF = (SQUARE[:, 0] > 0.4133).astype(int)
-SIZES = {"voxel_size": 2 * SPACING, "seed_size": 0.12}
+OPTIONS = {"voxel_size": 2 * SPACING, "seed_size": 0.12, "viewpoint": (0.4, 0.4, -1.0)}
 RNG = np.random.default_rng(5)
 INTENSITY = np.where(HALF, 30.0, 10.0) + RNG.standard_normal(len(SQUARE))
+
+
+@cache
+def without_features():
+    """The segmentation of the square by its points alone."""
+    return pcgraph.segment(SQUARE, **OPTIONS)
+
+
+@cache
+def by_intensity():
+    """The segmentation of the square whose halves differ in intensity."""
+    return pcgraph.segment(SQUARE, features=INTENSITY, **OPTIONS)
 
 
 def same_bytes(a, b):
@@ -43,8 +56,8 @@ def same_bytes(a, b):
 
 @pytest.mark.parametrize("method", [pcgraph.SurfaceGrowth(), pcgraph.Vccs(spatial_weight=0.2)], ids=["growth", "vccs"])
 def test_coplanar_halves_that_differ_in_intensity_alone_become_different_supervoxels(method):
-    blind = pcgraph.segment(SQUARE, **SIZES, method=method)
-    seeing = pcgraph.segment(SQUARE, features=INTENSITY, **SIZES, method=method)
+    blind = pcgraph.segment(SQUARE, **OPTIONS, method=method)
+    seeing = pcgraph.segment(SQUARE, features=INTENSITY, **OPTIONS, method=method)
     assert undersegmentation_error(blind.supervoxels, HALF) > 0.1
     inside = np.abs(SQUARE[:, 0] - 0.4133) > 2 * SPACING  # but for voxels that hold both
     sides = [np.unique(seeing.supervoxels[inside & (side == HALF)]) for side in (0, 1)]
@@ -53,13 +66,13 @@ def test_coplanar_halves_that_differ_in_intensity_alone_become_different_supervo
     assert means.shape == (seeing.graph.n_nodes, 1)
     assert means[sides[0]].max() < means[sides[1]].min()
     off = type(method)(feature_weight=0.0, spatial_weight=method.spatial_weight)
-    same_bytes(pcgraph.segment(SQUARE, features=INTENSITY, **SIZES, method=off), blind)
+    same_bytes(pcgraph.segment(SQUARE, features=INTENSITY, **OPTIONS, method=off), blind)
 
 
 @pytest.mark.parametrize(("unit", "offset"), [(2.0**-30, 0.0), (1e-3, 0.0), (-7.0, 0.0), (1.0, 1e6), (255.0, -3e4)])
 def test_unit_and_offset_do_not_matter(unit, offset):
-    expected = pcgraph.segment(SQUARE, features=INTENSITY, **SIZES)
-    found = pcgraph.segment(SQUARE, features=INTENSITY * unit + offset, **SIZES)
+    expected = by_intensity()
+    found = pcgraph.segment(SQUARE, features=INTENSITY * unit + offset, **OPTIONS)
     assert np.array_equal(found.supervoxels, expected.supervoxels)
     features = np.sign(unit) * found.graph.node_features.features
     assert features == pytest.approx(expected.graph.node_features.features, abs=1e-3)
@@ -75,10 +88,9 @@ CONSTANT = {
 
 @pytest.mark.parametrize("name", CONSTANT)
 def test_a_constant_changes_nothing_to_the_byte(name):
-    plain = pcgraph.segment(SQUARE, **SIZES)
-    same_bytes(pcgraph.segment(SQUARE, features=CONSTANT[name], **SIZES), plain)
-    alone = pcgraph.segment(SQUARE, features=INTENSITY, **SIZES)
-    both = pcgraph.segment(SQUARE, features=np.stack((CONSTANT[name], INTENSITY), axis=1), **SIZES)
+    same_bytes(pcgraph.segment(SQUARE, features=CONSTANT[name], **OPTIONS), without_features())
+    alone = by_intensity()
+    both = pcgraph.segment(SQUARE, features=np.stack((CONSTANT[name], INTENSITY), axis=1), **OPTIONS)
     same_bytes(both, alone)
     assert (both.graph.node_features.features[:, 0] == 0.0).all()
     assert np.array_equal(both.graph.node_features.features[:, 1:], alone.graph.node_features.features)
@@ -86,7 +98,7 @@ def test_a_constant_changes_nothing_to_the_byte(name):
 
 def test_noise_changes_nothing_to_the_byte():
     noise = np.random.default_rng(1).standard_cauchy((len(SQUARE), 3))
-    same_bytes(pcgraph.segment(SQUARE, features=noise, **SIZES), pcgraph.segment(SQUARE, **SIZES))
+    same_bytes(pcgraph.segment(SQUARE, features=noise, **OPTIONS), without_features())
 
 
 def test_order_does_not_matter():
@@ -156,7 +168,7 @@ def test_any_column_is_scaled_to_finite_numbers(values, power):
 
 
 def test_means_of_voxels_nodes_and_trees_are_those_of_numpy():
-    result = pcgraph.segment(SQUARE, features=np.stack((INTENSITY, SQUARE[:, 1]), axis=1), **SIZES)
+    result = pcgraph.segment(SQUARE, features=np.stack((INTENSITY, SQUARE[:, 1]), axis=1), **OPTIONS)
     scaled = result.feature_scaling.scaled(np.stack((INTENSITY, SQUARE[:, 1]), axis=1)).astype(float)
     grid, leaf = result.surface.grid, result.supervoxels
     for owner, means in ((grid.voxel_of_point, grid.features), (leaf, result.leaves.features)):
@@ -190,7 +202,7 @@ def test_autocorrelation_of_noise_and_of_fields():
 
 def test_updates_use_the_scale_of_the_first_scan():
     left, right = SQUARE[:, 0] < 0.5, SQUARE[:, 0] > 0.3
-    first = pcgraph.segment(SQUARE[left], features=INTENSITY[left], **SIZES)
+    first = pcgraph.segment(SQUARE[left], features=INTENSITY[left], **OPTIONS)
     second = pcgraph.update(first, SQUARE[right], features=INTENSITY[right])
     assert second.feature_scaling is first.feature_scaling
     both = np.concatenate((INTENSITY[left], INTENSITY[right]))[:, None]
@@ -203,7 +215,7 @@ def test_updates_use_the_scale_of_the_first_scan():
         with pytest.raises(ValueError, match=message):
             pcgraph.update(first, SQUARE[right], features=features)
     with pytest.raises(ValueError, match="features with both scans or with neither"):
-        pcgraph.update(pcgraph.segment(SQUARE, **SIZES), SQUARE, features=INTENSITY)
+        pcgraph.update(without_features(), SQUARE, features=INTENSITY)
 
 
 # --- names of columns -------------------------------------------------------------------------------------------------
@@ -212,21 +224,21 @@ def test_updates_use_the_scale_of_the_first_scan():
 def test_columns_by_name(tmp_path):
     columns = {"Intensity": INTENSITY, "wide": np.stack((INTENSITY, SQUARE[:, 1]), axis=1), "beam": HALF.astype("u1")}
     cloud = pcgraph.Cloud(SQUARE, columns=columns)
-    same_bytes(pcgraph.segment(cloud, **SIZES), pcgraph.segment(SQUARE, **SIZES))  # none counts unless named
+    same_bytes(pcgraph.segment(cloud, **OPTIONS), without_features())  # none counts unless named
     for names, table in (
         ("Intensity", INTENSITY),
         (["wide"], columns["wide"]),
         (("beam", "Intensity"), np.stack((HALF, INTENSITY), axis=1)),
         (INTENSITY, INTENSITY),
     ):
-        expected = pcgraph.segment(SQUARE, features=table, **SIZES)
-        found = pcgraph.segment(cloud, features=names, **SIZES)
+        expected = by_intensity() if table is INTENSITY else pcgraph.segment(SQUARE, features=table, **OPTIONS)
+        found = pcgraph.segment(cloud, features=names, **OPTIONS)
         same_bytes(found, expected)
         assert np.array_equal(found.leaves.features, expected.leaves.features)
     stored = {name: SQUARE[:, i] for i, name in enumerate("xyz")} | {"Intensity": INTENSITY}
     (tmp_path / "a.ply").write_bytes(encode_ply(stored))
-    of_file = pcgraph.segment(tmp_path / "a.ply", features="Intensity", **SIZES)
-    same_bytes(of_file, pcgraph.segment(SQUARE, features=INTENSITY, **SIZES))
+    of_file = pcgraph.segment(tmp_path / "a.ply", features="Intensity", **OPTIONS)
+    same_bytes(of_file, by_intensity())
     later = pcgraph.update(of_file, tmp_path / "a.ply", features="Intensity")
     assert later.leaves.features == pytest.approx(of_file.leaves.features, abs=1e-12)
 
@@ -259,10 +271,10 @@ def test_bad_features(name):
 
 
 def test_exports_have_features_by_number():
-    graph = pcgraph.segment(SQUARE, features=np.stack((INTENSITY, SQUARE[:, 1]), axis=1), **SIZES).graph
+    graph = pcgraph.segment(SQUARE, features=np.stack((INTENSITY, SQUARE[:, 1]), axis=1), **OPTIONS).graph
     names = graph.to_pyg()["x_names"]
     assert {"feature_0", "feature_1"} < {*names}
     assert graph.to_networkx().nodes[0]["feature_1"] == graph.node_features.features[0, 1]
-    plain = pcgraph.segment(SQUARE, **SIZES).graph
+    plain = without_features().graph
     assert plain.node_features.features.shape == (plain.n_nodes, 0)
     assert "features" not in plain.node_features.columns()

@@ -44,13 +44,14 @@ def test_gaps_are_those_of_a_search_of_all_pairs():
     found = gaps(grid, result.surface.normals, labels, result.graph.node_features, result.graph.edges)
     touching = {tuple(pair) for pair in result.graph.edges.tolist()}
     degree = np.diff(grid.indptr)
+    a, b = np.tril_indices(grid.n_voxels, -1)
+    widths = np.linalg.norm(grid.warped[a] - grid.warped[b], axis=1) / grid.size
+    near = (widths <= 3.0) & (labels[a] != labels[b]) & (np.maximum(degree[a], degree[b]) < 8)
     expected: dict[tuple[int, int], float] = {}
-    for i in range(grid.n_voxels):
-        for j in range(i):
-            pair = tuple(sorted((int(labels[i]), int(labels[j]))))
-            width = float(np.linalg.norm(grid.warped[i] - grid.warped[j]) / grid.size)
-            if pair[0] != pair[1] and pair not in touching and width <= 3.0 and max(degree[i], degree[j]) < 8:
-                expected[pair] = min(width, expected.get(pair, np.inf))
+    for i, j, width in zip(labels[a[near]].tolist(), labels[b[near]].tolist(), widths[near].tolist(), strict=True):
+        pair = min(i, j), max(i, j)
+        if pair not in touching:
+            expected[pair] = min(width, expected.get(pair, np.inf))
     assert [tuple(pair) for pair in found.edges.tolist()] == sorted(expected)
     assert found.widths == pytest.approx([expected[pair] for pair in sorted(expected)])
     assert len(expected) > 5

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Node classification: what neighbours and ancestors tell, determinism, and the manners of scikit-learn."""
+"""Node classification: what neighbours and ancestors tell, determinism, and the manners of scikit-learn.
+
+It takes a second to import, so tests do that themselves: not every worker runs one of them.
+"""
 
 from __future__ import annotations
 
+import importlib
 import json
 
 import numpy as np
 import pytest
 from simulated_rooms import room
-from sklearn.base import clone
-from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
-from sklearn.model_selection import GridSearchCV, cross_val_score
-from sklearn.naive_bayes import GaussianNB
-from sklearn.tree import DecisionTreeClassifier
 
 import pcgraph
-from pcgraph.learning import NodeClassifier, leaf_descriptors
+from pcgraph import learning
+from pcgraph.learning import leaf_descriptors
 from pcgraph.learning.descriptors import _climb, _contact_means, _uniform_tops
 
 
@@ -29,7 +29,7 @@ def rooms():
 
 def test_rooms_are_learned_from_rooms(rooms):
     results, classes, ups = rooms
-    taught = NodeClassifier().fit(results[:3], classes[:3], ups[:3])
+    taught = learning.NodeClassifier().fit(results[:3], classes[:3], ups[:3])
     assert taught.classes_.tolist() == [c for c in range(6) if any((truth == c).any() for truth in classes[:3])]
     floor_and_walls = (classes[3] == 0) | (classes[3] == 1)
     predicted = taught.predict(results[3], ups[3])
@@ -43,11 +43,13 @@ def test_rooms_are_learned_from_rooms(rooms):
 
 
 def test_probabilities_and_labels_lie_on_the_points(rooms):
+    from sklearn.tree import DecisionTreeClassifier
+
     _, classes, ups = rooms
     points = room(0, shape=(120, 160)).points
     points[10:14, 20:30] = np.nan
     holes = pcgraph.segment(points)
-    taught = NodeClassifier(DecisionTreeClassifier(random_state=0)).fit(holes, classes[0], ups[0])
+    taught = learning.NodeClassifier(DecisionTreeClassifier(random_state=0)).fit(holes, classes[0], ups[0])
     share, labels = taught.predict_proba(holes, ups[0]), taught.predict(holes, ups[0])
     assert share.shape == (*points.shape[:2], len(taught.classes_))
     missing = np.isnan(points[..., 0])
@@ -71,10 +73,12 @@ NAMES = np.array(["floor", "wall", "table", "box", "ball", "lamp", ""])
     ],
 )
 def test_labels_may_be_any_numbers_and_text(rooms, rename, unlabelled, tmp_path):
+    from sklearn.tree import DecisionTreeClassifier
+
     results, classes, ups = rooms
-    plain = NodeClassifier(DecisionTreeClassifier(random_state=0)).fit(results[0], classes[0], ups[0])
+    plain = learning.NodeClassifier(DecisionTreeClassifier(random_state=0)).fit(results[0], classes[0], ups[0])
     inner = DecisionTreeClassifier(random_state=0)
-    other = NodeClassifier(inner, unlabelled=unlabelled).fit(results[0], rename(classes[0]), ups[0])
+    other = learning.NodeClassifier(inner, unlabelled=unlabelled).fit(results[0], rename(classes[0]), ups[0])
     expected = rename(plain.predict(results[1], ups[1]))
     # Where two classes are as probable the first is taken: their order is another.
     assert np.mean(other.predict(results[1], ups[1]) == expected) > 0.99
@@ -83,7 +87,7 @@ def test_labels_may_be_any_numbers_and_text(rooms, rename, unlabelled, tmp_path)
         plain.score(results[1], classes[1], ups[1]), abs=0.01
     )
     other.save(tmp_path / "a.json")
-    loaded = NodeClassifier.load(tmp_path / "a.json")
+    loaded = learning.NodeClassifier.load(tmp_path / "a.json")
     assert (
         loaded.classes_.tolist() == other.classes_.tolist() == sorted({*rename(classes[0][classes[0] >= 0]).tolist()})
     )
@@ -94,16 +98,20 @@ def test_labels_of_other_kinds_are_refused(rooms):
     results, classes, _ = rooms
     for wrong in (classes[0] + 0.5, np.full(classes[0].shape, None), [[1, 2], [3]]):
         with pytest.raises(ValueError, match=r"truth|inhomogeneous"):
-            NodeClassifier().fit(results[0], wrong)
+            learning.NodeClassifier().fit(results[0], wrong)
     with pytest.raises(ValueError, match="one kind"):
-        NodeClassifier().fit(results[:2], [classes[0], NAMES[classes[1]]])
+        learning.NodeClassifier().fit(results[:2], [classes[0], NAMES[classes[1]]])
     with pytest.raises(ValueError, match="unlabelled of the labels' kind"):
-        NodeClassifier(unlabelled="none").fit(results[0], classes[0])
+        learning.NodeClassifier(unlabelled="none").fit(results[0], classes[0])
 
 
 def test_cross_validation_over_whole_clouds(rooms):
+    from sklearn.base import clone
+    from sklearn.model_selection import GridSearchCV, cross_val_score
+    from sklearn.tree import DecisionTreeClassifier
+
     results, classes, ups = rooms
-    tree = NodeClassifier(DecisionTreeClassifier(random_state=0))
+    tree = learning.NodeClassifier(DecisionTreeClassifier(random_state=0))
     scores = cross_val_score(tree, results, classes, cv=2, error_score="raise")
     own = [clone(tree).fit(results[2:], classes[2:]).score(results[:2], classes[:2])]
     own += [clone(tree).fit(results[:2], classes[:2]).score(results[2:], classes[2:])]
@@ -115,10 +123,15 @@ def test_cross_validation_over_whole_clouds(rooms):
 
 
 def test_cross_validation_of_clouds_of_different_sizes(rooms):
+    from sklearn.model_selection import cross_val_score
+    from sklearn.tree import DecisionTreeClassifier
+
     results, classes, _ = rooms
     small = room(7, shape=(60, 80))
     clouds, truths = [*results[:2], pcgraph.segment(small.points)], [*classes[:2], small.classes]
-    scores = cross_val_score(NodeClassifier(DecisionTreeClassifier()), clouds, truths, cv=3, error_score="raise")
+    scores = cross_val_score(
+        learning.NodeClassifier(DecisionTreeClassifier()), clouds, truths, cv=3, error_score="raise"
+    )
     assert scores.shape == (3,)
 
 
@@ -126,16 +139,19 @@ def test_cross_validation_of_clouds_of_different_sizes(rooms):
     "estimator",
     [
         None,
-        RandomForestClassifier(7, max_depth=6, random_state=1),
-        ExtraTreesClassifier(5, random_state=1),
-        DecisionTreeClassifier(random_state=2),
+        ("ensemble", "RandomForestClassifier", {"n_estimators": 7, "max_depth": 6, "random_state": 1}),
+        ("ensemble", "ExtraTreesClassifier", {"n_estimators": 5, "random_state": 1}),
+        ("tree", "DecisionTreeClassifier", {"random_state": 2}),
     ],
 )
 def test_what_is_saved_predicts_the_same(rooms, estimator, tmp_path):
+    if estimator is not None:
+        module, name, settings = estimator
+        estimator = getattr(importlib.import_module(f"sklearn.{module}"), name)(**settings)
     results, classes, ups = rooms
-    taught = NodeClassifier(estimator, ancestors=2, pose=False).fit(results[0], classes[0], ups[0])
+    taught = learning.NodeClassifier(estimator, ancestors=2, pose=False).fit(results[0], classes[0], ups[0])
     taught.save(tmp_path / "rooms.json")
-    loaded = NodeClassifier.load(tmp_path / "rooms.json")
+    loaded = learning.NodeClassifier.load(tmp_path / "rooms.json")
     assert loaded.get_params() == {**taught.get_params(deep=False), "estimator": None}
     assert np.array_equal(loaded.predict_nodes(results[3]), taught.predict_nodes(results[3]))
     loaded.save(tmp_path / "again.json")
@@ -144,17 +160,20 @@ def test_what_is_saved_predicts_the_same(rooms, estimator, tmp_path):
 
 
 def test_only_trees_are_saved(rooms, tmp_path):
+    from sklearn.naive_bayes import GaussianNB
+    from sklearn.tree import DecisionTreeClassifier
+
     results, classes, _ = rooms
     tree = DecisionTreeClassifier(random_state=0)
     with pytest.raises(ValueError, match="call fit"):
-        NodeClassifier().save(tmp_path / "a.json")
+        learning.NodeClassifier().save(tmp_path / "a.json")
     with pytest.raises(ValueError, match="decision trees to save, got GaussianNB"):
-        NodeClassifier(GaussianNB()).fit(results[0], classes[0]).save(tmp_path / "a.json")
+        learning.NodeClassifier(GaussianNB()).fit(results[0], classes[0]).save(tmp_path / "a.json")
     rng = np.random.RandomState(0)
     with pytest.raises(ValueError, match="plain settings"):
-        NodeClassifier(tree, random_state=rng).fit(results[0], classes[0]).save(tmp_path / "a.json")
+        learning.NodeClassifier(tree, random_state=rng).fit(results[0], classes[0]).save(tmp_path / "a.json")
     with pytest.raises(pcgraph.CloudWriteError):
-        NodeClassifier(tree).fit(results[0], classes[0]).save(tmp_path / "no" / "a.json")
+        learning.NodeClassifier(tree).fit(results[0], classes[0]).save(tmp_path / "no" / "a.json")
     assert not list(tmp_path.iterdir())
 
 
@@ -207,7 +226,7 @@ LIES = {
 def test_a_file_by_hand_is_read(stored):
     folder, content = stored
     (folder / "good.json").write_text(json.dumps(content))
-    forest = NodeClassifier.load(folder / "good.json").estimator_
+    forest = learning.NodeClassifier.load(folder / "good.json").estimator_
     assert forest.predict_proba(np.array([[0.0, 0.4], [9.0, 0.6]])).tolist() == [[1.0, 0.0], [0.0, 1.0]]
 
 
@@ -216,7 +235,7 @@ def test_lying_files_are_refused(name, stored):
     folder, content = stored
     (folder / "bad.json").write_text(json.dumps(content | LIES[name]))
     with pytest.raises(ValueError, match="expected a classifier of nodes in") as refusal:
-        NodeClassifier.load(folder / "bad.json")
+        learning.NodeClassifier.load(folder / "bad.json")
     assert len(str(refusal.value).splitlines()) == 1
     assert len(str(refusal.value)) < 600
 
@@ -227,20 +246,23 @@ def test_lying_files_are_refused(name, stored):
 def test_other_files_are_refused(content, tmp_path):
     (tmp_path / "bad.json").write_bytes(content)
     with pytest.raises(ValueError, match="expected a classifier of nodes in"):
-        NodeClassifier.load(tmp_path / "bad.json")
+        learning.NodeClassifier.load(tmp_path / "bad.json")
     with pytest.raises(pcgraph.CloudReadError):
-        NodeClassifier.load(tmp_path / "none.json")
+        learning.NodeClassifier.load(tmp_path / "none.json")
 
 
 def test_the_same_seed_gives_the_same_answer(rooms):
     results, classes, ups = rooms
-    first, second = (NodeClassifier(random_state=3).fit(results[0], classes[0], ups[0]) for _ in range(2))
+    first, second = (learning.NodeClassifier(random_state=3).fit(results[0], classes[0], ups[0]) for _ in range(2))
     assert np.array_equal(first.predict_nodes(results[2], ups[2]), second.predict_nodes(results[2], ups[2]))
 
 
 def test_params_and_clones():
+    from sklearn.base import clone
+    from sklearn.tree import DecisionTreeClassifier
+
     inner = DecisionTreeClassifier(max_depth=3)
-    classifier = NodeClassifier(inner, neighbours=2)
+    classifier = learning.NodeClassifier(inner, neighbours=2)
     assert classifier.get_params(deep=False) == {
         "unlabelled": None,
         "estimator": inner,
@@ -316,10 +338,10 @@ def test_wrong_input_is_refused(rooms):
         with pytest.raises(ValueError, match="at least 0"):
             leaf_descriptors(results[0], **arguments)
     with pytest.raises(ValueError, match="call fit"):
-        NodeClassifier().predict(results[0])
+        learning.NodeClassifier().predict(results[0])
     with pytest.raises(ValueError, match="labelled point"):
-        NodeClassifier().fit(results[0], np.full_like(classes[0], -1))
+        learning.NodeClassifier().fit(results[0], np.full_like(classes[0], -1))
     with pytest.raises(ValueError, match="one truth"):
-        NodeClassifier().fit(results[:2], classes[:1])
+        learning.NodeClassifier().fit(results[:2], classes[:1])
     with pytest.raises(ValueError, match="shape"):
-        NodeClassifier().fit(results[0], classes[0][:5])
+        learning.NodeClassifier().fit(results[0], classes[0][:5])

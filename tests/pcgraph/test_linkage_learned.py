@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from clouds import box, patch
 from graphs import random_graph
-from sklearn.linear_model import LogisticRegression
 
 import pcgraph
 from pcgraph.graph.adjacency import EdgeFeatures
@@ -47,6 +46,8 @@ def test_it_is_scikit_learns_regression(stack):
     model = LearnedLinkage.fit([result], [truth]).model
     columns = np.stack(list(edge_evidence(result.graph).values()), axis=1)
     rows = (columns - model.means) / model.scales
+    from sklearn.linear_model import LogisticRegression
+
     by_them = LogisticRegression()
     by_them.classes_ = np.array([False, True])
     by_them.coef_, by_them.intercept_ = np.array([model.coefficients]), np.array([model.intercept])

@@ -359,10 +359,10 @@ def test_a_process_that_dies_at_any_step_leaves_the_old_or_the_new(tmp_path: Pat
     steps = steps_of_a_replacement(tmp_path)
     assert steps > 20
     seen = set()
+    publish(tmp_path / "before", OLD)
+    write(tmp_path / "before", MINE)
     for step in range(steps):
-        target = tmp_path / f"n{step}"
-        publish(target, OLD)
-        write(target, MINE)
+        target = shutil.copytree(tmp_path / "before", tmp_path / f"n{step}")
         with pytest.MonkeyPatch.context() as patch:
             count_down(patch, step, Stop)
             patch.setattr(output._Staging, "release", end_of_process)
@@ -382,11 +382,11 @@ def test_a_process_that_dies_at_any_step_leaves_the_old_or_the_new(tmp_path: Pat
 
 def test_a_disk_that_fails_at_any_step_leaves_the_old_or_the_new(tmp_path: Path) -> None:
     """It is full or broken, by turns: both are told alike, and nothing asks which it was."""
+    publish(tmp_path / "before", OLD)
+    write(tmp_path / "before", MINE)
     for step in range(steps_of_a_replacement(tmp_path)):
         number = (errno.ENOSPC, errno.EIO)[step % 2]
-        target = tmp_path / f"n{step}"
-        publish(target, OLD)
-        write(target, MINE)
+        target = shutil.copytree(tmp_path / "before", tmp_path / f"n{step}")
         with pytest.MonkeyPatch.context() as patch:
             count_down(patch, step, partial(OSError, number, os.strerror(number)))
             with pytest.raises((Refused, OSError)) as caught:
@@ -481,9 +481,9 @@ def test_one_file_of_a_directory_is_replaced_with_its_digest(tmp_path: Path) -> 
 
 
 def test_a_replaced_file_is_ours_at_every_step(tmp_path: Path) -> None:
+    publish(tmp_path / "before", OLD)
     for step in range(12):
-        target = tmp_path / f"n{step}"
-        publish(target, OLD)
+        target = shutil.copytree(tmp_path / "before", tmp_path / f"n{step}")
         with pytest.MonkeyPatch.context() as patch:
             count_down(patch, step, Stop)
             with suppress(Stop):
@@ -660,7 +660,7 @@ def test_a_process_killed_while_it_clears_up_leaves_what_the_next_one_knows(tmp_
 def test_processes_that_meet_say_so_and_nothing_else(tmp_path: Path) -> None:
     """Claims that are made while others are given up: no work is lost, and no other error comes."""
     code = (
-        "import time; os.fsync = os.fstat; until = time.time() + 0.5\n"
+        "import time; os.fsync = os.fstat; until = time.time() + 0.3\n"
         "while time.time() < until:\n"
         "    try:\n"
         "        with new_directory(sys.argv[1], KIND) as folder:\n"

@@ -10,11 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from sklearn.tree import DecisionTreeClassifier
 
 import pcgraph
 from pcgraph import plain_files
-from pcgraph.learning import NodeClassifier
 from pcgraph.plain_files import write_file, write_files
 from pcgraph.tree.learned import EdgeModel
 
@@ -120,9 +118,11 @@ def test_a_signal_takes_what_is_half_written_and_its_directories_away(
 @pytest.fixture(scope="module")
 def savers(boxes):
     """Calls that save something to a path, by the ending of its name."""
+    from sklearn.tree import DecisionTreeClassifier
+
     points, truth, result = boxes
     model = EdgeModel(("step_voxels",), (0.0,), (1.0,), (2.0,), -2.0, 0.5)
-    taught = NodeClassifier(DecisionTreeClassifier(max_depth=2)).fit(result, truth)
+    taught = pcgraph.learning.NodeClassifier(DecisionTreeClassifier(max_depth=2)).fit(result, truth)
     return {
         "graphml": result.graph.write_graphml,
         "linkage.json": pcgraph.LearnedLinkage(model).save,

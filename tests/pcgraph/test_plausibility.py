@@ -13,6 +13,12 @@ from pcgraph import CloudWarning
 POINTS, _, VIEWPOINT = two_boxes_on_a_plane()
 
 
+@pytest.fixture(scope="module")
+def one():
+    """The segmentation of one scan."""
+    return pcgraph.segment(POINTS)
+
+
 def test_float32_far_from_the_origin_is_noticed():
     far = (POINTS + np.array([4.5e5, 5.4e6, 300.0])).astype(np.float32)  # as of a map projection
     with pytest.warns(CloudWarning, match="float32 comes in steps of 0.5 m"):
@@ -22,10 +28,10 @@ def test_float32_far_from_the_origin_is_noticed():
 
 
 @pytest.mark.parametrize("apart", [1e-9, 1e-5])
-def test_a_dozen_copies_of_a_scan_are_one_scan(apart):
+def test_a_dozen_copies_of_a_scan_are_one_scan(one, apart):
     rng = np.random.default_rng(0)
     copies = np.concatenate([POINTS + rng.normal(0.0, apart, POINTS.shape) for _ in range(12)])
-    one, many = pcgraph.segment(POINTS), pcgraph.segment(copies)
+    many = pcgraph.segment(copies)
     assert one.voxel_size / 4 < many.voxel_size < one.voxel_size * 2
     assert many.labels.max() == one.labels.max()
 
@@ -37,9 +43,9 @@ def test_a_spacing_of_nearly_nothing_is_noticed():
         pcgraph.segment(np.concatenate((line, [[0.0, 0.0, 1.0]] * 3, line[-9:] + 0.5)))
 
 
-def test_two_scans_laid_on_each_other_have_the_spacing_of_one():
+def test_two_scans_laid_on_each_other_have_the_spacing_of_one(one):
     twice = np.concatenate((POINTS, POINTS + np.random.default_rng(0).normal(0.0, 1e-6, POINTS.shape)))
-    one, two = pcgraph.segment(POINTS), pcgraph.segment(twice)
+    two = pcgraph.segment(twice)
     assert one.voxel_size / 4 < two.voxel_size < one.voxel_size * 2
     assert two.labels.max() == one.labels.max()
 

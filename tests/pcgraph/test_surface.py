@@ -151,13 +151,20 @@ pcgraph.segment([[1.0, 1.0, 1.0]], viewpoint=(0, 0, 0)).graph.to_pyg()
 loaded("torch", "torch_geometric", "open3d", "networkx")
 from pcgraph.parallel import in_blocks
 in_blocks(lambda *block: sys.stdout.write("block "), 10**6)
+print()
+import numpy as np
+y, x = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
+points = np.stack((x, y, 1 + 0.2 * (x > 0.5)), axis=-1)
+for kind in (pcgraph.ConvexityLinkage(), pcgraph.WardLinkage()):
+    print(pcgraph.segment(points, linkage=kind, voxel_size=0.15).graph.n_nodes > 1)
 """
 
 
-def test_libraries_are_loaded_where_they_are_needed_and_threads_are_as_many_as_told():
+def test_libraries_are_loaded_where_they_are_needed_threads_are_as_many_as_told_and_all_runs_uncompiled():
     """One process, for starting one takes most of the time: importing loads none of them; scikit-learn comes with the
-    classifier, and all else works without it; PyG's arrays need no torch."""
-    line, environment = [sys.executable, "-c", LOADED], {**os.environ, "NUMBA_NUM_THREADS": "3"}
+    classifier, and all else works without it; PyG's arrays need no torch. Uncompiled as in a debugger."""
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "3", "NUMBA_DISABLE_JIT": "1"}
+    line = [sys.executable, "-c", LOADED]
     done = subprocess.run(line, capture_output=True, text=True, check=True, env=environment)
     missing = "NodeClassifier needs scikit-learn; pip install 'rangesim[learn]'"
-    assert done.stdout.splitlines() == ["[]", "[]", missing, "[]", "block block block "]
+    assert done.stdout.splitlines() == ["[]", "[]", missing, "[]", "block block block ", "True", "True"]

@@ -64,14 +64,14 @@ print([(k.py_func.__qualname__, str(s)) for k in kernels() for s in k.stats.cach
 """
 
 
-def run(code: str, folder: Path | None = None, **environment: str) -> str:
+def run(code: str, folder: Path, **environment: str) -> str:
     """What a process prints that is no worker of the tests: workers start no second process.
 
-    It imports the pcgraph in `folder`, or else that of the tests.
+    It imports the pcgraph in `folder`.
     """
     variables = {name: value for name, value in os.environ.items() if name != "PYTEST_XDIST_WORKER"} | environment
     line = [sys.executable, "-P", "-c", code]
-    variables["PYTHONPATH"] = str(folder or Path(pcgraph.__file__).parents[1])
+    variables["PYTHONPATH"] = str(folder)
     return subprocess.run(line, capture_output=True, text=True, check=True, timeout=300, env=variables).stdout
 
 
@@ -82,6 +82,7 @@ def test_where_kernels_are_missing_a_second_process_compiles_those_of_the_tree(t
     The package is a copy with the cache of the tests, less the two kernels that tell whether a cache is filled. That
     the halves forget no other shows in the first process, which then compares what both compile with what a call needs.
     """
+    warmup.compile_kernels()  # where no test has run yet
     source, package = Path(pcgraph.__file__).parent, tmp_path / "pcgraph"
     shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))  # with times, which caches know
     modules = [module for name, module in sys.modules.items() if name.startswith("pcgraph.")]
@@ -93,7 +94,7 @@ def test_where_kernels_are_missing_a_second_process_compiles_those_of_the_tree(t
         kept = f"{file.stem}.{kernel.py_func.__name__}-*.nb?"
         for kernel_file in () if left_out else Path(kernel.stats.cache_path).glob(kept):
             shutil.copy2(kernel_file, cache)
-    environment = {"NUMBA_NUM_THREADS": "2", "NUMBA_CACHE_DIR": ""}
+    environment = {"NUMBA_NUM_THREADS": "2", "NUMBA_CACHE_DIR": "", "PYTHONDONTWRITEBYTECODE": ""}
     *said, needed = run(KERNELS + FIRST, tmp_path, **environment).splitlines()
     assert said == ["True [False, False]", "[True, True] 0", "{'_expand'}", "set()"]
     *said, compiled_later = run(KERNELS + LATER, tmp_path, **environment).splitlines()
@@ -140,15 +141,3 @@ def test_an_index_of_another_version_of_numba_is_none(tmp_path):
     index = tmp_path / "a.nbi"
     index.write_bytes(pickle.dumps("0.1") + b"more")
     assert warmup._version_of(index) == "0.1"
-
-
-def test_everything_runs_uncompiled_too():
-    """As in a debugger; NUMBA_DISABLE_JIT=1."""
-    code = (
-        "import numpy as np, pcgraph\n"
-        "y, x = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))\n"
-        "points = np.stack((x, y, 1 + 0.2 * (x > 0.5)), axis=-1)\n"
-        "for kind in (pcgraph.ConvexityLinkage(), pcgraph.WardLinkage()):\n"
-        "    print(pcgraph.segment(points, linkage=kind, voxel_size=0.15).graph.n_nodes > 1)"
-    )
-    assert run(code, NUMBA_DISABLE_JIT="1") == "True\nTrue\n"
