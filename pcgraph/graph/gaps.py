@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
-from pcgraph.voxels.grid import VoxelGrid, voxels_within
-
-_WIDTH = 3.0  # voxel edges between centroids, at most
-_RIM = 8  # voxels around one amid a surface; a voxel with fewer lies where a surface ends
+from pcgraph.voxels.grid import MAX_GAP, VoxelGrid, boundary_voxels, voxels_within
 
 
 def gaps(
@@ -40,10 +37,10 @@ def gaps(
     Only voxels with fewer than eight around them are looked at: those at the ends of surfaces.
     """
     k = np.int64(len(nodes.size))
-    ends = np.diff(grid.indptr) < _RIM
-    rim = np.flatnonzero(ends)
-    near = voxels_within(grid, rim, _WIDTH, ends)
-    source, target = np.repeat(rim, np.diff(near.indptr)), near.neighbours.astype(np.int64)
+    is_boundary = boundary_voxels(grid)
+    boundary = np.flatnonzero(is_boundary)
+    near = voxels_within(grid, boundary, MAX_GAP, is_boundary)
+    source, target = np.repeat(boundary, np.diff(near.indptr)), near.neighbours.astype(np.int64)
     pairs: NDArray[np.int64] = np.stack((source, target), axis=1)
     pairs = pairs[(pairs[:, 0] < pairs[:, 1]) & (supervoxels[pairs[:, 0]] != supervoxels[pairs[:, 1]])]
     width = np.linalg.norm((grid.warped[pairs[:, 0]] - grid.warped[pairs[:, 1]]) / grid.size, axis=1)

@@ -21,6 +21,9 @@ _COLOR_STEPS = 65535.0
 _MAX_KEY = float(1 << 62)
 MAX_NEIGHBOURS = 26
 """Voxels around a voxel."""
+MAX_GAP = 3.0
+"""Voxel edges between the means of two voxels, at most, that a gap lies between."""
+_AMID = 8  # voxels around one amid a surface
 
 
 class Neighbourhood(NamedTuple):
@@ -389,6 +392,11 @@ def _pack(
 
 
 # --- which voxels lie near each other ---
+
+
+def boundary_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
+    """Whether each voxel lies where a surface ends, with fewer than eight around it, (v,) bool."""
+    return np.diff(grid.indptr) < _AMID
 
 
 def voxels_within(

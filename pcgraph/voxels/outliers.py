@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
 from pcgraph.parallel import in_blocks, kernel
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid, voxels_within
+from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, VoxelGrid, boundary_voxels, voxels_within
 from pcgraph.voxels.spacing import bounding_box
 
 OUTLIER = -2
@@ -23,12 +23,10 @@ _FAINT = 0.12  # of the mean number of points in the voxels around
 _CHANCE = 1e-4  # with which noise alone is as dense as what is kept
 _MUCH_NOISE = 0.03  # of the points
 _MIN_EXTENT = 32.0  # voxels: noise fills a volume, and a flat cloud has none
-_REACH = 3.0  # voxel edges, as far as gaps are bridged
-_VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * _REACH**3
+_VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * MAX_GAP**3
 _MAX_FRACTION = 2.0 / 3.0
 _PIECE = 5  # points: fewer, all alone, are no object
 _MANY_DETACHED = 0.02  # of the points
-_BOUNDARY = 8  # voxels around one amid a surface, as for gaps
 _NEAREST = 16  # voxels of which
 _FLAT = 0.05  # of the variance is at most across a surface; of noise 0.2
 
@@ -46,17 +44,16 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     of this density had, with a chance of more than 1 in 10 000, as many points in the voxels around it. Where noise is
     so thin that a reach of three voxel edges is nearly empty of it, there must be as few points within that reach, too,
     so that the thin far end of a scan is not taken for noise. Where many are outliers, so are the few points of voxels
-    beside full ones. What has been found is then looked at alone: where
-    most of the 16 nearest of it lie about a plane or a line, they are a coarse scan beside a fine one, and stay.
-    Clouds of fewer than 1000 points, and those of
-    which more than two thirds would be outliers, have none.
+    beside full ones. What has been found is then looked at alone: where most of the 16 nearest of it lie about a plane
+    or a line, they are a coarse scan beside a fine one, and stay. Clouds of fewer than 1000 points, and those of which
+    more than two thirds would be outliers, have none.
     """
     nothing = np.zeros(grid.n_voxels, np.bool_)
     n_points = int(grid.counts.sum())
-    around = np.empty(grid.n_voxels, np.int64)
-    in_blocks(_count_around, grid.n_voxels, grid.indptr, grid.neighbours, grid.counts, around)
     if n_points < _MIN_POINTS:
         return nothing
+    around = np.empty(grid.n_voxels, np.int64)
+    in_blocks(_count_around, grid.n_voxels, grid.indptr, grid.neighbours, grid.counts, around)
     order = np.argsort(around, kind="stable")
     points = np.cumsum(grid.counts[order])
     typical = float(around[order[np.searchsorted(points, (n_points + 1) // 2)]])  # median over the points
@@ -70,7 +67,7 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     background = density * _VOLUME_OF_REACH
     if background < 1.0 and outlier.any():
         alone = np.flatnonzero(outlier)
-        near = voxels_within(grid, alone, _REACH)
+        near = voxels_within(grid, alone, MAX_GAP)
         held = np.bincount(
             np.repeat(np.arange(len(alone)), np.diff(near.indptr)), grid.counts[near.neighbours], len(alone)
         )
@@ -112,7 +109,7 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     few = np.flatnonzero((degrees < _PIECE) & (grid.counts < _PIECE))
     if not len(few) or int(grid.counts.sum()) < _MIN_POINTS:
         return detached
-    near = voxels_within(grid, few, _REACH, degrees < _BOUNDARY)
+    near = voxels_within(grid, few, MAX_GAP, boundary_voxels(grid))
     of, to = [np.repeat(few, np.diff(near.indptr))], [near.neighbours]
     for slot in range(_PIECE - 1):  # touching voxels may have centroids farther apart
         some = few[degrees[few] > slot]
@@ -135,7 +132,7 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 
 def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:
     """Whether each voxel lies within three voxel edges of one of another grid of the same size and warp, (v,) bool."""
-    distances = cKDTree(other.warped / other.size).query(grid.warped / grid.size, distance_upper_bound=_REACH)[0]
+    distances = cKDTree(other.warped / other.size).query(grid.warped / grid.size, distance_upper_bound=MAX_GAP)[0]
     near: NDArray[np.bool_] = np.isfinite(distances)
     return near
 

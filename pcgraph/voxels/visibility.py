@@ -93,8 +93,7 @@ def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None)
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
-    low, high = bounding_box(grid.centroids)
-    middle, reach = (low + high) / 2.0, max(float((high - low).max()) / 2.0, float(grid.edge_lengths.min()))
+    middle, reach = _unit_frame(grid, grid.centroids)
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
     normals = _either_normals(grid)
     told, likely = np.zeros(grid.n_voxels), None
@@ -120,8 +119,7 @@ def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None)
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     """Fraction of the voxels that are visible from a place, (3,) float64, metres."""
-    low, high = bounding_box(np.concatenate((grid.centroids, place[None])))
-    middle, reach = (low + high) / 2.0, max(float((high - low).max()) / 2.0, _TINY * float(grid.edge_lengths.min()))
+    middle, reach = _unit_frame(grid, np.concatenate((grid.centroids, place[None])))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
     return float(seen_from((place - middle)[None] / reach, centres, widths, _either_normals(grid)).mean())
 
@@ -149,6 +147,12 @@ def seen_from(
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
     in_blocks(_look, len(places), places, bins, centres, widths, normals, seen, smallest=1)
     return seen
+
+
+def _unit_frame(grid: VoxelGrid, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Middle, (3,), and half extent of places, a voxel edge at least: lengths there are of the order of 1."""
+    low, high = bounding_box(places)
+    return (low + high) / 2.0, max(float((high - low).max()) / 2.0, float(grid.edge_lengths.min()))
 
 
 def _either_normals(grid: VoxelGrid) -> NDArray[np.float64]:
@@ -192,7 +196,7 @@ def _telling_places(
     closed = np.zeros(len(places))
     in_blocks(_count_hits, len(inside), inside, coarse.centroids, closed[_OUTSIDE : _OUTSIDE + len(inside)])
     found = _agreements(sides, _starts(sides, outside, likely))
-    weights = _most_telling(found, sides, coarse, closed, likely, _UPPER if viewpoint is None else _FROM_VIEWPOINT)
+    weights = _most_telling(found, sides, coarse, closed, likely, viewpoint is not None)
     chosen = _spread_choice(sides != 0.0, weights)
     return places[chosen], weights[chosen]
 
@@ -287,7 +291,7 @@ def _most_telling(
     coarse: VoxelGrid,
     closed: NDArray[np.float64],
     likely: NDArray[np.bool_],
-    likely_counts: float,
+    likely_is_told: bool,
 ) -> NDArray[np.float64]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface.
 
@@ -298,10 +302,11 @@ def _most_telling(
     visible = np.abs(sides).sum(axis=1)
     different = list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values())
     closed_in = [float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0.0 for s in different]
-    decided_counts, outside_counts = _DECIDED, _OUTSIDE_IN
+    decided_counts, outside_counts, likely_counts = _DECIDED, _OUTSIDE_IN, _UPPER
     if any(closed_in):
-        decided_counts, outside_counts = _DECIDED_CLOSED, _OUTSIDE_IN_CLOSED
-        likely_counts = likely_counts if likely_counts > _UPPER else 0.0
+        decided_counts, outside_counts, likely_counts = _DECIDED_CLOSED, _OUTSIDE_IN_CLOSED, 0.0
+    if likely_is_told:
+        likely_counts = _FROM_VIEWPOINT
     most, best = -np.inf, found.weights[0]
     for s in different:
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
