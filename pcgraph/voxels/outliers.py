@@ -50,10 +50,10 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     """
     nothing = np.zeros(grid.n_voxels, np.bool_)
     n_points = int(grid.counts.sum())
-    if n_points < _MIN_POINTS:
-        return nothing
     around = np.empty(grid.n_voxels, np.int64)
     in_blocks(_count_around, grid.n_voxels, grid.indptr, grid.neighbours, grid.counts, around)
+    if n_points < _MIN_POINTS:  # only now: the cloud that kernels are warmed up on is small
+        return nothing
     order = np.argsort(around, kind="stable")
     points = np.cumsum(grid.counts[order])
     typical = float(around[order[np.searchsorted(points, (n_points + 1) // 2)]])  # median over the points
