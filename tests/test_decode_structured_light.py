@@ -17,8 +17,9 @@ from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.status import Status
-from rangesim.decoding.triangulate import TriangulationLimits, triangulate
+from rangesim.decoding.triangulate import TriangulationLimits
 from rangesim.electronics.detector import Detector
+from rangesim.geometry.camera_projector import triangulate_coordinates
 from rangesim.rig import Intrinsics, Rig, translation
 from rangesim.sensors import IdealToF, StructuredLight, StructuredLightDecoder
 
@@ -167,7 +168,9 @@ def test_triangulation_undoes_projection_through_distorted_lenses(axes: tuple[st
     z = rng.uniform(0.8, 1.5, len(rays))
     points = rays * z[:, None]
     uv = projector.project((points - pose[:3, 3]) @ pose[:3, :3])
-    result = triangulate(rays, rig, uv[:, 0] if "columns" in axes else None, uv[:, 1] if "rows" in axes else None)
+    result = triangulate_coordinates(
+        rays, rig, uv[:, 0] if "columns" in axes else None, uv[:, 1] if "rows" in axes else None
+    )
     np.testing.assert_allclose(result.z, z, atol=1e-6)
     np.testing.assert_allclose(result.epipolar_px, 0, atol=1e-5)
 
@@ -198,7 +201,7 @@ def test_relative_error_is_the_derivative_of_depth(axis: int) -> None:
     z = np.linspace(0.8, 3, len(rays))
     pose = rig.T_camera_projector
     u = rig.projector.project((rays * z[:, None] - pose[:3, 3]) @ pose[:3, :3])[:, axis]
-    at, beside = (triangulate(rays, rig, *((c, None) if axis == 0 else (None, c))) for c in (u, u + 1e-4))
+    at, beside = (triangulate_coordinates(rays, rig, *((c, None) if axis == 0 else (None, c))) for c in (u, u + 1e-4))
     np.testing.assert_allclose(at.relative_error, np.abs(beside.z / at.z - 1) / 1e-4, rtol=1e-3)
 
 

@@ -11,8 +11,8 @@ Pixels are those of a pinhole: take lens distortion out first (`camera_matrix.id
 
 Degenerate pairs of views raise ValueError, judged by the noise of the data (`consensus.simpler_model_suffices`): points of
 one plane and a camera that only rotates map by a homography, which infinitely many F contain; the same view twice is one
-of these. For the relative pose a rotation alone has no translation; points of a plane have two poses, of which often but one
-has all points in front. Not found by this test: points on a ruled quadric with both centres (HZ 22.2), of which the
+of these. For the relative pose a rotation alone has no translation, and a plane has two poses that differ little in what is
+seen: find the pose of a known plane by `pose`. Not found by this test: points on a ruled quadric with both centres (HZ 22.2), of which the
 standard deviation of F tells where it is above `MAX_STANDARD_DEVIATION`.
 """
 
@@ -39,7 +39,7 @@ from rangesim.geometry.correspondences import (
     unit_norm,
 )
 from rangesim.geometry.homography import PARAMETERS as OF_HOMOGRAPHY
-from rangesim.geometry.homography import homography_dlt, homography_error, rotation_homography_error
+from rangesim.geometry.homography import homography_error, rotation_homography_error
 from rangesim.geometry.least_squares import Minimum, minimise
 from rangesim.geometry.projective_plane import homogeneous
 from rangesim.rig import pose
@@ -217,7 +217,7 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
 
     found = minimise(residuals, step, unit_norm(start))
     noise = found.noise(PARAMETERS) / scale if noise_px is None else noise_px
-    _refuse_homography(a, b, found.cost / scale**2, noise_px)
+    _refuse_homography(a, b, found.cost / scale**2, PARAMETERS, noise_px)
     in_tangent = found.covariance(max(noise * scale, 1e-300))
     tangent = _tangent(found.state)
     normal = tangent @ in_tangent @ tangent.T
@@ -331,9 +331,9 @@ def fit_relative_pose(
 ) -> RelativePose:
     """The relative pose of maximum likelihood for Gaussian noise, all pairs being right, and its covariance.
 
-    Minimises the squared Sampson distances in pixels over rotation and direction of translation, 5 parameters, from every
-    start that could be the right one: OpenCV's five-point algorithm, the eight-point algorithm, and the two poses that a
-    homography of a plane has (Malis, Vargas 2007).
+    Minimises the squared Sampson distances in pixels over rotation and direction of translation, 5 parameters, from
+    several solutions of the five-point algorithm (Nister 2004, by OpenCV), each in the one of its four poses that has the
+    points in front.
 
     Parameters
     ----------
@@ -343,8 +343,8 @@ def fit_relative_pose(
     Raises
     ------
     ValueError
-        Fewer than six different pairs; a rotation alone explains them to their noise (also: the same view twice); two poses
-        explain them alike, as may be with a plane; or no pose has them in front of both cameras.
+        Fewer than six different pairs; a rotation alone (also: the same view twice) or a plane explains them to their
+        noise; two poses explain them alike; or no pose has them in front of both cameras.
     """
     a, b = checked_pairs(first, second, 6, "a relative pose")
     check_noise(noise_px)
@@ -361,11 +361,13 @@ def fit_relative_pose(
         if facing is not None and not any(_is_same(facing, other.state) for other in minima):
             minima.append(minimise(residuals, _moved, facing))
     minima.sort(key=lambda minimum: minimum.cost)
-    _refuse_rotation(a, b, kf, ks, minima[0].cost if minima else np.inf, noise_px)
+    least = minima[0].cost if minima else np.inf
+    _refuse_rotation(a, b, kf, ks, least, noise_px)
+    _refuse_homography(a, b, least, OF_POSE, noise_px)
     if not minima:
         raise ValueError(
-            "expected points in front of both cameras, got pairs that no pose puts there; check the pairs, K and which view "
-            "is the first."
+            "expected points in front of both cameras, got pairs that no pose puts there: the camera only rotates, the pairs "
+            "are wrong, or K is."
         )
     best, freedom = minima[0], len(a) - OF_POSE
     rounding = consensus.rounding_of(np.concatenate([a, b]))
@@ -429,18 +431,18 @@ MIN_IN_FRONT = 0.75
 """Fraction of the points; the others may be so far that the noise decides on which side of infinity they are."""
 
 
-def _refuse_homography(a: Array, b: Array, cost: float, noise_px: float | None) -> None:
-    """Raise ValueError if a homography explains the pairs as well as F, with `cost` in px^2, to their noise."""
+def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_px: float | None) -> None:
+    """Raise ValueError if a homography explains the pairs to their noise, as a model of `parameters` with `cost` does."""
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
     simple = homography_error(a, b), 2 * n - OF_HOMOGRAPHY
-    if consensus.simpler_model_suffices(simple, (cost, n - PARAMETERS), noise_px, rounding):
+    if consensus.simpler_model_suffices(simple, (cost, n - parameters), noise_px, rounding):
         apart = float(np.sqrt(simple[0] / simple[1]))
         same = np.sqrt(((a - b) ** 2).mean()) <= 3 * max(noise_px or 0.0, apart, rounding)
         what = "one view twice" if same else "points of one plane or a camera that only rotates"
         hint = "" if noise_px is not None or n > 12 else " With so few pairs, state noise_px if you know it."
         raise ValueError(
             f"expected two views with parallax, got {n} pairs that a homography maps to each other within {apart:.3g} px: {what}; "
-            f"infinitely many fundamental matrices fit. Add points at other depths or move the camera.{hint}"
+            f"it leaves the epipoles open, or two poses. Add points at other depths or move the camera.{hint}"
         )
 
 
@@ -611,7 +613,7 @@ def _facing(T: Array, K_first: Array, K_second: Array, a: Array, b: Array) -> Ar
 
 
 def _starting_poses(a: Array, b: Array, K_first: Array, K_second: Array) -> list[Array]:
-    """Poses (4, 4) near which the right one may be: the best of the five-point algorithm, and those of a plane."""
+    """Poses (4, 4) near which the right one may be: the best of the five-point algorithm."""
     import cv2
 
     xa, xb = (np.ascontiguousarray(rays(camera_matrix(K), x)[:, :2]) for K, x in ((K_first, a), (K_second, b)))
@@ -635,12 +637,6 @@ def _starting_poses(a: Array, b: Array, K_first: Array, K_second: Array) -> list
             starts.append(T)
         if len(starts) == STARTS:
             break
-    _, rotations, translations, _ = cv2.decomposeHomographyMat(homography_dlt(xa, xb), np.eye(3))
-    for R, t in zip(rotations, translations, strict=True):
-        if np.linalg.norm(t) > 0:
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = R, t.ravel() / np.linalg.norm(t)
-            starts.append(T)
     return starts
 
 

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points in space from two views: linear, midpoint, and the optimal triangulation, with a covariance for each point.
+
+Two rays of measured pixels x, x' do not meet. Optimal is the point whose images are nearest to them: it minimises
+d^2(x, x^) + d^2(x', x'^) subject to x'^^T F x^ = 0, the maximum likelihood for equal Gaussian noise in both views.
+Linear and midpoint are quicker to explain and never better; they are here to be compared with.
+
+Hartley, Sturm: "Triangulation", CVIU 1997, solve it by the roots of a polynomial of degree 6. Lindstrom: "Triangulation
+made easy", CVPR 2010, by a few steps of a quadratic equation, hundreds of times as fast; they find the same minimum but
+for points near an epipole, where there are several, and where the polynomial decides here.
+
+Pixels are those of a pinhole: take lens distortion out first (`camera_matrix.ideal_pixels`). Points whose rays are
+parallel, or meet behind a camera, are NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pcgraph.parallel import in_blocks, kernel
+from rangesim.geometry.camera_matrix import centre, depth, project, rays
+from rangesim.geometry.correspondences import Array, checked_array
+from rangesim.geometry.two_view import fundamental_from_cameras
+
+NEAR_EPIPOLE = 0.25
+"""A correction by more than this fraction of a point's distance to its epipole is checked against all minima."""
+CONVERGED, MAX_STEPS = 1e-3, 20
+"""Steps end where one changes the correction by less than this fraction of it, so that the next would change it by about
+the square; where none does, it is checked likewise."""
+
+
+class CorrectedPixels(NamedTuple):
+    """first, second : (n, 2) float64 pixels whose rays meet."""
+
+    first: Array
+    second: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TriangulatedPoints:
+    """points : (n, 3) float64, metres, in the coordinates the camera matrices take; NaN where rays are parallel or meet
+    behind a camera. error_px : (n,) root of d^2(x, x^) + d^2(x', x'^), also where the point is NaN."""
+
+    points: Array
+    error_px: Array
+
+
+def triangulate_linear(
+    P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
+) -> TriangulatedPoints:
+    """Points by the homogeneous linear method: the least singular vector of the four equations x cross P X = 0 (HZ 12.2).
+
+    Its error is algebraic: it depends on the frame, and is worst where a point is far for one camera and near for the other.
+
+    Parameters
+    ----------
+    P_first, P_second : (3, 4) camera matrices. first, second : (n, 2) pixels.
+
+    Raises
+    ------
+    ValueError
+        The cameras have one centre; arrays of other shapes, or not finite.
+    """
+    p, q, x, y = _checked(P_first, P_second, first, second)
+    fundamental_from_cameras(p, q)  # the check of the centres
+    rows = [points[:, k, None] * P[2] - P[k] for P, points in ((p, x), (q, y)) for k in (0, 1)]
+    design = np.stack(rows, axis=1)
+    design /= np.linalg.norm(design, axis=-1, keepdims=True)
+    X = np.linalg.svd(design)[2][:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _judged(p, q, x, y, X[:, :3] / X[:, 3:])
+
+
+def triangulate_midpoint(
+    P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
+) -> TriangulatedPoints:
+    """Points half way between the two rays where they are nearest to each other; parameters as `triangulate_linear`."""
+    p, q, x, y = _checked(P_first, P_second, first, second)
+    fundamental_from_cameras(p, q)
+    C, D = (centre(P)[:3] / centre(P)[3] for P in (p, q))
+    d, e = rays(p, x), rays(q, y)
+    normal = np.cross(d, e)
+    size = (normal * normal).sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = (np.cross(D - C, e) * normal).sum(-1) / size
+        w = (np.cross(D - C, d) * normal).sum(-1) / size
+    return _judged(p, q, x, y, 0.5 * (C + z[:, None] * d + D + w[:, None] * e))
+
+
+def correct_pixels(F: ArrayLike, first: ArrayLike, second: ArrayLike) -> CorrectedPixels:
+    """The pairs nearest to the measured ones that satisfy x'^T F x = 0: the global minimum of |dx|^2 + |dx'|^2.
+
+    Both corrections are along the normals n = S F^T x'^, n' = S F x^ of the epipolar lines of the result (S takes the first
+    two entries): dx = lambda n, dx' = lambda n'. Steps evaluate these at the last result and solve the constraint,
+    a lambda^2 - 2 b lambda + c = 0, exactly (Lindstrom 2010, with the constraint kept at every step); two do for most points.
+    Where they do not converge, or correct by a large part of the distance to an epipole, Hartley and Sturm's polynomial decides.
+
+    Parameters
+    ----------
+    F : (3, 3), x'^T F x = 0, rank 2. first, second : (n, 2) pixels.
+
+    Raises
+    ------
+    ValueError
+        F is of another rank.
+    """
+    from rangesim.geometry.two_view import epipoles
+
+    x, y = checked_array("first", first, None, 2), checked_array("second", second, None, 2)
+    if x.shape != y.shape or x.ndim != 2:
+        raise ValueError(f"expected first and second as corresponding points (n, 2), got {x.shape} and {y.shape}.")
+    poles = epipoles(F)
+    result = np.empty((len(x), 4))
+    doubtful = np.empty(len(x), dtype=np.bool_)
+    matrix = np.ascontiguousarray(F, dtype=np.float64) / np.linalg.norm(F)
+    in_blocks(
+        _correct, len(x), matrix, poles.first, poles.second, np.ascontiguousarray(np.hstack([x, y])), result, doubtful
+    )
+    if doubtful.any():
+        exact = _by_polynomial(matrix, poles.first, poles.second, x[doubtful], y[doubtful])
+        result[doubtful] = exact
+    return CorrectedPixels(result[:, :2], result[:, 2:])
+
+
+def triangulate_optimal(
+    P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
+) -> TriangulatedPoints:
+    """Points whose images are nearest to the measured pixels: `correct_pixels`, then the rays, which meet exactly.
+
+    Parameters and errors are those of `triangulate_linear`.
+    """
+    p, q, x, y = _checked(P_first, P_second, first, second)
+    corrected = correct_pixels(fundamental_from_cameras(p, q), x, y)
+    rays_of = _Rays(*(_world_from_pixel(P) for P in (p, q)), *(centre(P)[:3] / centre(P)[3] for P in (p, q)))
+    points, error = np.empty((len(x), 3)), np.empty(len(x))
+    in_blocks(
+        _intersect,
+        len(x),
+        rays_of,
+        *(np.ascontiguousarray(a) for a in (corrected.first, corrected.second, x, y)),
+        points,
+        error,
+    )
+    return TriangulatedPoints(points, error)
+
+
+def point_covariance(
+    P_first: ArrayLike,
+    P_second: ArrayLike,
+    points: ArrayLike,
+    noise_first_px: ArrayLike = 1.0,
+    noise_second_px: ArrayLike = 1.0,
+) -> Array:
+    """(n, 3, 3) covariance in m^2 of optimally triangulated points: (J^T S^-1 J)^-1, the Cramer-Rao bound.
+
+    J (4, 3) holds the derivatives of both images by the point, S the covariance of the pixels (HZ 5.2.3). Optimal
+    triangulation weighs both views alike, and reaches this for equal noise.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, in front of both cameras; others are NaN.
+    noise_first_px, noise_second_px : standard deviation of a coordinate, a number or (n,); or covariances (2, 2) or
+        (n, 2, 2) in px^2.
+
+    Raises
+    ------
+    ValueError
+        Noise that is not positive, or a covariance that is not positive definite.
+    """
+    X = np.asarray(points, dtype=np.float64)
+    if X.ndim != 2 or X.shape[1] != 3:
+        raise ValueError(f"expected points of shape (n, 3), got {X.shape}.")
+    known = np.isfinite(X).all(axis=-1)
+    information = np.zeros((int(known.sum()), 3, 3))
+    for name, P, noise in (("noise_first_px", P_first, noise_first_px), ("noise_second_px", P_second, noise_second_px)):
+        p = checked_array("P", P, 3, 4)
+        image = X[known] @ p[:, :3].T + p[:, 3]
+        jacobian = (p[None, :2, :3] - (image[:, :2] / image[:, 2:])[:, :, None] * p[2, :3]) / image[:, 2, None, None]
+        jacobian[depth(p, X[known]) <= 0] = np.nan
+        weight = np.linalg.inv(_covariances(name, noise, len(X))[known])
+        information += np.swapaxes(jacobian, -1, -2) @ weight @ jacobian
+    result = np.full((len(X), 3, 3), np.nan)
+    sound = np.isfinite(information).all(axis=(-2, -1))
+    inverse = np.full_like(information, np.nan)
+    inverse[sound] = np.linalg.inv(information[sound])
+    result[known] = inverse
+    return result
+
+
+# ------------------------------------------------------------------------------------------- the pieces
+
+
+class _Rays(NamedTuple):
+    """M^-1 (3, 3) of either camera with det M > 0, and their centres (3,)."""
+
+    first: Array
+    second: Array
+    first_centre: Array
+    second_centre: Array
+
+
+def _world_from_pixel(P: Array) -> Array:
+    block = P[:, :3] * np.sign(np.linalg.det(P[:, :3]))
+    return np.ascontiguousarray(np.linalg.inv(block))
+
+
+def _checked(
+    P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
+) -> tuple[Array, Array, Array, Array]:
+    p, q = checked_array("P_first", P_first, 3, 4), checked_array("P_second", P_second, 3, 4)
+    x, y = checked_array("first", first, None, 2), checked_array("second", second, None, 2)
+    if p.ndim != 2 or q.ndim != 2:
+        raise ValueError(f"expected camera matrices of shape (3, 4), got {p.shape} and {q.shape}.")
+    if x.shape != y.shape or x.ndim != 2:
+        raise ValueError(f"expected first and second as corresponding points (n, 2), got {x.shape} and {y.shape}.")
+    return p, q, x, y
+
+
+def _judged(p: Array, q: Array, x: Array, y: Array, X: Array) -> TriangulatedPoints:
+    """With reprojection errors; NaN where not finite or not in front of both cameras."""
+    points, error = np.full(X.shape, np.nan), np.full(len(X), np.nan)
+    finite = np.isfinite(X).all(axis=-1)
+    sound = finite.copy()
+    for P in (p, q):
+        sound[finite] &= depth(P, X[finite]) > 0
+    points[sound] = X[sound]
+    parts = [project(P, X[sound]) - measured[sound] for P, measured in ((p, x), (q, y))]
+    error[sound] = np.linalg.norm(np.hstack(parts), axis=-1)
+    return TriangulatedPoints(points, error)
+
+
+def _covariances(name: str, noise: ArrayLike, n: int) -> Array:
+    """(n, 2, 2) px^2."""
+    given = checked_array(name, noise)
+    covariances = given[..., None, None] ** 2 * np.eye(2) if given.ndim < 2 else given
+    if (given.ndim < 2 and (given <= 0).any()) or covariances.shape[-2:] != (2, 2):
+        raise ValueError(f"expected {name} as positive pixels, a number or (n,), or covariances (2, 2) or (n, 2, 2).")
+    if (np.linalg.eigvalsh(covariances) <= 0).any():
+        raise ValueError(f"expected {name} to hold positive definite covariances, got one that is not.")
+    return np.broadcast_to(covariances, (n, 2, 2))
+
+
+@kernel
+def _correct(start, stop, F, pole_first, pole_second, pairs, result, doubtful):  # type: ignore[no-untyped-def]
+    """result[i] = the corrected pair (x, y, x', y'); doubtful[i] = whether its minimum may be another."""
+    for i in range(start, stop):
+        x, y, u, v = pairs[i, 0], pairs[i, 1], pairs[i, 2], pairs[i, 3]
+        c = u * (F[0, 0] * x + F[0, 1] * y + F[0, 2]) + v * (F[1, 0] * x + F[1, 1] * y + F[1, 2])
+        c += F[2, 0] * x + F[2, 1] * y + F[2, 2]
+        # normals of the epipolar lines of the measured pixels: in the first view n0, in the second m0
+        n0x, n0y = F[0, 0] * u + F[1, 0] * v + F[2, 0], F[0, 1] * u + F[1, 1] * v + F[2, 1]
+        m0x, m0y = F[0, 0] * x + F[0, 1] * y + F[0, 2], F[1, 0] * x + F[1, 1] * y + F[1, 2]
+        nx, ny, mx, my = n0x, n0y, m0x, m0y
+        dx = dy = du = dv = 0.0
+        change = size = 0.0
+        solved = True
+        for step in range(MAX_STEPS):
+            a = mx * (F[0, 0] * nx + F[0, 1] * ny) + my * (F[1, 0] * nx + F[1, 1] * ny)
+            b = 0.5 * (nx * n0x + ny * n0y + mx * m0x + my * m0y)
+            root = b * b - a * c
+            solved = root >= 0 and b > 0
+            if not solved:
+                break
+            scale = c / (b + np.sqrt(root))
+            ex, ey, eu, ev = scale * nx, scale * ny, scale * mx, scale * my
+            change = (ex - dx) ** 2 + (ey - dy) ** 2 + (eu - du) ** 2 + (ev - dv) ** 2
+            dx, dy, du, dv = ex, ey, eu, ev
+            size = dx * dx + dy * dy + du * du + dv * dv
+            nx, ny = n0x - F[0, 0] * du - F[1, 0] * dv, n0y - F[0, 1] * du - F[1, 1] * dv
+            mx, my = m0x - F[0, 0] * dx - F[0, 1] * dy, m0y - F[1, 0] * dx - F[1, 1] * dy
+            if step > 0 and change <= CONVERGED * CONVERGED * size:
+                break
+        result[i, 0], result[i, 1], result[i, 2], result[i, 3] = x - dx, y - dy, u - du, v - dv
+        # |e x (x, 1)| / |e_3|: the distance to the epipole, times |e_3|, which may be 0
+        wx, wy, wu, wv = pole_first[2], pole_first[2], pole_second[2], pole_second[2]
+        to_first = (wx * x - pole_first[0]) ** 2 + (wy * y - pole_first[1]) ** 2
+        to_second = (wu * u - pole_second[0]) ** 2 + (wv * v - pole_second[1]) ** 2
+        limit = NEAR_EPIPOLE * NEAR_EPIPOLE
+        near = size * wx * wx > limit * to_first or size * wu * wu > limit * to_second
+        doubtful[i] = not solved or near or change > CONVERGED * CONVERGED * size
+
+
+@kernel
+def _intersect(start, stop, cameras, first, second, measured_first, measured_second, points, error):  # type: ignore[no-untyped-def]
+    """points[i] = where the rays of the corrected pixels meet, in front of both; error[i] = the correction."""
+    M, N = cameras.first, cameras.second
+    bx = cameras.second_centre[0] - cameras.first_centre[0]
+    by = cameras.second_centre[1] - cameras.first_centre[1]
+    bz = cameras.second_centre[2] - cameras.first_centre[2]
+    for i in range(start, stop):
+        x, y, u, v = first[i, 0], first[i, 1], second[i, 0], second[i, 1]
+        px, py, pz = (
+            M[0, 0] * x + M[0, 1] * y + M[0, 2],
+            M[1, 0] * x + M[1, 1] * y + M[1, 2],
+            M[2, 0] * x + M[2, 1] * y + M[2, 2],
+        )
+        qx, qy, qz = (
+            N[0, 0] * u + N[0, 1] * v + N[0, 2],
+            N[1, 0] * u + N[1, 1] * v + N[1, 2],
+            N[2, 0] * u + N[2, 1] * v + N[2, 2],
+        )
+        nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+        size = nx * nx + ny * ny + nz * nz
+        along = (by * qz - bz * qy) * nx + (bz * qx - bx * qz) * ny + (bx * qy - by * qx) * nz
+        other = (by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz
+        if along > 0 and other > 0:  # so size > 0 as well
+            z = along / size
+            points[i, 0] = cameras.first_centre[0] + z * px
+            points[i, 1] = cameras.first_centre[1] + z * py
+            points[i, 2] = cameras.first_centre[2] + z * pz
+        else:
+            points[i, 0] = points[i, 1] = points[i, 2] = np.nan
+        dx, dy = x - measured_first[i, 0], y - measured_first[i, 1]
+        du, dv = u - measured_second[i, 0], v - measured_second[i, 1]
+        error[i] = np.sqrt(dx * dx + dy * dy + du * du + dv * dv)
+
+
+def _by_polynomial(F: Array, pole_first: Array, pole_second: Array, x: Array, y: Array) -> Array:
+    """(n, 4) corrected pairs by Hartley and Sturm's polynomial of degree 6 (HZ algorithm 12.1), all roots of all points.
+
+    In either view the measured point is moved to 0 and the epipole turned to (1, 0, f): then epipolar lines are (t f, 1, -t)
+    and (-f' (c t + d), a t + b, c t + d), and the squared distance s(t) of both points to them has its minimum at a root of
+    g(t) = t ((a t + b)^2 + f'^2 (c t + d)^2)^2 - (a d - b c) (1 + f^2 t^2)^2 (a t + b) (c t + d), or at infinity.
+    """
+    back_first, f = _epipolar_frame(pole_first, x)
+    back_second, g = _epipolar_frame(pole_second, y)
+    G = np.swapaxes(back_second, -1, -2) @ F @ back_first
+    a, b, c, d = G[:, 1, 1], G[:, 1, 2], G[:, 2, 1], G[:, 2, 2]
+    determinant = a * d - b * c
+    polynomial = np.zeros((len(x), 7))  # highest power first
+    for k in range(len(x)):
+        numerator, denominator = np.array([a[k], b[k]]), np.array([c[k], d[k]])
+        square = np.polyadd(np.polymul(numerator, numerator), g[k] ** 2 * np.polymul(denominator, denominator))
+        left = np.polymul([1, 0], np.polymul(square, square))
+        ellipse = np.array([f[k] ** 2, 0, 1])
+        right = determinant[k] * np.polymul(np.polymul(ellipse, ellipse), np.polymul(numerator, denominator))
+        whole = np.polysub(left, right)
+        polynomial[k, 7 - len(whole) :] = whole
+    polynomial /= np.abs(polynomial).max(axis=-1, keepdims=True)
+    t = np.full((len(x), 7), np.nan)
+    for k, coefficients in enumerate(polynomial):
+        found = np.roots(np.where(np.abs(coefficients) < 1e-15, 0, coefficients)).real
+        t[k, : len(found)] = found
+    columns = [v[:, None] for v in (a, b, c, d, f, g)]
+    a_, b_, c_, d_, f_, g_ = columns
+    cost = t**2 / (1 + f_**2 * t**2) + (c_ * t + d_) ** 2 / ((a_ * t + b_) ** 2 + g_**2 * (c_ * t + d_) ** 2)
+    with np.errstate(divide="ignore"):
+        at_infinity = 1 / f**2 + c**2 / (a**2 + g**2 * c**2)
+    best = np.nanargmin(cost, axis=1)
+    t_best = np.take_along_axis(t, best[:, None], 1)[:, 0]
+    beyond = at_infinity < np.take_along_axis(cost, best[:, None], 1)[:, 0]
+    one, zero = np.ones_like(f), np.zeros_like(f)
+    line_first = np.where(beyond[:, None], np.stack([f, zero, -one], -1), np.stack([t_best * f, one, -t_best], -1))
+    s, r = np.where(beyond, c, c * t_best + d), np.where(beyond, a, a * t_best + b)
+    line_second = np.stack([-g * s, r, s], axis=-1)
+    result = np.empty((len(x), 4))
+    for columns_out, line, back in ((slice(0, 2), line_first, back_first), (slice(2, 4), line_second, back_second)):
+        foot = np.stack([-line[:, 0] * line[:, 2], -line[:, 1] * line[:, 2], line[:, 0] ** 2 + line[:, 1] ** 2], -1)
+        image = (back @ foot[:, :, None])[..., 0]
+        result[:, columns_out] = image[:, :2] / image[:, 2:]
+    return result
+
+
+def _epipolar_frame(pole: Array, points: Array) -> tuple[Array, Array]:
+    """(n, 3, 3) maps to pixels from frames with the point at 0 and the epipole at (1, 0, f), and (n,) f."""
+    moved = pole[:2] - pole[2] * points
+    length = np.linalg.norm(moved, axis=-1)
+    cosine, sine = np.where(length > 0, moved.T / np.where(length > 0, length, 1), [[1.0], [0.0]])
+    back = np.zeros((len(points), 3, 3))
+    back[:, 0, 0] = back[:, 1, 1] = cosine
+    back[:, 0, 1], back[:, 1, 0] = -sine, sine
+    back[:, :2, 2], back[:, 2, 2] = points, 1
+    return back, pole[2] / np.maximum(length, 1e-300)
