@@ -131,6 +131,20 @@ def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None
     return bool(cost / max(least, rounding**2 * freedom) <= stats.f.isf(SIGNIFICANCE, freedom, freedom))
 
 
+def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
+    """Whether a model with a sum of squares `cost` has posterior odds above `SIGNIFICANCE` against the one with `least`.
+
+    exp(-(cost - least) / 2 variance) with known noise; without, (least / cost)^(freedom / 2), that of the profile likelihood.
+    For two models of the same data without points in space to be found along with them.
+    """
+    if noise_px is not None:
+        log_odds = -(cost - least) / (2 * noise_px**2)
+    else:
+        floor = rounding**2 * freedom
+        log_odds = -0.5 * freedom * np.log(max(cost, floor) / max(least, floor))
+    return bool(log_odds > np.log(SIGNIFICANCE))
+
+
 def spread(points: Array) -> float:
     """Extent of points (n, d): the root mean square of their distances from their centroid."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=-1).mean()))
