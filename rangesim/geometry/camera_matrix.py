@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera matrix P = K [R | t]: made, taken apart, applied, inverted; and the lens in front of it.
 
-x = P X for homogeneous world points X and pixels x; T_camera_world = [R | t] maps world to camera coordinates, metres, axes
-as OpenCV's. P knows no lens distortion: `ideal_pixels` takes it out of measured pixels and `lens_pixels` puts it in, both by
-`rangesim.rig.Intrinsics`, which alone knows the model. Hartley, Zisserman: "Multiple View Geometry in Computer Vision",
-2nd edition 2004 (HZ), chapter 6.
+x = P X for homogeneous world points X and pixels x; T_camera_world = [R | t] maps world to camera coordinates,
+metres, axes as OpenCV's. P knows no lens distortion: `ideal_pixels` takes it out of measured pixels and `lens_pixels`
+puts it in, both by `rangesim.rig.Intrinsics`, which alone knows the model. Hartley, Zisserman: "Multiple View
+Geometry in Computer Vision", 2nd edition 2004 (HZ), chapter 6.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def camera_matrix(camera: Intrinsics | ArrayLike, T_camera_world: ArrayLike | No
     Parameters
     ----------
     camera : Intrinsics, of which the distortion is left out, or K (3, 3).
-    T_camera_world : (4, 4) maps world to camera coordinates; None: the identity. Of a `Rig`'s camera it is the inverse of
-        `T_world_camera`.
+    T_camera_world : (4, 4) maps world to camera coordinates; None: the identity. Of a `Rig`'s camera it is the
+        inverse of `T_world_camera`.
 
     Raises
     ------
@@ -112,7 +112,8 @@ def decompose_zero_skew(P: ArrayLike) -> CameraParts:
 
 
 def centre(P: ArrayLike) -> Array:
-    """(..., 4) homogeneous camera centre of P (..., 3, 4): P C = 0, unit norm; the last entry is 0 of an affine camera."""
+    """(..., 4) homogeneous camera centre of P (..., 3, 4): P C = 0, unit norm; the last entry is 0 of an affine
+    camera."""
     _, values, axes = np.linalg.svd(checked_array("P", P, 3, 4))
     if np.any(values[..., 2] <= 1e-14 * values[..., 0]):
         raise ValueError("expected a camera matrix of rank 3, got one of lower rank.")
@@ -166,7 +167,8 @@ def back_project(P: ArrayLike, pixels: ArrayLike, depths: ArrayLike) -> Array:
 
 
 def ideal_pixels(camera: Intrinsics, pixels: ArrayLike) -> Array:
-    """(..., 2) where a pinhole with the same K would see what the lens shows at `pixels` (..., 2); NaN beyond its fold."""
+    """(..., 2) where a pinhole with the same K would see what the lens shows at `pixels` (..., 2); NaN beyond its
+    fold."""
     return np.asarray(camera.normalise(pixels) * [camera.fx, camera.fy] + [camera.cx, camera.cy])
 
 
@@ -189,7 +191,8 @@ def _check_invertible(block: Array) -> None:
     rows = block / np.maximum(np.linalg.norm(block, axis=-1, keepdims=True), 1e-300)  # pixels against metres
     if np.any(np.abs(np.linalg.det(rows)) <= ROUNDING**1.5):
         raise ValueError(
-            "expected a finite camera, got P with a singular left 3 x 3 block: its centre lies at infinity (an affine camera), "
+            "expected a finite camera, got P with a singular left 3 x 3 block: its centre lies at infinity (an "
+            "affine camera), "
             "and K, R and t do not exist."
         )
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose of a camera from points that are known in space: perspective n points, with covariance and ambiguity.
 
-The pose has 6 parameters, each point gives two equations; three points leave up to four poses, so four are needed. The image
-of a plane can be explained nearly as well by a second, mirrored tilt (Schweighofer, Pinz: "Robust pose estimation from a
-planar target", PAMI 2006): every pose that the noise does not tell from the best is reported.
+The pose has 6 parameters, each point gives two equations; three points leave up to four poses, so four are needed.
+The image of a plane can be explained nearly as well by a second, mirrored tilt (Schweighofer, Pinz: "Robust pose
+estimation from a planar target", PAMI 2006): every pose that the noise does not tell from the best is reported.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ TRIPLES, STARTS = 20, 6
 class CameraPose:
     """Where a camera stands.
 
-    T_camera_object : (4, 4) float64, maps coordinates of the points to the camera's, metres. covariance : (6, 6) of (rotation
-    vector applied after R, rad; t, metres). noise_px : standard deviation of a coordinate, as given or from the residuals.
-    inliers : (n,) bool. others : poses (4, 4) that the noise does not tell from this one, best first; none if it is sure.
+    T_camera_object : (4, 4) float64, maps coordinates of the points to the camera's, metres. covariance : (6, 6) of
+    (rotation vector applied after R, rad; t, metres). noise_px : standard deviation of a coordinate, as given or from
+    the residuals. inliers : (n,) bool. others : poses (4, 4) that the noise does not tell from this one, best first;
+    none if it is sure.
     """
 
     T_camera_object: Array
@@ -56,9 +57,10 @@ def fit_camera_pose(
 ) -> CameraPose:
     """The pose of maximum likelihood for Gaussian noise of the pixels, all pairs being right, and its covariance.
 
-    Minimises the reprojection error through the lens, distortion included, by Levenberg-Marquardt over the 6 parameters, from
-    OpenCV's SQPNP (Terzakis, Lourakis 2020), of planes its IPPE (Collins, Bartoli 2014), which gives both tilts, and P3P of
-    triples. Of the minima that differ, the best is the pose; those with posterior odds above 1e-5 are its `others`.
+    Minimises the reprojection error through the lens, distortion included, by Levenberg-Marquardt over the 6
+    parameters, from OpenCV's SQPNP (Terzakis, Lourakis 2020), of planes its IPPE (Collins, Bartoli 2014), which gives
+    both tilts, and P3P of triples. Of the minima that differ, the best is the pose; those with posterior odds above
+    1e-5 are its `others`.
 
     Parameters
     ----------
@@ -68,15 +70,16 @@ def fit_camera_pose(
     Raises
     ------
     ValueError
-        Fewer than four different points; points on one line, or so nearly that the noise decides; pixels that no ray of the lens
-        reaches; or no pose has the points in front of the camera.
+        Fewer than four different points; points on one line, or so nearly that the noise decides; pixels that no ray
+        of the lens reaches; or no pose has the points in front of the camera.
     """
     X, x = _checked(points, pixels, camera, 4)
     check_noise(noise_px)
     extents = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if extents[1] <= ROUNDING * extents[0]:
         raise ValueError(
-            f"expected points that are not on one line, got {len(X)} that are: the turn about it is open; add points beside it."
+            f"expected points that are not on one line, got {len(X)} that are: the turn about it is open; add "
+            "points beside it."
         )
     minima: list[Minimum[Array]] = []
     for start in _starting_poses(X, x, camera, is_planar=extents[2] <= PLANAR * extents[0]):
@@ -84,14 +87,17 @@ def fit_camera_pose(
         if not any(_is_same(found.state, other.state) for other in minima):
             minima.append(found)
     if not minima:
-        raise ValueError("expected points in front of the camera, got pairs that no pose puts there; check them and the camera.")
+        raise ValueError(
+            "expected points in front of the camera, got pairs that no pose puts there; check them and the camera."
+        )
     minima.sort(key=lambda minimum: minimum.cost)
     best, freedom = minima[0], 2 * len(X) - PARAMETERS
     noise = best.noise(PARAMETERS) if noise_px is None else noise_px
     covariance = best.covariance(max(noise, 1e-300))
     if not np.sqrt(np.trace(covariance[:3, :3])) <= MAX_ROTATION_DEVIATION:
         raise ValueError(
-            f"expected points that determine a pose, got some that leave its rotation open at a noise of {noise:.3g} px: nearly on one "
+            "expected points that determine a pose, got some that leave its rotation open at a noise of "
+            f"{noise:.3g} px: nearly on one "
             "line, too near to each other, or pairs that do not belong together; add points, or look at the pairs."
         )
     rounding = consensus.rounding_of(x)
@@ -108,8 +114,8 @@ def find_camera_pose(
 ) -> CameraPose:
     """The pose that most pairs agree with: OpenCV's USAC over P3P, then `fit_camera_pose` until the inliers stay.
 
-    A pair is an inlier where its error is below the 99 % quantile at `noise_px`, in front of the camera. The same seed gives
-    the same result.
+    A pair is an inlier where its error is below the 99 % quantile at `noise_px`, in front of the camera. The same
+    seed gives the same result.
 
     Parameters
     ----------
@@ -155,7 +161,9 @@ def _checked(points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, least: in
         check_distinct(name, values, least, "a camera's pose (three leave up to four poses)")
     beyond = int(np.count_nonzero(~np.isfinite(camera.normalise(x)).all(axis=-1)))
     if beyond:
-        raise ValueError(f"expected pixels that a ray through the lens reaches, got {beyond} beyond its fold; leave them out.")
+        raise ValueError(
+            f"expected pixels that a ray through the lens reaches, got {beyond} beyond its fold; leave them out."
+        )
     return X, x
 
 
@@ -163,7 +171,8 @@ def _refuse_chance(agreeing: int, pixels: Array, threshold: float) -> None:
     area, _ = consensus.bounding_area(pixels)
     if consensus.agree_by_chance(agreeing, len(pixels), 3, np.pi * threshold**2 / area):
         raise ValueError(
-            f"expected the image of points in one pose, got {len(pixels)} pairs of which at most {agreeing} agree, no more than chance; "
+            f"expected the image of points in one pose, got {len(pixels)} pairs of which at most {agreeing} agree, "
+            "no more than chance; "
             "the pairs are wrong, or the camera or noise_px is."
         )
 

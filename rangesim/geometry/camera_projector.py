@@ -2,8 +2,8 @@
 """Projector coordinates to depth: where a camera ray meets the projector's light plane, or comes nearest to its ray.
 
 The ray of a camera pixel is known: the pixel is where its light was measured. What has an error is the projector
-coordinate decoded there. So the optimal triangulation of camera and projector moves the projector coordinate alone, to the
-nearest place on the ray's epipolar line; that of two cameras, which shares the correction between both views
+coordinate decoded there. So the optimal triangulation of camera and projector moves the projector coordinate alone,
+to the nearest place on the ray's epipolar line; that of two cameras, which shares the correction between both views
 (`two_view_triangulation`), would give the depth of a ray that was not measured.
 """
 
@@ -40,11 +40,11 @@ def triangulate_coordinates(
     """Depth of camera rays from projector coordinates.
 
     With a = R^T d and b = -R^T t (camera ray d and camera centre in projector coordinates), the point at depth
-    z projects to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z: the epipolar line through a and b. Column
-    x_p and row y_p each give an equation linear in w (ray meets plane). With both, they are first moved to the nearest
-    place on the line, in projector pixels, where the two equations agree: the maximum likelihood for errors of one size
-    in column and row. The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w b_z), axes in
-    quadrature (lens distortion left out).
+    z projects to x_p = (a_x + w b_x) / (a_z + w b_z) at inverse depth w = 1/z: the epipolar line through a and b.
+    Column x_p and row y_p each give an equation linear in w (ray meets plane). With both, they are first moved to the
+    nearest place on the line, in projector pixels, where the two equations agree: the maximum likelihood for errors
+    of one size in column and row. The relative error is z / |dx_p/dw| with dx_p/dw = f (b_x - x_p b_z) / (a_z + w
+    b_z), axes in quadrature (lens distortion left out).
 
     Parameters
     ----------

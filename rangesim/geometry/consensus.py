@@ -2,9 +2,9 @@
 """Which correspondences agree with a model, whether more do than chance explains, and whether a simpler model would do.
 
 OpenCV's USAC (a RANSAC with local optimisation) proposes a model of data with outliers. What this adds is the
-judgement: `agree_by_chance` after Moisan and Stival ("A probabilistic criterion to detect rigid point matches between two
-images", IJCV 2004), and `simpler_model_suffices`, the F test of nested models, which finds degenerate data by the noise
-that they have instead of a threshold in pixels.
+judgement: `agree_by_chance` after Moisan and Stival ("A probabilistic criterion to detect rigid point matches between
+two images", IJCV 2004), and `simpler_model_suffices`, the F test of nested models, which finds degenerate data by the
+noise that they have instead of a threshold in pixels.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ Model = TypeVar("Model")
 INLIER_PROBABILITY = 0.99
 """Of a correct correspondence to count as one."""
 SIGNIFICANCE = 1e-5
-"""Probability of taking degenerate data for sound ones, or chance for a model. Of planes and rotations it is an ideal: an F
-fits their noise better than its parameters say, and up to 5 times 1e-3 of them pass a test at 1e-3 (measured)."""
+"""Probability of taking degenerate data for sound ones, or chance for a model. Of planes and rotations it is an
+ideal: an F fits their noise better than its parameters say, and up to 5 times 1e-3 of them pass a test at 1e-3
+(measured)."""
 MAX_ROUNDS = 20
 
 
@@ -102,8 +103,8 @@ def simpler_model_suffices(
 
     Parameters
     ----------
-    simple, full : sum of squares in px^2, and degrees of freedom: residuals less parameters. Infinite: it does not fit at
-        all, and leaves nothing to tell the noise from.
+    simple, full : sum of squares in px^2, and degrees of freedom: residuals less parameters. Infinite: it does not
+        fit at all, and leaves nothing to tell the noise from.
     rounding : px; residuals below are none.
     """
     floor = rounding**2
@@ -123,8 +124,8 @@ def simpler_model_suffices(
 def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
     """Whether data do not reject a model with a sum of squares `cost` beside the best one of its kind, with `least`.
 
-    Two such models, as the two poses of a plane, look at different components of the noise, so that their sums of squares
-    are nearly independent: the test is chi^2, or F if the noise is unknown, of all degrees of freedom.
+    Two such models, as the two poses of a plane, look at different components of the noise, so that their sums of
+    squares are nearly independent: the test is chi^2, or F if the noise is unknown, of all degrees of freedom.
     """
     if noise_px is not None:
         return bool(cost / noise_px**2 <= stats.chi2.isf(SIGNIFICANCE, freedom))
@@ -132,10 +133,11 @@ def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None
 
 
 def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
-    """Whether a model with a sum of squares `cost` has posterior odds above `SIGNIFICANCE` against the one with `least`.
+    """Whether a model with a sum of squares `cost` has posterior odds above `SIGNIFICANCE` against the one with
+    `least`.
 
-    exp(-(cost - least) / 2 variance) with known noise; without, (least / cost)^(freedom / 2), that of the profile likelihood.
-    For two models of the same data without points in space to be found along with them.
+    exp(-(cost - least) / 2 variance) with known noise; without, (least / cost)^(freedom / 2), that of the profile
+    likelihood. For two models of the same data without points in space to be found along with them.
     """
     if noise_px is not None:
         log_odds = -(cost - least) / (2 * noise_px**2)

@@ -7,15 +7,18 @@ depends on where zero lies, as long as points and calibration matrices agree; on
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangesim.settings.config import shown
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 ROUNDING = 1e-9
-"""Relative size below which a number is rounding: of singular values, and of residuals in units of the points' spread."""
+"""Relative size below which a number is rounding: of singular values, and of residuals in units of the points'
+spread."""
 
 
 def checked_array(name: str, value: ArrayLike, *shape: int | None) -> Array:

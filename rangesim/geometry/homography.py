@@ -40,9 +40,9 @@ Noisy = Literal["second", "both"]
 class Homography:
     """A homography x' = H x and how well it is known.
 
-    matrix : (3, 3) float64, Frobenius norm 1, determinant positive. covariance : (9, 9) float64 of `matrix`, row by row,
-    rank 8 (its scale is fixed); NaN if the noise is unknown. noise_px : standard deviation of one coordinate of the points,
-    as given, or as the residuals say; NaN with four pairs, which leave none. inliers : (n,) bool.
+    matrix : (3, 3) float64, Frobenius norm 1, determinant positive. covariance : (9, 9) float64 of `matrix`, row by
+    row, rank 8 (its scale is fixed); NaN if the noise is unknown. noise_px : standard deviation of one coordinate of
+    the points, as given, or as the residuals say; NaN with four pairs, which leave none. inliers : (n,) bool.
     """
 
     matrix: Array
@@ -51,7 +51,8 @@ class Homography:
     inliers: np.ndarray
 
     def transfer_covariance(self, points: ArrayLike) -> Array:
-        """(n, 2, 2) covariance in px^2 of where `points` (n, 2) are mapped to, by the uncertainty of H alone (HZ 5.12)."""
+        """(n, 2, 2) covariance in px^2 of where `points` (n, 2) are mapped to, by the uncertainty of H alone (HZ
+        5.12)."""
         first = checked_array("points", points, None, 2)
         _, by_matrix, _ = _transfer(self.matrix, first)
         return np.asarray(by_matrix @ self.covariance @ np.swapaxes(by_matrix, -1, -2))
@@ -95,9 +96,9 @@ def fit_homography(
     """The homography of maximum likelihood for Gaussian noise, all pairs being right, and its covariance.
 
     "second": minimises the transfer error sum |x' - H x|^2, for exact points `first` such as those of a printed board.
-    "both": noise in both images; minimises sum e^T (I + A A^T)^-1 e with e = x' - H x and A = d(H x)/dx, which is Sampson's
-    first-order form of the reprojection error (HZ 4.2.6). Levenberg-Marquardt from `homography_dlt`, over the 8
-    dimensions that a matrix of unit norm has. The covariance is noise^2 (J^T J)^-1, taken to the 9 entries.
+    "both": noise in both images; minimises sum e^T (I + A A^T)^-1 e with e = x' - H x and A = d(H x)/dx, which is
+    Sampson's first-order form of the reprojection error (HZ 4.2.6). Levenberg-Marquardt from `homography_dlt`, over
+    the 8 dimensions that a matrix of unit norm has. The covariance is noise^2 (J^T J)^-1, taken to the 9 entries.
 
     Parameters
     ----------
@@ -128,7 +129,8 @@ def fit_homography(
         in_tangent = found.covariance(max(noise * scale, 1e-300))
         if not np.sqrt(np.trace(in_tangent)) <= MAX_STANDARD_DEVIATION:
             raise ValueError(
-                f"expected points that determine a homography, got some that are collinear, or nearly the same, to their noise of "
+                "expected points that determine a homography, got some that are collinear, or nearly the same, to "
+                "their noise of "
                 f"{noise:.3g} px; add points away from the line."
             )
         covariance = covariance_of_unit_norm(found.state, to_pixels, tangent @ in_tangent @ tangent.T)
@@ -177,7 +179,8 @@ def find_homography(
 
 
 def transfer_error(H: ArrayLike, first: ArrayLike, second: ArrayLike, noisy: Noisy = "both") -> Array:
-    """(n,) pixels: |x' - H x|, or of both points together to their nearest exact pair (Sampson); see `fit_homography`."""
+    """(n,) pixels: |x' - H x|, or of both points together to their nearest exact pair (Sampson); see
+    `fit_homography`."""
     residuals = _residuals(
         checked_array("H", H, 3, 3),
         checked_array("first", first, None, 2),
@@ -238,7 +241,8 @@ def check_not_collinear(first: Array, second: Array) -> None:
             for i, j, k in combinations(range(4), 3):
                 if abs(np.linalg.det(np.stack([unit[j] - unit[i], unit[k] - unit[i]]))) <= ROUNDING:
                     raise ValueError(
-                        f"expected four points with no three collinear, got points {i}, {j} and {k} of {name} on one line; "
+                        f"expected four points with no three collinear, got points {i}, {j} and {k} of {name} on "
+                        "one line; "
                         "add points away from it."
                     )
 
@@ -247,7 +251,8 @@ def _refuse_chance(agreeing: int, second: Array, threshold: float) -> None:
     area, _ = consensus.bounding_area(second)
     if consensus.agree_by_chance(agreeing, len(second), 4, np.pi * threshold**2 / area):
         raise ValueError(
-            f"expected points that a homography maps to each other, got {len(second)} pairs of which at most {agreeing} agree, "
+            f"expected points that a homography maps to each other, got {len(second)} pairs of which at most "
+            f"{agreeing} agree, "
             "no more than chance; the scene is not a plane, the pairs are wrong, or noise_px is."
         )
 
@@ -285,7 +290,8 @@ def _transfer(h: Array, points: Array) -> tuple[Array, Array, Array]:
 
 
 def _whitening(by_point: Array, ratio: float, noisy: Noisy) -> Array:
-    """(n, 2, 2) L^-1 with L L^T = I + ratio^2 A A^T, the covariance of x' - H x. ratio : of the noises, first / second."""
+    """(n, 2, 2) L^-1 with L L^T = I + ratio^2 A A^T, the covariance of x' - H x. ratio : of the noises, first /
+    second."""
     if noisy == "second":
         return np.broadcast_to(np.eye(2), by_point.shape)
     covariance = np.eye(2) + ratio**2 * by_point @ np.swapaxes(by_point, -1, -2)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nonlinear least squares over rotations, directions and matrices up to scale: Levenberg and Marquardt on a manifold.
 
-SciPy's solvers work on vectors. Here a state is anything, and a step is a vector in its tangent space, so that a rotation
-stays a rotation, no parameter is redundant and the inverse of J^T J is the covariance (Madsen, Nielsen, Tingleff:
-"Methods for non-linear least squares problems", 2004, for the damping).
+SciPy's solvers work on vectors. Here a state is anything, and a step is a vector in its tangent space, so that a
+rotation stays a rotation, no parameter is redundant and the inverse of J^T J is the covariance (Madsen, Nielsen,
+Tingleff: "Methods for non-linear least squares problems", 2004, for the damping).
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 """The projective plane: points and lines, the four kinds of plane transforms, rectification of planes.
 
 A point (x, y) is any multiple of (x, y, 1), a line a x + b y + c = 0 any multiple of (a, b, c). Points with a last
-coordinate of 0 lie at infinity, all of them on the line (0, 0, 1). Hartley, Zisserman: "Multiple View Geometry in Computer
-Vision", 2nd edition 2004 (HZ), chapter 2, whose symbols are kept.
+coordinate of 0 lie at infinity, all of them on the line (0, 0, 1). Hartley, Zisserman: "Multiple View Geometry in
+Computer Vision", 2nd edition 2004 (HZ), chapter 2, whose symbols are kept.
 
 All functions but `classify` and the rectifications work on batches: leading dimensions broadcast.
 """
@@ -107,8 +107,8 @@ class Decomposition:
         H_S = [s R, t; 0, 1]    H_A = [K, 0; 0, 1]    H_P = [I, 0; v^T, 1]
 
     scale : s, positive. rotation_rad : angle of R, anticlockwise from x to y. is_reversing : whether H mirrors, which
-    then stands in K. translation : (2,) t. affine : (2, 2) K, upper triangular, determinant 1 or -1, first entry positive.
-    projective : (2,) v, 1 / length.
+    then stands in K. translation : (2,) t. affine : (2, 2) K, upper triangular, determinant 1 or -1, first entry
+    positive. projective : (2,) v, 1 / length.
     """
 
     scale: float
@@ -156,9 +156,9 @@ class Decomposition:
 class PlaneTransform:
     """What a map of the plane is.
 
-    kind : the most special of isometry, similarity, affinity, projectivity that it is. degrees_of_freedom : of its kind.
-    invariants : what its kind keeps (`INVARIANTS`). decomposition : None if it sends the origin to infinity (H33 = 0),
-    where there is none: move the origin first.
+    kind : the most special of isometry, similarity, affinity, projectivity that it is. degrees_of_freedom : of its
+    kind. invariants : what its kind keeps (`INVARIANTS`). decomposition : None if it sends the origin to infinity
+    (H33 = 0), where there is none: move the origin first.
     """
 
     kind: Kind
@@ -174,8 +174,9 @@ def classify(H: ArrayLike, tolerance: float = 1e-9, extent: float = 1.0) -> Plan
     ----------
     H : (3, 3), x' = H x; any multiple is the same map.
     tolerance : relative; how far from the more special kind H may be. Not a projectivity: over the region the scale
-        h31 x + h32 y + h33 changes by less. Not an affinity: the singular values of the upper left 2 x 2 block are equal
-        to it. Not a similarity: they are 1 to it. 1e-9 asks for exact maps; an estimated one has errors of its own.
+        h31 x + h32 y + h33 changes by less. Not an affinity: the singular values of the upper left 2 x 2 block are
+        equal to it. Not a similarity: they are 1 to it. 1e-9 asks for exact maps; an estimated one has errors of its
+        own.
     extent : the radius about the origin of the region where the map is used, in units of the points; it makes the first
         of the three free of units.
 
@@ -217,7 +218,8 @@ def _is_singular(h: Array) -> np.ndarray:
 
 
 def _decomposition(h: Array) -> Decomposition | None:
-    """Of H with H33 = 1: the block A = s R K + t v^T, and QR of A - t v^T is R times the rest; None if that is singular."""
+    """Of H with H33 = 1: the block A = s R K + t v^T, and QR of A - t v^T is R times the rest; None if that is
+    singular."""
     t, v = h[:2, 2], h[2, :2]
     block = h[:2, :2] - np.outer(t, v)
     size = np.sqrt(abs(np.linalg.det(block)))
@@ -279,8 +281,8 @@ def metric_rectification(
 
     Parameters
     ----------
-    orthogonal : pairs of lines (3,), images of lines that are orthogonal in the plane. Two pairs of different directions
-        with a vanishing line, else five in general position.
+    orthogonal : pairs of lines (3,), images of lines that are orthogonal in the plane. Two pairs of different
+        directions with a vanishing line, else five in general position.
     vanishing_line : (3,) image of the line at infinity; (0, 0, 1) if the image is affinely rectified.
 
     Raises
@@ -293,7 +295,8 @@ def metric_rectification(
     if len(orthogonal) < needed:
         known = "" if vanishing_line is None else ", with the vanishing line given"
         raise ValueError(
-            f"expected {needed} pairs of orthogonal lines for a metric rectification{known}, got {len(orthogonal)}: each "
+            f"expected {needed} pairs of orthogonal lines for a metric rectification{known}, got "
+            f"{len(orthogonal)}: each "
             "pair is one equation for the image of the circular points."
         )
     lines = [np.stack([checked_array("line", pair[k], 3) for pair in orthogonal]) for k in (0, 1)]
@@ -312,7 +315,8 @@ def metric_rectification(
         values = -values
     if not (values[1] > ROUNDING * values[0] and abs(values[2]) < 0.5 * values[1]):
         raise ValueError(
-            "expected pairs of orthogonal lines of one plane, got lines that no plane has (the conic of the circular points "
+            "expected pairs of orthogonal lines of one plane, got lines that no plane has (the conic of the "
+            "circular points "
             "is not positive semidefinite); check which lines belong together."
         )
     a = axes * np.sqrt([values[0], values[1], 1.0])
@@ -334,7 +338,8 @@ def _conic_of_circular_points(first: Array, second: Array, affine: bool) -> Arra
     unknowns = len(terms) - 1
     if values[unknowns - 1] <= ROUNDING * values[0]:
         raise ValueError(
-            f"expected {unknowns} independent pairs of orthogonal lines, got pairs that repeat each other: parallel pairs "
+            f"expected {unknowns} independent pairs of orthogonal lines, got pairs that repeat each other: "
+            "parallel pairs "
             "of lines give the same equation; add pairs of other directions."
         )
     conic = np.zeros((3, 3))

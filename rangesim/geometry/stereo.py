@@ -2,9 +2,9 @@
 """Stereo on parallel cameras: rectification, matching along rows, disparity to depth and its error.
 
 Two pinholes with parallel axes and one focal length f, a baseline b apart along x, see a point at depth z with the
-disparity d = x - x' = f b / z on the same row: F = [0, 0, 0; 0, 0, -1; 0, 1, 0], and the epipoles lie at infinity, (1, 0, 0).
-`rectify` makes any two calibrated cameras so by turning them about their centres (Fusiello, Trucco, Verri: "A compact
-algorithm for rectification of stereo pairs", 2000).
+disparity d = x - x' = f b / z on the same row: F = [0, 0, 0; 0, 0, -1; 0, 1, 0], and the epipoles lie at infinity,
+(1, 0, 0). `rectify` makes any two calibrated cameras so by turning them about their centres (Fusiello, Trucco, Verri:
+"A compact algorithm for rectification of stereo pairs", 2000).
 
 Here images meet coordinates. Pixel centres lie at integer + 0.5, OpenCV's at integers: `warp` converts, nothing else.
 """
@@ -64,9 +64,9 @@ class ParallelCameras:
 class RectifiedPair:
     """Two cameras turned to be parallel, and how their images and pixels get there.
 
-    first, second : Intrinsics of the real cameras. camera : Intrinsics of both rectified ones, a pinhole, the image large
-    enough for all that either sees. R_rectified_first, R_rectified_second : (3, 3), turn camera coordinates into rectified
-    ones. baseline_m : metres; the second rectified camera stands there on the x axis of the first.
+    first, second : Intrinsics of the real cameras. camera : Intrinsics of both rectified ones, a pinhole, the image
+    large enough for all that either sees. R_rectified_first, R_rectified_second : (3, 3), turn camera coordinates
+    into rectified ones. baseline_m : metres; the second rectified camera stands there on the x axis of the first.
     """
 
     first: Intrinsics
@@ -100,14 +100,16 @@ class RectifiedPair:
         return self.camera.project(self.second.directions(pixels) @ self.R_rectified_second.T)
 
     def warp(self, first: np.ndarray, second: np.ndarray) -> tuple[Array, Array]:
-        """The images (h, w) of both cameras as the rectified ones see them, float32; NaN where a camera sees nothing."""
+        """The images (h, w) of both cameras as the rectified ones see them, float32; NaN where a camera sees
+        nothing."""
         return (
             _warped(self.first, self.camera, self.R_rectified_first, first),
             _warped(self.second, self.camera, self.R_rectified_second, second),
         )
 
     def points(self, disparity_px: np.ndarray) -> Array:
-        """(h, w, 3) float64 points, metres, coordinates of the first camera as it really stands; NaN where there is none.
+        """(h, w, 3) float64 points, metres, coordinates of the first camera as it really stands; NaN where there is
+        none.
 
         Parameters
         ----------
@@ -165,7 +167,8 @@ def rectify(first: Intrinsics, second: Intrinsics, T_second_first: ArrayLike) ->
 
 
 _ALONG_BASELINE = (
-    "expected cameras that look across their baseline, got ones that look along it: {why}; move the camera sideways, or match along "
+    "expected cameras that look across their baseline, got ones that look along it: {why}; move the camera "
+    "sideways, or match along "
     "epipolar lines without rectification."
 )
 
@@ -173,22 +176,24 @@ _ALONG_BASELINE = (
 def match_rows(
     first: np.ndarray, second: np.ndarray, disparities_px: tuple[float, float], block_px: int = 5
 ) -> np.ndarray:
-    """(h, w) float32 disparities d = x - x' of the first image of a rectified pair, to 1/16 pixel; NaN where none is sure.
+    """(h, w) float32 disparities d = x - x' of the first image of a rectified pair, to 1/16 pixel; NaN where none is
+    sure.
 
     OpenCV's semi-global matching (Hirschmueller, PAMI 2008; all eight directions), its usual penalties for steps of one
     pixel and more, with the check that the match back from the second image agrees within one pixel.
 
     Parameters
     ----------
-    first, second : (h, w) images, any unit; NaN where there is none, as `RectifiedPair.warp` returns. The second should be exposed as
-        the first.
+    first, second : (h, w) images, any unit; NaN where there is none, as `RectifiedPair.warp` returns. The second
+        should be exposed as the first.
     disparities_px : least and largest that is looked for: `ParallelCameras.disparity` of the largest and least depth.
     block_px : odd, side of the blocks that are compared.
 
     Raises
     ------
     ValueError
-        Images that are not of one size or have no contrast, a range that is empty or wider than the image, an even block.
+        Images that are not of one size or have no contrast, a range that is empty or wider than the image, an even
+        block.
     """
     import cv2
 
@@ -236,7 +241,9 @@ def _eight_bits(first: Array, second: Array) -> tuple[np.ndarray, np.ndarray]:
     low, high = np.nanquantile(first, [0.005, 0.995])
     if not high > low:
         raise ValueError("expected images with contrast, got a first image of one value.")
-    result = [np.nan_to_num(np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8) for image in (first, second)]
+    result = [
+        np.nan_to_num(np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8) for image in (first, second)
+    ]
     return result[0], result[1]
 
 

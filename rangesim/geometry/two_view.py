@@ -4,16 +4,17 @@
 Corresponding pixels x (first view) and x' (second view) satisfy x'^T F x = 0. F has rank 2 and 7 degrees of freedom;
 l' = F x and l = F^T x' are the epipolar lines, F e = 0 and F^T e' = 0 the epipoles. With known K the essential matrix
 E = K'^T F K = [t]_x R has 5: the rotation and the direction of the translation of T_second_first, which maps
-coordinates of the first camera to those of the second. Hartley, Zisserman: "Multiple View Geometry in Computer Vision", 2nd
-edition 2004 (HZ), chapters 9 to 11.
+coordinates of the first camera to those of the second. Hartley, Zisserman: "Multiple View Geometry in Computer
+Vision", 2nd edition 2004 (HZ), chapters 9 to 11.
 
 Pixels are those of a pinhole: take lens distortion out first (`camera_matrix.ideal_pixels`).
 
-Degenerate pairs of views raise ValueError, judged by the noise of the data (`consensus.simpler_model_suffices`): points of
-one plane and a camera that only rotates map by a homography, which infinitely many F contain; the same view twice is one
-of these. For the relative pose a rotation alone has no translation, and a plane has two poses that differ little in what is
-seen: find the pose of a known plane by `pose`. Not found by this test: points on a ruled quadric with both centres (HZ 22.2), of which the
-standard deviation of F tells where it is above `MAX_STANDARD_DEVIATION`.
+Degenerate pairs of views raise ValueError, judged by the noise of the data (`consensus.simpler_model_suffices`):
+points of one plane and a camera that only rotates map by a homography, which infinitely many F contain; the same view
+twice is one of these. For the relative pose a rotation alone has no translation, and a plane has two poses that
+differ little in what is seen: find the pose of a known plane by `pose`. Not found by this test: points on a ruled
+quadric with both centres (HZ 22.2), of which the standard deviation of F tells where it is above
+`MAX_STANDARD_DEVIATION`.
 """
 
 from __future__ import annotations
@@ -99,8 +100,8 @@ def epipoles(F: ArrayLike) -> Epipoles:
 
 
 def lines_in_second(F: ArrayLike, first: ArrayLike) -> Array:
-    """(n, 3) epipolar lines l' = F x in the second view of pixels (n, 2) of the first; a^2 + b^2 = 1, so that l' x' is a
-    distance in pixels. The epipole itself has none: NaN."""
+    """(n, 3) epipolar lines l' = F x in the second view of pixels (n, 2) of the first; a^2 + b^2 = 1, so that l' x'
+    is a distance in pixels. The epipole itself has none: NaN."""
     return _normalised_lines(homogeneous(first) @ _checked_F(F).T)
 
 
@@ -184,14 +185,14 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     """F of maximum likelihood for Gaussian noise in both views, all pairs being right, and its covariance.
 
     Minimises the sum of squared Sampson distances, to first order the reprojection error of HZ algorithm 11.3, over the
-    7 dimensions of matrices of rank 2 and unit norm: steps U [A, b; c^T, 0] V^T, with F = U D V^T, then the nearest matrix of
-    rank 2. From `eight_point` by Levenberg-Marquardt.
+    7 dimensions of matrices of rank 2 and unit norm: steps U [A, b; c^T, 0] V^T, with F = U D V^T, then the nearest
+    matrix of rank 2. From `eight_point` by Levenberg-Marquardt.
 
     Parameters
     ----------
     first, second : (n, 2) pixels, n >= 8.
-    noise_px : standard deviation of a coordinate; None: from the residuals, which takes more than eight pairs to be sure
-        that data are not degenerate.
+    noise_px : standard deviation of a coordinate; None: from the residuals, which takes more than eight pairs to be
+        sure that data are not degenerate.
 
     Raises
     ------
@@ -223,8 +224,10 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     normal = tangent @ in_tangent @ tangent.T
     if not np.sqrt(np.trace(normal)) <= MAX_STANDARD_DEVIATION:
         raise ValueError(
-            f"expected points that determine the fundamental matrix, got some that leave it open at a noise of {noise:.3g} px: near "
-            "to a plane, to a surface that contains both centres, or with too small a baseline; add points at other depths."
+            "expected points that determine the fundamental matrix, got some that leave it open at a noise of "
+            f"{noise:.3g} px: near "
+            "to a plane, to a surface that contains both centres, or with too small a baseline; add points at "
+            "other depths."
         )
     to_pixels = np.kron(from_b.T, from_a.T)
     covariance = covariance_of_unit_norm(found.state, to_pixels, normal)
@@ -239,13 +242,14 @@ def find_fundamental(first: ArrayLike, second: ArrayLike, noise_px: float = 1.0,
     Parameters
     ----------
     first, second : (n, 2) pixels, n >= 9.
-    noise_px : standard deviation of a coordinate of a right pair; an inlier's Sampson distance is below its 99 % quantile.
+    noise_px : standard deviation of a coordinate of a right pair; an inlier's Sampson distance is below its 99 %
+        quantile.
 
     Raises
     ------
     ValueError
-        As `fit_fundamental`; no more pairs agree than chance lets; or those off the best homography do so by chance, which
-        would hide a plane or a rotation with some wrong pairs.
+        As `fit_fundamental`; no more pairs agree than chance lets; or those off the best homography do so by chance,
+        which would hide a plane or a rotation with some wrong pairs.
     """
     import cv2
 
@@ -276,9 +280,9 @@ def find_fundamental(first: ArrayLike, second: ArrayLike, noise_px: float = 1.0,
 class RelativePose:
     """Where the second camera stands as seen from the first, up to the length of the baseline.
 
-    T_second_first : (4, 4), maps coordinates of the first camera to the second's; |t| = 1, for points alone do not know it.
-    covariance : (5, 5) of (rotation vector applied after R, rad; two orthogonal turns of t, rad); NaN if the noise is
-    unknown. noise_px : standard deviation of a coordinate. inliers : (n,) bool.
+    T_second_first : (4, 4), maps coordinates of the first camera to the second's; |t| = 1, for points alone do not
+    know it. covariance : (5, 5) of (rotation vector applied after R, rad; two orthogonal turns of t, rad); NaN if the
+    noise is unknown. noise_px : standard deviation of a coordinate. inliers : (n,) bool.
     """
 
     T_second_first: Array
@@ -332,8 +336,8 @@ def fit_relative_pose(
     """The relative pose of maximum likelihood for Gaussian noise, all pairs being right, and its covariance.
 
     Minimises the squared Sampson distances in pixels over rotation and direction of translation, 5 parameters, from
-    several solutions of the five-point algorithm (Nister 2004, by OpenCV), each in the one of its four poses that has the
-    points in front.
+    several solutions of the five-point algorithm (Nister 2004, by OpenCV), each in the one of its four poses that has
+    the points in front.
 
     Parameters
     ----------
@@ -366,7 +370,8 @@ def fit_relative_pose(
     _refuse_homography(a, b, least, OF_POSE, noise_px)
     if not minima:
         raise ValueError(
-            "expected points in front of both cameras, got pairs that no pose puts there: the camera only rotates, the pairs "
+            "expected points in front of both cameras, got pairs that no pose puts there: the camera only "
+            "rotates, the pairs "
             "are wrong, or K is."
         )
     best, freedom = minima[0], len(a) - OF_POSE
@@ -375,7 +380,8 @@ def fit_relative_pose(
         if consensus.is_as_likely(other.cost, best.cost, freedom, noise_px, rounding):
             angle = np.degrees(_angle(other.state[:3, :3] @ best.state[:3, :3].T))
             raise ValueError(
-                f"expected points with one relative pose, got two that explain them to their noise, {angle:.1f} degrees apart: "
+                f"expected points with one relative pose, got two that explain them to their noise, {angle:.1f} "
+                "degrees apart: "
                 "they lie on a plane, or are few; add points off it."
             )
     noise = best.noise(OF_POSE) if noise_px is None else noise_px
@@ -393,8 +399,8 @@ def find_relative_pose(
 ) -> RelativePose:
     """The relative pose that most pairs agree with: OpenCV's USAC, then `fit_relative_pose` until the inliers stay.
 
-    Parameters and errors are those of `fit_relative_pose`, with n >= 8; also ValueError if no more pairs agree than chance
-    would let.
+    Parameters and errors are those of `fit_relative_pose`, with n >= 8; also ValueError if no more pairs agree than
+    chance would let.
     """
     import cv2
 
@@ -424,7 +430,8 @@ def find_relative_pose(
 # ------------------------------------------------------------------------------------------- degenerate views
 
 _DEPENDENT = (
-    "expected pairs that determine the fundamental matrix, got {n} whose equations depend on each other: points of one plane, a "
+    "expected pairs that determine the fundamental matrix, got {n} whose equations depend on each other: points "
+    "of one plane, a "
     "camera that only rotates, one view twice, or repeated points; add points at other depths or move the camera."
 )
 MIN_IN_FRONT = 0.75
@@ -432,7 +439,8 @@ MIN_IN_FRONT = 0.75
 
 
 def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_px: float | None) -> None:
-    """Raise ValueError if a homography explains the pairs to their noise, as a model of `parameters` with `cost` does."""
+    """Raise ValueError if a homography explains the pairs to their noise, as a model of `parameters` with `cost`
+    does."""
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
     simple = homography_error(a, b), 2 * n - OF_HOMOGRAPHY
     if consensus.simpler_model_suffices(simple, (cost, n - parameters), noise_px, rounding):
@@ -441,7 +449,8 @@ def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_p
         what = "one view twice" if same else "points of one plane or a camera that only rotates"
         hint = "" if noise_px is not None or n > 12 else " With so few pairs, state noise_px if you know it."
         raise ValueError(
-            f"expected two views with parallax, got {n} pairs that a homography maps to each other within {apart:.3g} px: {what}; "
+            f"expected two views with parallax, got {n} pairs that a homography maps to each other within "
+            f"{apart:.3g} px: {what}; "
             f"it leaves the epipoles open, or two poses. Add points at other depths or move the camera.{hint}"
         )
 
@@ -453,7 +462,8 @@ def _refuse_rotation(a: Array, b: Array, K_first: Array, K_second: Array, cost: 
     if consensus.simpler_model_suffices(simple, (cost, n - OF_POSE), noise_px, rounding):
         apart = float(np.sqrt(simple[0] / simple[1]))
         raise ValueError(
-            f"expected a camera that moved, got {n} pairs that a rotation alone explains within {apart:.3g} px: there is no direction "
+            f"expected a camera that moved, got {n} pairs that a rotation alone explains within {apart:.3g} px: "
+            "there is no direction "
             "of translation; move the camera sideways."
         )
 
@@ -461,8 +471,8 @@ def _refuse_rotation(a: Array, b: Array, K_first: Array, K_second: Array, cost: 
 def _refuse_plane_with_outliers(a: Array, b: Array, inliers: np.ndarray, noise_px: float, threshold: float) -> None:
     """Raise ValueError if the pairs that agree with F but not with the best homography agree by chance.
 
-    A plane and any two pairs off it determine some F, wrong pairs too (Chum, Werner, Matas: "Two-view geometry estimation
-    unaffected by a dominant plane", CVPR 2005); here those that agree with it are counted.
+    A plane and any two pairs off it determine some F, wrong pairs too (Chum, Werner, Matas: "Two-view geometry
+    estimation unaffected by a dominant plane", CVPR 2005); here those that agree with it are counted.
     """
     from rangesim.geometry.homography import find_homography, transfer_error
 
@@ -487,11 +497,13 @@ def _refuse_chance(agreeing: int, a: Array, b: Array, threshold: float, minimal:
         return
     if plane:
         raise ValueError(
-            f"expected points at several depths, got pairs of one plane, or of a camera that only rotates, and {len(a)} others of which "
+            "expected points at several depths, got pairs of one plane, or of a camera that only rotates, and "
+            f"{len(a)} others of which "
             f"{agreeing} agree with an epipolar geometry, no more than chance; add points off the plane."
         )
     raise ValueError(
-        f"expected two views of one rigid scene, got {len(a)} pairs of which at most {agreeing} agree, no more than chance; the pairs "
+        f"expected two views of one rigid scene, got {len(a)} pairs of which at most {agreeing} agree, no more "
+        "than chance; the pairs "
         "are wrong, or noise_px is."
     )
 
@@ -528,7 +540,8 @@ def _rank_two(F: Array) -> Array:
 
 
 def _tangent(F: Array) -> Array:
-    """(9, 7) orthonormal directions in which a matrix of rank 2 and unit norm can change: U M V^T, M33 = 0, not along F."""
+    """(9, 7) orthonormal directions in which a matrix of rank 2 and unit norm can change: U M V^T, M33 = 0, not along
+    F."""
     u, values, vt = np.linalg.svd(F)
     basis = np.kron(u, vt.T)[:, :8]  # columns vec(u_i v_j^T), the last of which, (3, 3), is left out
     along = np.zeros((1, 8))

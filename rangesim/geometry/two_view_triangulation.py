@@ -29,8 +29,8 @@ from rangesim.geometry.two_view import fundamental_from_cameras
 NEAR_EPIPOLE = 0.25
 """A correction by more than this fraction of a point's distance to its epipole is checked against all minima."""
 CONVERGED, MAX_STEPS = 1e-3, 20
-"""Steps end where one changes the correction by less than this fraction of it, so that the next would change it by about
-the square; where none does, it is checked likewise."""
+"""Steps end where one changes the correction by less than this fraction of it, so that the next would change it by
+about the square; where none does, it is checked likewise."""
 
 
 class CorrectedPixels(NamedTuple):
@@ -52,9 +52,11 @@ class TriangulatedPoints:
 def triangulate_linear(
     P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> TriangulatedPoints:
-    """Points by the homogeneous linear method: the least singular vector of the four equations x cross P X = 0 (HZ 12.2).
+    """Points by the homogeneous linear method: the least singular vector of the four equations x cross P X = 0 (HZ
+    12.2).
 
-    Its error is algebraic: it depends on the frame, and is worst where a point is far for one camera and near for the other.
+    Its error is algebraic: it depends on the frame, and is worst where a point is far for one camera and near for the
+    other.
 
     Parameters
     ----------
@@ -94,10 +96,11 @@ def triangulate_midpoint(
 def correct_pixels(F: ArrayLike, first: ArrayLike, second: ArrayLike) -> CorrectedPixels:
     """The pairs nearest to the measured ones that satisfy x'^T F x = 0: the global minimum of |dx|^2 + |dx'|^2.
 
-    Both corrections are along the normals n = S F^T x'^, n' = S F x^ of the epipolar lines of the result (S takes the first
-    two entries): dx = lambda n, dx' = lambda n'. Steps evaluate these at the last result and solve the constraint,
-    a lambda^2 - 2 b lambda + c = 0, exactly (Lindstrom 2010, with the constraint kept at every step); two do for most points.
-    Where they do not converge, or correct by a large part of the distance to an epipole, Hartley and Sturm's polynomial decides.
+    Both corrections are along the normals n = S F^T x'^, n' = S F x^ of the epipolar lines of the result (S takes the
+    first two entries): dx = lambda n, dx' = lambda n'. Steps evaluate these at the last result and solve the
+    constraint, a lambda^2 - 2 b lambda + c = 0, exactly (Lindstrom 2010, with the constraint kept at every step); two
+    do for most points. Where they do not converge, or correct by a large part of the distance to an epipole, Hartley
+    and Sturm's polynomial decides.
 
     Parameters
     ----------
@@ -223,10 +226,10 @@ def _checked(
 def _judged(p: Array, q: Array, x: Array, y: Array, X: Array) -> TriangulatedPoints:
     """With reprojection errors; NaN where not finite or not in front of both cameras."""
     points, error = np.full(X.shape, np.nan), np.full(len(X), np.nan)
-    finite = np.isfinite(X).all(axis=-1)
+    finite = np.asarray(np.isfinite(X).all(axis=-1))
     sound = finite.copy()
     for P in (p, q):
-        sound[finite] &= depth(P, X[finite]) > 0
+        sound[finite] = sound[finite] & (depth(P, X[finite]) > 0)
     points[sound] = X[sound]
     parts = [project(P, X[sound]) - measured[sound] for P, measured in ((p, x), (q, y))]
     error[sound] = np.linalg.norm(np.hstack(parts), axis=-1)
@@ -320,11 +323,13 @@ def _intersect(start, stop, cameras, first, second, measured_first, measured_sec
 
 
 def _by_polynomial(F: Array, pole_first: Array, pole_second: Array, x: Array, y: Array) -> Array:
-    """(n, 4) corrected pairs by Hartley and Sturm's polynomial of degree 6 (HZ algorithm 12.1), all roots of all points.
+    """(n, 4) corrected pairs by Hartley and Sturm's polynomial of degree 6 (HZ algorithm 12.1), all roots of all
+    points.
 
-    In either view the measured point is moved to 0 and the epipole turned to (1, 0, f): then epipolar lines are (t f, 1, -t)
-    and (-f' (c t + d), a t + b, c t + d), and the squared distance s(t) of both points to them has its minimum at a root of
-    g(t) = t ((a t + b)^2 + f'^2 (c t + d)^2)^2 - (a d - b c) (1 + f^2 t^2)^2 (a t + b) (c t + d), or at infinity.
+    In either view the measured point is moved to 0 and the epipole turned to (1, 0, f): then epipolar lines are (t f,
+    1, -t) and (-f' (c t + d), a t + b, c t + d), and the squared distance s(t) of both points to them has its minimum
+    at a root of g(t) = t ((a t + b)^2 + f'^2 (c t + d)^2)^2 - (a d - b c) (1 + f^2 t^2)^2 (a t + b) (c t + d), or at
+    infinity.
     """
     back_first, f = _epipolar_frame(pole_first, x)
     back_second, g = _epipolar_frame(pole_second, y)
