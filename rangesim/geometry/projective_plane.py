@@ -300,7 +300,7 @@ def metric_rectification(
             "pair is one equation for the image of the circular points."
         )
     lines = [np.stack([checked_array("line", pair[k], 3) for pair in orthogonal]) for k in (0, 1)]
-    to_affine = np.eye(3)
+    to_affine: Array = np.eye(3)
     if vanishing_line is not None:
         to_affine = _sending_to_infinity(checked_array("vanishing_line", vanishing_line, 3))
     lines = [map_lines(to_affine, some) for some in lines]

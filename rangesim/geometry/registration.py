@@ -152,7 +152,7 @@ def _turned(T: Array, source: Array, target: Array) -> list[Array]:
     middle."""
     axes = np.linalg.svd(target - target.mean(axis=0), full_matrices=False)[2]
     middle = T[:3, :3] @ source.mean(axis=0) + T[:3, 3]
-    result = []
+    result: list[Array] = []
     for axis in axes:
         for quarters in (1, 2, 3):
             turn = np.eye(4)
