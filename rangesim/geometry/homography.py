@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from rangesim.geometry import consensus
@@ -31,8 +31,8 @@ from rangesim.geometry.correspondences import (
 from rangesim.geometry.least_squares import Minimum, minimise
 
 PARAMETERS = 8
-MAX_STANDARD_DEVIATION = 0.3
-"""Of H at unit norm in normalised coordinates, 1 at most: beyond, the noise determines it and not the points."""
+COLLINEAR = 1e-7
+"""Distance from a line, relative to the spread of the points, that is rounding."""
 Noisy = Literal["second", "both"]
 
 
@@ -108,13 +108,14 @@ def fit_homography(
     Raises
     ------
     ValueError
-        As `homography_dlt`; or the points are so near to a degenerate set that their noise decides.
+        As `homography_dlt`; or all points but one lie on a line to their noise.
     """
     a, b = checked_pairs(first, second, 4, "a homography")
     check_noise(noise_px)
     if noisy not in ("second", "both"):
         raise ValueError(f"expected noisy to be 'second' or 'both', got {noisy!r}.")
-    check_not_collinear(a, b)
+    for name, points in (("first", a), ("second", b)):
+        _refuse_collinear(name, points, 0.0)
     from_a, from_b = normalising_transform(a), normalising_transform(b)
     start = from_b @ homography_dlt(a, b) @ np.linalg.inv(from_a)
     found = _maximum_likelihood(
@@ -125,14 +126,11 @@ def fit_homography(
     to_pixels = np.kron(np.linalg.inv(from_b), from_a.T)  # of row-major vectors: vec(B^-1 H A)
     covariance = np.full((9, 9), np.nan)
     if np.isfinite(noise):
+        for name, points in (("first", a), ("second", b)):
+            if (name, noisy) != ("first", "second"):
+                _refuse_collinear(name, points, float(noise))
         tangent = _tangent(found.state)
         in_tangent = found.covariance(max(noise * scale, 1e-300))
-        if not np.sqrt(np.trace(in_tangent)) <= MAX_STANDARD_DEVIATION:
-            raise ValueError(
-                "expected points that determine a homography, got some that are collinear, or nearly the same, to "
-                "their noise of "
-                f"{noise:.3g} px; add points away from the line."
-            )
         covariance = covariance_of_unit_norm(found.state, to_pixels, tangent @ in_tangent @ tangent.T)
     matrix = _oriented(np.linalg.inv(from_b) @ found.state @ from_a)
     return Homography(matrix, covariance, float(noise), np.ones(len(a), dtype=bool))
@@ -229,22 +227,28 @@ def rotation_homography_error(first: Array, second: Array, K_first: Array, K_sec
     return minimise(residuals, step, start).cost
 
 
-def check_not_collinear(first: Array, second: Array) -> None:
-    """Raise ValueError unless four of the points lie in general position: no three collinear, in both images."""
-    for name, points in (("first", first), ("second", second)):
-        unit = apply_similarity(normalising_transform(points), points)
-        if np.linalg.svd(unit - unit.mean(axis=0), compute_uv=False)[1] <= ROUNDING * len(points):
-            raise ValueError(
-                f"expected four points with no three collinear, got all {len(points)} of {name} on one line."
-            )
-        if len(points) == 4:
-            for i, j, k in combinations(range(4), 3):
-                if abs(np.linalg.det(np.stack([unit[j] - unit[i], unit[k] - unit[i]]))) <= ROUNDING:
-                    raise ValueError(
-                        f"expected four points with no three collinear, got points {i}, {j} and {k} of {name} on "
-                        "one line; "
-                        "add points away from it."
-                    )
+def _refuse_collinear(name: str, points: Array, noise_px: float) -> None:
+    """Raise ValueError unless two of the points (n, 2) lie off every line through the others, to their noise.
+
+    One point off a line is no fourth in general position. For each point, the smallest eigenvalue of the scatter of
+    the others is the sum of squared distances from their best line; over the variance it follows chi^2 if that is
+    noise.
+    """
+    n, size = len(points), consensus.spread(points)
+    unit = (points - points.mean(axis=0)) / size
+    scatter = unit.T @ unit - n / (n - 1) * unit[:, :, None] * unit[:, None, :]
+    half, product = scatter[:, [0, 1], [0, 1]].sum(-1) / 2, np.linalg.det(scatter)
+    least = half - np.sqrt(np.maximum(half**2 - product, 0))
+    allowed = (noise_px / size) ** 2 * stats.chi2.isf(consensus.SIGNIFICANCE, n - 3)
+    odd = int(np.argmin(least))
+    if least[odd] <= max(allowed, COLLINEAR**2 * n):
+        others = np.delete(np.arange(n), odd).tolist()
+        which = f"points {others} of {name}" if n == 4 else f"{n - 1} of the {n} points of {name}, or all,"
+        raise ValueError(
+            f"expected four points with no three collinear, got {which} on one line to their noise of "
+            f"{noise_px:.3g} px; add points "
+            "away from it."
+        )
 
 
 def _refuse_chance(agreeing: int, second: Array, threshold: float) -> None:
