@@ -12,9 +12,9 @@ Pixels are those of a pinhole: take lens distortion out first (`camera_matrix.id
 Degenerate pairs of views raise ValueError, judged by the noise of the data (`consensus.simpler_model_suffices`):
 points of one plane and a camera that only rotates map by a homography, which infinitely many F contain; the same view
 twice is one of these. For the relative pose a rotation alone has no translation, and a plane has two poses that
-differ little in what is seen: find the pose of a known plane by `pose`. Not found by this test: points on a ruled
-quadric with both centres (HZ 22.2), of which the standard deviation of F tells where it is above
-`MAX_STANDARD_DEVIATION`.
+differ little in what is seen: find the pose of a known plane by `pose`. Points on a ruled
+quadric that contains both centres have up to three F (HZ 22.2): they are looked for, and refused where the noise does
+not tell them apart.
 """
 
 from __future__ import annotations
@@ -48,6 +48,8 @@ from rangesim.rig import pose
 PARAMETERS = 7
 OF_POSE = 5
 OF_ROTATION = 3
+ANOTHER = 0.02
+"""Difference of an entry of F, at unit norm in normalised coordinates, from which on it is another one."""
 MAX_STANDARD_DEVIATION = 0.3
 """Of F at unit norm in normalised coordinates, 1 at most: beyond, the noise determines it and not the points."""
 
@@ -152,15 +154,7 @@ def seven_point(first: ArrayLike, second: ArrayLike) -> Array:
     _, values, axes = np.linalg.svd(_design(apply_similarity(from_a, a), apply_similarity(from_b, b)))
     if values[6] <= ROUNDING * values[0]:
         raise ValueError(_DEPENDENT.format(n=7))
-    one, two = axes[7].reshape(3, 3), axes[8].reshape(3, 3)
-    # the cubic through four of its values; with one or the other matrix on top its highest term cannot vanish for both
-    places = np.array([-1.0, 0.0, 1.0, 2.0])
-    cubic = np.polyfit(places, [np.linalg.det(two + s * one) for s in places], 3)
-    roots = np.roots(np.where(np.abs(cubic) < 1e-14 * np.abs(cubic).max(), 0.0, cubic))
-    real = roots.real[np.abs(roots.imag) <= 1e-6 * (1 + np.abs(roots))]
-    found = [two + s * one for s in real]
-    if abs(cubic[0]) < 1e-14 * np.abs(cubic).max():
-        found.append(one)
+    found = _singular_members(axes[7].reshape(3, 3), axes[8].reshape(3, 3))
     return unit_norm(from_b.T @ np.stack([_rank_two(F) for F in found]) @ from_a)
 
 
@@ -217,8 +211,22 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
         return unit_norm(_rank_two(F + (_tangent(F) @ delta).reshape(3, 3)))
 
     found = minimise(residuals, step, unit_norm(start))
+    _, _, axes = np.linalg.svd(_design(unit_a, unit_b))
+    members = _singular_members(axes[7].reshape(3, 3), axes[8].reshape(3, 3))
+    minima = [minimise(residuals, step, unit_norm(_rank_two(F))) for F in members]
+    found = min([found, *minima], key=lambda minimum: minimum.cost)
     noise = found.noise(PARAMETERS) / scale if noise_px is None else noise_px
     _refuse_homography(a, b, found.cost / scale**2, PARAMETERS, noise_px)
+    rounding = consensus.rounding_of(np.concatenate([a, b]))
+    for other in minima:
+        apart = min(np.abs(other.state - sign * found.state).max() for sign in (1, -1))
+        costs = other.cost / scale**2, found.cost / scale**2
+        if apart > ANOTHER and consensus.is_as_likely(*costs, len(a) - PARAMETERS, noise_px, rounding):
+            raise ValueError(
+                f"expected points with one fundamental matrix, got {len(a)} pairs that two explain to their noise: "
+                "the points "
+                "lie on a surface that contains both centres, or are few; add points at other depths."
+            )
     in_tangent = found.covariance(max(noise * scale, 1e-300))
     tangent = _tangent(found.state)
     normal = tangent @ in_tangent @ tangent.T
@@ -531,6 +539,17 @@ def _noise_of(residuals: Array, parameters: int) -> float:
 def _design(a: Array, b: Array) -> Array:
     """(n, 9) rows x' (x) x of the equations x'^T F x = 0."""
     return np.asarray((homogeneous(b)[:, :, None] * homogeneous(a)[:, None, :]).reshape(len(a), 9))
+
+
+def _singular_members(one: Array, two: Array) -> list[Array]:
+    """The one to three matrices two + s one, or one, whose determinant is 0."""
+    # the cubic through four of its values; where its highest term vanishes, `one` itself is singular
+    places = np.array([-1.0, 0.0, 1.0, 2.0])
+    cubic = np.polyfit(places, [np.linalg.det(two + s * one) for s in places], 3)
+    negligible = np.abs(cubic) < 1e-14 * np.abs(cubic).max()
+    roots = np.roots(np.where(negligible, 0.0, cubic))
+    found = [two + s * one for s in roots.real[np.abs(roots.imag) <= 1e-6 * (1 + np.abs(roots))]]
+    return [*found, one] if negligible[0] else found
 
 
 def _rank_two(F: Array) -> Array:
