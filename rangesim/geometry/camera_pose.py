@@ -71,7 +71,8 @@ def fit_camera_pose(
     ------
     ValueError
         Fewer than four different points; points on one line, or so nearly that the noise decides; pixels that no ray
-        of the lens reaches; or no pose has the points in front of the camera.
+        of the lens reaches; no pose has the points in front of the camera; or the residuals are over three times the
+        stated noise.
     """
     X, x = _checked(points, pixels, camera, 4)
     check_noise(noise_px)
@@ -92,6 +93,7 @@ def fit_camera_pose(
         )
     minima.sort(key=lambda minimum: minimum.cost)
     best, freedom = minima[0], 2 * len(X) - PARAMETERS
+    consensus.refuse_misfit(best.cost, freedom, noise_px, "one pose")
     noise = best.noise(PARAMETERS) if noise_px is None else noise_px
     covariance = best.covariance(max(noise, 1e-300))
     if not np.sqrt(np.trace(covariance[:3, :3])) <= MAX_ROTATION_DEVIATION:

@@ -26,6 +26,8 @@ SIGNIFICANCE = 1e-5
 ideal: an F fits their noise better than its parameters say, and up to 5 times 1e-3 of them pass a test at 1e-3
 (measured)."""
 MAX_ROUNDS = 20
+MAX_EXCESS = 3.0
+"""Times the stated noise that residuals may be."""
 
 
 def usac(threshold_px: float, seed: int) -> Any:
@@ -145,6 +147,24 @@ def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | Non
         floor = rounding**2 * freedom
         log_odds = -0.5 * freedom * np.log(max(cost, floor) / max(least, floor))
     return bool(log_odds > np.log(SIGNIFICANCE))
+
+
+def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str) -> None:
+    """Raise ValueError if residuals are over three times the noise that was stated, and not by accident.
+
+    Parameters
+    ----------
+    cost, freedom : sum of squares in px^2 of what the model leaves, and its degrees of freedom.
+    """
+    if noise_px is None or freedom <= 0:
+        return
+    excess = cost / noise_px**2
+    if excess > MAX_EXCESS**2 * freedom and excess > stats.chi2.isf(SIGNIFICANCE, freedom):
+        raise ValueError(
+            f"expected pairs that {model} explains to their noise of {noise_px:.3g} px, got residuals of "
+            f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (find them by the robust function), or "
+            "noise_px is."
+        )
 
 
 def spread(points: Array) -> float:

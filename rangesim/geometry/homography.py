@@ -108,7 +108,8 @@ def fit_homography(
     Raises
     ------
     ValueError
-        As `homography_dlt`; or all points but one lie on a line to their noise.
+        As `homography_dlt`; or all points but one lie on a line to their noise; or the residuals are over three times
+        the stated noise.
     """
     a, b = checked_pairs(first, second, 4, "a homography")
     check_noise(noise_px)
@@ -122,6 +123,7 @@ def fit_homography(
         start, apply_similarity(from_a, a), apply_similarity(from_b, b), from_b[0, 0] / from_a[0, 0], noisy
     )
     scale = from_b[0, 0]  # normalised units per pixel of the second image
+    consensus.refuse_misfit(found.cost / scale**2, 2 * len(a) - PARAMETERS, noise_px, "a homography")
     noise = found.noise(PARAMETERS) / scale if noise_px is None else noise_px
     to_pixels = np.kron(np.linalg.inv(from_b), from_a.T)  # of row-major vectors: vec(B^-1 H A)
     covariance = np.full((9, 9), np.nan)

@@ -191,7 +191,8 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     Raises
     ------
     ValueError
-        As `eight_point`; or a homography explains the points to their noise: a plane, a rotation alone, one view twice.
+        As `eight_point`; or a homography explains the points to their noise: a plane, a rotation alone, one view twice;
+        or the residuals are over three times the stated noise.
     """
     a, b = checked_pairs(first, second, 8, "a fundamental matrix")
     check_noise(noise_px)
@@ -215,6 +216,7 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     members = _singular_members(axes[7].reshape(3, 3), axes[8].reshape(3, 3))
     minima = [minimise(residuals, step, unit_norm(_rank_two(F))) for F in members]
     found = min([found, *minima], key=lambda minimum: minimum.cost)
+    consensus.refuse_misfit(found.cost / scale**2, len(a) - PARAMETERS, noise_px, "an epipolar geometry")
     noise = found.noise(PARAMETERS) / scale if noise_px is None else noise_px
     _refuse_homography(a, b, found.cost / scale**2, PARAMETERS, noise_px)
     rounding = consensus.rounding_of(np.concatenate([a, b]))
@@ -356,7 +358,8 @@ def fit_relative_pose(
     ------
     ValueError
         Fewer than six different pairs; a rotation alone (also: the same view twice) or a plane explains them to their
-        noise; two poses explain them alike; or no pose has them in front of both cameras.
+        noise; two poses explain them alike; no pose has them in front of both cameras; or the
+        residuals are over three times the stated noise.
     """
     a, b = checked_pairs(first, second, 6, "a relative pose")
     check_noise(noise_px)
@@ -392,6 +395,7 @@ def fit_relative_pose(
                 "degrees apart: "
                 "they lie on a plane, or are few; add points off it."
             )
+    consensus.refuse_misfit(best.cost, freedom, noise_px, "a relative pose")
     noise = best.noise(OF_POSE) if noise_px is None else noise_px
     return RelativePose(best.state, best.covariance(max(noise, 1e-300)), float(noise), np.ones(len(a), dtype=bool))
 

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose of a camera from known points: against OpenCV and the Cramer-Rao bound; planes with two poses; bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from geometry_scenes import cramer_rao, efficiency, rigid
+from scipy.spatial.transform import Rotation
+
+from rangesim.geometry import calibration_matrix, find_camera_pose, fit_camera_pose
+from rangesim.rig import Intrinsics
+
+cv2 = pytest.importorskip("cv2")
+
+CAMERA = Intrinsics(640, 480, 800, 805, 321, 242, (-0.2, 0.05, 1e-3, -1e-3))
+TRUE = rigid((0.3, -0.4, 0.2), (0.1, 0.05, 2.5))
+NOISE = 0.3
+
+
+def target(random: np.random.Generator, n: int, plane: bool = False, size: float = 1.0) -> np.ndarray:
+    X = random.uniform(-0.5, 0.5, (n, 3)) * size
+    if plane:
+        X[:, 2] = 0
+    return X
+
+
+def seen(X: np.ndarray, T: np.ndarray = TRUE) -> np.ndarray:
+    return CAMERA.project(X @ T[:3, :3].T + T[:3, 3])
+
+
+def difference(T: np.ndarray, other: np.ndarray = TRUE) -> np.ndarray:
+    """(6,) rotation vector and translation between two poses."""
+    return np.concatenate([Rotation.from_matrix(T[:3, :3] @ other[:3, :3].T).as_rotvec(), T[:3, 3] - other[:3, 3]])
+
+
+@pytest.mark.parametrize("plane", [False, True])
+@pytest.mark.parametrize("n", [4, 6, 30])
+def test_exact_pixels_give_the_pose_through_a_distorted_lens(n: int, plane: bool) -> None:
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        X = target(random, n, plane)
+        found = fit_camera_pose(X, seen(X), CAMERA, noise_px=1e-6)
+        assert np.abs(difference(found.T_camera_object)).max() < 1e-4
+
+
+def test_it_agrees_with_opencv() -> None:
+    random = np.random.default_rng(1)
+    for _ in range(10):
+        X = target(random, 15)
+        x = seen(X) + random.normal(0, NOISE, (15, 2))
+        _, vector, t = cv2.solvePnP(X, x, calibration_matrix(CAMERA), np.array(CAMERA.distortion))
+        theirs = rigid(vector.ravel(), t.ravel())
+        ours = fit_camera_pose(X, x, CAMERA).T_camera_object
+        assert np.abs(difference(ours, theirs)).max() < 1e-4
+        cost = [((seen(X, T) - x) ** 2).sum() for T in (ours, theirs)]
+        assert cost[0] <= cost[1] * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_it_reaches_the_bound_and_knows_it(plane: bool) -> None:
+    random = np.random.default_rng(2)
+    X = target(random, 20, plane)
+
+    def predict(v: np.ndarray) -> np.ndarray:
+        return seen(
+            X,
+            rigid((Rotation.from_rotvec(v[:3]) * Rotation.from_matrix(TRUE[:3, :3])).as_rotvec(), TRUE[:3, 3] + v[3:]),
+        )
+
+    bound = cramer_rao(predict, lambda v: v, np.zeros(6), NOISE)
+    fits = [fit_camera_pose(X, seen(X) + random.normal(0, NOISE, (20, 2)), CAMERA) for _ in range(60)]
+    errors = np.stack([difference(fit.T_camera_object) for fit in fits])
+    assert 0.8 < efficiency(errors, bound, rank=6) < 1.2
+    assert np.mean([fit.noise_px for fit in fits]) == pytest.approx(NOISE, rel=0.05)
+    exact = fit_camera_pose(X, seen(X), CAMERA, noise_px=NOISE)
+    np.testing.assert_allclose(exact.covariance, bound, atol=1e-4 * np.abs(bound).max())
+    assert not any(fit.is_ambiguous for fit in fits)
+
+
+def test_a_small_plane_has_two_poses_and_both_are_reported() -> None:
+    random = np.random.default_rng(3)
+    reported = right = 0
+    for _ in range(20):
+        X = target(random, 12, plane=True, size=0.12)
+        found = fit_camera_pose(X, seen(X) + random.normal(0, NOISE, (12, 2)), CAMERA, noise_px=NOISE)
+        poses = [found.T_camera_object, *found.others]
+        reported += found.is_ambiguous
+        right += min(np.abs(difference(T)[:3]).max() for T in poses) < 0.2
+    assert reported >= 15
+    assert right >= 18  # one of them is the true one
+    # a large one seen obliquely has one
+    X = target(random, 12, plane=True)
+    assert not fit_camera_pose(X, seen(X) + random.normal(0, NOISE, (12, 2)), CAMERA).is_ambiguous
+
+
+def test_wrong_pairs_are_left_out() -> None:
+    random = np.random.default_rng(4)
+    X = target(random, 80)
+    x = seen(X) + random.normal(0, NOISE, (80, 2))
+    x[:40] = random.uniform(0, 480, (40, 2))
+    found = find_camera_pose(X, x, CAMERA, NOISE)
+    assert found.inliers[40:].mean() > 0.9
+    assert not found.inliers[:40].any()
+    assert np.abs(difference(found.T_camera_object)).max() < 0.02
+    assert found.noise_px == pytest.approx(NOISE, rel=0.2)
+    np.testing.assert_array_equal(found.T_camera_object, find_camera_pose(X, x, CAMERA, NOISE).T_camera_object)
+
+
+X, RANDOM = target(np.random.default_rng(5), 12), np.random.default_rng(6)
+LINE = np.linspace(-0.5, 0.5, 8)[:, None] * [1.0, 0.3, 0.2]
+WIDE = Intrinsics(640, 480, 300, 300, 320, 240, (-0.9,))
+
+
+def test_points_on_a_line_to_their_noise_leave_the_turn_open() -> None:
+    for _ in range(5):
+        nearly = LINE + RANDOM.normal(0, 1e-4, LINE.shape)
+        with pytest.raises(ValueError, match="leave its rotation open"):
+            fit_camera_pose(nearly, seen(LINE) + RANDOM.normal(0, NOISE, (8, 2)), CAMERA, noise_px=NOISE)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: fit_camera_pose(X[:3], seen(X[:3]), CAMERA), "three leave up to four poses"),
+        (lambda: fit_camera_pose(np.repeat(X[:3], 3, 0), np.repeat(seen(X[:3]), 3, 0), CAMERA), "3 different ones"),
+        (lambda: fit_camera_pose(LINE, seen(LINE), CAMERA), "turn about it is open"),
+        (lambda: fit_camera_pose(X, seen(X)[:5], CAMERA), "as many pixels"),
+        (lambda: fit_camera_pose(X, np.full((12, 2), np.nan), CAMERA), "24 NaN"),
+        (lambda: fit_camera_pose(X, seen(X), CAMERA, noise_px=0), "noise_px"),
+        (lambda: fit_camera_pose(X, RANDOM.uniform(0, 600, (12, 2)), WIDE), "beyond its fold"),
+        (lambda: find_camera_pose(X[:5], seen(X[:5]), CAMERA), "at least 6"),
+        (lambda: find_camera_pose(target(RANDOM, 40), RANDOM.uniform(0, 480, (40, 2)), CAMERA, NOISE), "than chance"),
+    ],
+)
+def test_what_cannot_be_done_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_points_behind_the_camera_are_no_pose() -> None:
+    """Pixels of points behind a pinhole, as a projection without cheirality gives them, are mirrored: no pose fits."""
+    T = rigid((0.3, -0.4, 0.2), (0.1, 0.05, -2.5))
+    Y = X @ T[:3, :3].T + T[:3, 3]
+    pixels = Y[:, :2] / Y[:, 2:] * 800 + [320, 240]
+    plain = Intrinsics(640, 480, 800, 800, 320, 240)
+    with pytest.raises(ValueError, match=r"to their noise of 0.3 px, got residuals"):
+        fit_camera_pose(X, pixels, plain, noise_px=NOISE)
+    with pytest.raises(ValueError, match="chance"):
+        find_camera_pose(X, pixels, plain, NOISE)

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangulation of two views: the global minimum against OpenCV's polynomial, never worse than linear, at the bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from geometry_scenes import FIRST, SECOND, T_SECOND_FIRST, K, cramer_rao, efficiency, points, rigid
+
+from rangesim.geometry import (
+    camera_matrix,
+    correct_pixels,
+    fundamental_from_cameras,
+    point_covariance,
+    project,
+    sampson_distance,
+    triangulate_linear,
+    triangulate_midpoint,
+    triangulate_optimal,
+)
+
+cv2 = pytest.importorskip("cv2")
+
+FORWARD = camera_matrix(K, rigid((0, 0, 0), (0.02, 0.01, -0.5)))
+ASIDE = camera_matrix(K, rigid((0, -0.1, 0), (0.5, 0, 0)))
+METHODS = {"linear": triangulate_linear, "midpoint": triangulate_midpoint, "optimal": triangulate_optimal}
+
+
+def noisy_pixels(other: np.ndarray, n: int, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(seed)
+    X = points(random, n)
+    a, b = project(FIRST, X), project(other, X)
+    return X, a + random.normal(0, noise, a.shape), b + random.normal(0, noise, b.shape)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("scale", [1.0, -3.0])
+def test_exact_pixels_give_the_point(method: str, scale: float) -> None:
+    """Whatever the scale and sign of the camera matrices."""
+    X, a, b = noisy_pixels(SECOND, 200, 0.0)
+    found = METHODS[method](FIRST, scale * SECOND, a, b)
+    np.testing.assert_allclose(found.points, X, atol=1e-8)
+    np.testing.assert_allclose(found.error_px, 0, atol=1e-8)
+
+
+@pytest.mark.parametrize("other", [SECOND, ASIDE, FORWARD], ids=["second", "aside", "forward"])
+@pytest.mark.parametrize("noise", [0.1, 2.0, 30.0])
+def test_it_is_the_global_minimum_and_never_worse_than_the_others(other: np.ndarray, noise: float) -> None:
+    _, a, b = noisy_pixels(other, 4000, noise)
+    F = fundamental_from_cameras(FIRST, other)
+    corrected = correct_pixels(F, a, b)
+    assert np.abs(sampson_distance(F, *corrected)).max() < 1e-8  # they satisfy the constraint
+    cost = ((corrected.first - a) ** 2 + (corrected.second - b) ** 2).sum(-1)
+    u, v = cv2.correctMatches(F, a[None], b[None])  # Hartley and Sturm's polynomial
+    exact = ((u[0] - a) ** 2 + (v[0] - b) ** 2).sum(-1)
+    fails = ~np.isfinite(exact)
+    assert fails.mean() < 0.01
+    assert (cost[~fails] <= exact[~fails] * (1 + 1e-6) + 1e-9).all()
+    assert (cost >= sampson_distance(F, a, b) ** 2 * 0.2).all()
+    optimal = triangulate_optimal(FIRST, other, a, b)
+    np.testing.assert_allclose(optimal.error_px, np.sqrt(cost), rtol=1e-9, atol=1e-12)
+    for method in (triangulate_linear, triangulate_midpoint):
+        theirs = method(FIRST, other, a, b).error_px
+        known = np.isfinite(theirs)
+        assert known.mean() > 0.6
+        assert (optimal.error_px[known] <= theirs[known] + 1e-6).all()
+    # and the points reproject to the corrected pixels
+    sound = np.isfinite(optimal.points).all(axis=-1)
+    for P, pixels in ((FIRST, corrected.first), (other, corrected.second)):
+        np.testing.assert_allclose(project(P, optimal.points[sound]), pixels[sound], atol=1e-5)
+
+
+def test_points_near_an_epipole_get_the_best_of_several_minima() -> None:
+    F = fundamental_from_cameras(FIRST, FORWARD)
+    random = np.random.default_rng(1)
+    from rangesim.geometry import epipoles
+
+    e, e_ = (pole[:2] / pole[2] for pole in epipoles(F))
+    a, b = e + random.normal(0, 5, (500, 2)), e_ + random.normal(0, 5, (500, 2))
+    corrected = correct_pixels(F, a, b)
+    cost = ((corrected.first - a) ** 2 + (corrected.second - b) ** 2).sum(-1)
+    # no line through the epipoles, out of many, is nearer to the pairs
+    angles = np.linspace(0, np.pi, 2000)
+    lines = np.stack([np.cos(angles), np.sin(angles), -np.cos(angles) * e[0] - np.sin(angles) * e[1]], axis=-1)
+    on_line = np.stack([e[0] - np.sin(angles), e[1] + np.cos(angles), np.ones_like(angles)], axis=-1) @ F.T
+    on_line /= np.linalg.norm(on_line[:, :2], axis=-1, keepdims=True)
+    x, y = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (a, b))
+    least = ((x @ lines.T) ** 2 + (y @ on_line.T) ** 2).min(axis=1)
+    assert (cost <= least * (1 + 1e-9) + 1e-9).all()
+    assert (cost > least * 0.8 - 1e-3).all()
+
+
+def test_optimal_reaches_the_bound_and_midpoint_does_not_beat_it() -> None:
+    X, noise, trials = np.array([[0.4, -0.5, 3.5]]), 0.5, 4000
+    random = np.random.default_rng(2)
+    a, b = (np.repeat(project(P, X), trials, axis=0) + random.normal(0, noise, (trials, 2)) for P in (FIRST, FORWARD))
+
+    def predict(v: np.ndarray) -> np.ndarray:
+        return np.concatenate([project(P, v[None]).ravel() for P in (FIRST, FORWARD)])
+
+    bound = cramer_rao(predict, lambda v: v, X[0], noise)
+    ours = point_covariance(FIRST, FORWARD, X, noise, noise)[0]
+    np.testing.assert_allclose(ours, bound, rtol=1e-4)
+    reached = {name: efficiency(m(FIRST, FORWARD, a, b).points - X, bound, rank=3) for name, m in METHODS.items()}
+    assert 0.8 < reached["optimal"] < 1.2
+    assert reached["optimal"] <= min(reached.values()) + 0.01
+
+
+def test_covariance_takes_noise_in_every_form() -> None:
+    X = points(np.random.default_rng(3), 5)
+    plain = point_covariance(FIRST, SECOND, X, 0.5, 0.25)
+    full = point_covariance(FIRST, SECOND, X, 0.25 * np.eye(2), np.full(5, 0.25))
+    np.testing.assert_allclose(plain, full)
+    np.testing.assert_allclose(point_covariance(FIRST, -SECOND, X, 1.0, 0.5), 4 * plain)
+    behind = point_covariance(FIRST, SECOND, [(0, 0, -1.0), (np.nan, 0, 1)])
+    assert np.isnan(behind).all()
+
+
+def test_the_error_of_depth_is_that_of_the_formula() -> None:
+    """Parallel cameras: sigma_z = z^2 sigma_d / (f b) with sigma_d = sqrt(2) sigma."""
+    first, second = (
+        camera_matrix(np.diag([800, 800, 1])),
+        camera_matrix(np.diag([800, 800, 1]), rigid((0, 0, 0), (-0.2, 0, 0))),
+    )
+    for z in (1.0, 4.0):
+        C = point_covariance(first, second, [(0.1, 0, z)], 0.1, 0.1)[0]
+        assert np.sqrt(C[2, 2]) == pytest.approx(z**2 * np.sqrt(2) * 0.1 / (800 * 0.2), rel=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_rays_that_do_not_meet_in_front_give_nan(method: str) -> None:
+    parallel = camera_matrix(K, rigid((0, 0, 0), (-0.2, 0, 0)))
+    pixel, shift = np.array([(320.0, 240.0)] * 3), np.array([(10.0, 0), (0, 0), (-10, 0)])
+    found = METHODS[method](FIRST, parallel, pixel, pixel - shift)
+    assert found.points[0, 2] == pytest.approx(800 * 0.2 / 10)
+    assert np.isnan(found.points[1:]).all()  # parallel; they diverge, and meet behind
+
+
+def test_two_million_points_a_second() -> None:
+    """On one core it is 5 million; this only guards against a return to loops in Python."""
+    import time
+
+    _, a, b = noisy_pixels(SECOND, 200_000, 1.0)
+    triangulate_optimal(FIRST, SECOND, a[:10], b[:10])
+    start = time.process_time()
+    triangulate_optimal(FIRST, SECOND, a, b)
+    assert len(a) / (time.process_time() - start) > 5e5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_cannot_be_done_is_said(method: str) -> None:
+    pixel = np.array([(320.0, 240.0)])
+    turned = camera_matrix(K, rigid((0, 0.1, 0), (0, 0, 0)))
+    for arguments, message in (
+        ((FIRST, turned, pixel, pixel), "same centre"),
+        ((FIRST, SECOND, pixel, np.repeat(pixel, 2, 0)), "corresponding points"),
+        ((FIRST, SECOND, pixel, [(np.nan, 0)]), "1 NaN"),
+        ((FIRST, K, pixel, pixel), r"P_second of shape \(\.\.\., 3, 4\)"),
+        ((FIRST[None], SECOND, pixel, pixel), r"shape \(3, 4\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            METHODS[method](*arguments)
+    for noise in (0.0, -np.eye(2), np.ones((3, 3))):
+        with pytest.raises(ValueError, match="noise_first_px"):
+            point_covariance(FIRST, SECOND, [(0, 0, 3.0)], noise)
+    with pytest.raises(ValueError, match="rank 2"):
+        correct_pixels(np.eye(3), pixel, pixel)
+    assert T_SECOND_FIRST.shape == (4, 4)
