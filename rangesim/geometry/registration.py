@@ -103,7 +103,7 @@ def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, 
     extent if that is larger, are matched and three matches make a pose (Open3D's
     `registration_ransac_based_on_feature_matching`). The results of four runs, and the best one turned by quarters
     and halves about the target's principal axes, go through `icp`; the one that agrees best counts. The same seed
-    gives the same result.
+    gives the same result, to the rounding of Open3D's parallel sums.
 
     Parameters
     ----------

@@ -48,6 +48,8 @@ from rangesim.rig import pose
 PARAMETERS = 7
 OF_POSE = 5
 OF_ROTATION = 3
+MAX_PIXELS = 1e5
+"""Coordinates of images, about."""
 ANOTHER = 0.02
 """Difference of an entry of F, at unit norm in normalised coordinates, from which on it is another one."""
 MAX_STANDARD_DEVIATION = 0.3
@@ -527,10 +529,10 @@ def _checked_F(F: ArrayLike) -> Array:
     matrix = checked_array("F", F, 3, 3)
     if matrix.ndim != 2:
         raise ValueError(f"expected F of shape (3, 3), got {matrix.shape}.")
-    scaled = matrix
-    for axis in (0, 1, 0, 1):  # pixels against ones
-        scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=axis, keepdims=True), 1e-300)
-    values = np.linalg.svd(scaled, compute_uv=False)
+    # pixels against ones: in units of some hundred pixels the blocks of F are of one size
+    block, border = np.linalg.norm(matrix[:2, :2]), max(np.linalg.norm(matrix[2, :2]), np.linalg.norm(matrix[:2, 2]))
+    unit = min(border / block, MAX_PIXELS) if border > 0 and block > 0 else 1.0
+    values = np.linalg.svd(matrix * np.outer([unit, unit, 1], [unit, unit, 1]), compute_uv=False)
     if not (values[1] > 1e-12 * values[0] and values[2] <= 1e-6 * values[0]):
         raise ValueError(f"expected F of rank 2, got singular values {values.tolist()} after scaling.")
     return matrix

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registration of clouds of a known part: from a first guess and without one; what slides, is symmetric or apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from geometry_scenes import rigid
+from scipy.spatial.transform import Rotation
+
+from rangesim.geometry import Registration, icp, register
+
+TRUE = rigid((0.3, -0.8, 1.2), (0.5, 0.1, 0.3))
+"""Maps the source's coordinates to the target's."""
+
+
+def box(
+    random: np.random.Generator, n: int, size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)
+) -> np.ndarray:
+    """(n, 3) points on the faces of a box."""
+    p, face = random.uniform(-0.5, 0.5, (n, 3)), random.integers(0, 6, n)
+    p[np.arange(n), face // 2] = np.where(face % 2, 0.5, -0.5)
+    return p * size + at
+
+
+def part(random: np.random.Generator, n: int) -> np.ndarray:
+    """A block with two bosses, that looks different from all sides."""
+    bosses = (
+        box(random, n // 4, (0.08, 0.06, 0.15), (0.1, 0.05, 0.12)),
+        box(random, n // 4, (0.05, 0.12, 0.06), (-0.1, -0.02, 0.08)),
+    )
+    return np.concatenate([box(random, n // 2, (0.3, 0.2, 0.1)), *bosses])
+
+
+def sphere(random: np.random.Generator, n: int) -> np.ndarray:
+    p = random.normal(size=(n, 3))
+    return np.asarray(0.1 * p / np.linalg.norm(p, axis=1, keepdims=True))
+
+
+def cylinder(random: np.random.Generator, n: int) -> np.ndarray:
+    a = random.uniform(0, 2 * np.pi, n)
+    return np.stack([0.05 * np.cos(a), 0.05 * np.sin(a), random.uniform(-0.1, 0.1, n)], axis=-1)
+
+
+def plane(random: np.random.Generator, n: int) -> np.ndarray:
+    return np.concatenate([random.uniform(-0.1, 0.1, (n, 2)), np.zeros((n, 1))], axis=1)
+
+
+def pair(shape, noise: float = 0.0, n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+    """Two independent samplings; the source as if seen from another place."""
+    random = np.random.default_rng(seed)
+    source, target = shape(random, n), shape(random, n)
+    source = (source - TRUE[:3, 3]) @ TRUE[:3, :3]
+    return source + random.normal(0, noise, source.shape), target + random.normal(0, noise, target.shape)
+
+
+def off(found: Registration) -> tuple[float, float]:
+    """Degrees and metres from the truth, the latter at the part's middle."""
+    E = found.T_target_source @ np.linalg.inv(TRUE)
+    return float(np.degrees(Rotation.from_matrix(E[:3, :3]).magnitude())), float(np.linalg.norm(E[:3, 3]))
+
+
+@pytest.mark.parametrize("noise", [0.0, 5e-4])
+def test_icp_finds_the_pose_from_a_near_one(noise: float) -> None:
+    source, target = pair(part, noise)
+    found = icp(source, target, rigid((0.05, 0.04, -0.06), (0.004, 0, 0.003)) @ TRUE)
+    degrees, metres = off(found)
+    assert degrees < 0.15
+    assert metres < 2e-4
+    assert found.fitness > 0.95
+    assert found.target_fitness > 0.95
+    assert found.constraint > 0.05
+
+
+def test_icp_is_a_minimum_of_the_distances_to_the_surface() -> None:
+    """Of the truth and of poses beside it none has a smaller root mean square distance to the tangent planes."""
+    source, target = pair(part, 3e-4)
+    best = icp(source, target, TRUE)
+    assert best.rms_m < 1.3e-3
+    for axis in np.eye(6):
+        turned = rigid(0.03 * axis[:3], 0.003 * axis[3:]) @ best.T_target_source
+        again = icp(source, target, turned)
+        assert np.abs(again.T_target_source - best.T_target_source).max() < 1e-3
+
+
+def test_register_needs_no_first_guess_and_repeats() -> None:
+    source, target = pair(part, 3e-4)
+    found = register(source, target)
+    degrees, metres = off(found)
+    assert degrees < 0.2
+    assert metres < 3e-4
+    np.testing.assert_allclose(found.T_target_source, register(source, target).T_target_source, atol=1e-9)
+
+
+def test_half_an_overlap_is_reported_as_that() -> None:
+    source, target = pair(part, 3e-4, n=6000)
+    seen = source @ TRUE[:3, :3].T + TRUE[:3, 3]
+    found = icp(source[seen[:, 0] < 0.08], target[target[:, 0] > -0.08], TRUE)
+    assert off(found)[0] < 0.3
+    assert 0.3 < found.fitness < 0.6
+    assert 0.3 < found.target_fitness < 0.6
+    with pytest.raises(ValueError, match="expected 90% of the source"):
+        icp(source[seen[:, 0] < 0.08], target[target[:, 0] > -0.08], TRUE, min_fitness=0.9)
+
+
+@pytest.mark.parametrize("shape", [sphere, cylinder, plane])
+@pytest.mark.parametrize("noise", [0.0, 3e-4])
+def test_what_slides_is_refused(shape, noise: float) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match="surfaces that hold each other"):
+        icp(*pair(shape, noise), TRUE)
+
+
+def test_a_symmetric_part_is_refused_without_a_first_guess() -> None:
+    def block(random: np.random.Generator, n: int) -> np.ndarray:
+        return box(random, n, (0.3, 0.2, 0.1))
+
+    source, target = pair(block, 3e-4)
+    for seed in (0, 1):
+        with pytest.raises(ValueError, match="one way, got two poses"):
+            register(source, target, seed=seed)
+    assert off(icp(source, target, TRUE))[0] < 0.2
+
+
+SOURCE, TARGET = pair(part, n=400)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: icp(SOURCE + 5, TARGET), "expected 30% of the source on the target, got 0.0%"),
+        (lambda: register(SOURCE, pair(sphere, n=400)[1] * 10), "expected"),
+        (lambda: icp(SOURCE[:10], TARGET), "at least 20"),
+        (lambda: icp(np.repeat(SOURCE[:10], 4, axis=0), TARGET), "20 different"),
+        (lambda: icp(SOURCE[:, :2], TARGET), r"shape \(\.\.\., n, 3\)"),
+        (lambda: icp(SOURCE, np.full_like(TARGET, np.nan)), "NaN"),
+        (lambda: icp(SOURCE, TARGET, np.diag([2, 1, 1, 1])), "rigid"),
+        (lambda: icp(SOURCE, TARGET, max_distance_m=0), "max_distance_m"),
+        (lambda: register(SOURCE, TARGET, min_fitness=1.5), "min_fitness"),
+    ],
+)
+def test_what_cannot_be_done_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=message):
+        call()
