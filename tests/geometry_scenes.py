@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesim.geometry import camera_matrix
+from rangesim.geometry import projection_matrix
 
 K = np.array([[800.0, 0, 320], [0, 810, 240], [0, 0, 1]])
 
@@ -22,7 +22,7 @@ def rigid(turn: Iterable[float], move: Iterable[float]) -> np.ndarray:
 
 
 T_SECOND_FIRST = rigid((0.05, -0.2, 0.03), (0.3, 0.05, 0.1))
-FIRST, SECOND = camera_matrix(K), camera_matrix(K, T_SECOND_FIRST)
+FIRST, SECOND = projection_matrix(K), projection_matrix(K, T_SECOND_FIRST)
 
 
 def points(random: np.random.Generator, n: int, plane: bool = False) -> np.ndarray:

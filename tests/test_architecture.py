@@ -150,6 +150,63 @@ def test_open3d_is_imported_only_where_it_is_used(path: Path) -> None:
     assert "open3d" not in {name.split(".")[0] for name in imports(path, top_level_only=True)}
 
 
+@pytest.mark.parametrize("path", [*modules("rangesim"), *modules("pcgraph")], ids=relative)
+def test_opencv_is_imported_only_inside_functions_of_geometry(path: Path) -> None:
+    assert "cv2" not in {name.split(".")[0] for name in imports(path, top_level_only=True)}
+    assert relative(path).startswith("rangesim/geometry/") or "cv2" not in {n.split(".")[0] for n in imports(path)}
+
+
+@pytest.mark.parametrize("path", modules("rangesim/geometry"), ids=relative)
+def test_geometry_knows_cameras_and_arrays_alone(path: Path) -> None:
+    inside = {name for name in imports(path) if name.startswith(("rangesim", "pcgraph"))}
+    assert all(
+        n.startswith(("rangesim.geometry", "rangesim.rig", "rangesim.settings", "pcgraph.parallel")) for n in inside
+    )
+
+
+GEOMETRY = {
+    "camera_matrix": "CameraParts back_project calibration_matrix centre decompose decompose_zero_skew depth "
+    "ideal_pixels lens_pixels project projection_matrix rays",
+    "camera_pose": "CameraPose find_camera_pose fit_camera_pose",
+    "camera_projector": "ProjectorTriangulation triangulate_coordinates",
+    "hand_eye": "HandEye eye_in_hand eye_to_hand",
+    "homography": "Homography find_homography fit_homography homography_dlt transfer_error",
+    "projective_plane": "LINE_AT_INFINITY Decomposition PlaneTransform affine_rectification classify euclidean "
+    "homogeneous "
+    "is_at_infinity join map_lines map_points meet metric_rectification point_at_infinity",
+    "registration": "Registration icp register",
+    "stereo": "ParallelCameras RectifiedPair match_rows rectify",
+    "two_view": "Epipoles FundamentalMatrix RelativePose eight_point epipoles essential_from_pose find_fundamental "
+    "find_relative_pose fit_fundamental fit_relative_pose fundamental_from_cameras fundamental_from_pose in_front "
+    "lines_in_first lines_in_second poses_from_essential sampson_distance seven_point",
+    "two_view_triangulation": "CorrectedPixels TriangulatedPoints correct_pixels point_covariance triangulate_linear "
+    "triangulate_midpoint triangulate_optimal",
+}
+
+
+def test_the_public_surface_of_geometry_is_this() -> None:
+    """And type checkers see the same names."""
+    import rangesim.geometry as geometry
+
+    wanted = {name: f"rangesim.geometry.{chapter}" for chapter, names in GEOMETRY.items() for name in names.split()}
+    assert set(geometry.__all__) == set(wanted)
+    assert not set(wanted) & set(GEOMETRY)  # a module would take the place of a function of its name
+    tree = ast.parse((ROOT / "rangesim" / "geometry" / "__init__.py").read_text())
+    block = next(n for n in tree.body if isinstance(n, ast.If))
+    seen = {a.asname: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names if a.asname}
+    assert seen == wanted
+    for name in wanted:
+        assert getattr(geometry, name).__doc__ or name.isupper()
+
+
+def test_geometry_loads_neither_opencv_nor_open3d_until_they_are_used() -> None:
+    code = (
+        "from rangesim.geometry import classify, fundamental_from_cameras, rectify, icp, eye_in_hand; "
+        "import sys; print(*sys.modules)"
+    )
+    assert not (RENDERER | {"open3d", "cv2"}) & set(run(code).split())
+
+
 def test_the_public_surface_is_this() -> None:
     assert rangesim.__all__ == [
         "Ambient",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from geometry_scenes import rigid
@@ -11,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from rangesim.geometry import (
     back_project,
     calibration_matrix,
-    camera_matrix,
     centre,
     decompose,
     decompose_zero_skew,
@@ -19,11 +19,10 @@ from rangesim.geometry import (
     ideal_pixels,
     lens_pixels,
     project,
+    projection_matrix,
     rays,
 )
 from rangesim.rig import Intrinsics
-
-cv2 = pytest.importorskip("cv2")
 
 CAMERA = Intrinsics(640, 480, 800, 790, 322, 236, (-0.2, 0.05, 1e-3, -2e-3))
 
@@ -32,7 +31,7 @@ def random_camera(random: np.random.Generator, skew: float = 0.0) -> tuple[np.nd
     """K, pose and P at a random scale, of either sign."""
     K = np.array([[random.uniform(300, 2000), skew, 320], [0, random.uniform(300, 2000), 240], [0, 0, 1]])
     T = rigid(Rotation.random(rng=random).as_rotvec(), random.normal(0, 2, 3))
-    return K, T, random.normal() * 3 * camera_matrix(K, T)
+    return K, T, random.normal() * 3 * projection_matrix(K, T)
 
 
 @pytest.mark.parametrize("skew", [0.0, 12.0])
@@ -70,14 +69,16 @@ def test_the_closed_form_of_zero_skew_is_the_textbooks() -> None:
     np.testing.assert_allclose(
         found, (A[0, 2], A[1, 2], np.sqrt(A[0, 0] - A[0, 2] ** 2), np.sqrt(A[1, 1] - A[1, 2] ** 2))
     )
-    np.testing.assert_allclose(camera_matrix(parts.K, parts.T_camera_world), camera_matrix(K, T), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(
+        projection_matrix(parts.K, parts.T_camera_world), projection_matrix(K, T), rtol=1e-7, atol=1e-7
+    )
 
 
 def test_the_pose_has_six_parameters() -> None:
     """P has eleven degrees of freedom; five are K, six the pose."""
 
     def camera(v: np.ndarray) -> np.ndarray:
-        P = camera_matrix([[v[0], v[1], v[2]], [0, v[3], v[4]], [0, 0, 1]], rigid(v[5:8], v[8:]))
+        P = projection_matrix([[v[0], v[1], v[2]], [0, v[3], v[4]], [0, 0, 1]], rigid(v[5:8], v[8:]))
         return np.asarray(P / np.linalg.norm(P)).ravel()
 
     at = np.array([2.0, 0.1, 0.3, 1.8, 0.2, 0.1, -0.2, 0.3, 0.5, 0.4, 3.0])
@@ -109,7 +110,7 @@ def test_batches_of_cameras() -> None:
 
 
 def test_points_behind_the_camera_have_no_image() -> None:
-    P = -2 * camera_matrix(CAMERA)
+    P = -2 * projection_matrix(CAMERA)
     X = np.array([(0.1, 0.2, 2.0), (0.1, 0.2, -2.0), (0.1, 0.2, 0.0)])
     np.testing.assert_allclose(depth(P, X), (2, -2, 0))
     assert np.isfinite(project(P, X)).all(axis=1).tolist() == [True, False, False]
@@ -118,7 +119,7 @@ def test_points_behind_the_camera_have_no_image() -> None:
 def test_projection_is_that_of_the_rig_and_of_opencv() -> None:
     X = np.random.default_rng(5).uniform((-1, -1, 2), (1, 1, 5), (40, 3))
     T = rigid((0.1, 0.2, -0.1), (0.1, 0, 0.2))
-    ideal = project(camera_matrix(CAMERA, T), X)
+    ideal = project(projection_matrix(CAMERA, T), X)
     shown = lens_pixels(CAMERA, ideal)
     np.testing.assert_allclose(shown, CAMERA.project(X @ T[:3, :3].T + T[:3, 3]), atol=1e-9)
     theirs, _ = cv2.projectPoints(
@@ -133,7 +134,7 @@ def test_projection_is_that_of_the_rig_and_of_opencv() -> None:
 
 
 def test_parts_become_intrinsics_unless_skewed() -> None:
-    assert decompose(camera_matrix(CAMERA)).intrinsics(640, 480).fx == pytest.approx(800)
+    assert decompose(projection_matrix(CAMERA)).intrinsics(640, 480).fx == pytest.approx(800)
     _, _, P = random_camera(np.random.default_rng(6), skew=5.0)
     with pytest.raises(ValueError, match="zero skew"):
         decompose(P).intrinsics(640, 480)
@@ -153,7 +154,7 @@ AFFINE = np.array([[1.0, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
         (lambda: centre(np.zeros((3, 4))), "rank 3"),
         (lambda: decompose(np.eye(3)), r"shape \(\.\.\., 3, 4\)"),
         (lambda: decompose(np.full((3, 4), np.inf)), "12 NaN or infinite"),
-        (lambda: camera_matrix(CAMERA, np.diag([2, 1, 1, 1])), "rigid"),
+        (lambda: projection_matrix(CAMERA, np.diag([2, 1, 1, 1])), "rigid"),
     ],
 )
 def test_what_is_no_camera_is_said(call, message: str) -> None:  # type: ignore[no-untyped-def]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from geometry_scenes import cramer_rao, efficiency, rigid
@@ -10,8 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.geometry import calibration_matrix, find_camera_pose, fit_camera_pose
 from rangesim.rig import Intrinsics
-
-cv2 = pytest.importorskip("cv2")
 
 CAMERA = Intrinsics(640, 480, 800, 805, 321, 242, (-0.2, 0.05, 1e-3, -1e-3))
 TRUE = rigid((0.3, -0.4, 0.2), (0.1, 0.05, 2.5))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from geometry_scenes import rigid
 
-from rangesim.geometry import camera_matrix, project, triangulate_coordinates, triangulate_optimal
+from rangesim.geometry import project, projection_matrix, triangulate_coordinates, triangulate_optimal
 from rangesim.rig import Intrinsics, Rig
 
 TRIALS = 20000
@@ -87,7 +87,7 @@ def test_two_cameras_triangulation_gives_the_depth_of_another_ray() -> None:
     """It shares the correction with the camera pixel, which has no error, and is no better along the known ray."""
     device, noise = rig(40), 1.0
     rays, uv, _ = readings(device, 0.9, noise)
-    P = camera_matrix(device.camera), camera_matrix(device.projector, np.linalg.inv(device.T_camera_projector))
+    P = projection_matrix(device.camera), projection_matrix(device.projector, np.linalg.inv(device.T_camera_projector))
     pixels = np.repeat([[250.0, 300.0]], TRIALS, axis=0)
     theirs = triangulate_optimal(*P, pixels, uv).points
     moved = np.linalg.norm(project(P[0], theirs) - pixels, axis=-1)

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from geometry_scenes import alike, cramer_rao, efficiency
 from skimage.transform import ProjectiveTransform
 
 from rangesim.geometry import find_homography, fit_homography, homography_dlt, map_points, transfer_error
-
-cv2 = pytest.importorskip("cv2")
 
 TRUE = np.array([[1.1, 0.1, 30], [-0.05, 0.9, 20], [1e-4, 2e-4, 1]])
 UNIT = TRUE / np.linalg.norm(TRUE)

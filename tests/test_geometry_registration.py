@@ -84,40 +84,50 @@ def test_icp_is_a_minimum_of_the_distances_to_the_surface() -> None:
 
 
 def test_register_needs_no_first_guess_and_repeats() -> None:
-    source, target = pair(part, 3e-4)
+    source, target = pair(part, 3e-4, n=2000)
     found = register(source, target)
     degrees, metres = off(found)
-    assert degrees < 0.2
-    assert metres < 3e-4
+    assert degrees < 0.3
+    assert metres < 5e-4
     np.testing.assert_allclose(found.T_target_source, register(source, target).T_target_source, atol=1e-9)
 
 
-def test_half_an_overlap_is_reported_as_that() -> None:
+def overlap(x: float) -> tuple[np.ndarray, np.ndarray]:
+    """The part from -0.15 to x, and from -x to 0.15."""
     source, target = pair(part, 3e-4, n=6000)
-    seen = source @ TRUE[:3, :3].T + TRUE[:3, 3]
-    found = icp(source[seen[:, 0] < 0.08], target[target[:, 0] > -0.08], TRUE)
-    assert off(found)[0] < 0.3
-    assert 0.3 < found.fitness < 0.6
-    assert 0.3 < found.target_fitness < 0.6
+    return source[(source @ TRUE[:3, :3].T + TRUE[:3, 3])[:, 0] < x], target[target[:, 0] > -x]
+
+
+def test_a_part_of_an_overlap_is_reported_as_that() -> None:
+    found = icp(*overlap(0.1), TRUE)
+    degrees, metres = off(found)
+    assert degrees < 0.2
+    assert metres < 3e-4
+    assert 0.6 < found.fitness < 0.75
     with pytest.raises(ValueError, match="expected 90% of the source"):
-        icp(source[seen[:, 0] < 0.08], target[target[:, 0] > -0.08], TRUE, min_fitness=0.9)
+        icp(*overlap(0.1), TRUE, min_fitness=0.9)
+
+
+def test_too_small_an_overlap_that_fits_in_two_ways_is_refused() -> None:
+    """Of the bosses each cloud shows one then, and they fit on each other."""
+    with pytest.raises(ValueError, match=r"fit in one way, got two poses 0 degrees and 0\.04"):
+        icp(*overlap(0.08), TRUE)
 
 
 @pytest.mark.parametrize("shape", [sphere, cylinder, plane])
 @pytest.mark.parametrize("noise", [0.0, 3e-4])
 def test_what_slides_is_refused(shape, noise: float) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match="surfaces that hold each other"):
-        icp(*pair(shape, noise), TRUE)
+        icp(*pair(shape, noise, n=1500), TRUE)
 
 
 def test_a_symmetric_part_is_refused_without_a_first_guess() -> None:
     def block(random: np.random.Generator, n: int) -> np.ndarray:
         return box(random, n, (0.3, 0.2, 0.1))
 
-    source, target = pair(block, 3e-4)
-    for seed in (0, 1):
-        with pytest.raises(ValueError, match="one way, got two poses"):
-            register(source, target, seed=seed)
+    source, target = pair(block, 3e-4, n=2000)
+    with pytest.raises(ValueError, match="one way, got two poses"):
+        register(source, target)
     assert off(icp(source, target, TRUE))[0] < 0.2
 
 

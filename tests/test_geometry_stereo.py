@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from geometry_scenes import rigid
 
 from rangesim.geometry import (
     ParallelCameras,
-    camera_matrix,
     epipoles,
     fundamental_from_cameras,
     fundamental_from_pose,
@@ -18,11 +18,10 @@ from rangesim.geometry import (
     map_points,
     match_rows,
     project,
+    projection_matrix,
     rectify,
 )
 from rangesim.rig import Intrinsics
-
-cv2 = pytest.importorskip("cv2")
 
 LEFT = Intrinsics(320, 240, 300, 302, 161, 118, (-0.1, 0.02))
 RIGHT = Intrinsics(320, 240, 310, 308, 158, 122, (-0.08,))
@@ -57,7 +56,7 @@ def test_rectified_epipolar_lines_are_rows_and_epipoles_lie_at_infinity() -> Non
     a, b = pair.pixels_of_first(LEFT.project(X)), pair.pixels_of_second(RIGHT.project(X @ T[:3, :3].T + T[:3, 3]))
     np.testing.assert_allclose(a[:, 1], b[:, 1], atol=1e-5)
     # in homographies of the pinholes: F becomes that of a translation along x
-    K = [camera_matrix(c)[:, :3] for c in (LEFT, RIGHT)]
+    K = [projection_matrix(c)[:, :3] for c in (LEFT, RIGHT)]
     F = np.linalg.inv(pair.H_second).T @ fundamental_from_pose(*K, T) @ np.linalg.inv(pair.H_first)
     np.testing.assert_allclose(
         np.abs(F / np.linalg.norm(F)), np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) / np.sqrt(2), atol=1e-9
@@ -74,7 +73,7 @@ def test_rectified_epipolar_lines_are_rows_and_epipoles_lie_at_infinity() -> Non
 
 def test_rotations_are_opencvs_up_to_the_choice_of_the_turn_about_the_baseline() -> None:
     pair = rectify(LEFT, RIGHT, T)
-    K = [camera_matrix(c)[:, :3] for c in (LEFT, RIGHT)]
+    K = [projection_matrix(c)[:, :3] for c in (LEFT, RIGHT)]
     theirs = cv2.stereoRectify(K[0], np.zeros(5), K[1], np.zeros(5), (320, 240), T[:3, :3], T[:3, 3:])
     for ours, other in ((pair.R_rectified_first, theirs[0]), (pair.R_rectified_second, theirs[1])):
         turn = ours @ other.T
@@ -147,10 +146,10 @@ def test_disparity_depth_and_error_are_the_fronto_parallel_formulas() -> None:
     assert np.std(noisy) == pytest.approx(float(stereo.depth_error(2.0, 0.1)), rel=0.03)
     # and F of such cameras has epipoles at infinity on the rows
     K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
-    F = fundamental_from_cameras(camera_matrix(K), camera_matrix(K, rigid((0, 0, 0), (-0.1, 0, 0))))
+    F = fundamental_from_cameras(projection_matrix(K), projection_matrix(K, rigid((0, 0, 0), (-0.1, 0, 0))))
     np.testing.assert_allclose(np.abs(epipoles(F).first), (1, 0, 0), atol=1e-12)
     X = scene_points(np.random.default_rng(4), 10)
-    a, b = (project(camera_matrix(K, rigid((0, 0, 0), (x, 0, 0))), X) for x in (0, -0.1))
+    a, b = (project(projection_matrix(K, rigid((0, 0, 0), (x, 0, 0))), X) for x in (0, -0.1))
     np.testing.assert_allclose(((homogeneous(b) @ F) * homogeneous(a)).sum(-1), 0, atol=1e-9)
     np.testing.assert_allclose(stereo.depth(a[:, 0] - b[:, 0]), X[:, 2])
 

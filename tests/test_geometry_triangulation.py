@@ -3,26 +3,25 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from geometry_scenes import FIRST, SECOND, T_SECOND_FIRST, K, cramer_rao, efficiency, points, rigid
 
 from rangesim.geometry import (
-    camera_matrix,
     correct_pixels,
     fundamental_from_cameras,
     point_covariance,
     project,
+    projection_matrix,
     sampson_distance,
     triangulate_linear,
     triangulate_midpoint,
     triangulate_optimal,
 )
 
-cv2 = pytest.importorskip("cv2")
-
-FORWARD = camera_matrix(K, rigid((0, 0, 0), (0.02, 0.01, -0.5)))
-ASIDE = camera_matrix(K, rigid((0, -0.1, 0), (0.5, 0, 0)))
+FORWARD = projection_matrix(K, rigid((0, 0, 0), (0.02, 0.01, -0.5)))
+ASIDE = projection_matrix(K, rigid((0, -0.1, 0), (0.5, 0, 0)))
 METHODS = {"linear": triangulate_linear, "midpoint": triangulate_midpoint, "optimal": triangulate_optimal}
 
 
@@ -119,8 +118,8 @@ def test_covariance_takes_noise_in_every_form() -> None:
 def test_the_error_of_depth_is_that_of_the_formula() -> None:
     """Parallel cameras: sigma_z = z^2 sigma_d / (f b) with sigma_d = sqrt(2) sigma."""
     first, second = (
-        camera_matrix(np.diag([800, 800, 1])),
-        camera_matrix(np.diag([800, 800, 1]), rigid((0, 0, 0), (-0.2, 0, 0))),
+        projection_matrix(np.diag([800, 800, 1])),
+        projection_matrix(np.diag([800, 800, 1]), rigid((0, 0, 0), (-0.2, 0, 0))),
     )
     for z in (1.0, 4.0):
         C = point_covariance(first, second, [(0.1, 0, z)], 0.1, 0.1)[0]
@@ -129,7 +128,7 @@ def test_the_error_of_depth_is_that_of_the_formula() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_rays_that_do_not_meet_in_front_give_nan(method: str) -> None:
-    parallel = camera_matrix(K, rigid((0, 0, 0), (-0.2, 0, 0)))
+    parallel = projection_matrix(K, rigid((0, 0, 0), (-0.2, 0, 0)))
     pixel, shift = np.array([(320.0, 240.0)] * 3), np.array([(10.0, 0), (0, 0), (-10, 0)])
     found = METHODS[method](FIRST, parallel, pixel, pixel - shift)
     assert found.points[0, 2] == pytest.approx(800 * 0.2 / 10)
@@ -150,7 +149,7 @@ def test_two_million_points_a_second() -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_what_cannot_be_done_is_said(method: str) -> None:
     pixel = np.array([(320.0, 240.0)])
-    turned = camera_matrix(K, rigid((0, 0.1, 0), (0, 0, 0)))
+    turned = projection_matrix(K, rigid((0, 0.1, 0), (0, 0, 0)))
     for arguments, message in (
         ((FIRST, turned, pixel, pixel), "same centre"),
         ((FIRST, SECOND, pixel, np.repeat(pixel, 2, 0)), "corresponding points"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 from geometry_scenes import FIRST, SECOND, T_SECOND_FIRST, K, alike, cramer_rao, efficiency, points, rigid
@@ -12,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from skimage.transform import FundamentalMatrixTransform
 
 from rangesim.geometry import (
-    camera_matrix,
     eight_point,
     epipoles,
     essential_from_pose,
@@ -28,11 +28,10 @@ from rangesim.geometry import (
     lines_in_second,
     poses_from_essential,
     project,
+    projection_matrix,
     sampson_distance,
     seven_point,
 )
-
-cv2 = pytest.importorskip("cv2")
 
 F = fundamental_from_cameras(FIRST, SECOND)
 NOISE = 0.3
@@ -42,7 +41,7 @@ def views(
     random: np.random.Generator, n: int, noise: float = 0.0, plane: bool = False, T: np.ndarray = T_SECOND_FIRST
 ) -> tuple[np.ndarray, np.ndarray]:
     X = points(random, n, plane)
-    a, b = project(FIRST, X), project(camera_matrix(K, T), X)
+    a, b = project(FIRST, X), project(projection_matrix(K, T), X)
     return a + random.normal(0, 1, a.shape) * noise, b + random.normal(0, 1, b.shape) * noise
 
 
@@ -204,7 +203,7 @@ def test_the_relative_pose_reaches_the_bound() -> None:
 
     def predict(v: np.ndarray) -> np.ndarray:
         Y = v[6:].reshape(-1, 3)
-        return np.concatenate([project(FIRST, Y).ravel(), project(camera_matrix(K, moved(v)), Y).ravel()])
+        return np.concatenate([project(FIRST, Y).ravel(), project(projection_matrix(K, moved(v)), Y).ravel()])
 
     def quantity(v: np.ndarray) -> np.ndarray:
         return np.concatenate([v[:3], (t + v[3:6]) / np.linalg.norm(t + v[3:6])])

@@ -41,7 +41,11 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
     assert list((tmp_path / "out" / "segments").glob("*.ply"))
 
 
-ARGUMENTS = {"segmentation": ["--width", "320"], "two_cameras": ["--width", "80"]}
+ARGUMENTS = {
+    "rectification": ["rectification.png", "--width", "160"],
+    "segmentation": ["--width", "320"],
+    "two_cameras": ["--width", "80"],
+}
 """Of the examples that can be had smaller."""
 
 

@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from rangesim.geometry.camera_matrix import CameraParts as CameraParts
     from rangesim.geometry.camera_matrix import back_project as back_project
     from rangesim.geometry.camera_matrix import calibration_matrix as calibration_matrix
-    from rangesim.geometry.camera_matrix import camera_matrix as camera_matrix
     from rangesim.geometry.camera_matrix import centre as centre
     from rangesim.geometry.camera_matrix import decompose as decompose
     from rangesim.geometry.camera_matrix import decompose_zero_skew as decompose_zero_skew
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
     from rangesim.geometry.camera_matrix import ideal_pixels as ideal_pixels
     from rangesim.geometry.camera_matrix import lens_pixels as lens_pixels
     from rangesim.geometry.camera_matrix import project as project
+    from rangesim.geometry.camera_matrix import projection_matrix as projection_matrix
     from rangesim.geometry.camera_matrix import rays as rays
     from rangesim.geometry.camera_pose import CameraPose as CameraPose
     from rangesim.geometry.camera_pose import find_camera_pose as find_camera_pose
@@ -86,7 +86,6 @@ else:
                 "CameraParts",
                 "back_project",
                 "calibration_matrix",
-                "camera_matrix",
                 "centre",
                 "decompose",
                 "decompose_zero_skew",
@@ -94,6 +93,7 @@ else:
                 "ideal_pixels",
                 "lens_pixels",
                 "project",
+                "projection_matrix",
                 "rays",
             ],
             "camera_pose": ["CameraPose", "find_camera_pose", "fit_camera_pose"],

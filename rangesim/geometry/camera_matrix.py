@@ -49,7 +49,7 @@ def calibration_matrix(intrinsics: Intrinsics) -> Array:
     return np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1.0]])
 
 
-def camera_matrix(camera: Intrinsics | ArrayLike, T_camera_world: ArrayLike | None = None) -> Array:
+def projection_matrix(camera: Intrinsics | ArrayLike, T_camera_world: ArrayLike | None = None) -> Array:
     """(3, 4) P = K [R | t].
 
     Parameters

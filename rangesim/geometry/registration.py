@@ -9,7 +9,7 @@ alike (a symmetric part).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,8 @@ from rangesim.rig import pose
 LEAST_POINTS = 20
 PARTNER_SPACINGS = 3.0
 """Spacings of the target's points within which a point has a partner at the end."""
+FINAL_SPACINGS = 1.5
+"""The same that the last steps are taken with: what is beyond the other cloud's border pulls the less."""
 START_SPACINGS = 12.0
 """The same at the start: how far, about, the first guess of `icp` may be off."""
 NORMAL_NEIGHBOURS = 20
@@ -72,7 +74,9 @@ def icp(
     """Refines a first guess: iterative closest points, point to plane (Chen, Medioni 1992), by Open3D.
 
     Minimises the distances of source points to the tangent planes of their nearest target points, within a distance
-    that is halved from `max_distance_m` to 3 spacings of the target.
+    that is halved from `max_distance_m` to 1.5 spacings of the target; then again from half of it, a quarter and so
+    on. The result that agrees best counts: a large distance reaches far, but pulls clouds that overlap in part over
+    each other.
 
     Parameters
     ----------
@@ -84,15 +88,19 @@ def icp(
     Raises
     ------
     ValueError
-        Fewer than 20 different points, fewer partners than `min_fitness`, or surfaces that slide on each other.
+        Fewer than 20 different points, fewer partners than `min_fitness`, surfaces that slide on each other, or two
+        poses that fit nearly alike.
     """
-    clouds = _checked(source, target)
+    moving, fixed = _checked(source, target)
     start = np.eye(4) if T_target_source is None else pose(T_target_source, "T_target_source")
     _check_fraction(min_fitness)
     if max_distance_m is not None and not max_distance_m > 0:
         raise ValueError(f"expected max_distance_m to be positive, got {max_distance_m!r}.")
-    found = _refined(*clouds, _with_normals(clouds[1]), start, max_distance_m)
+    surface = _Surface.of(fixed)
+    results = [_refined(moving, surface, start, d) for d in surface.halved(max_distance_m)]
+    found = max(results, key=_agreement)
     _refuse_failure(found, min_fitness, "start nearer to the right pose, with a larger max_distance_m, or by register")
+    _refuse_others(found, results, moving, surface)
     return found
 
 
@@ -116,31 +124,47 @@ def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, 
         As `icp`; or another pose fits nearly as well: a symmetric shape, or one with too little to tell its sides
         apart.
     """
-    clouds = _checked(source, target)
+    moving, fixed = _checked(source, target)
     _check_fraction(min_fitness)
-    normals = _with_normals(clouds[1])
-    some = np.random.default_rng(seed).permutation(len(clouds[0]))[:COMPARED_POINTS]
-    few = clouds[0][some]
-    tried = [_refined(few, clouds[1], normals, start, None) for start in _feature_poses(*clouds, seed)]
+    surface = _Surface.of(fixed)
+    few = moving[np.random.default_rng(seed).permutation(len(moving))[:COMPARED_POINTS]]
+    start_m = START_SPACINGS * surface.spacing
+    tried = [_refined(few, surface, start, start_m) for start in _feature_poses(moving, surface, seed)]
     if not tried:
-        raise ValueError(
-            "expected clouds with features in common, got none that match; give icp a first guess instead."
-        )
-    turned = _turned(max(tried, key=_agreement).T_target_source, *clouds)
-    tried += [_refined(few, clouds[1], normals, start, None) for start in turned]
+        raise ValueError("expected clouds with features in common, got none; give icp a first guess instead.")
+    turned = _turned(max(tried, key=_agreement).T_target_source, moving, fixed)
+    tried += [_refined(few, surface, start, start_m) for start in turned]
     best = max(tried, key=_agreement)
-    found = _refined(*clouds, normals, best.T_target_source, PARTNER_SPACINGS * _spacing(clouds[1]))
+    found = _refined(moving, surface, best.T_target_source, PARTNER_SPACINGS * surface.spacing)
     _refuse_failure(found, min_fitness, "scan with more overlap, or give icp a first guess")
-    reach = PARTNER_SPACINGS * _spacing(clouds[1])
-    for other in tried:
-        if other.agreement >= AS_GOOD * best.agreement and _distance(best, other, few) > 2 * reach:
-            angle = np.degrees(Rotation.from_matrix(_relative(best, other)[:3, :3]).magnitude())
-            raise ValueError(
-                f"expected clouds that fit in one way, got two poses {angle:.0f} degrees apart that fit alike "
-                "(agreement "
-                f"{best.agreement:.3f} and {other.agreement:.3f}): the shape is symmetric; give icp a first guess."
-            )
+    _refuse_others(best, tried, few, surface)
     return found
+
+
+class _Surface(NamedTuple):
+    """A target: its points (m, 3), with normals as Open3D's cloud, their search tree and median spacing in metres."""
+
+    points: Array
+    cloud: Any
+    tree: Any
+    spacing: float
+
+    @classmethod
+    def of(cls, points: Array) -> _Surface:
+        import open3d as o3d
+
+        tree = cKDTree(points)
+        cloud = _cloud(points)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
+        return cls(points, cloud, tree, float(np.median(tree.query(points, k=2)[0][:, 1])))
+
+    def halved(self, distance_m: float | None) -> list[float]:
+        """Distances from `distance_m`, None being 12 spacings, halved down to 1.5 spacings."""
+        last = FINAL_SPACINGS * self.spacing
+        distances = [max(last, START_SPACINGS * self.spacing if distance_m is None else distance_m)]
+        while distances[-1] > last:
+            distances.append(max(last, distances[-1] / 2))
+        return distances
 
 
 def _agreement(found: Registration) -> float:
@@ -190,9 +214,20 @@ def _refuse_failure(found: Registration, min_fitness: float, hint: str) -> None:
         )
 
 
-def _spacing(points: Array) -> float:
-    """Median distance of points to their nearest neighbour."""
-    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+def _refuse_others(best: Registration, tried: list[Registration], source: Array, surface: _Surface) -> None:
+    for other in tried:
+        far = _distance(best, other, source) > 2 * PARTNER_SPACINGS * surface.spacing
+        if far and other.agreement >= AS_GOOD * best.agreement:
+            relative = _relative(best, other)
+            angle = np.degrees(Rotation.from_matrix(relative[:3, :3]).magnitude())
+            raise ValueError(
+                f"expected clouds that fit in one way, got two poses {angle:.0f} degrees and "
+                f"{_distance(best, other, source):.3g} m "
+                f"apart that fit alike (agreement {best.agreement:.3f} and {other.agreement:.3f}): what both "
+                "clouds show is "
+                "symmetric, or too little; scan with more overlap, or give icp a nearer guess and a smaller "
+                "max_distance_m."
+            )
 
 
 def _cloud(points: Array) -> Any:
@@ -201,70 +236,50 @@ def _cloud(points: Array) -> Any:
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
 
 
-def _with_normals(points: Array) -> Any:
+def _refined(source: Array, surface: _Surface, start: Array, distance_m: float) -> Registration:
+    """Result of ICP from one start, with a distance that is halved down to 1.5 spacings; whatever it is worth."""
     import open3d as o3d
 
-    cloud = _cloud(points)
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
-    return cloud
-
-
-def _refined(
-    source: Array, target: Array, target_cloud: Any, start: Array, max_distance_m: float | None
-) -> Registration:
-    """Result of ICP from one start, whatever it is worth."""
-    import open3d as o3d
-
-    spacing = _spacing(target)
-    reach = PARTNER_SPACINGS * spacing
-    distance = max(reach, START_SPACINGS * spacing if max_distance_m is None else max_distance_m)
-    method = o3d.pipelines.registration.TransformationEstimationPointToPlane()
-    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(1e-9, 1e-9, 60)
+    registration = o3d.pipelines.registration
+    method = registration.TransformationEstimationPointToPlane()
+    criteria = registration.ICPConvergenceCriteria(1e-9, 1e-9, 60)
     cloud, T = _cloud(source), np.array(start)
-    while True:
-        T = o3d.pipelines.registration.registration_icp(
-            cloud, target_cloud, distance, T, method, criteria
-        ).transformation
-        if distance <= reach:
-            break
-        distance = max(reach, distance / 2)
-    return _judged(source, target, np.asarray(target_cloud.normals), np.array(T), reach)
+    for distance in surface.halved(distance_m):
+        T = registration.registration_icp(cloud, surface.cloud, distance, T, method, criteria).transformation
+    return _judged(source, surface, np.array(T))
 
 
-def _judged(source: Array, target: Array, normals: Array, T: Array, reach: float) -> Registration:
-    moved = source @ T[:3, :3].T + T[:3, 3]
-    distance, partner = cKDTree(target).query(moved, distance_upper_bound=reach)
+def _judged(source: Array, surface: _Surface, T: Array) -> Registration:
+    moved, reach = source @ T[:3, :3].T + T[:3, 3], PARTNER_SPACINGS * surface.spacing
+    distance, partner = surface.tree.query(moved, distance_upper_bound=reach)
     has = np.isfinite(distance)
-    other = np.isfinite(cKDTree(moved).query(target, distance_upper_bound=reach)[0])
+    other = np.isfinite(cKDTree(moved).query(surface.points, distance_upper_bound=reach)[0])
     if not has.any():
         return Registration(T, 0.0, float(other.mean()), float("nan"), 0.0, 0.0)
-    n = normals[partner[has]]
-    off = ((moved[has] - target[partner[has]]) * n).sum(axis=-1)
+    n = np.asarray(surface.cloud.normals)[partner[has]]
+    off = ((moved[has] - surface.points[partner[has]]) * n).sum(axis=-1)
+    # Gelfand, Ikemoto, Rusinkiewicz, Levoy: "Geometrically stable sampling for the ICP algorithm", 2003
     arm = moved[has] - moved[has].mean(axis=0)
-    size = np.sqrt((arm**2).sum(axis=-1).mean())
-    rows = np.hstack(
-        [np.cross(arm / size, n), n]
-    )  # Gelfand, Ikemoto, Rusinkiewicz, Levoy: "Geometrically stable sampling", 2003
+    rows = np.hstack([np.cross(arm / np.sqrt((arm**2).sum(axis=-1).mean()), n), n])
     values = np.linalg.eigvalsh(rows.T @ rows)
-    agreement = np.maximum(-1, 1 - (off * PARTNER_SPACINGS / reach) ** 2).sum() / len(source)
     return Registration(
         T_target_source=T,
         fitness=float(has.mean()),
         target_fitness=float(other.mean()),
         rms_m=float(np.sqrt((off**2).mean())),
         constraint=float(max(values[0], 0) / values[-1]),
-        agreement=float(agreement),
+        agreement=float(np.maximum(-1, 1 - (off / surface.spacing) ** 2).sum() / len(source)),
     )
 
 
-def _feature_poses(source: Array, target: Array, seed: int) -> list[Array]:
+def _feature_poses(source: Array, surface: _Surface, seed: int) -> list[Array]:
     """(4, 4) poses that the matches of features propose, one of each run."""
     import open3d as o3d
 
-    extent = float(np.linalg.norm(np.ptp(target, axis=0)))
-    voxel = max(FEATURE_SPACINGS * _spacing(target), MIN_FEATURE_FRACTION * extent)
+    extent = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
+    voxel = max(FEATURE_SPACINGS * surface.spacing, MIN_FEATURE_FRACTION * extent)
     few, features = [], []
-    for points in (source, target):
+    for points in (source, surface.points):
         cloud = _cloud(points).voxel_down_sample(voxel)
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
         cloud.orient_normals_towards_camera_location(cloud.get_center())  # a side that does not depend on the pose

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from rangesim.geometry import consensus
-from rangesim.geometry.camera_matrix import camera_matrix, centre, rays
+from rangesim.geometry.camera_matrix import centre, projection_matrix, rays
 from rangesim.geometry.correspondences import (
     ROUNDING,
     Array,
@@ -332,8 +332,8 @@ def in_front(
 ) -> np.ndarray:
     """(n,) bool: the rays through pixels (n, 2) come nearest to each other in front of both cameras (cheirality)."""
     T = np.asarray(T_second_first, dtype=np.float64)
-    d = rays(camera_matrix(K_first), first) @ T[:3, :3].T
-    e = rays(camera_matrix(K_second), second)
+    d = rays(projection_matrix(K_first), first) @ T[:3, :3].T
+    e = rays(projection_matrix(K_second), second)
     t = T[:3, 3]
     # z d + t = z' e in the least-squares sense
     dd, de, ee = (d * d).sum(-1), (d * e).sum(-1), (e * e).sum(-1)
@@ -654,7 +654,7 @@ def _starting_poses(a: Array, b: Array, K_first: Array, K_second: Array) -> list
     """Poses (4, 4) near which the right one may be: the best of the five-point algorithm."""
     import cv2
 
-    xa, xb = (np.ascontiguousarray(rays(camera_matrix(K), x)[:, :2]) for K, x in ((K_first, a), (K_second, b)))
+    xa, xb = (np.ascontiguousarray(rays(projection_matrix(K), x)[:, :2]) for K, x in ((K_first, a), (K_second, b)))
     random = np.random.default_rng(0)
     found: list[Array] = []
     for _ in range(SAMPLES):
