@@ -16,7 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.geometry import consensus
 from rangesim.geometry.camera_matrix import calibration_matrix, ideal_pixels
-from rangesim.geometry.correspondences import ROUNDING, Array, check_distinct, check_noise, checked_array
+from rangesim.geometry.correspondences import (
+    ROUNDING,
+    Array,
+    check_distinct,
+    check_noise,
+    checked_array,
+    right_singular_vectors,
+)
 from rangesim.geometry.least_squares import Minimum, minimise
 from rangesim.rig import Intrinsics
 from rangesim.rig.distortion import distort
@@ -233,7 +240,7 @@ def _starting_poses(X: Array, x: Array, camera: Intrinsics, is_planar: bool) -> 
     found += zip(rotations, translations, strict=True)
     if is_planar:
         middle = X.mean(axis=0)
-        axes = np.linalg.svd(X - middle)[2]
+        axes = right_singular_vectors(X - middle)[1]
         axes[2] *= np.sign(np.linalg.det(axes))
         flat = (X - middle) @ axes.T
         flat[:, 2] = 0

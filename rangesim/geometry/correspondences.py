@@ -105,6 +105,16 @@ def unit_norm(matrix: Array) -> Array:
     return np.asarray(matrix / np.linalg.norm(matrix, axis=(-2, -1), keepdims=True))
 
 
+def right_singular_vectors(matrix: Array) -> tuple[Array, Array]:
+    """Singular values (..., min(m, k)), largest first, and all right singular vectors (..., k, k) of (..., m, k).
+
+    NumPy's full decomposition would also make the m left ones of m entries each: gigabytes for some thousand points.
+    """
+    rows, columns = matrix.shape[-2:]
+    _, values, axes = np.linalg.svd(matrix, full_matrices=rows < columns)
+    return values, axes
+
+
 def covariance_of_unit_norm(matrix: Array, linear_map: Array, covariance: Array) -> Array:
     """(9, 9) covariance of the unit-norm matrix L m, of the row-major vector m with covariance C: J L C L^T J^T.
 

@@ -26,6 +26,7 @@ from rangesim.geometry.correspondences import (
     checked_pairs,
     covariance_of_unit_norm,
     normalising_transform,
+    right_singular_vectors,
     unit_norm,
 )
 from rangesim.geometry.least_squares import Minimum, minimise
@@ -271,7 +272,7 @@ def _null_vector(a: Array, b: Array) -> tuple[Array, Array]:
         np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=-1),
         np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=-1),
     ]
-    _, values, axes = np.linalg.svd(np.concatenate(rows, axis=-2))
+    values, axes = right_singular_vectors(np.concatenate(rows, axis=-2))
     missing = 9 - values.shape[-1]
     if missing > 0:
         values = np.concatenate([values, np.zeros((*values.shape[:-1], missing))], axis=-1)

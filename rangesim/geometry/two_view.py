@@ -37,6 +37,7 @@ from rangesim.geometry.correspondences import (
     checked_pairs,
     covariance_of_unit_norm,
     normalising_transform,
+    right_singular_vectors,
     unit_norm,
 )
 from rangesim.geometry.homography import PARAMETERS as OF_HOMOGRAPHY
@@ -153,7 +154,7 @@ def seven_point(first: ArrayLike, second: ArrayLike) -> Array:
     if len(a) != 7:
         raise ValueError(f"expected seven pairs of points, got {len(a)}; use eight_point or fit_fundamental.")
     from_a, from_b = normalising_transform(a), normalising_transform(b)
-    _, values, axes = np.linalg.svd(_design(apply_similarity(from_a, a), apply_similarity(from_b, b)))
+    values, axes = right_singular_vectors(_design(apply_similarity(from_a, a), apply_similarity(from_b, b)))
     if values[6] <= ROUNDING * values[0]:
         raise ValueError(_DEPENDENT.format(n=7))
     found = _singular_members(axes[7].reshape(3, 3), axes[8].reshape(3, 3))
@@ -171,7 +172,7 @@ def eight_point(first: ArrayLike, second: ArrayLike) -> Array:
     """
     a, b = checked_pairs(first, second, 8, "the eight-point algorithm")
     from_a, from_b = normalising_transform(a), normalising_transform(b)
-    _, values, axes = np.linalg.svd(_design(apply_similarity(from_a, a), apply_similarity(from_b, b)))
+    values, axes = right_singular_vectors(_design(apply_similarity(from_a, a), apply_similarity(from_b, b)))
     if values[7] <= ROUNDING * values[0]:
         raise ValueError(_DEPENDENT.format(n=len(a)))
     return unit_norm(from_b.T @ _rank_two(axes[8].reshape(3, 3)) @ from_a)
@@ -214,7 +215,7 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
         return unit_norm(_rank_two(F + (_tangent(F) @ delta).reshape(3, 3)))
 
     found = minimise(residuals, step, unit_norm(start))
-    _, _, axes = np.linalg.svd(_design(unit_a, unit_b))
+    _, axes = right_singular_vectors(_design(unit_a, unit_b))
     members = _singular_members(axes[7].reshape(3, 3), axes[8].reshape(3, 3))
     minima = [minimise(residuals, step, unit_norm(_rank_two(F))) for F in members]
     found = min([found, *minima], key=lambda minimum: minimum.cost)

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras and rigs calibrated by views of a board, rendered or real; names load on first use. docs/calibration.md."""
+
+from __future__ import annotations
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from rangesim.calibration.boards import Board as Board
+    from rangesim.calibration.boards import BoardView as BoardView
+    from rangesim.calibration.boards import CharucoBoard as CharucoBoard
+    from rangesim.calibration.boards import Checkerboard as Checkerboard
+    from rangesim.calibration.boards import CircleGrid as CircleGrid
+    from rangesim.calibration.bundle import Bundle as Bundle
+    from rangesim.calibration.bundle import Observation as Observation
+    from rangesim.calibration.bundle import adjust as adjust
+    from rangesim.calibration.rig_calibration import RigCalibration as RigCalibration
+    from rangesim.calibration.rig_calibration import calibrate_rig as calibrate_rig
+    from rangesim.calibration.rig_calibration import projector_view as projector_view
+    from rangesim.calibration.zhang import CameraCalibration as CameraCalibration
+    from rangesim.calibration.zhang import calibrate_camera as calibrate_camera
+    from rangesim.calibration.zhang import intrinsics_from_homographies as intrinsics_from_homographies
+else:
+    import lazy_loader
+
+    __getattr__, __dir__, __all__ = lazy_loader.attach(
+        __name__,
+        submod_attrs={
+            "boards": ["Board", "BoardView", "CharucoBoard", "Checkerboard", "CircleGrid"],
+            "bundle": ["Bundle", "Observation", "adjust"],
+            "rig_calibration": ["RigCalibration", "calibrate_rig", "projector_view"],
+            "zhang": ["CameraCalibration", "calibrate_camera", "intrinsics_from_homographies"],
+        },
+    )

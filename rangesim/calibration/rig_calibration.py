@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera and a projector calibrated together, from structured light on a board.
+
+The projector is a camera that is told what it sees: the decoded coordinates around a corner of the board, where the
+camera sees it, are a homography of the camera's pixels there, and that maps the corner into the projector (Moreno,
+Taubin: "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012). Corners of a checkerboard lie
+where black meets white, so no single decoded pixel would do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rangesim.calibration.boards import Board, BoardView
+from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
+from rangesim.calibration.zhang import calibrate_camera, check_views, judged
+from rangesim.capture import Capture
+from rangesim.decoding.range_image import RangeImage
+from rangesim.geometry.correspondences import Array
+from rangesim.geometry.homography import homography_dlt
+from rangesim.geometry.projective_plane import map_points
+from rangesim.rig import Rig
+from rangesim.sensors.structured_light import WHITE, StructuredLight, StructuredLightDecoder
+
+MIN_AROUND, MAX_AROUND = 24, 600
+"""Decoded pixels around a corner that its homography takes."""
+REACH = 0.9
+"""Of the distance between neighbouring corners in the image: how far around a corner decoded pixels are taken."""
+OUTLIER = 4.0
+"""Robust standard deviations beyond which a decoded pixel is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigCalibration:
+    """A rig, how well it is known, and where the boards were.
+
+    rig : Rig, at the world's origin; its lenses have five coefficients of distortion. camera_deviations,
+    projector_deviations : (9,) standard deviations of fx, fy, cx, cy in pixels and of k1, k2, p1, p2, k3; 0 for those
+    held. baseline_m, baseline_deviation_m : distance of the two centres, and its standard deviation, metres.
+    T_camera_board : (k, 4, 4), metres. camera_residuals, projector_residuals : k arrays (m, 2), pixels, projected less
+    seen. camera_rms_px, projector_rms_px : root mean square of the reprojection errors, over points.
+    """
+
+    rig: Rig
+    camera_deviations: Array
+    projector_deviations: Array
+    baseline_m: float
+    baseline_deviation_m: float
+    T_camera_board: Array
+    camera_residuals: tuple[Array, ...]
+    projector_residuals: tuple[Array, ...]
+    camera_rms_px: float
+    projector_rms_px: float
+
+
+def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> BoardView:
+    """The board as the projector would see it: where the camera's corners lie in its image.
+
+    Parameters
+    ----------
+    view : of the camera. decoded : with columns and rows of the projector. spacing_px : camera pixels between
+        neighbouring corners, about; `REACH` of it is looked at around each, on which the lenses' distortion must
+        be nearly a homography's.
+
+    Corners with fewer than `MIN_AROUND` decoded pixels around them are left out.
+    """
+    if decoded.projector_column is None or decoded.projector_row is None:
+        raise ValueError("expected columns and rows of the projector to be decoded, got one axis; show both.")
+    column, row = decoded.projector_column, decoded.projector_row
+    height, width = column.shape
+    reach = REACH * spacing_px
+    indices, pixels = [], []
+    for index, corner in zip(view.indices, view.pixels, strict=True):
+        left, top = (max(int(c - reach), 0) for c in corner)
+        right, bottom = (min(int(c + reach) + 1, n) for c, n in zip(corner, (width, height), strict=True))
+        y, x = np.mgrid[top:bottom, left:right] + 0.5
+        here = np.stack([x, y], axis=-1)
+        there = np.stack([column[top:bottom, left:right], row[top:bottom, left:right]], axis=-1).astype(np.float64)
+        usable = np.isfinite(there).all(axis=-1) & (np.linalg.norm(here - corner, axis=-1) <= reach)
+        every = max(1, int(usable.sum()) // MAX_AROUND)
+        seen = _seen_through(here[usable][::every], there[usable][::every], corner)
+        if seen is not None:
+            indices.append(index)
+            pixels.append(seen)
+    return BoardView(np.array(indices, np.int64), np.array(pixels, np.float64).reshape(-1, 2))
+
+
+def _seen_through(here: Array, there: Array, corner: Array) -> Array | None:
+    """(2,) where a homography of decoded pixels maps a corner; None if they are too few or on one side of it."""
+    kept = np.ones(len(here), bool)
+    for _ in range(3):
+        if kept.sum() < MIN_AROUND or not _surrounds(here[kept] - corner):
+            return None
+        H = homography_dlt(here[kept], there[kept])
+        errors = np.linalg.norm(map_points(H, here) - there, axis=-1)
+        spread = 1.4826 * float(np.median(errors[kept])) / 1.1774  # of a coordinate: errors are Rayleigh's
+        within = errors <= OUTLIER * max(spread, 1e-6)
+        if (within == kept).all():
+            break
+        kept = within
+    return np.asarray(map_points(H, corner[None])[0])
+
+
+def _surrounds(offsets: Array) -> bool:
+    """Whether points (n, 2) lie in at least three of the quadrants around 0, a sixteenth of them in each."""
+    quadrant = 2 * (offsets[:, 0] > 0) + (offsets[:, 1] > 0)
+    return int((np.bincount(quadrant, minlength=4) >= len(offsets) / 16).sum()) >= 3
+
+
+def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: int = 5) -> RigCalibration:
+    """A camera and a projector from structured light on a board, each capture with the board in another pose.
+
+    The corners are found in the white frames, the projector's coordinates decoded without a rig (whatever rig a capture
+    brings along is not looked at), both devices calibrated by themselves, then everything together by `bundle.adjust`,
+    each device's errors weighed by its noise.
+
+    Parameters
+    ----------
+    captures : three or more, of `StructuredLight` with columns and rows.
+    coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for pinholes.
+
+    Raises
+    ------
+    ValueError
+        A capture of another sensor or size; a board that is not found (which one, is said); fewer than three; or views
+        that do not determine the rig.
+    """
+    views, projector_views = [], []
+    for k, capture in enumerate(captures):
+        try:
+            view, seen = _views(board, capture)
+        except ValueError as error:
+            raise ValueError(f"capture {k}: {error}") from error
+        if capture.frames.shape != captures[0].frames.shape or capture.sensor != captures[0].sensor:
+            raise ValueError(f"capture {k}: expected the sensor and the size of capture 0, got another.")
+        views.append(view)
+        projector_views.append(seen)
+    check_views(views, coefficients)
+    sensor = captures[0].sensor
+    assert isinstance(sensor, StructuredLight)
+    height, width = captures[0].frames.shape[1:]
+    camera = calibrate_camera(board, views, width, height, coefficients=coefficients)
+    projector = calibrate_camera(
+        board, projector_views, sensor.projector_width, sensor.projector_height, coefficients=coefficients
+    )
+    observations = [
+        Observation(device, k, board.points[view.indices], view.pixels, alone.noise_px)
+        for device, alone, some in ((0, camera, views), (1, projector, projector_views))
+        for k, view in enumerate(some)
+    ]
+    between = projector.T_camera_board @ np.linalg.inv(camera.T_camera_board)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(between[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = np.median(between[:, :3, 3], axis=0)
+    start = Bundle((camera.camera, projector.camera), T, camera.T_camera_board)
+    found = adjust(start, observations, coefficients)
+    _, deviations = judged(found, observations)
+    bundle, lens = found.state, 4 + coefficients
+    covariance = found.covariance(found.noise(found.jacobian.shape[1]))
+    moved = slice(2 * lens + 3, 2 * lens + POSE)
+    translation = bundle.T_second_first[:3, 3]
+    baseline = float(np.linalg.norm(translation))
+    along = translation / baseline
+    residuals = [bundle.project(seen) - seen.pixels for seen in observations]
+    of_camera, of_projector = tuple(residuals[: len(views)]), tuple(residuals[len(views) :])
+    by_device = np.zeros((2, LENS))
+    by_device[:, :lens] = deviations[: 2 * lens].reshape(2, lens)
+    return RigCalibration(
+        Rig(*bundle.devices, T_camera_projector=np.linalg.inv(bundle.T_second_first)),
+        by_device[0],
+        by_device[1],
+        baseline,
+        float(np.sqrt(along @ covariance[moved, moved] @ along)),
+        bundle.T_first_board,
+        of_camera,
+        of_projector,
+        *(float(np.sqrt((np.concatenate(some) ** 2).sum(axis=1).mean())) for some in (of_camera, of_projector)),
+    )
+
+
+def _views(board: Board, capture: Capture) -> tuple[BoardView, BoardView]:
+    """The board as camera and projector see it."""
+    if not isinstance(capture.sensor, StructuredLight):
+        raise ValueError(f"expected a capture of StructuredLight, got one of {type(capture.sensor).__name__}.")
+    view = board.find(capture.frames[WHITE])
+    decoded = StructuredLightDecoder().decode(replace(capture, rig=None))
+    grid = np.full((board.rows, board.columns, 2), np.nan)
+    grid[view.indices // board.columns, view.indices % board.columns] = view.pixels
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+    seen = projector_view(view, decoded, float(np.nanmedian(np.concatenate(steps))))
+    if len(seen.indices) < 6:
+        raise ValueError(
+            f"expected the projector to light the board, got {len(seen.indices)} of {len(view.indices)} corners with "
+            "decoded pixels around them; move the board into its light."
+        )
+    return view, seen

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera calibrated by views of a plane: homographies, the image of the absolute conic, then everything at once.
+
+Z. Zhang: "A flexible new technique for camera calibration", PAMI 2000. Each view of a plane maps the plane's circular
+points to two points of the image of the absolute conic, omega = K^-T K^-1: two linear equations for its 5 degrees of
+freedom, so three views determine it. Where they do not (boards that are parallel to each other, or all straight in
+front), that is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rangesim.calibration.boards import Board, BoardView
+from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
+from rangesim.geometry.camera_pose import fit_camera_pose
+from rangesim.geometry.correspondences import Array, checked_array, unit_norm
+from rangesim.geometry.homography import fit_homography
+from rangesim.geometry.least_squares import Minimum
+from rangesim.rig import Intrinsics
+
+MIN_VIEWS = 3
+DETERMINED = 1e-4
+"""The second smallest singular value of the equations of the conic, relative to the largest, below which their views
+are parallel to each other, to what noise allows to tell."""
+MAX_DEVIATION = 0.1
+"""Standard deviation of a focal length, relative, above which the views do not determine it."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """A camera, how well it is known, and where the boards were.
+
+    camera : Intrinsics, with five coefficients of distortion. deviations : (9,) standard deviations of fx, fy, cx, cy
+    in pixels and of k1, k2, p1, p2, k3; 0 for those held. T_camera_board : (k, 4, 4) maps the board's coordinates to
+    the camera's, metres. residuals : k arrays (m, 2), pixels, projected less seen. noise_px : standard deviation of a
+    coordinate, from the residuals. rms_px : root mean square of the reprojection errors, over points.
+    """
+
+    camera: Intrinsics
+    deviations: Array
+    T_camera_board: Array
+    residuals: tuple[Array, ...]
+    noise_px: float
+    rms_px: float
+
+
+def intrinsics_from_homographies(homographies: ArrayLike) -> Array:
+    """(3, 3) K of a camera from homographies (k, 3, 3) that map a plane's coordinates to pixels (Zhang 2000, 3.1).
+
+    With columns h1, h2 of each: h1^T omega h2 = 0 and h1^T omega h1 = h2^T omega h2, linear in the six entries of the
+    symmetric omega, up to scale; then omega = K^-T K^-1 by Cholesky. K33 = 1, skew included.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three homographies; views that are parallel to each other; or homographies of no camera (omega is not
+        positive definite).
+    """
+    H = checked_array("homographies", homographies, 3, 3)
+    if H.ndim != 3 or len(H) < MIN_VIEWS:
+        n = len(H) if H.ndim == 3 else 1
+        raise ValueError(
+            f"expected at least {MIN_VIEWS} views of the plane, got {n}: each gives two equations for the 5 degrees of "
+            "freedom of the absolute conic's image."
+        )
+    # pixels about their middle and of size 1, planes of size 1: the equations are then of one size
+    corners = H[:, :2, 2] / H[:, 2:, 2]
+    middle = corners.mean(axis=0)
+    size = max(float(np.abs(corners - middle).max()), 1e-3 * float(np.abs(middle).max()), 1.0)
+    to_unit = np.array([[1 / size, 0, -middle[0] / size], [0, 1 / size, -middle[1] / size], [0, 0, 1.0]])
+    unit = unit_norm(to_unit @ H)
+    scale = np.linalg.norm(unit[:, :, :2], axis=(1, 2), keepdims=True)
+    first, second = ((unit[:, :, :2] / scale)[:, :, k] for k in (0, 1))
+    rows = np.concatenate([_conic_row(first, second), _conic_row(first, first) - _conic_row(second, second)])
+    _, values, axes = np.linalg.svd(rows)
+    if not values[4] > DETERMINED * values[0]:
+        raise ValueError(
+            f"expected views of the plane under different tilts, got {len(H)} that are nearly parallel to each other: "
+            "they do not determine the camera; tilt the board."
+        )
+    a, b, c, d, e, f = axes[5]
+    omega = np.array([[a, b, d], [b, c, e], [d, e, f]])
+    omega = omega if omega[0, 0] > 0 else -omega
+    if np.linalg.eigvalsh(omega)[0] <= 0:
+        raise ValueError(
+            "expected homographies of one camera, got some whose absolute conic is not one (not positive definite): "
+            "wrong points, much distortion, or views that differ too little."
+        )
+    K = np.linalg.inv(np.linalg.cholesky(omega).T)
+    K = np.linalg.inv(to_unit) @ (K / K[2, 2])
+    return np.asarray(K / K[2, 2])
+
+
+def calibrate_camera(
+    board: Board, views: Sequence[BoardView], width: int, height: int, *, coefficients: int = 5
+) -> CameraCalibration:
+    """A camera from views of a board: `intrinsics_from_homographies`, then all parameters by `bundle.adjust`.
+
+    Parameters
+    ----------
+    views : of `board.find`, three or more, under different tilts, ten to twenty all over the image for a good one.
+    width, height : of the images, pixels.
+    coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for a pinhole.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three views, or views that do not determine the camera.
+    """
+    check_views(views, coefficients)
+    K = intrinsics_from_homographies(
+        [fit_homography(board.points[view.indices, :2], view.pixels, noisy="second").matrix for view in views]
+    )
+    start = Intrinsics(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    observations = [Observation(0, k, board.points[view.indices], view.pixels) for k, view in enumerate(views)]
+    found = adjust(Bundle((start,), np.eye(4), board_poses(start, observations)), observations, coefficients)
+    noise, deviations = judged(found, observations)
+    residuals = tuple(found.state.project(seen) - seen.pixels for seen in observations)
+    everywhere = np.concatenate(residuals)
+    lens = np.zeros(LENS)
+    lens[: 4 + coefficients] = deviations[: 4 + coefficients]
+    return CameraCalibration(
+        found.state.devices[0],
+        lens,
+        found.state.T_first_board,
+        residuals,
+        noise,
+        float(np.sqrt((everywhere**2).sum(axis=1).mean())),
+    )
+
+
+def check_views(views: Sequence[BoardView], coefficients: int) -> None:
+    """Raise ValueError unless there are enough views, and a number of coefficients from 0 to 5."""
+    if len(views) < MIN_VIEWS:
+        raise ValueError(
+            f"expected at least {MIN_VIEWS} views of the board, got {len(views)}: each gives two equations for the 5 "
+            "degrees of freedom of the absolute conic's image."
+        )
+    if coefficients not in range(6):
+        raise ValueError(f"expected 0 to 5 coefficients of distortion, got {coefficients!r}.")
+
+
+def board_poses(camera: Intrinsics, observations: Sequence[Observation]) -> Array:
+    """(k, 4, 4) poses of the boards of a camera that is roughly known."""
+    return np.stack([fit_camera_pose(seen.points, seen.pixels, camera).T_camera_object for seen in observations])
+
+
+def judged(found: Minimum[Bundle], observations: Sequence[Observation]) -> tuple[float, Array]:
+    """Noise of a coordinate, pixels, and standard deviations of the parameters.
+
+    Raises
+    ------
+    ValueError
+        There are fewer observations than parameters, or they leave a focal length open.
+    """
+    parameters = found.jacobian.shape[1]
+    if len(found.residuals) <= parameters:
+        raise ValueError(
+            f"expected more coordinates than the {parameters} parameters, got {len(found.residuals)}; add views or "
+            "points, or free fewer coefficients."
+        )
+    noise = found.noise(parameters)
+    deviations = np.sqrt(np.diag(found.covariance(max(noise, 1e-12))))
+    n_devices, n_views = len(found.state.devices), len(found.state.T_first_board)
+    lens = (parameters - POSE * (n_views + n_devices - 1)) // n_devices
+    for k, device in enumerate(found.state.devices):
+        relative = float((deviations[k * lens : k * lens + 2] / [device.fx, device.fy]).max())
+        if not relative <= MAX_DEVIATION:
+            raise ValueError(
+                "expected views that determine the focal length, got some that leave it open (standard deviation "
+                f"{100 * relative:.3g} %): tilt the board more, in different directions."
+            )
+    return noise, deviations
+
+
+def _conic_row(a: Array, b: Array) -> Array:
+    """(k, 6) coefficients of a^T omega b in the entries 11, 12, 22, 13, 23, 33 of omega."""
+    return np.stack(
+        [
+            a[:, 0] * b[:, 0],
+            a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0],
+            a[:, 1] * b[:, 1],
+            a[:, 0] * b[:, 2] + a[:, 2] * b[:, 0],
+            a[:, 1] * b[:, 2] + a[:, 2] * b[:, 1],
+            a[:, 2] * b[:, 2],
+        ],
+        axis=-1,
+    )

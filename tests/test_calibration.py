@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration: boards as they are drawn and found, Zhang's conic, bundles at their bound, rigs rendered and real."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rangesim
+from rangesim.calibration import (
+    BoardView,
+    Bundle,
+    CharucoBoard,
+    Checkerboard,
+    CircleGrid,
+    Observation,
+    adjust,
+    calibrate_camera,
+    calibrate_rig,
+    intrinsics_from_homographies,
+)
+from rangesim.capture.capture_files import import_capture
+from rangesim.rig import Intrinsics
+
+CAMERA = Intrinsics(640, 480, 700.0, 702.0, 322.0, 238.0, (-0.12, 0.05, 0.001, -0.002, 0.01))
+BOARD = Checkerboard(9, 6, 0.025)
+BOARDS = [BOARD, CharucoBoard(9, 6, 0.025, 0.018), CircleGrid(9, 6, 0.025, 0.014)]
+
+
+def lens(device):
+    return np.array([device.fx, device.fy, device.cx, device.cy, *device.coefficients])
+
+
+def pose(turn_deg, middle, board=BOARD):
+    """T_camera_board with the middle of the board's points at a place."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
+    T[:3, 3] = np.asarray(middle) - T[:3, :3] @ board.points.mean(axis=0)
+    return T
+
+
+def poses(n, rng, device=CAMERA, tilt=40.0):
+    """Boards that the device sees as a whole."""
+    found = []
+    while len(found) < n:
+        T = pose(rng.uniform(-tilt, tilt, 3), rng.uniform([-0.15, -0.1, 0.4], [0.15, 0.1, 0.7]))
+        pixels = device.project(BOARD.points @ T[:3, :3].T + T[:3, 3])
+        if np.isfinite(pixels).all() and (pixels > 5).all() and (pixels < [635, 475]).all():
+            found.append(T)
+    return np.stack(found)
+
+
+def views(T_camera_board, device, noise, rng):
+    places = BOARD.points @ np.swapaxes(T_camera_board[:, :3, :3], 1, 2) + T_camera_board[:, None, :3, 3]
+    return [BoardView(np.arange(54), p + rng.normal(0, noise, p.shape)) for p in device.project(places)]
+
+
+# ------------------------------------------------------------------------------------------- boards
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: type(b).__name__)
+def test_a_board_is_found_where_it_is_drawn(board):
+    n = 64
+    image = board.image(n)
+    assert image.shape == ((board.rows - 1 + 2 * board.margin) * n, (board.columns - 1 + 2 * board.margin) * n)
+    view = board.find(image * 3000.0)
+    expected = (board.points[:, :2] / board.spacing_m + board.margin) * n
+    assert view.indices.tolist() == list(range(54))
+    assert np.abs(view.pixels - expected).max() < 0.06
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: type(b).__name__)
+def test_a_rendered_board_is_found_where_it_stands(board):
+    """Also that it is not mirrored, nor turned by half: the indices are right."""
+    T = pose((20, -25, 5), (0, 0, 0.6), board)
+    scene = rangesim.load_scene(board.scene(T))
+    rig = replace(scene.rig(baseline_m=0.05, width=640, height=480), camera=replace(CAMERA, distortion=()))
+    white = rangesim.transport(scene, rig, [rangesim.IdealToF()], spp=32).white
+    view = board.find(white)
+    expected = rig.camera.project(board.points @ T[:3, :3].T + T[:3, 3])
+    assert len(view.indices) == 54
+    assert np.sqrt(((view.pixels - expected[view.indices]) ** 2).mean()) < 0.1
+
+
+def test_an_image_without_the_board_says_so():
+    with pytest.raises(ValueError, match="Checkerboard of 9 x 6 points in the image, found none"):
+        BOARD.find(np.random.default_rng(0).random((200, 300)))
+    with pytest.raises(ValueError, match="grey image"):
+        BOARD.find(np.zeros((20, 30, 3)))
+    with pytest.raises(ValueError, match="finite"):
+        BOARD.find(np.full((200, 300), np.nan))
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Checkerboard(1, 6, 0.02), "columns"),
+        (lambda: Checkerboard(9, 6, -0.02), "square_m"),
+        (lambda: CharucoBoard(9, 6, 0.02, 0.03), "marker_m below square_m"),
+        (lambda: CharucoBoard(9, 6, 0.02, 0.01, "DICT_NONE"), "one of OpenCV's"),
+        (lambda: CharucoBoard(30, 30, 0.02, 0.01, "DICT_5X5_50"), "dictionary of 480 markers"),
+        (lambda: CircleGrid(9, 6, 0.02, 0.03), "diameter_m below distance_m"),
+    ],
+)
+def test_boards_that_cannot_be(make, says):
+    with pytest.raises(ValueError, match=says):
+        make()
+
+
+# ------------------------------------------------------------------------------------------- Zhang
+
+
+def test_three_homographies_give_the_camera():
+    """K, skew included, from H = K [r1 r2 t], each of another scale."""
+    K = np.array([[800.0, 3.0, 310.0], [0, 790.0, 250.0], [0, 0, 1.0]])
+    H = [
+        s * K @ pose(turn, (0, 0, 0.5))[:3][:, [0, 1, 3]]
+        for s, turn in ((2, (30, 0, 0)), (-5, (0, 30, 10)), (1, (-20, 20, 0)))
+    ]
+    assert np.allclose(intrinsics_from_homographies(H), K, rtol=1e-7)
+
+
+def test_fewer_than_three_views_do_not():
+    rng = np.random.default_rng(0)
+    two = views(poses(2, rng), CAMERA, 0.1, rng)
+    with pytest.raises(ValueError, match="5 degrees of freedom of the absolute conic"):
+        calibrate_camera(BOARD, two, 640, 480)
+    with pytest.raises(ValueError, match="at least 3 views of the plane, got 1"):
+        intrinsics_from_homographies(np.eye(3))
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0), (25, -10, 0)])
+def test_views_that_are_parallel_do_not(turn):
+    rng = np.random.default_rng(1)
+    T = np.stack([pose(turn, (0.02 * k - 0.04, 0.01 * k, 0.5 + 0.03 * k)) for k in range(5)])
+    with pytest.raises(ValueError, match=r"tilt the board|not positive definite"):
+        calibrate_camera(BOARD, views(T, CAMERA, 0.05, rng), 640, 480)
+
+
+def test_a_camera_is_found_to_the_bound_and_as_opencv_finds_it():
+    cv2 = pytest.importorskip("cv2")
+    rng = np.random.default_rng(2)
+    errors = []
+    for _ in range(20):
+        T = poses(12, rng)
+        seen = views(T, CAMERA, 0.1, rng)
+        found = calibrate_camera(BOARD, seen, 640, 480)
+        assert 0.09 < found.noise_px < 0.11
+        errors.append((lens(found.camera) - lens(CAMERA)) / found.deviations)
+    assert np.abs(found.T_camera_board - T).max() < 5e-3
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.25  # as the covariance says, which is the bound
+    points = [BOARD.points.astype(np.float32)] * 12
+    rms, K, D, *_ = cv2.calibrateCamera(
+        points, [(v.pixels - 0.5).astype(np.float32) for v in seen], (640, 480), None, None
+    )
+    assert np.isclose(found.rms_px, rms, rtol=1e-4)
+    assert np.allclose([K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5], lens(found.camera)[:4], atol=0.02)
+    assert np.allclose(D.ravel(), found.camera.distortion, atol=2e-3)
+
+
+def test_coefficients_are_free_as_told():
+    rng = np.random.default_rng(3)
+    pinhole = replace(CAMERA, distortion=())
+    found = calibrate_camera(BOARD, views(poses(6, rng), pinhole, 0.1, rng), 640, 480, coefficients=0)
+    assert found.camera.distortion == (0.0,) * 5
+    assert (found.deviations[4:] == 0).all()
+    assert np.abs(lens(found.camera) - lens(pinhole))[:4].max() < 4
+    with pytest.raises(ValueError, match="0 to 5 coefficients"):
+        calibrate_camera(BOARD, views(poses(3, rng), pinhole, 0.1, rng), 640, 480, coefficients=6)
+
+
+# ------------------------------------------------------------------------------------------- bundles
+
+
+def test_a_bundle_of_two_devices_is_found_exactly_from_afar():
+    rng = np.random.default_rng(4)
+    second = Intrinsics(1280, 800, 1500.0, 1504.0, 632.0, 415.0, (-0.05, 0.02, 0.0, 0.001, 0.0))
+    T_second_first = pose((1, 8, -2), (0, 0, 0))
+    T_second_first[:3, 3] = (-0.1, 0.003, 0.01)
+    true = Bundle((CAMERA, second), T_second_first, poses(8, rng, tilt=30.0))
+    seen = [Observation(device, k, BOARD.points, np.zeros((54, 2))) for device in (0, 1) for k in range(8)]
+    seen = [replace(one, pixels=true.project(one)) for one in seen]
+    off = np.eye(4)
+    off[:3, :3] = Rotation.from_rotvec((0.02, -0.03, 0.01)).as_matrix()
+    start = Bundle(
+        (Intrinsics(640, 480, 650.0, 650.0, 320.0, 240.0), Intrinsics(1280, 800, 1400.0, 1400.0, 640.0, 400.0)),
+        off @ T_second_first,
+        np.stack([off @ T for T in true.T_first_board]),
+    )
+    found = adjust(start, seen)
+    assert found.cost < 1e-12
+    for k in range(2):
+        assert np.allclose(lens(found.state.devices[k]), lens(true.devices[k]), rtol=1e-5, atol=1e-5)
+    assert np.allclose(found.state.T_second_first, T_second_first, atol=1e-7)
+
+
+def test_jacobians_are_derivatives():
+    rng = np.random.default_rng(5)
+    bundle = Bundle((CAMERA, CAMERA), pose((2, 5, 0), (0.05, 0, 0)), poses(1, rng))
+    seen = [Observation(device, 0, BOARD.points[:5], rng.random((5, 2)), 0.5) for device in (0, 1)]
+    captured = {}
+
+    def spy(residuals, step, start):
+        captured.update(residuals=residuals, step=step, start=start)
+        return
+
+    from rangesim.calibration import bundle as module
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "minimise", spy)
+        adjust(bundle, seen)
+    _, jacobian = captured["residuals"](captured["start"])
+    for k in range(jacobian.shape[1]):
+        moved = np.zeros(jacobian.shape[1])
+        moved[k] = 1e-6
+        ahead, _ = captured["residuals"](captured["step"](captured["start"], moved))
+        behind, _ = captured["residuals"](captured["step"](captured["start"], -moved))
+        assert np.allclose((ahead - behind) / 2e-6, jacobian[:, k], rtol=1e-5, atol=1e-3), k
+
+
+# ------------------------------------------------------------------------------------------- rigs
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    """Four captures of a board by a known rig, and that."""
+    camera = Intrinsics(480, 360, 520.0, 521.0, 243.0, 178.0, (-0.1, 0.05))
+    projector = Intrinsics(512, 384, 640.0, 641.0, 252.0, 200.0, (-0.05, 0.02))
+    T_camera_projector = pose((0, -8, 0), (0, 0, 0))
+    T_camera_projector[:3, 3] = (0.1, 0.003, 0.005)
+    sensor = rangesim.StructuredLight(projector_width=512, projector_height=384, axes=("columns", "rows"))
+    captures = []
+    for turn in ((25, 0, 5), (-20, 15, 0), (0, -30, -10), (15, 25, 20)):
+        scene = rangesim.load_scene(BOARD.scene(pose(turn, (0.01, 0, 0.5))))
+        rig = replace(
+            scene.rig(baseline_m=0.1, projector_size=(512, 384), width=480, height=360),
+            camera=camera,
+            projector=projector,
+            T_camera_projector=T_camera_projector,
+        )
+        signals = rangesim.transport(scene, rig, [sensor], spp=16)
+        captures.append(rangesim.expose(signals, sensor, sensor.default_detector, seed=len(captures)))
+    return captures, rig
+
+
+def test_a_rendered_rig_is_calibrated_to_what_it_says(rendered):
+    captures, rig = rendered
+    found = calibrate_rig(BOARD, [replace(capture, rig=None) for capture in captures], coefficients=2)
+    for device, deviations, true in (
+        (found.rig.camera, found.camera_deviations, rig.camera),
+        (found.rig.projector, found.projector_deviations, rig.projector),
+    ):
+        off = lens(device) - lens(true)
+        assert np.abs(off[:2] / lens(true)[:2]).max() < 0.005
+        assert (np.abs(off[:6]) < 6 * deviations[:6] + [0.1, 0.1, 0.1, 0.1, 1e-3, 1e-3]).all()
+    baseline = np.linalg.norm(rig.T_camera_projector[:3, 3])
+    assert abs(found.baseline_m - baseline) < min(6 * found.baseline_deviation_m + 1e-5, 0.005 * baseline)
+    assert found.camera_rms_px < 0.1
+    assert found.projector_rms_px < 0.2
+    assert np.abs(found.rig.T_camera_projector[:3, :3] - rig.T_camera_projector[:3, :3]).max() < 5e-3
+
+
+def test_a_capture_that_does_not_do_is_named(rendered):
+    captures, _ = rendered
+    with pytest.raises(ValueError, match="at least 3 views"):
+        calibrate_rig(BOARD, captures[:2])
+    with pytest.raises(ValueError, match="capture 0: expected a Checkerboard of 7 x 5"):
+        calibrate_rig(Checkerboard(7, 5, 0.025), captures)
+    columns_only = rangesim.StructuredLight(projector_width=512, projector_height=384)
+    frames = captures[0].frames[[*range(len(columns_only.frame_names()) - 2), -2, -1]]
+    with pytest.raises(ValueError, match="capture 0: expected columns and rows"):
+        calibrate_rig(BOARD, [replace(captures[0], frames=frames, sensor=columns_only, rig=None)] * 3)
+
+
+def test_one_pose_of_a_real_board_allows_a_pose_and_no_more(real_data):
+    """One view gives two of the conic's five equations: no calibration; with a known camera, where the board stands."""
+    from rangesim.geometry import fit_camera_pose
+    from rangesim.rig.calibration_files import load_calibration
+
+    folder = real_data / "graycode_board"
+    sensor = rangesim.StructuredLight(code="gray", projector_width=1024, projector_height=768, axes=("columns", "rows"))
+    capture = import_capture(folder / "capture_0", sensor)
+    board = Checkerboard(9, 7, 0.075)
+    with pytest.raises(ValueError, match="at least 3 views"):
+        calibrate_rig(board, [capture])
+    view = board.find(capture.frames[-2])
+    rig = load_calibration(folder / "calibration_result.xml", projector_size=(1024, 768))
+    found = fit_camera_pose(board.points, view.pixels, rig.camera)
+    assert found.noise_px < 0.5
+    assert 0.5 < found.T_camera_object[2, 3] < 5.0
