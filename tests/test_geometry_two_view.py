@@ -280,6 +280,8 @@ def test_a_plane_with_wrong_pairs_is_no_scene() -> None:
             b[:30] = random.uniform(0, 480, (30, 2))
             with pytest.raises(ValueError, match=r"off the plane|points of one plane"):
                 find_fundamental(a, b, NOISE)
+            with pytest.raises(ValueError, match=r"off the plane|points of one plane|rotation alone|no pose"):
+                find_relative_pose(a, b, K, K, NOISE)
 
 
 def test_chance_is_no_scene() -> None:

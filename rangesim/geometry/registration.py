@@ -209,8 +209,7 @@ def _refuse_failure(found: Registration, min_fitness: float, hint: str) -> None:
     if found.constraint < MIN_CONSTRAINT:
         raise ValueError(
             f"expected surfaces that hold each other, got ones that slide (constraint {found.constraint:.1e}): a "
-            "plane, a sphere, a cylinder; "
-            "add points of another shape to the clouds, such as what they stand on."
+            "plane, a sphere, a cylinder; add points of another shape to the clouds, such as what they stand on."
         )
 
 
@@ -222,11 +221,9 @@ def _refuse_others(best: Registration, tried: list[Registration], source: Array,
             angle = np.degrees(Rotation.from_matrix(relative[:3, :3]).magnitude())
             raise ValueError(
                 f"expected clouds that fit in one way, got two poses {angle:.0f} degrees and "
-                f"{_distance(best, other, source):.3g} m "
-                f"apart that fit alike (agreement {best.agreement:.3f} and {other.agreement:.3f}): what both "
-                "clouds show is "
-                "symmetric, or too little; scan with more overlap, or give icp a nearer guess and a smaller "
-                "max_distance_m."
+                f"{_distance(best, other, source):.3g} m apart that fit alike (agreement {best.agreement:.3f} and "
+                f"{other.agreement:.3f}): what both clouds show is symmetric, or too little; scan with more overlap, "
+                "or give icp a nearer guess and a smaller max_distance_m."
             )
 
 
