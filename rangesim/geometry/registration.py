@@ -2,8 +2,8 @@
 """Where one point cloud lies in another: iterative closest points, and registration without a first guess, by Open3D.
 
 A failed registration looks like a result, so what could be one raises ValueError: too few points with a partner,
-surfaces that slide on each other (a plane, a sphere, a cylinder), and, without a first guess, two poses that fit
-alike (a symmetric part).
+surfaces that slide on each other (a plane, a sphere, a cylinder), and two poses that fit alike (a symmetric part, or
+too small an overlap).
 """
 
 from __future__ import annotations

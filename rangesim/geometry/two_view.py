@@ -12,9 +12,8 @@ Pixels are those of a pinhole: take lens distortion out first (`camera_matrix.id
 Degenerate pairs of views raise ValueError, judged by the noise of the data (`consensus.simpler_model_suffices`):
 points of one plane and a camera that only rotates map by a homography, which infinitely many F contain; the same view
 twice is one of these. For the relative pose a rotation alone has no translation, and a plane has two poses that
-differ little in what is seen: find the pose of a known plane by `pose`. Points on a ruled
-quadric that contains both centres have up to three F (HZ 22.2): they are looked for, and refused where the noise does
-not tell them apart.
+differ little in what is seen: find the pose of a known plane by `camera_pose`. Points on a ruled quadric that contains
+both centres have up to three F (HZ 22.2): they are looked for, and refused where the noise does not tell them apart.
 """
 
 from __future__ import annotations
