@@ -37,7 +37,7 @@ def difference(T: np.ndarray, other: np.ndarray = TRUE) -> np.ndarray:
 @pytest.mark.parametrize("n", [4, 6, 30])
 def test_exact_pixels_give_the_pose_through_a_distorted_lens(n: int, plane: bool) -> None:
     random = np.random.default_rng(0)
-    for _ in range(5):
+    for _ in range(3):
         X = target(random, n, plane)
         found = fit_camera_pose(X, seen(X), CAMERA, noise_px=1e-6)
         assert np.abs(difference(found.T_camera_object)).max() < 1e-4
@@ -68,7 +68,7 @@ def test_it_reaches_the_bound_and_knows_it(plane: bool) -> None:
         )
 
     bound = cramer_rao(predict, lambda v: v, np.zeros(6), NOISE)
-    fits = [fit_camera_pose(X, seen(X) + random.normal(0, NOISE, (20, 2)), CAMERA) for _ in range(60)]
+    fits = [fit_camera_pose(X, seen(X) + random.normal(0, NOISE, (20, 2)), CAMERA) for _ in range(45)]
     errors = np.stack([difference(fit.T_camera_object) for fit in fits])
     assert 0.8 < efficiency(errors, bound, rank=6) < 1.2
     assert np.mean([fit.noise_px for fit in fits]) == pytest.approx(NOISE, rel=0.05)
@@ -80,14 +80,14 @@ def test_it_reaches_the_bound_and_knows_it(plane: bool) -> None:
 def test_a_small_plane_has_two_poses_and_both_are_reported() -> None:
     random = np.random.default_rng(3)
     reported = right = 0
-    for _ in range(20):
+    for _ in range(14):
         X = target(random, 12, plane=True, size=0.12)
         found = fit_camera_pose(X, seen(X) + random.normal(0, NOISE, (12, 2)), CAMERA, noise_px=NOISE)
         poses = [found.T_camera_object, *found.others]
         reported += found.is_ambiguous
         right += min(np.abs(difference(T)[:3]).max() for T in poses) < 0.2
-    assert reported >= 15
-    assert right >= 18  # one of them is the true one
+    assert reported >= 11
+    assert right >= 12  # one of them is the true one
     # a large one seen obliquely has one
     X = target(random, 12, plane=True)
     assert not fit_camera_pose(X, seen(X) + random.normal(0, NOISE, (12, 2)), CAMERA).is_ambiguous

@@ -64,9 +64,10 @@ def test_turns_about_one_axis_are_refused(noise: float) -> None:
     random = np.random.default_rng(3)
     axis = np.array([0.3, 0.5, 0.8])
     hand = np.stack([rigid(a * axis, random.normal(0, 0.3, 3)) for a in np.linspace(0, 2, 10)])
+    said = np.stack([T @ rigid(random.normal(0, 1, 3) * noise, (0, 0, 0)) for T in hand])  # robots err, too
     for solve, chain in ((eye_in_hand, hand), (eye_to_hand, np.linalg.inv(hand))):
         with pytest.raises(ValueError, match="two different axes"):
-            solve(hand, sightings(chain, random, noise, noise))
+            solve(said, sightings(chain, random, noise, noise))
 
 
 HAND = robot(np.random.default_rng(4), 5)

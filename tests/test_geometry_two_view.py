@@ -151,7 +151,7 @@ def test_f_reaches_the_bound_and_knows_it() -> None:
 
     bound = cramer_rao(predict, quantity, np.concatenate([SECOND.ravel(), X.ravel()]), NOISE)
     fits = [
-        fit_fundamental(a + random.normal(0, NOISE, a.shape), b + random.normal(0, NOISE, b.shape)) for _ in range(120)
+        fit_fundamental(a + random.normal(0, NOISE, a.shape), b + random.normal(0, NOISE, b.shape)) for _ in range(80)
     ]
     errors = np.stack([alike(fit.matrix, F).ravel() - F.ravel() for fit in fits])
     assert 0.8 < efficiency(errors, bound, rank=7) < 1.2
@@ -162,7 +162,7 @@ def test_f_reaches_the_bound_and_knows_it() -> None:
         [
             alike(eight_point(a + random.normal(0, NOISE, a.shape), b + random.normal(0, NOISE, b.shape)), F).ravel()
             - F.ravel()
-            for _ in range(120)
+            for _ in range(80)
         ]
     )
     assert efficiency(linear, bound, rank=7) > efficiency(errors, bound, rank=7)
@@ -210,7 +210,7 @@ def test_the_relative_pose_reaches_the_bound() -> None:
 
     bound = cramer_rao(predict, quantity, np.concatenate([np.zeros(6), X.ravel()]), NOISE)
     errors = []
-    for _ in range(50):
+    for _ in range(40):
         fit = fit_relative_pose(
             a + random.normal(0, NOISE, a.shape), b + random.normal(0, NOISE, b.shape), K, K, noise_px=NOISE
         )
@@ -280,6 +280,8 @@ def test_a_plane_with_wrong_pairs_is_no_scene() -> None:
             b[:30] = random.uniform(0, 480, (30, 2))
             with pytest.raises(ValueError, match=r"off the plane|points of one plane"):
                 find_fundamental(a, b, NOISE)
+            with pytest.raises(ValueError, match=r"off the plane|points of one plane|rotation alone|no pose"):
+                find_relative_pose(a, b, K, K, NOISE)
 
 
 def test_chance_is_no_scene() -> None:

@@ -192,8 +192,7 @@ def _check_invertible(block: Array) -> None:
     if np.any(np.abs(np.linalg.det(rows)) <= ROUNDING**1.5):
         raise ValueError(
             "expected a finite camera, got P with a singular left 3 x 3 block: its centre lies at infinity (an "
-            "affine camera), "
-            "and K, R and t do not exist."
+            "affine camera), and K, R and t do not exist."
         )
 
 

@@ -86,8 +86,8 @@ def fit_camera_pose(
     extents = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if extents[1] <= ROUNDING * extents[0]:
         raise ValueError(
-            f"expected points that are not on one line, got {len(X)} that are: the turn about it is open; add "
-            "points beside it."
+            f"expected points that are not on one line, got {len(X)} that are: the turn about it is open; add points "
+            "beside it."
         )
     minima: list[Minimum[Array]] = []
     for start in _starting_poses(X, x, camera, is_planar=extents[2] <= PLANAR * extents[0]):
@@ -105,9 +105,9 @@ def fit_camera_pose(
     covariance = best.covariance(max(noise, 1e-300))
     if not np.sqrt(np.trace(covariance[:3, :3])) <= MAX_ROTATION_DEVIATION:
         raise ValueError(
-            "expected points that determine a pose, got some that leave its rotation open at a noise of "
-            f"{noise:.3g} px: nearly on one "
-            "line, too near to each other, or pairs that do not belong together; add points, or look at the pairs."
+            f"expected points that determine a pose, got some that leave its rotation open at a noise of {noise:.3g} "
+            "px: nearly on one line, too near to each other, or pairs that do not belong together; add points, or "
+            "look at the pairs."
         )
     rounding = consensus.rounding_of(x)
     others = tuple(
@@ -180,9 +180,8 @@ def _refuse_chance(agreeing: int, pixels: Array, threshold: float) -> None:
     area, _ = consensus.bounding_area(pixels)
     if consensus.agree_by_chance(agreeing, len(pixels), 3, np.pi * threshold**2 / area):
         raise ValueError(
-            f"expected the image of points in one pose, got {len(pixels)} pairs of which at most {agreeing} agree, "
-            "no more than chance; "
-            "the pairs are wrong, or the camera or noise_px is."
+            f"expected the image of points in one pose, got {len(pixels)} pairs of which at most {agreeing} agree, no "
+            "more than chance; the pairs are wrong, or the camera or noise_px is."
         )
 
 

@@ -92,7 +92,8 @@ def _on_epipolar_line(
     a: np.ndarray, b: np.ndarray, x: np.ndarray, y: np.ndarray, projector: Intrinsics
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n,) x and y moved to the nearest place, in projector pixels, on the lines a cross b of rays a (3, n)."""
-    line_x, line_y, rest = np.cross(a, b[:, None], axis=0)
+    line_x, line_y = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
+    rest = a[0] * b[1] - a[1] * b[0]
     off = line_x * x + line_y * y + rest
     slope_x, slope_y = line_x / projector.fx, line_y / projector.fy  # per pixel
     off = off / (slope_x**2 + slope_y**2)

@@ -162,8 +162,8 @@ def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str)
     if excess > MAX_EXCESS**2 * freedom and excess > stats.chi2.isf(SIGNIFICANCE, freedom):
         raise ValueError(
             f"expected pairs that {model} explains to their noise of {noise_px:.3g} px, got residuals of "
-            f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (find them by the robust function), or "
-            "noise_px is."
+            f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (find them by the robust function), or noise_px "
+            "is."
         )
 
 

@@ -78,7 +78,7 @@ def homography_dlt(first: ArrayLike, second: ArrayLike) -> Array:
         raise ValueError(f"expected first and second as corresponding points (..., n, 2), got {a.shape} and {b.shape}.")
     if a.shape[-2] < 4:
         raise ValueError(
-            f"expected at least 4 pairs of points for a homography, two equations each for 8 degrees of freedom, got "
+            "expected at least 4 pairs of points for a homography, two equations each for 8 degrees of freedom, got "
             f"{a.shape[-2]}."
         )
     from_a, from_b = normalising_transform(a), normalising_transform(b)
@@ -157,14 +157,11 @@ def find_homography(
     ValueError
         As `fit_homography`, or no more pairs agree than chance would let.
     """
-    import cv2
-
     a, b = checked_pairs(first, second, 5, "a robust homography")
     check_noise(noise_px)
     threshold = consensus.inlier_threshold(noise_px, 2)
-    # OpenCV measures in the second image alone, where the noise of both adds up
-    found, mask = cv2.findHomography(a, b, consensus.usac(threshold * (1.0 if noisy == "second" else np.sqrt(2)), seed))
-    _refuse_chance(0 if found is None else int(mask.sum()), b, threshold)
+    chosen = largest_plane(a, b, noise_px, noisy, seed)
+    _refuse_chance(int(chosen.sum()), b, threshold)
 
     def fit(chosen: np.ndarray) -> Homography:
         return fit_homography(a[chosen], b[chosen], noisy=noisy, noise_px=noise_px)
@@ -172,11 +169,21 @@ def find_homography(
     def error(model: Homography) -> Array:
         return transfer_error(model.matrix, a, b, noisy)
 
-    model, inliers = consensus.consistent_set(mask.ravel() > 0, threshold, fit, error, least=5)
+    model, inliers = consensus.consistent_set(chosen, threshold, fit, error, least=5)
     _refuse_chance(int(inliers.sum()), b, threshold)
     residuals = error(model)[inliers]
     noise = float(np.sqrt(residuals @ residuals / (2 * len(residuals) - PARAMETERS)))
     return replace(model, inliers=inliers, noise_px=noise, covariance=model.covariance * (noise / noise_px) ** 2)
+
+
+def largest_plane(first: Array, second: Array, noise_px: float, noisy: Noisy = "both", seed: int = 0) -> np.ndarray:
+    """(n,) bool: the pairs of the homography that OpenCV's USAC finds most to agree with; none where it finds none."""
+    import cv2
+
+    # OpenCV measures in the second image alone, where the noise of both adds up
+    threshold = consensus.inlier_threshold(noise_px, 2) * (1.0 if noisy == "second" else np.sqrt(2))
+    found, mask = cv2.findHomography(first, second, consensus.usac(threshold, seed))
+    return np.zeros(len(first), dtype=bool) if found is None else np.asarray(mask.ravel() > 0)
 
 
 def transfer_error(H: ArrayLike, first: ArrayLike, second: ArrayLike, noisy: Noisy = "both") -> Array:
@@ -248,9 +255,8 @@ def _refuse_collinear(name: str, points: Array, noise_px: float) -> None:
         others = np.delete(np.arange(n), odd).tolist()
         which = f"points {others} of {name}" if n == 4 else f"{n - 1} of the {n} points of {name}, or all,"
         raise ValueError(
-            f"expected four points with no three collinear, got {which} on one line to their noise of "
-            f"{noise_px:.3g} px; add points "
-            "away from it."
+            f"expected four points with no three collinear, got {which} on one line to their noise of {noise_px:.3g} "
+            "px; add points away from it."
         )
 
 
@@ -259,8 +265,7 @@ def _refuse_chance(agreeing: int, second: Array, threshold: float) -> None:
     if consensus.agree_by_chance(agreeing, len(second), 4, np.pi * threshold**2 / area):
         raise ValueError(
             f"expected points that a homography maps to each other, got {len(second)} pairs of which at most "
-            f"{agreeing} agree, "
-            "no more than chance; the scene is not a plane, the pairs are wrong, or noise_px is."
+            f"{agreeing} agree, no more than chance; the scene is not a plane, the pairs are wrong, or noise_px is."
         )
 
 

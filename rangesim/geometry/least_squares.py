@@ -68,7 +68,7 @@ def minimise(
     for _ in range(MAX_STEPS):
         normal, slope = here.jacobian.T @ here.jacobian, here.jacobian.T @ here.residuals
         scale = np.maximum(np.diag(normal), 1e-30)
-        delta = np.linalg.solve(normal + np.diag(damping * scale), -slope)
+        delta = np.linalg.lstsq(normal + np.diag(damping * scale), -slope, rcond=None)[0]  # it may be singular
         there = Minimum(step(here.state, delta), *residuals(step(here.state, delta)))
         predicted = -delta @ (2 * slope + normal @ delta)
         if not (np.isfinite(there.cost) and there.cost <= here.cost):

@@ -265,8 +265,8 @@ def affine_rectification(parallel: Sequence[tuple[ArrayLike, ArrayLike]]) -> Arr
     _, values, axes = np.linalg.svd(points / lengths[:, None])
     if values[1] <= ROUNDING:
         raise ValueError(
-            "expected pairs of two directions, got pairs whose images meet in one point: they are all parallel to each "
-            "other and determine a single point of the vanishing line; add a pair of another direction."
+            "expected pairs of two directions, got pairs whose images meet in one point: they are all parallel to "
+            "each other and determine a single point of the vanishing line; add a pair of another direction."
         )
     return _sending_to_infinity(transform.T @ axes[2])
 
@@ -295,9 +295,8 @@ def metric_rectification(
     if len(orthogonal) < needed:
         known = "" if vanishing_line is None else ", with the vanishing line given"
         raise ValueError(
-            f"expected {needed} pairs of orthogonal lines for a metric rectification{known}, got "
-            f"{len(orthogonal)}: each "
-            "pair is one equation for the image of the circular points."
+            f"expected {needed} pairs of orthogonal lines for a metric rectification{known}, got {len(orthogonal)}: "
+            "each pair is one equation for the image of the circular points."
         )
     lines = [np.stack([checked_array("line", pair[k], 3) for pair in orthogonal]) for k in (0, 1)]
     to_affine: Array = np.eye(3)
@@ -315,9 +314,8 @@ def metric_rectification(
         values = -values
     if not (values[1] > ROUNDING * values[0] and abs(values[2]) < 0.5 * values[1]):
         raise ValueError(
-            "expected pairs of orthogonal lines of one plane, got lines that no plane has (the conic of the "
-            "circular points "
-            "is not positive semidefinite); check which lines belong together."
+            "expected pairs of orthogonal lines of one plane, got lines that no plane has (the conic of the circular "
+            "points is not positive semidefinite); check which lines belong together."
         )
     a = axes * np.sqrt([values[0], values[1], 1.0])
     rectified = np.linalg.inv(a) @ transform @ to_affine
@@ -338,9 +336,8 @@ def _conic_of_circular_points(first: Array, second: Array, affine: bool) -> Arra
     unknowns = len(terms) - 1
     if values[unknowns - 1] <= ROUNDING * values[0]:
         raise ValueError(
-            f"expected {unknowns} independent pairs of orthogonal lines, got pairs that repeat each other: "
-            "parallel pairs "
-            "of lines give the same equation; add pairs of other directions."
+            f"expected {unknowns} independent pairs of orthogonal lines, got pairs that repeat each other: parallel "
+            "pairs of lines give the same equation; add pairs of other directions."
         )
     conic = np.zeros((3, 3))
     for (i, j), value in zip(terms, axes[-1], strict=True):

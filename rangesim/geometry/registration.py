@@ -2,8 +2,8 @@
 """Where one point cloud lies in another: iterative closest points, and registration without a first guess, by Open3D.
 
 A failed registration looks like a result, so what could be one raises ValueError: too few points with a partner,
-surfaces that slide on each other (a plane, a sphere, a cylinder), and, without a first guess, two poses that fit
-alike (a symmetric part).
+surfaces that slide on each other (a plane, a sphere, a cylinder), and two poses that fit alike (a symmetric part, or
+too small an overlap).
 """
 
 from __future__ import annotations
@@ -209,8 +209,7 @@ def _refuse_failure(found: Registration, min_fitness: float, hint: str) -> None:
     if found.constraint < MIN_CONSTRAINT:
         raise ValueError(
             f"expected surfaces that hold each other, got ones that slide (constraint {found.constraint:.1e}): a "
-            "plane, a sphere, a cylinder; "
-            "add points of another shape to the clouds, such as what they stand on."
+            "plane, a sphere, a cylinder; add points of another shape to the clouds, such as what they stand on."
         )
 
 
@@ -222,11 +221,9 @@ def _refuse_others(best: Registration, tried: list[Registration], source: Array,
             angle = np.degrees(Rotation.from_matrix(relative[:3, :3]).magnitude())
             raise ValueError(
                 f"expected clouds that fit in one way, got two poses {angle:.0f} degrees and "
-                f"{_distance(best, other, source):.3g} m "
-                f"apart that fit alike (agreement {best.agreement:.3f} and {other.agreement:.3f}): what both "
-                "clouds show is "
-                "symmetric, or too little; scan with more overlap, or give icp a nearer guess and a smaller "
-                "max_distance_m."
+                f"{_distance(best, other, source):.3g} m apart that fit alike (agreement {best.agreement:.3f} and "
+                f"{other.agreement:.3f}): what both clouds show is symmetric, or too little; scan with more overlap, "
+                "or give icp a nearer guess and a smaller max_distance_m."
             )
 
 

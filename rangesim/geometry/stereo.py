@@ -167,9 +167,8 @@ def rectify(first: Intrinsics, second: Intrinsics, T_second_first: ArrayLike) ->
 
 
 _ALONG_BASELINE = (
-    "expected cameras that look across their baseline, got ones that look along it: {why}; move the camera "
-    "sideways, or match along "
-    "epipolar lines without rectification."
+    "expected cameras that look across their baseline, got ones that look along it: {why}; move the camera sideways, "
+    "or match along epipolar lines without rectification."
 )
 
 

@@ -12,9 +12,8 @@ Pixels are those of a pinhole: take lens distortion out first (`camera_matrix.id
 Degenerate pairs of views raise ValueError, judged by the noise of the data (`consensus.simpler_model_suffices`):
 points of one plane and a camera that only rotates map by a homography, which infinitely many F contain; the same view
 twice is one of these. For the relative pose a rotation alone has no translation, and a plane has two poses that
-differ little in what is seen: find the pose of a known plane by `pose`. Points on a ruled
-quadric that contains both centres have up to three F (HZ 22.2): they are looked for, and refused where the noise does
-not tell them apart.
+differ little in what is seen: find the pose of a known plane by `camera_pose`. Points on a ruled quadric that contains
+both centres have up to three F (HZ 22.2): they are looked for, and refused where the noise does not tell them apart.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from rangesim.geometry.correspondences import (
     unit_norm,
 )
 from rangesim.geometry.homography import PARAMETERS as OF_HOMOGRAPHY
-from rangesim.geometry.homography import homography_error, rotation_homography_error
+from rangesim.geometry.homography import homography_error, largest_plane, rotation_homography_error
 from rangesim.geometry.least_squares import Minimum, minimise
 from rangesim.geometry.projective_plane import homogeneous
 from rangesim.rig import pose
@@ -229,8 +228,7 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
         if apart > ANOTHER and consensus.is_as_likely(*costs, len(a) - PARAMETERS, noise_px, rounding):
             raise ValueError(
                 f"expected points with one fundamental matrix, got {len(a)} pairs that two explain to their noise: "
-                "the points "
-                "lie on a surface that contains both centres, or are few; add points at other depths."
+                "the points lie on a surface that contains both centres, or are few; add points at other depths."
             )
     in_tangent = found.covariance(max(noise * scale, 1e-300))
     tangent = _tangent(found.state)
@@ -238,9 +236,8 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     if not np.sqrt(np.trace(normal)) <= MAX_STANDARD_DEVIATION:
         raise ValueError(
             "expected points that determine the fundamental matrix, got some that leave it open at a noise of "
-            f"{noise:.3g} px: near "
-            "to a plane, to a surface that contains both centres, or with too small a baseline; add points at "
-            "other depths."
+            f"{noise:.3g} px: near to a plane, to a surface that contains both centres, or with too small a baseline; "
+            "add points at other depths."
         )
     to_pixels = np.kron(from_b.T, from_a.T)
     covariance = covariance_of_unit_norm(found.state, to_pixels, normal)
@@ -281,7 +278,7 @@ def find_fundamental(first: ArrayLike, second: ArrayLike, noise_px: float = 1.0,
     chosen = mask.ravel() > 0
     model, inliers = consensus.consistent_set(chosen, threshold, fit, error, least=9)
     _refuse_chance(int(inliers.sum()), a, b, threshold, PARAMETERS)
-    _refuse_plane_with_outliers(a, b, inliers, noise_px, threshold)
+    _refuse_plane_with_outliers(a, b, inliers, noise_px)
     noise = _noise_of(sampson_distance(model.matrix, a[inliers], b[inliers]), PARAMETERS)
     return replace(model, inliers=inliers, noise_px=noise, covariance=model.covariance * (noise / noise_px) ** 2)
 
@@ -384,9 +381,8 @@ def fit_relative_pose(
     _refuse_homography(a, b, least, OF_POSE, noise_px)
     if not minima:
         raise ValueError(
-            "expected points in front of both cameras, got pairs that no pose puts there: the camera only "
-            "rotates, the pairs "
-            "are wrong, or K is."
+            "expected points in front of both cameras, got pairs that no pose puts there: the camera only rotates, "
+            "the pairs are wrong, or K is."
         )
     best, freedom = minima[0], len(a) - OF_POSE
     rounding = consensus.rounding_of(np.concatenate([a, b]))
@@ -395,8 +391,7 @@ def fit_relative_pose(
             angle = np.degrees(_angle(other.state[:3, :3] @ best.state[:3, :3].T))
             raise ValueError(
                 f"expected points with one relative pose, got two that explain them to their noise, {angle:.1f} "
-                "degrees apart: "
-                "they lie on a plane, or are few; add points off it."
+                "degrees apart: they lie on a plane, or are few; add points off it."
             )
     consensus.refuse_misfit(best.cost, freedom, noise_px, "a relative pose")
     noise = best.noise(OF_POSE) if noise_px is None else noise_px
@@ -437,6 +432,7 @@ def find_relative_pose(
 
     model, inliers = consensus.consistent_set(mask.ravel() > 0, threshold, fit, error, least=8)
     _refuse_chance(int(inliers.sum()), a, b, threshold, OF_POSE)
+    _refuse_plane_with_outliers(a, b, inliers, noise_px)
     F = fundamental_from_pose(kf, ks, model.T_second_first)
     noise = _noise_of(sampson_distance(F, a[inliers], b[inliers]), OF_POSE)
     return replace(model, inliers=inliers, noise_px=noise, covariance=model.covariance * (noise / noise_px) ** 2)
@@ -445,9 +441,9 @@ def find_relative_pose(
 # ------------------------------------------------------------------------------------------- degenerate views
 
 _DEPENDENT = (
-    "expected pairs that determine the fundamental matrix, got {n} whose equations depend on each other: points "
-    "of one plane, a "
-    "camera that only rotates, one view twice, or repeated points; add points at other depths or move the camera."
+    "expected pairs that determine the fundamental matrix, got {n} whose equations depend on each other: points of "
+    "one plane, a camera that only rotates, one view twice, or repeated points; add points at other depths or move "
+    "the camera."
 )
 MIN_IN_FRONT = 0.75
 """Fraction of the points; the others may be so far that the noise decides on which side of infinity they are."""
@@ -464,9 +460,9 @@ def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_p
         what = "one view twice" if same else "points of one plane or a camera that only rotates"
         hint = "" if noise_px is not None or n > 12 else " With so few pairs, state noise_px if you know it."
         raise ValueError(
-            f"expected two views with parallax, got {n} pairs that a homography maps to each other within "
-            f"{apart:.3g} px: {what}; "
-            f"it leaves the epipoles open, or two poses. Add points at other depths or move the camera.{hint}"
+            f"expected two views with parallax, got {n} pairs that a homography maps to each other within {apart:.3g} "
+            f"px: {what}; it leaves the epipoles open, or two poses. Add points at other depths or move the "
+            f"camera.{hint}"
         )
 
 
@@ -477,25 +473,19 @@ def _refuse_rotation(a: Array, b: Array, K_first: Array, K_second: Array, cost: 
     if consensus.simpler_model_suffices(simple, (cost, n - OF_POSE), noise_px, rounding):
         apart = float(np.sqrt(simple[0] / simple[1]))
         raise ValueError(
-            f"expected a camera that moved, got {n} pairs that a rotation alone explains within {apart:.3g} px: "
-            "there is no direction "
-            "of translation; move the camera sideways."
+            f"expected a camera that moved, got {n} pairs that a rotation alone explains within {apart:.3g} px: there "
+            "is no direction of translation; move the camera sideways."
         )
 
 
-def _refuse_plane_with_outliers(a: Array, b: Array, inliers: np.ndarray, noise_px: float, threshold: float) -> None:
-    """Raise ValueError if the pairs that agree with F but not with the best homography agree by chance.
+def _refuse_plane_with_outliers(a: Array, b: Array, inliers: np.ndarray, noise_px: float) -> None:
+    """Raise ValueError if the pairs that agree with F but not with the largest plane agree by chance.
 
     A plane and any two pairs off it determine some F, wrong pairs too (Chum, Werner, Matas: "Two-view geometry
     estimation unaffected by a dominant plane", CVPR 2005); here those that agree with it are counted.
     """
-    from rangesim.geometry.homography import find_homography, transfer_error
-
-    try:
-        plane = find_homography(a, b, noise_px)
-    except ValueError:  # no plane at all is what is hoped for
-        return
-    off = transfer_error(plane.matrix, a, b) > consensus.inlier_threshold(noise_px, 2)
+    off = ~largest_plane(a, b, 2 * noise_px)  # twice as wide: no straggler of the plane counts as off it
+    threshold = consensus.inlier_threshold(noise_px, 1)
     _refuse_chance(int((inliers & off).sum()), a[off], b[off], threshold, minimal=2, plane=True)
 
 
@@ -513,13 +503,12 @@ def _refuse_chance(agreeing: int, a: Array, b: Array, threshold: float, minimal:
     if plane:
         raise ValueError(
             "expected points at several depths, got pairs of one plane, or of a camera that only rotates, and "
-            f"{len(a)} others of which "
-            f"{agreeing} agree with an epipolar geometry, no more than chance; add points off the plane."
+            f"{len(a)} others of which {agreeing} agree with an epipolar geometry, no more than chance; add points "
+            "off the plane."
         )
     raise ValueError(
-        f"expected two views of one rigid scene, got {len(a)} pairs of which at most {agreeing} agree, no more "
-        "than chance; the pairs "
-        "are wrong, or noise_px is."
+        f"expected two views of one rigid scene, got {len(a)} pairs of which at most {agreeing} agree, no more than "
+        "chance; the pairs are wrong, or noise_px is."
     )
 
 

@@ -5,9 +5,9 @@ Two rays of measured pixels x, x' do not meet. Optimal is the point whose images
 d^2(x, x^) + d^2(x', x'^) subject to x'^^T F x^ = 0, the maximum likelihood for equal Gaussian noise in both views.
 Linear and midpoint are quicker to explain and never better; they are here to be compared with.
 
-Hartley, Sturm: "Triangulation", CVIU 1997, solve it by the roots of a polynomial of degree 6. Lindstrom: "Triangulation
-made easy", CVPR 2010, by a few steps of a quadratic equation, hundreds of times as fast; they find the same minimum but
-for points near an epipole, where there are several, and where the polynomial decides here.
+Hartley, Sturm: "Triangulation", CVIU 1997, solve it over all epipolar lines, by the roots of a polynomial. Lindstrom:
+"Triangulation made easy", CVPR 2010, by a few steps of a quadratic equation, hundreds of times as fast; they find the
+same minimum but for points near an epipole, where there are several, and where a search over all lines decides here.
 
 Pixels are those of a pinhole: take lens distortion out first (`camera_matrix.ideal_pixels`). Points whose rays are
 parallel, or meet behind a camera, are NaN.
@@ -24,11 +24,12 @@ from numpy.typing import ArrayLike
 from pcgraph.parallel import in_blocks, kernel
 from rangesim.geometry.camera_matrix import centre, depth, project, rays
 from rangesim.geometry.correspondences import Array, checked_array
+from rangesim.geometry.projective_plane import homogeneous
 from rangesim.geometry.two_view import fundamental_from_cameras
 
 NEAR_EPIPOLE = 0.25
 """A correction by more than this fraction of a point's distance to its epipole is checked against all minima."""
-CONVERGED, MAX_STEPS = 1e-3, 20
+CONVERGED, MAX_STEPS = 1e-5, 20
 """Steps end where one changes the correction by less than this fraction of it, so that the next would change it by
 about the square; where none does, it is checked likewise."""
 
@@ -100,7 +101,7 @@ def correct_pixels(F: ArrayLike, first: ArrayLike, second: ArrayLike) -> Correct
     first two entries): dx = lambda n, dx' = lambda n'. Steps evaluate these at the last result and solve the
     constraint, a lambda^2 - 2 b lambda + c = 0, exactly (Lindstrom 2010, with the constraint kept at every step); two
     do for most points. Where they do not converge, or correct by a large part of the distance to an epipole, Hartley
-    and Sturm's polynomial decides.
+    and Sturm's search over all epipolar lines decides.
 
     Parameters
     ----------
@@ -124,8 +125,9 @@ def correct_pixels(F: ArrayLike, first: ArrayLike, second: ArrayLike) -> Correct
         _correct, len(x), matrix, poles.first, poles.second, np.ascontiguousarray(np.hstack([x, y])), result, doubtful
     )
     if doubtful.any():
-        exact = _by_polynomial(matrix, poles.first, poles.second, x[doubtful], y[doubtful])
-        result[doubtful] = exact
+        which = np.flatnonzero(doubtful)
+        for some in np.array_split(which, -(-len(which) // AT_ONCE)):
+            result[some] = _over_the_pencil(matrix, poles.first, x[some], y[some])
     return CorrectedPixels(result[:, :2], result[:, 2:])
 
 
@@ -322,61 +324,62 @@ def _intersect(start, stop, cameras, first, second, measured_first, measured_sec
         error[i] = np.sqrt(dx * dx + dy * dy + du * du + dv * dv)
 
 
-def _by_polynomial(F: Array, pole_first: Array, pole_second: Array, x: Array, y: Array) -> Array:
-    """(n, 4) corrected pairs by Hartley and Sturm's polynomial of degree 6 (HZ algorithm 12.1), all roots of all
-    points.
+def _over_the_pencil(F: Array, pole: Array, x: Array, y: Array) -> Array:
+    """(n, 4) corrected pairs by a search over all epipolar lines: the feet of both pixels on the best pair of lines.
 
-    In either view the measured point is moved to 0 and the epipole turned to (1, 0, f): then epipolar lines are (t f,
-    1, -t) and (-f' (c t + d), a t + b, c t + d), and the squared distance s(t) of both points to them has its minimum
-    at a root of g(t) = t ((a t + b)^2 + f'^2 (c t + d)^2)^2 - (a d - b c) (1 + f^2 t^2)^2 (a t + b) (c t + d), or at
-    infinity.
+    Lines through the epipole e are l = L u, their partners l' = F [e]_x l = L' u, with u of the unit circle, so that
+    both squared distances, (g u)^2 / u^T B u with g = x^T L and B = (S L)^T (S L), depend on one angle (Hartley,
+    Sturm 1997, who find the up to three minima by the roots of a polynomial of degree 6). Here the angles are
+    sampled, ever more closely around the two where one of the distances vanishes, and the three lowest minima are
+    narrowed down by golden sections.
     """
-    back_first, f = _epipolar_frame(pole_first, x)
-    back_second, g = _epipolar_frame(pole_second, y)
-    G = np.swapaxes(back_second, -1, -2) @ F @ back_first
-    a, b, c, d = G[:, 1, 1], G[:, 1, 2], G[:, 2, 1], G[:, 2, 2]
-    determinant = a * d - b * c
-    polynomial = np.zeros((len(x), 7))  # highest power first
-    for k in range(len(x)):
-        numerator, denominator = np.array([a[k], b[k]]), np.array([c[k], d[k]])
-        square = np.polyadd(np.polymul(numerator, numerator), g[k] ** 2 * np.polymul(denominator, denominator))
-        left = np.polymul([1, 0], np.polymul(square, square))
-        ellipse = np.array([f[k] ** 2, 0, 1])
-        right = determinant[k] * np.polymul(np.polymul(ellipse, ellipse), np.polymul(numerator, denominator))
-        whole = np.polysub(left, right)
-        polynomial[k, 7 - len(whole) :] = whole
-    polynomial /= np.abs(polynomial).max(axis=-1, keepdims=True)
-    t = np.full((len(x), 7), np.nan)
-    for k, coefficients in enumerate(polynomial):
-        found = np.roots(np.where(np.abs(coefficients) < 1e-15, 0, coefficients)).real
-        t[k, : len(found)] = found
-    columns = [v[:, None] for v in (a, b, c, d, f, g)]
-    a_, b_, c_, d_, f_, g_ = columns
-    cost = t**2 / (1 + f_**2 * t**2) + (c_ * t + d_) ** 2 / ((a_ * t + b_) ** 2 + g_**2 * (c_ * t + d_) ** 2)
-    with np.errstate(divide="ignore"):
-        at_infinity = 1 / f**2 + c**2 / (a**2 + g**2 * c**2)
-    best = np.nanargmin(cost, axis=1)
-    t_best = np.take_along_axis(t, best[:, None], 1)[:, 0]
-    beyond = at_infinity < np.take_along_axis(cost, best[:, None], 1)[:, 0]
-    one, zero = np.ones_like(f), np.zeros_like(f)
-    line_first = np.where(beyond[:, None], np.stack([f, zero, -one], -1), np.stack([t_best * f, one, -t_best], -1))
-    s, r = np.where(beyond, c, c * t_best + d), np.where(beyond, a, a * t_best + b)
-    line_second = np.stack([-g * s, r, s], axis=-1)
-    result = np.empty((len(x), 4))
-    for columns_out, line, back in ((slice(0, 2), line_first, back_first), (slice(2, 4), line_second, back_second)):
-        foot = np.stack([-line[:, 0] * line[:, 2], -line[:, 1] * line[:, 2], line[:, 0] ** 2 + line[:, 1] ** 2], -1)
-        image = (back @ foot[:, :, None])[..., 0]
-        result[:, columns_out] = image[:, :2] / image[:, 2:]
-    return result
+    first = np.linalg.svd(pole[None])[2][1:].T  # (3, 2) lines through the epipole
+    second = F @ np.cross(pole, first, axis=0)
+    B, B_ = first[:2].T @ first[:2], second[:2].T @ second[:2]
+    # angles in a metric between those of the two views
+    metric = np.linalg.cholesky(B / np.trace(B) + B_ / np.trace(B_) + 1e-12 * np.eye(2))
+    to_lines = np.linalg.inv(metric).T
+    lines = first @ to_lines, second @ to_lines
+    g, g_ = homogeneous(x) @ lines[0], homogeneous(y) @ lines[1]
+
+    def cost(angles: Array) -> Array:
+        """(n, k) px^2 at angles (n, k)."""
+        u = np.stack([np.cos(angles), np.sin(angles)])
+        total = np.zeros(angles.shape)
+        for form, at in ((lines[0], g), (lines[1], g_)):
+            normal = np.einsum("ij,jnk->ink", form[:2], u)
+            total += np.einsum("nj,jnk->nk", at, u) ** 2 / np.maximum((normal**2).sum(axis=0), 1e-300)
+        return total
+
+    steps = np.geomspace(1e-8, 1.5, AROUND_ZEROS)  # not to a right angle, where both sides meet
+    around = np.concatenate([-steps, [0.0], steps])
+    zeros = np.stack([np.arctan2(-at[:, 0], at[:, 1]) for at in (g, g_)], axis=1) % np.pi
+    even = np.broadcast_to(np.pi / EVENLY * (np.arange(EVENLY) + 0.123), (len(x), EVENLY))
+    angles = np.sort(np.concatenate([even, (zeros[:, :, None] + around).reshape(len(x), -1) % np.pi], axis=1), axis=1)
+    angles = np.concatenate([angles[:, -1:] - np.pi, angles, angles[:, :1] + np.pi], axis=1)
+    sampled = cost(angles)
+    lowest = np.where(
+        (sampled[:, 1:-1] <= sampled[:, :-2]) & (sampled[:, 1:-1] <= sampled[:, 2:]), sampled[:, 1:-1], np.inf
+    )
+    chosen = np.argsort(lowest, axis=1)[:, :3] + 1
+    low, high = (np.take_along_axis(angles, chosen + side, axis=1) for side in (-1, 1))
+    for _ in range(GOLDEN_STEPS):
+        width = GOLDEN * (high - low)
+        falls = cost(high - width) > cost(low + width)
+        low, high = np.where(falls, high - width, low), np.where(falls, high, low + width)
+    middle = 0.5 * (low + high)
+    best = np.take_along_axis(middle, np.argmin(cost(middle), axis=1)[:, None], axis=1)[:, 0]
+    u = np.stack([np.cos(best), np.sin(best)], axis=-1)
+    feet = []
+    for form, pixels in ((lines[0], x), (lines[1], y)):
+        line = u @ form.T
+        off = (line[:, :2] * pixels).sum(axis=-1) + line[:, 2]
+        feet.append(pixels - (off / (line[:, :2] ** 2).sum(axis=-1))[:, None] * line[:, :2])
+    return np.hstack(feet)
 
 
-def _epipolar_frame(pole: Array, points: Array) -> tuple[Array, Array]:
-    """(n, 3, 3) maps to pixels from frames with the point at 0 and the epipole at (1, 0, f), and (n,) f."""
-    moved = pole[:2] - pole[2] * points
-    length = np.linalg.norm(moved, axis=-1)
-    cosine, sine = np.where(length > 0, moved.T / np.where(length > 0, length, 1), [[1.0], [0.0]])
-    back = np.zeros((len(points), 3, 3))
-    back[:, 0, 0] = back[:, 1, 1] = cosine
-    back[:, 0, 1], back[:, 1, 0] = -sine, sine
-    back[:, :2, 2], back[:, 2, 2] = points, 1
-    return back, pole[2] / np.maximum(length, 1e-300)
+EVENLY, AROUND_ZEROS = 64, 40
+"""Angles that are sampled over all, and on either side of each of the two zeros."""
+GOLDEN, GOLDEN_STEPS = 0.5 * (np.sqrt(5) - 1), 45
+AT_ONCE = 4096
+"""Pairs whose angles are sampled in one go, for the memory that it takes."""
