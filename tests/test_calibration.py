@@ -78,7 +78,7 @@ def test_a_rendered_board_is_found_where_it_stands(board):
     T = pose((20, -25, 5), (0, 0, 0.6), board)
     scene = rangesim.load_scene(board.scene(T))
     rig = replace(scene.rig(baseline_m=0.05, width=640, height=480), camera=replace(CAMERA, distortion=()))
-    white = rangesim.transport(scene, rig, [rangesim.IdealToF()], spp=32).white
+    white = rangesim.transport(scene, rig, [rangesim.IdealToF()], spp=32).energy.projector
     view = board.find(white)
     expected = rig.camera.project(board.points @ T[:3, :3].T + T[:3, 3])
     assert len(view.indices) == 54
@@ -144,7 +144,7 @@ def test_a_camera_is_found_to_the_bound_and_as_opencv_finds_it():
     cv2 = pytest.importorskip("cv2")
     rng = np.random.default_rng(2)
     errors = []
-    for _ in range(20):
+    for _ in range(8):
         T = poses(12, rng)
         seen = views(T, CAMERA, 0.1, rng)
         found = calibrate_camera(BOARD, seen, 640, 480)

@@ -42,6 +42,7 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 
 
 ARGUMENTS = {
+    "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
     "rectification": ["rectification.png", "--width", "160"],
     "segmentation": ["--width", "320"],
     "two_cameras": ["--width", "80"],

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from rangesim.calibration.bundle import Bundle as Bundle
     from rangesim.calibration.bundle import Observation as Observation
     from rangesim.calibration.bundle import adjust as adjust
+    from rangesim.calibration.rendered import RenderedSet as RenderedSet
+    from rangesim.calibration.rendered import default_rig as default_rig
+    from rangesim.calibration.rendered import render_set as render_set
     from rangesim.calibration.rig_calibration import RigCalibration as RigCalibration
     from rangesim.calibration.rig_calibration import calibrate_rig as calibrate_rig
     from rangesim.calibration.rig_calibration import projector_view as projector_view
@@ -27,6 +30,7 @@ else:
         submod_attrs={
             "boards": ["Board", "BoardView", "CharucoBoard", "Checkerboard", "CircleGrid"],
             "bundle": ["Bundle", "Observation", "adjust"],
+            "rendered": ["RenderedSet", "default_rig", "render_set"],
             "rig_calibration": ["RigCalibration", "calibrate_rig", "projector_view"],
             "zhang": ["CameraCalibration", "calibrate_camera", "intrinsics_from_homographies"],
         },

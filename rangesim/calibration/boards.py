@@ -98,7 +98,7 @@ class Board(ABC):
         if not np.isfinite(values).all():
             raise ValueError("expected an image with finite values, got NaN or infinity.")
         low, high = np.quantile(values, [0.001, 0.999])
-        grey = np.uint8(255.0 * np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0))
+        grey = (255.0 * np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0)).astype(np.uint8)
         found = self._find(grey)
         if found is None:
             raise ValueError(
@@ -116,6 +116,9 @@ class Board(ABC):
         ----------
         T_world_board : (4, 4) metres. The camera has the world's axes: x right, y down, z forward.
         """
+        from rangesim.environment.backend import select_variant
+
+        select_variant()
         import mitsuba as mi
 
         drawn = BLACK + (WHITE - BLACK) * self.image()[::-1]  # Mitsuba's v points up
@@ -170,7 +173,7 @@ class Checkerboard(Board):
         """(h, w) float64, 0 ink, 1 board; the square before the first corner is black."""
         squares = np.ones((self.rows + 3, self.columns + 3))
         squares[1:-1, 1:-1] = np.indices((self.rows + 1, self.columns + 1)).sum(axis=0) % 2
-        return np.kron(squares, np.ones((pixels_per_spacing, pixels_per_spacing)))
+        return squares.repeat(pixels_per_spacing, axis=0).repeat(pixels_per_spacing, axis=1)
 
     def _find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array] | None:
         import cv2

@@ -30,6 +30,8 @@ MIN_AROUND, MAX_AROUND = 24, 600
 """Decoded pixels around a corner that its homography takes."""
 REACH = 0.9
 """Of the distance between neighbouring corners in the image: how far around a corner decoded pixels are taken."""
+MAX_GAP = 2.8
+"""Radians."""
 OUTLIER = 4.0
 """Robust standard deviations beyond which a decoded pixel is left out."""
 
@@ -106,9 +108,12 @@ def _seen_through(here: Array, there: Array, corner: Array) -> Array | None:
 
 
 def _surrounds(offsets: Array) -> bool:
-    """Whether points (n, 2) lie in at least three of the quadrants around 0, a sixteenth of them in each."""
-    quadrant = 2 * (offsets[:, 0] > 0) + (offsets[:, 1] > 0)
-    return int((np.bincount(quadrant, minlength=4) >= len(offsets) / 16).sum()) >= 3
+    """Whether points (n, 2) lie around 0: no gap between their directions is as wide as `MAX_GAP`.
+
+    Two white squares across a corner do, where black ones send too little light back.
+    """
+    angles = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
+    return float(np.diff(angles, append=angles[0] + 2 * np.pi).max()) < MAX_GAP
 
 
 def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: int = 5) -> RigCalibration:
@@ -160,6 +165,7 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
     found = adjust(start, observations, coefficients)
     _, deviations = judged(found, observations)
     bundle, lens = found.state, 4 + coefficients
+    camera_found, projector_found = bundle.devices
     covariance = found.covariance(found.noise(found.jacobian.shape[1]))
     moved = slice(2 * lens + 3, 2 * lens + POSE)
     translation = bundle.T_second_first[:3, 3]
@@ -170,7 +176,7 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
     by_device = np.zeros((2, LENS))
     by_device[:, :lens] = deviations[: 2 * lens].reshape(2, lens)
     return RigCalibration(
-        Rig(*bundle.devices, T_camera_projector=np.linalg.inv(bundle.T_second_first)),
+        Rig(camera_found, projector_found, T_camera_projector=np.linalg.inv(bundle.T_second_first)),
         by_device[0],
         by_device[1],
         baseline,
