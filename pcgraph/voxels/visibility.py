@@ -36,10 +36,8 @@ _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
 _TOLD = 40.0  # votes of the viewpoint for one of the places
-_CLOSED = 0.962  # of all directions hit by something, from places inside: all was seen from within, or from around it
-_DECIDED, _OUTSIDE_IN, _UPPER = 0.08, 0.02, 0.002  # what counts where as much is seen,
-_DECIDED_CLOSED, _OUTSIDE_IN_CLOSED = 0.01, 0.002  # and where places inside are closed in
-_FROM_VIEWPOINT = 0.02
+_CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
+_DECIDED, _OUTSIDE_IN, _UPPER, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _VIEWS = 12  # places that the voxels themselves are looked at from
@@ -47,7 +45,7 @@ _SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
-
+_SLANTED = 8.0  # widths between squares of one surface of which one may seem to hide the other
 _STEEPEST = 4.0  # of a square that is seen at a slant: tangent of its angle
 _TINY = 1e-12
 _FAR = 1e3  # voxel edges from a voxel to its orientation point
@@ -295,29 +293,27 @@ def _most_telling(
 ) -> NDArray[np.float64]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface.
 
-    A crease is hidden by what is beside it, so cells count as shown beside shown ones. Where an agreement is one of
-    places closed in, as in a room, those alone count half: of a room all but narrow gaps is seen from within.
+    A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
+    one of places closed in, as in a room: of that all but narrow gaps is seen from within.
     """
     cells = np.repeat(np.arange(coarse.n_voxels), np.diff(coarse.indptr))
     visible = np.abs(sides).sum(axis=1)
     different = list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values())
-    closed_in = [float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0.0 for s in different]
-    decided_counts, outside_counts, likely_counts = _DECIDED, _OUTSIDE_IN, _UPPER
-    if any(closed_in):
-        decided_counts, outside_counts, likely_counts = _DECIDED_CLOSED, _OUTSIDE_IN_CLOSED, 0.0
-    if likely_is_told:
-        likely_counts = _FROM_VIEWPOINT
+    is_closed = any(float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0 for s in different)
+    likely_counts = _FROM_VIEWPOINT if likely_is_told else _UPPER
     most, best = -np.inf, found.weights[0]
     for s in different:
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
         shown = np.einsum("k,kn->n", weights, np.maximum(sides * found.outward[s], 0.0))
         shown = np.minimum(shown / _WELL_SEEN, 1.0)
-        around = shown.copy()
-        np.maximum.at(around, cells, shown[coarse.neighbours])
-        score = float((around + shown).mean()) / 2.0 if any(closed_in) else float(around.mean())
+        if not is_closed:
+            around = shown.copy()
+            np.maximum.at(around, cells, shown[coarse.neighbours])
+            shown = around
+        score = float(shown.mean())
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
-        score += decided_counts * float(decided[visible > 0.0].mean())
-        for some, counts in ((slice(_OUTSIDE), outside_counts), (likely, likely_counts)):
+        score += _DECIDED * float(decided[visible > 0.0].mean())
+        for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, likely_counts)):
             score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
@@ -400,6 +396,21 @@ def _count_hits(
         hits[k] = hit.mean()
 
 
+@routine
+def _on_one_surface(
+    i: int, j: int, centres: NDArray[np.float64], widths: NDArray[np.float64], normals: NDArray[np.float64]
+) -> bool:
+    """Whether two squares lie on each other's planes and near: at a slant one may seem to hide the other."""
+    if abs(normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]) < _SAME:
+        return False
+    x, y, z = centres[i, 0] - centres[j, 0], centres[i, 1] - centres[j, 1], centres[i, 2] - centres[j, 2]
+    off = max(
+        abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]),
+        abs(x * normals[j, 0] + y * normals[j, 1] + z * normals[j, 2]),
+    )
+    return off < widths[i] and x * x + y * y + z * z < (_SLANTED * widths[i]) ** 2
+
+
 @kernel
 def _look(
     start: int,
@@ -417,6 +428,7 @@ def _look(
     for k in range(start, stop):
         bins = bins_of[k]
         nearest = np.full(bins * bins, np.float32(np.inf), np.float32)
+        first = np.zeros(bins * bins, np.int32)
         for i in range(n):
             x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
             ranges[i] = math.sqrt(x * x + y * y + z * z)
@@ -435,10 +447,13 @@ def _look(
                     reaches = ranges[i] * np.float32(1.0 + slope * off)
                     if reaches < nearest[p * bins + q]:
                         nearest[p * bins + q] = reaches
+                        first[p * bins + q] = i
         for i in range(n):
             # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
             depth = widths[i] + 0.5 * ranges[i] / per_radian[i]
-            seen[k, i] = at[i] >= 0 and ranges[i] <= nearest[at[i]] + depth
+            seen[k, i] = at[i] >= 0 and (
+                ranges[i] <= nearest[at[i]] + depth or _on_one_surface(i, first[at[i]], centres, widths, normals)
+            )
 
 
 @kernel
