@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.spacing import bounding_box, sphere_directions
@@ -139,7 +139,7 @@ def seen_from(
         Towards either side. A square that is seen at a slant hides little of what lies beside it on the same surface.
     """
     seen = np.empty((len(places), len(centres)), np.bool_)
-    some = slice(None, None, max(1, len(centres) // 1000))  # to know how fine a map it takes
+    some = slice(None, None, max(1, len(centres) // 200))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
@@ -187,15 +187,15 @@ def _telling_places(
     upper = np.arange(len(places)) < _OUTSIDE // 2
     likely = upper if viewpoint is None else np.arange(len(places)) == len(places) - 1
     normals = _either_normals(coarse)
-    sides = seen_from(places, coarse.centroids, coarse.edge_lengths, normals).astype(np.float32)
-    for k, place in enumerate(places):
-        rays = place - coarse.centroids
-        sides[k] *= np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
+    seen = seen_from(places, coarse.centroids, coarse.edge_lengths, normals)
+    sides = np.empty(seen.shape, np.float32)
+    in_blocks(_find_sides, len(places), places, coarse.centroids, normals, seen, sides, smallest=1)
     closed = np.zeros(len(places))
-    in_blocks(_count_hits, len(inside), inside, coarse.centroids, closed[_OUTSIDE : _OUTSIDE + len(inside)])
+    hits = closed[_OUTSIDE : _OUTSIDE + len(inside)]
+    in_blocks(_count_hits, len(inside), inside, coarse.centroids, hits, smallest=1)
     found = _agreements(sides, _starts(sides, outside, likely))
     weights = _most_telling(found, sides, coarse, closed, likely, viewpoint is not None)
-    chosen = _spread_choice(sides != 0.0, weights)
+    chosen = _spread_choice(seen, weights)
     return places[chosen], weights[chosen]
 
 
@@ -248,6 +248,17 @@ def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agr
     return found
 
 
+@summing_routine
+def _balance(sides: NDArray[np.float32], outward: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
+    """Sums of the cosines that a place sees, less those on the wrong side, and of all whose outside is known."""
+    net = known = np.float32(0.0)
+    for i in range(len(sides)):
+        value = sides[i] * outward[i]
+        net += value
+        known += abs(value)
+    return net, known
+
+
 @kernel
 def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements) -> None:
     """Places that agree decide where the outside lies, and those that see it there count, by turns until it stands."""
@@ -271,14 +282,10 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
                 break
             largest = np.float32(_TINY)
             for k in range(n_places):
-                right = wrong = np.float32(0.0)
-                for i in range(n):
-                    value = sides[k, i] * outward[i]
-                    right += max(value, np.float32(0.0))
-                    wrong += max(-value, np.float32(0.0))
-                found.agreed[s, k], found.known[s, k] = right, right + wrong
-                net = max(right - wrong, np.float32(0.0))
-                weights[k] = math.sqrt(net) * (net / max(right + wrong, np.float32(_TINY))) ** 4
+                net, known = _balance(sides[k], outward)
+                found.agreed[s, k], found.known[s, k] = (net + known) / 2.0, known
+                net = max(net, np.float32(0.0))
+                weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
                 largest = max(largest, weights[k])
             weights /= largest
 
@@ -356,7 +363,8 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
     if not len(free):
         return places[:0]
     places, clearance, hits = places[free], clearance[free], np.empty(len(free))
-    in_blocks(_count_hits, len(free), places, coarse.centroids[:: max(1, coarse.n_voxels // _SOME)], hits)
+    some = coarse.centroids[:: max(1, coarse.n_voxels // _SOME)]
+    in_blocks(_count_hits, len(free), places, some, hits, smallest=1)
     among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
     chosen = [among[np.argmax(clearance[among])]]
     nearest = np.full(len(among), np.inf)
@@ -409,6 +417,25 @@ def _on_one_surface(
         abs(x * normals[j, 0] + y * normals[j, 1] + z * normals[j, 2]),
     )
     return off < widths[i] and x * x + y * y + z * z < (_SLANTED * widths[i]) ** 2
+
+
+@kernel
+def _find_sides(
+    start: int,
+    stop: int,
+    places: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    seen: NDArray[np.bool_],
+    sides: NDArray[np.float32],
+) -> None:
+    """Set the cosine between each normal and the direction to each place, 0 where hidden."""
+    for k in range(start, stop):
+        for i in range(len(centres)):
+            x, y, z = places[k, 0] - centres[i, 0], places[k, 1] - centres[i, 1], places[k, 2] - centres[i, 2]
+            length = max(math.sqrt(x * x + y * y + z * z), _TINY)
+            cosine = (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / length
+            sides[k, i] = cosine if seen[k, i] else 0.0
 
 
 @kernel
