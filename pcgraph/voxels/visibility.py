@@ -266,9 +266,11 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
     total = np.empty(n, np.float32)
     for s in range(start, stop):
         weights, outward = found.weights[s], found.outward[s]
-        outward[:] = 0.0
+        for i in range(n):
+            outward[i] = 0.0
         for _ in range(_ROUNDS):
-            total[:] = 0.0
+            for i in range(n):
+                total[i] = 0.0
             for k in range(n_places):
                 if weights[k] > 0.0:
                     for i in range(n):
@@ -287,7 +289,8 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
                 net = max(net, np.float32(0.0))
                 weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
                 largest = max(largest, weights[k])
-            weights /= largest
+            for k in range(n_places):
+                weights[k] /= largest
 
 
 def _most_telling(
@@ -396,12 +399,15 @@ def _count_hits(
     """Set the fraction of directions in which there is something, from each place, on a map of 8 x 8 bins."""
     bins = 8
     for k in range(start, stop):
-        hit = np.zeros((bins, bins), np.bool_)
+        hit = np.zeros(bins * bins, np.bool_)
         for i in range(len(centres)):
             x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
             u, v = _bin_of(x, y, z, bins)
-            hit[min(int(u), bins - 1), min(int(v), bins - 1)] = True
-        hits[k] = hit.mean()
+            hit[min(int(u), bins - 1) * bins + min(int(v), bins - 1)] = True
+        n_hits = 0
+        for b in range(bins * bins):
+            n_hits += hit[b]
+        hits[k] = n_hits / (bins * bins)
 
 
 @routine
@@ -454,8 +460,9 @@ def _look(
     at, ranges, per_radian = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     for k in range(start, stop):
         bins = bins_of[k]
-        nearest = np.full(bins * bins, np.float32(np.inf), np.float32)
-        first = np.zeros(bins * bins, np.int32)
+        nearest, first = np.empty(bins * bins, np.float32), np.empty(bins * bins, np.int32)
+        for b in range(bins * bins):
+            nearest[b] = np.inf
         for i in range(n):
             x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
             ranges[i] = math.sqrt(x * x + y * y + z * z)
