@@ -5,16 +5,14 @@ from __future__ import annotations
 
 import inspect
 import re
-import sys
 from difflib import get_close_matches
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from zlib import crc32
 
 import pcgraph
 from pcgraph.errors import PcgraphError
+from pcgraph.python_files import run_python_file
 
 _SEPARATOR = ".py:"
 
@@ -88,18 +86,10 @@ def _module(path: Path) -> ModuleType:
     """The module of a Python file, which runs."""
     if not path.is_file():
         raise PcgraphError(f"{path} does not exist; expected a Python file")
-    name = f"_pcgraph_file_{path.stem}_{crc32(bytes(path)):x}"
-    spec = spec_from_file_location(name, path)
-    assert spec is not None, path  # a .py file has one
-    assert spec.loader is not None, path
-    module = module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their own module up
     try:
-        spec.loader.exec_module(module)
+        return run_python_file(path, "pcgraph")
     except (Exception, SystemExit) as error:
-        del sys.modules[name]
         raise PcgraphError(f"{path} fails: {type(error).__name__}: {_brief(error)}") from error
-    return module
 
 
 def _brief(thing: object) -> str:

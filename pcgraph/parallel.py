@@ -16,6 +16,11 @@ Wrappers that nobody calls are left out here and below: they would cost a third 
 """
 routine = njit(cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)
 """Decorator of a compiled function that only kernels call."""
+summing_routine = njit(cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True, fastmath={"reassoc"})
+"""The same for one whose sums are taken in lanes, as wide as the processor's, and five times as fast.
+
+Their last digits then depend on the kind of processor, as NumPy's own do, but not on the number of threads.
+"""
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")

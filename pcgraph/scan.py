@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -137,8 +138,10 @@ def segment(
     compile_in_two_processes()
     n_points = len(cloud.points)
     for _ in range(2):
-        voxel = _voxel_size(cloud, voxel_size, seed_size)
-        found, warp = _place_and_warp(cloud, place, camera, range_growth)
+        voxel, (found, warp) = side_by_side(
+            partial(_voxel_size, cloud, voxel_size, seed_size),
+            partial(_place_and_warp, cloud, place, camera, range_growth),
+        )
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:

@@ -2,7 +2,7 @@
 """Compiling kernels ahead of their first use, in two processes.
 
 Compiled kernels are kept in numba's cache, so this is done once per installation. Compiling holds the interpreter's
-lock, so threads are no help; a second process compiles what graph and tree need, this one what voxels need.
+lock, so threads are no help; a second process compiles half of it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.spacing import some_blocks, spacing_law
-from pcgraph.voxels.visibility import visible_sides
+from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
 
 _EDGE = 24  # points along the cloud's edges
@@ -102,21 +102,28 @@ def compile_in_two_processes() -> None:
 
 
 def compile_voxels() -> None:
-    """Compile what it takes from points to supervoxels."""
-    image, _ = _step()
-    points = image.reshape(-1, 3)
-    method, warp = SurfaceGrowth(), CameraWarp(np.zeros(3), 1.0)
+    """Compile what it takes from points to supervoxels, less most of the orientation."""
+    points, grid = _step_in_voxels()
     some_blocks(points)
     spacing_law(points)
-    grid = voxel_grid(points, np.full(points.shape, 0.5), 3.5 * _SPACING, warp)
     outlier_voxels(grid)
-    visible_sides(grid)
+    visible_fraction(grid, np.zeros(3))
+    method = SurfaceGrowth()
     planes = method.planes(grid, np.zeros(3))
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
     method.supervoxel_of_point(points, grid, planes, supervoxels)
 
 
-def compile_graph_and_tree() -> None:
+def compile_the_rest() -> None:
+    """Compile what it takes from supervoxels to objects, then the orientation.
+
+    By then the other process has left in numba's cache what this needs of voxels.
+    """
+    _compile_graph_and_tree()
+    visible_sides(_step_in_voxels()[1])
+
+
+def _compile_graph_and_tree() -> None:
     """Compile what it takes from supervoxels to objects."""
     places = np.array([[0.0, 0, 1], [0.1, 0, 1], [0.2, 0, 1], [0.2, 0.1, 1.1]])
     n = len(places)
@@ -150,6 +157,13 @@ def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, y = np.meshgrid(steps, steps)
     depth = np.where((x > steps[8]) & (y > steps[8]), 0.9, 1.0)  # metres
     return np.stack((x, y, depth), axis=-1), np.broadcast_to(np.array([0.0, 0.0, -1.0]), (_EDGE, _EDGE, 3))
+
+
+def _step_in_voxels() -> tuple[NDArray[np.float64], VoxelGrid]:
+    """The same as a list of points, and their voxels."""
+    points = _step()[0].reshape(-1, 3)
+    warp = CameraWarp(np.zeros(3), 1.0)
+    return points, voxel_grid(points, np.full(points.shape, 0.5), 3.5 * _SPACING, warp)
 
 
 @contextmanager
@@ -186,12 +200,12 @@ def _version_of(index: Path) -> object:
 
 
 def _second_process() -> subprocess.Popen[bytes] | None:
-    """The process that compiles graph and tree; None where there is but one thread, no interpreter to start, or where
+    """The process that compiles the rest; None where there is but one thread, no interpreter to start, or where
     other processes of a pool are likely to compile too."""
     in_pool = multiprocessing.parent_process() is not None or "PYTEST_XDIST_WORKER" in os.environ
     if in_pool or config.NUMBA_NUM_THREADS < 2 or not Path(sys.executable or "").name.startswith("python"):
         return None
-    code = "import gc; gc.disable(); from pcgraph.warmup import compile_graph_and_tree; compile_graph_and_tree()"
+    code = "import gc; gc.disable(); from pcgraph.warmup import compile_the_rest; compile_the_rest()"
     paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
     quiet = subprocess.DEVNULL
     try:

@@ -48,6 +48,7 @@ STOREYS = [
     "interrupts",
     "short_repr",
     "plain_files",
+    "python_files",
     "output",
     "cloud",
     "columns",

@@ -243,7 +243,7 @@ def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     if len(chosen) <= _NEIGHBOUR:
         return chosen[:0], np.empty(0)
     sample = chosen[:_READINGS]
-    spacing = cKDTree(chosen).query(sample, k=_NEIGHBOUR + 1)[0][:, -1]
+    spacing = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)[0][:, -1]
     usable = np.isfinite(spacing) & (spacing > 0.0)
     return sample[usable], spacing[usable]
 

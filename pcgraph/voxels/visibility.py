@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.spacing import bounding_box, sphere_directions
@@ -36,10 +36,8 @@ _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
 _TOLD = 40.0  # votes of the viewpoint for one of the places
-_CLOSED = 0.962  # of all directions hit by something, from places inside: all was seen from within, or from around it
-_DECIDED, _OUTSIDE_IN, _UPPER = 0.08, 0.02, 0.002  # what counts where as much is seen,
-_DECIDED_CLOSED, _OUTSIDE_IN_CLOSED = 0.01, 0.002  # and where places inside are closed in
-_FROM_VIEWPOINT = 0.02
+_CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
+_DECIDED, _OUTSIDE_IN, _UPPER, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _VIEWS = 12  # places that the voxels themselves are looked at from
@@ -47,7 +45,7 @@ _SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
-
+_SLANTED = 8.0  # widths between squares of one surface of which one may seem to hide the other
 _STEEPEST = 4.0  # of a square that is seen at a slant: tangent of its angle
 _TINY = 1e-12
 _FAR = 1e3  # voxel edges from a voxel to its orientation point
@@ -141,7 +139,7 @@ def seen_from(
         Towards either side. A square that is seen at a slant hides little of what lies beside it on the same surface.
     """
     seen = np.empty((len(places), len(centres)), np.bool_)
-    some = slice(None, None, max(1, len(centres) // 1000))  # to know how fine a map it takes
+    some = slice(None, None, max(1, len(centres) // 200))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
@@ -189,15 +187,15 @@ def _telling_places(
     upper = np.arange(len(places)) < _OUTSIDE // 2
     likely = upper if viewpoint is None else np.arange(len(places)) == len(places) - 1
     normals = _either_normals(coarse)
-    sides = seen_from(places, coarse.centroids, coarse.edge_lengths, normals).astype(np.float32)
-    for k, place in enumerate(places):
-        rays = place - coarse.centroids
-        sides[k] *= np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
+    seen = seen_from(places, coarse.centroids, coarse.edge_lengths, normals)
+    sides = np.empty(seen.shape, np.float32)
+    in_blocks(_find_sides, len(places), places, coarse.centroids, normals, seen, sides, smallest=1)
     closed = np.zeros(len(places))
-    in_blocks(_count_hits, len(inside), inside, coarse.centroids, closed[_OUTSIDE : _OUTSIDE + len(inside)])
+    hits = closed[_OUTSIDE : _OUTSIDE + len(inside)]
+    in_blocks(_count_hits, len(inside), inside, coarse.centroids, hits, smallest=1)
     found = _agreements(sides, _starts(sides, outside, likely))
     weights = _most_telling(found, sides, coarse, closed, likely, viewpoint is not None)
-    chosen = _spread_choice(sides != 0.0, weights)
+    chosen = _spread_choice(seen, weights)
     return places[chosen], weights[chosen]
 
 
@@ -250,6 +248,17 @@ def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agr
     return found
 
 
+@summing_routine
+def _balance(sides: NDArray[np.float32], outward: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
+    """Sums of the cosines that a place sees, less those on the wrong side, and of all whose outside is known."""
+    net = known = np.float32(0.0)
+    for i in range(len(sides)):
+        value = sides[i] * outward[i]
+        net += value
+        known += abs(value)
+    return net, known
+
+
 @kernel
 def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements) -> None:
     """Places that agree decide where the outside lies, and those that see it there count, by turns until it stands."""
@@ -257,9 +266,11 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
     total = np.empty(n, np.float32)
     for s in range(start, stop):
         weights, outward = found.weights[s], found.outward[s]
-        outward[:] = 0.0
+        for i in range(n):
+            outward[i] = 0.0
         for _ in range(_ROUNDS):
-            total[:] = 0.0
+            for i in range(n):
+                total[i] = 0.0
             for k in range(n_places):
                 if weights[k] > 0.0:
                     for i in range(n):
@@ -273,16 +284,13 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
                 break
             largest = np.float32(_TINY)
             for k in range(n_places):
-                right = wrong = np.float32(0.0)
-                for i in range(n):
-                    value = sides[k, i] * outward[i]
-                    right += max(value, np.float32(0.0))
-                    wrong += max(-value, np.float32(0.0))
-                found.agreed[s, k], found.known[s, k] = right, right + wrong
-                net = max(right - wrong, np.float32(0.0))
-                weights[k] = math.sqrt(net) * (net / max(right + wrong, np.float32(_TINY))) ** 4
+                net, known = _balance(sides[k], outward)
+                found.agreed[s, k], found.known[s, k] = (net + known) / 2.0, known
+                net = max(net, np.float32(0.0))
+                weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
                 largest = max(largest, weights[k])
-            weights /= largest
+            for k in range(n_places):
+                weights[k] /= largest
 
 
 def _most_telling(
@@ -295,29 +303,27 @@ def _most_telling(
 ) -> NDArray[np.float64]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface.
 
-    A crease is hidden by what is beside it, so cells count as shown beside shown ones. Where an agreement is one of
-    places closed in, as in a room, those alone count half: of a room all but narrow gaps is seen from within.
+    A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
+    one of places closed in, as in a room: of that all but narrow gaps is seen from within.
     """
     cells = np.repeat(np.arange(coarse.n_voxels), np.diff(coarse.indptr))
     visible = np.abs(sides).sum(axis=1)
     different = list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values())
-    closed_in = [float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0.0 for s in different]
-    decided_counts, outside_counts, likely_counts = _DECIDED, _OUTSIDE_IN, _UPPER
-    if any(closed_in):
-        decided_counts, outside_counts, likely_counts = _DECIDED_CLOSED, _OUTSIDE_IN_CLOSED, 0.0
-    if likely_is_told:
-        likely_counts = _FROM_VIEWPOINT
+    is_closed = any(float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0 for s in different)
+    likely_counts = _FROM_VIEWPOINT if likely_is_told else _UPPER
     most, best = -np.inf, found.weights[0]
     for s in different:
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
         shown = np.einsum("k,kn->n", weights, np.maximum(sides * found.outward[s], 0.0))
         shown = np.minimum(shown / _WELL_SEEN, 1.0)
-        around = shown.copy()
-        np.maximum.at(around, cells, shown[coarse.neighbours])
-        score = float((around + shown).mean()) / 2.0 if any(closed_in) else float(around.mean())
+        if not is_closed:
+            around = shown.copy()
+            np.maximum.at(around, cells, shown[coarse.neighbours])
+            shown = around
+        score = float(shown.mean())
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
-        score += decided_counts * float(decided[visible > 0.0].mean())
-        for some, counts in ((slice(_OUTSIDE), outside_counts), (likely, likely_counts)):
+        score += _DECIDED * float(decided[visible > 0.0].mean())
+        for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, likely_counts)):
             score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
@@ -360,7 +366,8 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
     if not len(free):
         return places[:0]
     places, clearance, hits = places[free], clearance[free], np.empty(len(free))
-    in_blocks(_count_hits, len(free), places, coarse.centroids[:: max(1, coarse.n_voxels // _SOME)], hits)
+    some = coarse.centroids[:: max(1, coarse.n_voxels // _SOME)]
+    in_blocks(_count_hits, len(free), places, some, hits, smallest=1)
     among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
     chosen = [among[np.argmax(clearance[among])]]
     nearest = np.full(len(among), np.inf)
@@ -392,12 +399,49 @@ def _count_hits(
     """Set the fraction of directions in which there is something, from each place, on a map of 8 x 8 bins."""
     bins = 8
     for k in range(start, stop):
-        hit = np.zeros((bins, bins), np.bool_)
+        hit = np.zeros(bins * bins, np.bool_)
         for i in range(len(centres)):
             x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
             u, v = _bin_of(x, y, z, bins)
-            hit[min(int(u), bins - 1), min(int(v), bins - 1)] = True
-        hits[k] = hit.mean()
+            hit[min(int(u), bins - 1) * bins + min(int(v), bins - 1)] = True
+        n_hits = 0
+        for b in range(bins * bins):
+            n_hits += hit[b]
+        hits[k] = n_hits / (bins * bins)
+
+
+@routine
+def _on_one_surface(
+    i: int, j: int, centres: NDArray[np.float64], widths: NDArray[np.float64], normals: NDArray[np.float64]
+) -> bool:
+    """Whether two squares lie on each other's planes and near: at a slant one may seem to hide the other."""
+    if abs(normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]) < _SAME:
+        return False
+    x, y, z = centres[i, 0] - centres[j, 0], centres[i, 1] - centres[j, 1], centres[i, 2] - centres[j, 2]
+    off = max(
+        abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]),
+        abs(x * normals[j, 0] + y * normals[j, 1] + z * normals[j, 2]),
+    )
+    return off < widths[i] and x * x + y * y + z * z < (_SLANTED * widths[i]) ** 2
+
+
+@kernel
+def _find_sides(
+    start: int,
+    stop: int,
+    places: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    seen: NDArray[np.bool_],
+    sides: NDArray[np.float32],
+) -> None:
+    """Set the cosine between each normal and the direction to each place, 0 where hidden."""
+    for k in range(start, stop):
+        for i in range(len(centres)):
+            x, y, z = places[k, 0] - centres[i, 0], places[k, 1] - centres[i, 1], places[k, 2] - centres[i, 2]
+            length = max(math.sqrt(x * x + y * y + z * z), _TINY)
+            cosine = (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / length
+            sides[k, i] = cosine if seen[k, i] else 0.0
 
 
 @kernel
@@ -416,7 +460,9 @@ def _look(
     at, ranges, per_radian = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     for k in range(start, stop):
         bins = bins_of[k]
-        nearest = np.full(bins * bins, np.float32(np.inf), np.float32)
+        nearest, first = np.empty(bins * bins, np.float32), np.empty(bins * bins, np.int32)
+        for b in range(bins * bins):
+            nearest[b] = np.inf
         for i in range(n):
             x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
             ranges[i] = math.sqrt(x * x + y * y + z * z)
@@ -435,10 +481,13 @@ def _look(
                     reaches = ranges[i] * np.float32(1.0 + slope * off)
                     if reaches < nearest[p * bins + q]:
                         nearest[p * bins + q] = reaches
+                        first[p * bins + q] = i
         for i in range(n):
             # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
             depth = widths[i] + 0.5 * ranges[i] / per_radian[i]
-            seen[k, i] = at[i] >= 0 and ranges[i] <= nearest[at[i]] + depth
+            seen[k, i] = at[i] >= 0 and (
+                ranges[i] <= nearest[at[i]] + depth or _on_one_surface(i, first[at[i]], centres, widths, normals)
+            )
 
 
 @kernel

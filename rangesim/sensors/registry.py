@@ -4,15 +4,13 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import is_dataclass
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from zlib import crc32
 
+from pcgraph.python_files import run_python_file
 from rangesim.errors import FileFormatError
 from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict
@@ -147,17 +145,10 @@ def _module(path: Path) -> ModuleType:
     changed = path.stat().st_mtime_ns
     if path in _MODULES and _MODULES[path][0] == changed:
         return _MODULES[path][1]
-    name = f"_rangesim_file_{path.stem}_{crc32(bytes(path)):x}"
-    spec = spec_from_file_location(name, path)
-    assert spec is not None, path  # a .py file has one
-    assert spec.loader is not None, path
-    module = module_from_spec(spec)
     before = [(family, dict(family.known)) for family in (Sensor, Decoder)]
-    sys.modules[name] = module  # dataclasses look their own module up
     try:
-        spec.loader.exec_module(module)
+        module = run_python_file(path, "rangesim")
     except (Exception, SystemExit) as error:
-        del sys.modules[name]
         for family, known in before:
             family.known.clear()
             family.known.update(known)

@@ -117,6 +117,18 @@ def test_a_wall_has_no_leaks_in_any_direction(direction):
     assert not seen[len(wall) :].any()
 
 
+@pytest.mark.parametrize(("slant", "least"), [(0.0, 1.0), (0.8, 0.99), (1.2, 0.75)])
+def test_a_plane_hides_nothing_of_itself_but_another_behind_it(slant, least):
+    """At a slant, its near part is in front of its far part in one direction, as far as a map resolves."""
+    wall = np.stack(np.meshgrid(*2 * (np.arange(-1, 1, 0.04) + 0.02,), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    behind = wall[np.abs(wall[:, :2]).max(axis=1) < 0.4] - np.array((0, 0, 0.2))
+    place = 2.0 * np.array([[np.sin(slant), 0.3 * np.sin(slant), np.cos(slant)]])
+    squares = np.concatenate((wall, behind))
+    seen = seen_from(place, squares, np.full(len(squares), 0.04), np.tile((0.0, 0.0, 1.0), (len(squares), 1)))[0]
+    assert seen[: len(wall)].mean() >= least
+    assert not seen[len(wall) :].any()
+
+
 def test_a_corridor_with_little_in_it_is_seen_from_within():
     walls = faces((0, 0, 0), (9, 1.8, 2.4), 0.04)
     cupboard = faces((3.0, 0.02, 0.02), (3.8, 0.5, 1.2), 0.04, "-x +x +y +z")
