@@ -24,6 +24,7 @@ from rangesim.calibration import (
 )
 from rangesim.capture.capture_files import import_capture
 from rangesim.rig import Intrinsics
+from rangesim.rig.calibration_files import load_calibration
 
 CAMERA = Intrinsics(640, 480, 700.0, 702.0, 322.0, 238.0, (-0.12, 0.05, 0.001, -0.002, 0.01))
 BOARD = Checkerboard(9, 6, 0.025)
@@ -85,6 +86,15 @@ def test_a_rendered_board_is_found_where_it_stands(board):
     assert np.sqrt(((view.pixels - expected[view.indices]) ** 2).mean()) < 0.1
 
 
+def test_a_part_of_a_charuco_board_is_enough():
+    board, n = BOARDS[1], 64
+    view = board.find(board.image(n)[:, : 6 * n])  # four columns of corners, and what the fifth would need is cut
+    expected = (board.points[view.indices, :2] / board.spacing_m + board.margin) * n
+    assert {index % 9 for index in view.indices.tolist()} <= set(range(5))
+    assert len(view.indices) >= 18
+    assert np.abs(view.pixels - expected).max() < 0.1
+
+
 def test_an_image_without_the_board_says_so():
     with pytest.raises(ValueError, match="Checkerboard of 9 x 6 points in the image, found none"):
         BOARD.find(np.random.default_rng(0).random((200, 300)))
@@ -128,6 +138,8 @@ def test_fewer_than_three_views_do_not():
     two = views(poses(2, rng), CAMERA, 0.1, rng)
     with pytest.raises(ValueError, match="5 degrees of freedom of the absolute conic"):
         calibrate_camera(BOARD, two, 640, 480)
+    with pytest.raises(ValueError, match="view 0: expected indices of the board's 15 points, got 0 to 53"):
+        calibrate_camera(Checkerboard(5, 3, 0.025), [*two, two[0]], 640, 480)
     with pytest.raises(ValueError, match="at least 3 views of the plane, got 1"):
         intrinsics_from_homographies(np.eye(3))
 
@@ -278,7 +290,6 @@ def test_a_capture_that_does_not_do_is_named(rendered):
 def test_one_pose_of_a_real_board_allows_a_pose_and_no_more(real_data):
     """One view gives two of the conic's five equations: no calibration; with a known camera, where the board stands."""
     from rangesim.geometry import fit_camera_pose
-    from rangesim.rig.calibration_files import load_calibration
 
     folder = real_data / "graycode_board"
     sensor = rangesim.StructuredLight(code="gray", projector_width=1024, projector_height=768, axes=("columns", "rows"))
@@ -291,3 +302,65 @@ def test_one_pose_of_a_real_board_allows_a_pose_and_no_more(real_data):
     found = fit_camera_pose(board.points, view.pixels, rig.camera)
     assert found.noise_px < 0.5
     assert 0.5 < found.T_camera_object[2, 3] < 5.0
+
+
+# ------------------------------------------------------------------------------------------- files and command line
+
+
+def test_the_command_writes_what_calibration_reads_and_opencv_too(rendered, tmp_path, capsys):
+    import cv2
+
+    from rangesim.cli import app
+
+    captures, rig = rendered
+    for k, capture in enumerate(captures):
+        capture.save(tmp_path / f"pose_{k}")
+    folders = [str(tmp_path / f"pose_{k}") for k in range(4)]
+    options = ["--points", "9x6", "--spacing", "0.025", "--coefficients", "2"]
+    for name in ("rig.json", "rig.yml"):
+        app(["calibrate", *folders, *options, "--out", str(tmp_path / name)], standalone_mode=False)
+    said = capsys.readouterr().out
+    assert "baseline" in said
+    assert "pose_3" in said
+    found = load_calibration(tmp_path / "rig.json")
+    assert abs(found.camera.fx / rig.camera.fx - 1) < 0.005
+    file = cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
+    K, R, T, F = (file.getNode(name).mat() for name in ("projector_matrix", "R", "T", "F"))
+    X = np.array([[0.02, -0.03, 0.5], [0.1, 0.05, 0.6]])
+    coefficients = file.getNode("projector_distortion").mat()
+    seen, _ = cv2.projectPoints(X, cv2.Rodrigues(R)[0], T, K, coefficients)
+    by_rig = np.linalg.inv(found.T_camera_projector)
+    expected = found.projector.project(X @ by_rig[:3, :3].T + by_rig[:3, 3])
+    assert np.allclose(seen.reshape(-1, 2) + 0.5, expected, atol=1e-6)
+    pinhole, _ = cv2.projectPoints(X, cv2.Rodrigues(R)[0], T, K, None)
+    by_camera, _ = cv2.projectPoints(X, np.zeros(3), np.zeros(3), file.getNode("camera_matrix").mat(), None)
+    ends = [np.c_[pixels.reshape(-1, 2), np.ones(2)] for pixels in (pinhole, by_camera)]
+    assert np.abs(np.einsum("ni,ij,nj->n", ends[0], F, ends[1])).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (["--points", "9"], "COLUMNSxROWS"),
+        (["--board", "charco"], "did you mean 'charuco'"),
+        (["--board", "circles"], "--marker METRES"),
+        (["--marker", "0.02"], "a checkerboard has none"),
+        (["--out", "rig.txt"], "end in .json"),
+    ],
+)
+def test_what_the_command_refuses(change, says, tmp_path):
+    from rangesim.cli import app
+
+    arguments = [
+        "calibrate",
+        str(tmp_path),
+        "--points",
+        "9x6",
+        "--spacing",
+        "0.025",
+        "--out",
+        str(tmp_path / "rig.json"),
+    ]
+    with pytest.raises(ValueError, match=says):
+        app([*arguments, *change], standalone_mode=False)
+    assert not (tmp_path / "rig.json").exists()

@@ -144,7 +144,7 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
             raise ValueError(f"capture {k}: expected the sensor and the size of capture 0, got another.")
         views.append(view)
         projector_views.append(seen)
-    check_views(views, coefficients)
+    check_views(board, views, coefficients)
     sensor = captures[0].sensor
     assert isinstance(sensor, StructuredLight)
     height, width = captures[0].frames.shape[1:]

@@ -112,7 +112,7 @@ def calibrate_camera(
     ValueError
         Fewer than three views, or views that do not determine the camera.
     """
-    check_views(views, coefficients)
+    check_views(board, views, coefficients)
     K = intrinsics_from_homographies(
         [fit_homography(board.points[view.indices, :2], view.pixels, noisy="second").matrix for view in views]
     )
@@ -134,13 +134,20 @@ def calibrate_camera(
     )
 
 
-def check_views(views: Sequence[BoardView], coefficients: int) -> None:
-    """Raise ValueError unless there are enough views, and a number of coefficients from 0 to 5."""
+def check_views(board: Board, views: Sequence[BoardView], coefficients: int) -> None:
+    """Raise ValueError unless there are enough views of this board, and a number of coefficients from 0 to 5."""
     if len(views) < MIN_VIEWS:
         raise ValueError(
             f"expected at least {MIN_VIEWS} views of the board, got {len(views)}: each gives two equations for the 5 "
             "degrees of freedom of the absolute conic's image."
         )
+    n_points = board.columns * board.rows
+    for k, view in enumerate(views):
+        if len(view.indices) and not 0 <= view.indices.min() <= view.indices.max() < n_points:
+            raise ValueError(
+                f"view {k}: expected indices of the board's {n_points} points, got {view.indices.min()} to "
+                f"{view.indices.max()}; is it a view of another board?"
+            )
     if coefficients not in range(6):
         raise ValueError(f"expected 0 to 5 coefficients of distortion, got {coefficients!r}.")
 

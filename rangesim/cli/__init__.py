@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 import rangesim
+from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
@@ -22,6 +23,7 @@ app = typer.Typer(
 )
 app.command("run")(run_command)
 app.command("decode")(decode_command)
+app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)
 app.command("report")(report_command)
 app.command("verify")(verify_command)

@@ -71,8 +71,8 @@ def decode_command(
     say_where(out, check_directory(out, DECODED, inputs=[capture]))
     taken_with = _own_sensor(sensor) if sensor else None
     if taken_with is None and projector is not None:
-        taken_with = _structured_light(code, projector, axes, period, steps)
-    loaded = _load(capture, taken_with, bits)
+        taken_with = structured_light(code, projector, axes, period, steps)
+    loaded = load_frames(capture, taken_with, bits)
     if taken_with is not None and type(loaded.sensor) is not type(taken_with):
         raise ValueError(f"expected --sensor to name the sensor of {capture}, {loaded.sensor.type_name}.")
     if calibration:
@@ -105,7 +105,7 @@ def _options(names: tuple[str, ...], given: set[str]) -> str:
     return ", ".join(f"--{name.replace('_', '-')}" for name in names if name in given)
 
 
-def _load(folder: Path, sensor: Sensor | None, bits: int | None) -> Capture:
+def load_frames(folder: Path, sensor: Sensor | None, bits: int | None) -> Capture:
     """The capture of a directory with a sidecar, or of bare images."""
     import rangesim
     from rangesim.capture.capture_files import SIDECAR
@@ -155,7 +155,7 @@ def _own_sensor(name: str) -> Sensor:
     return sensor_of(name)
 
 
-def _structured_light(code: str, projector: str, axes: str, period: float, steps: int) -> StructuredLight:
+def structured_light(code: str, projector: str, axes: str, period: float, steps: int) -> StructuredLight:
     from rangesim.sensors import StructuredLight
     from rangesim.settings.config import nearest, shown
 

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rangesim calibrate`: captures of a board to a rig."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rangesim.cli.decode import load_frames, structured_light
+
+if TYPE_CHECKING:
+    from rangesim.calibration import Board, RigCalibration
+
+KINDS = ("checkerboard", "charuco", "circles")
+
+
+def calibrate_command(
+    captures: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Three or more, each a capture that rangesim wrote or a folder of images.", show_default=False
+        ),
+    ],
+    points: Annotated[str, typer.Option(help="Inner corners (discs) of the board, such as 9x6.")] = ...,  # type: ignore[assignment]
+    spacing: Annotated[float, typer.Option(help="Metres between neighbouring corners (discs).")] = ...,  # type: ignore[assignment]
+    out: Annotated[Path, typer.Option("--out", "-o", help="The rig: .json, or .yml, .yaml, .xml for OpenCV.")] = ...,  # type: ignore[assignment]
+    board: Annotated[str, typer.Option(help="checkerboard, charuco or circles.")] = "checkerboard",
+    marker: Annotated[
+        float | None, typer.Option(help="Metres: a charuco marker's side, or a disc's diameter.", show_default=False)
+    ] = None,
+    dictionary: Annotated[str, typer.Option(help="Of charuco markers, OpenCV's name.")] = "DICT_5X5_250",
+    coefficients: Annotated[int, typer.Option(help="Free of k1, k2, p1, p2, k3, in this order.")] = 5,
+    code: Annotated[str, typer.Option(help="Of bare images: gray or gray-phase.")] = "gray",
+    projector: Annotated[
+        str | None, typer.Option(help="Of bare images: projector pixels, for example 1024x768.")
+    ] = None,
+    period: Annotated[float, typer.Option(help="Of gray-phase images: fringe period, projector pixels.")] = 16.0,
+    steps: Annotated[int, typer.Option(help="Of gray-phase images: phase steps per axis.")] = 4,
+    bits: Annotated[
+        int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
+    ] = None,
+) -> None:
+    """Calibrate camera and projector from structured light, columns and rows, on a board in three or more poses.
+
+    Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good one.
+
+    Examples:
+
+      rangesim calibrate pose_*/ --points 9x6 --spacing 0.025 --projector 1280x800 --out rig.json
+
+      rangesim decode scan --projector 1280x800 --calibration rig.json --out out/scan
+    """
+    from rangesim.calibration import calibrate_rig
+    from rangesim.calibration.opencv_files import SUFFIXES, save_opencv
+    from rangesim.rig.calibration_files import save_calibration
+
+    if out.suffix.lower() not in (".json", *SUFFIXES):
+        raise ValueError(f"expected --out to end in .json, {', '.join(SUFFIXES)}, got {out.name!r}.")
+    target = _board(board, points, spacing, marker, dictionary)
+    sensor = None if projector is None else structured_light(code, projector, "columns,rows", period, steps)
+    found = calibrate_rig(target, [load_frames(path, sensor, bits) for path in captures], coefficients=coefficients)
+    (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
+    typer.echo(_table(found, captures))
+    typer.echo(f"{out}: written.")
+
+
+def _board(kind: str, points: str, spacing: float, marker: float | None, dictionary: str) -> Board:
+    from rangesim.calibration import CharucoBoard, Checkerboard, CircleGrid
+    from rangesim.settings.config import nearest, shown
+
+    size = re.fullmatch(r"(\d+)[x×](\d+)", points)
+    if not size:
+        raise ValueError(f"expected --points as COLUMNSxROWS, such as 9x6, got {shown(points)}.")
+    if kind not in KINDS:
+        raise ValueError(f"expected --board out of {', '.join(KINDS)}, got {kind!r}{nearest(kind, KINDS)}.")
+    columns, rows = int(size[1]), int(size[2])
+    if kind == "checkerboard":
+        if marker is not None:
+            raise ValueError("expected --marker with --board charuco or circles alone; a checkerboard has none.")
+        return Checkerboard(columns, rows, spacing)
+    if marker is None:
+        raise ValueError(f"expected --marker METRES with --board {kind}.")
+    if kind == "charuco":
+        return CharucoBoard(columns, rows, spacing, marker, dictionary)
+    return CircleGrid(columns, rows, spacing, marker)
+
+
+def _table(found: RigCalibration, captures: list[Path]) -> str:
+    """What was found, with standard deviations, and the errors of each capture."""
+    import numpy as np
+
+    lines = []
+    for name, device, deviations in (
+        ("camera", found.rig.camera, found.camera_deviations),
+        ("projector", found.rig.projector, found.projector_deviations),
+    ):
+        values = (device.fx, device.fy, device.cx, device.cy, *device.coefficients)
+        labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+        shown = (f"{a} {v:.6g} ± {d:.2g}" for a, v, d in zip(labels, values, deviations, strict=True))
+        lines.append(f"{name:10s}{', '.join(shown)}")
+    lines.append(f"{'baseline':10s}{1e3 * found.baseline_m:.4f} ± {1e3 * found.baseline_deviation_m:.2g} mm")
+    lines.append("reprojection, pixels, root mean square in camera and projector:")
+    for path, *both in zip(captures, found.camera_residuals, found.projector_residuals, strict=True):
+        lines.append(f"  {path}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
+    return "\n".join([*lines, f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}"])
