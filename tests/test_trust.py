@@ -334,11 +334,11 @@ def test_closed_standard_streams_are_no_obstacle(command: Command, tmp_path: Pat
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="terminals hang up on POSIX")
 @pytest.mark.parametrize("ignored", [False, True])
 def test_a_closed_terminal_ends_a_run_as_an_interrupt_does(tmp_path: Path, ignored: bool) -> None:
-    """But not with nohup, which ignores the signal beforehand."""
+    """But not with nohup, which ignores the signal beforehand, as it may have for the tests themselves."""
     out = tmp_path / "n"
     spp = "3000" if ignored else "20000"
     line = [sys.executable, "-m", "rangesim", "run", PLANE, *TINY, "--spp", spp, "--out", str(out)]
-    start = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN) if ignored else None
+    start = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
     with subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=start) as process:
         wait_until(lambda: bool(list((out / STAGING).glob("work-*"))), process)
         process.send_signal(signal.SIGHUP)
