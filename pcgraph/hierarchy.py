@@ -148,10 +148,10 @@ def roots(parents: NDArray[np.int32]) -> NDArray[np.int32]:
 @kernel
 def propagation_sources(parents: NDArray[np.int32], condition: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Node whose value each node has after `propagate_sequential`, (k,) int32: it or one above it."""
-    sources = np.arange(len(parents)).astype(np.int32)
+    sources = np.empty(len(parents), np.int32)
     for node in range(len(parents) - 1, -1, -1):
-        if condition[node]:
-            sources[node] = sources[parents[node]]
+        parent = parents[node]
+        sources[node] = sources[parent] if condition[node] and parent != node else node
     return sources
 
 

@@ -34,6 +34,7 @@ from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
+from pcgraph.voxels import visibility
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.spacing import some_blocks, spacing_law
@@ -102,7 +103,7 @@ def compile_in_two_processes() -> None:
 
 
 def compile_voxels() -> None:
-    """Compile what it takes from points to supervoxels, less most of the orientation."""
+    """Compile what it takes from points to supervoxels, and half of the orientation."""
     points, grid = _step_in_voxels()
     some_blocks(points)
     spacing_law(points)
@@ -112,6 +113,7 @@ def compile_voxels() -> None:
     planes = method.planes(grid, np.zeros(3))
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
     method.supervoxel_of_point(points, grid, planes, supervoxels)
+    visibility._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
 
 
 def compile_the_rest() -> None:
