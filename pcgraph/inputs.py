@@ -197,7 +197,10 @@ def clean_cloud(
 
 
 def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64] | None:
-    """The viewpoint, (3,) or (n, 3) float64, metres: as given, the origin of an organised cloud, or None."""
+    """The viewpoint, (3,) or (n, 3) float64, metres: as given, the origin of an organised cloud, or None.
+
+    The same place for each point is one viewpoint.
+    """
     if viewpoint is not None:
         given = _numbers("viewpoint", viewpoint).astype(np.float64)
         per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
@@ -207,7 +210,8 @@ def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[n
                 f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
                 f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
             )
-        return position
+        one = position.ndim == 2 and len(position) > 0 and bool((position == position[0]).all())
+        return position[0] if one else position
     return np.zeros(3) if len(cloud.shape) == 2 else None
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clouds import two_boxes_on_a_plane
 
 import pcgraph
 from pcgraph.io.ply import encode_ply
@@ -88,6 +89,13 @@ def same(a, b):
     pairs = [(a.supervoxels, b.supervoxels), (a.tree.altitudes, b.tree.altitudes), (a.viewpoint, b.viewpoint)]
     pairs.append((a.tree.moments.centroids, b.tree.moments.centroids))
     return all(np.array_equal(first, second) for first, second in pairs)
+
+
+def test_one_viewpoint_repeated_for_each_point_is_one():
+    points, place = two_boxes_on_a_plane()[0], np.array([0.1, 0.2, -3.0])
+    assert same(
+        pcgraph.segment(points, viewpoint=np.tile(place, (len(points), 1))), pcgraph.segment(points, viewpoint=place)
+    )
 
 
 def test_a_cloud_brings_its_colours_normals_and_viewpoint():
