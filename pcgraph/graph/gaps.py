@@ -37,22 +37,24 @@ def gaps(
     Only voxels with fewer than eight around them are looked at: those at the ends of surfaces.
     """
     k = np.int64(len(nodes.size))
-    is_boundary = boundary_voxels(grid)
-    boundary = np.flatnonzero(is_boundary)
-    near = voxels_within(grid, boundary, MAX_GAP, is_boundary)
-    source, target = np.repeat(boundary, np.diff(near.indptr)), near.neighbours.astype(np.int64)
-    pairs: NDArray[np.int64] = np.stack((source, target), axis=1)
-    pairs = pairs[(pairs[:, 0] < pairs[:, 1]) & (supervoxels[pairs[:, 0]] != supervoxels[pairs[:, 1]])]
-    width = np.linalg.norm((grid.warped[pairs[:, 0]] - grid.warped[pairs[:, 1]]) / grid.size, axis=1)
-    voxel = pairs.T.ravel()  # each side of each pair
-    other = supervoxels[pairs[:, ::-1].T.ravel()].astype(np.int64)
-    own, width = supervoxels[voxel].astype(np.int64), np.tile(width, 2)
-    key = np.minimum(own, other) * k + np.maximum(own, other)
-    new = ~np.isin(key, touching[:, 0].astype(np.int64) * k + touching[:, 1])
-    voxel, own, other, width, key = voxel[new], own[new], other[new], width[new], key[new]
-    order = np.lexsort((width, other, voxel))  # of each voxel the shortest way to each other supervoxel
-    first = order[np.flatnonzero(np.diff(voxel[order] * k + other[order], prepend=-1))]
-    voxel, own, other, width, key = voxel[first], own[first], other[first], width[first], key[first]
+    boundary = np.flatnonzero(boundary_voxels(grid))
+    near = voxels_within(grid, boundary, MAX_GAP, boundary, later=True)
+    source, target = np.repeat(boundary, np.diff(near.indptr)), near.neighbours
+    key = _keys(supervoxels[source], supervoxels[target], k)
+    apart = supervoxels[source] != supervoxels[target]
+    apart[apart] = ~np.isin(key[apart], _keys(touching[:, 0], touching[:, 1], k))
+    source, target, key = source[apart], target[apart], key[apart]
+    width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / grid.size, axis=1)
+    key, width = np.tile(key, 2), np.tile(width, 2)  # each side of each pair
+    voxel, other = np.concatenate((source, target)), np.concatenate((supervoxels[target], supervoxels[source]))
+    ways = voxel * k + other
+    order = np.argsort(ways, kind="stable")
+    starts = np.flatnonzero(np.diff(ways[order], prepend=-1))
+    if len(starts):
+        width = np.minimum.reduceat(width[order], starts)  # of each voxel the shortest way to each other supervoxel
+    first = order[starts]
+    voxel, other, key = voxel[first], other[first], key[first]
+    own = supervoxels[voxel]
     keys, edge = np.unique(key, return_inverse=True)
     edges = np.stack((keys // k, keys % k), axis=1).astype(np.int32)
     facing = facing_sides(grid, normals, edges, voxel, 2 * edge + (own > other))
@@ -60,3 +62,8 @@ def gaps(
     np.minimum.at(shortest, edge, width)
     weights = np.bincount(edge, np.exp(1.0 - width), len(edges)).astype(np.float64)
     return Gaps(edges, edge_features(nodes, facing), shortest, weights)
+
+
+def _keys(a: NDArray[np.int32], b: NDArray[np.int32], k: np.int64) -> NDArray[np.int64]:
+    """One number per pair of supervoxels below k, (m,), in either order."""
+    return np.minimum(a, b).astype(np.int64) * k + np.maximum(a, b)

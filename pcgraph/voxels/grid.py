@@ -400,7 +400,12 @@ def boundary_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 
 
 def voxels_within(
-    grid: VoxelGrid, voxels: NDArray[np.int64], reach: float, among: NDArray[np.bool_] | None = None
+    grid: VoxelGrid,
+    voxels: NDArray[np.int64],
+    reach: float,
+    among: NDArray[np.int64] | None = None,
+    *,
+    later: bool = False,
 ) -> Neighbourhood:
     """The voxels whose points' mean lies within some voxel edges of that of each of m voxels, without itself.
 
@@ -410,43 +415,57 @@ def voxels_within(
     voxels : (m,) int64
         Ascending.
     reach : float, voxel edges
-    among : (v,) bool, optional
-        Which voxels may be found. Default: all.
+    among : (a,) int64, optional
+        Which voxels may be found, ascending. Default: all.
+    later : bool
+        Whether only those of larger numbers than the voxel's own are sought: each pair once.
     """
-    among = np.ones(grid.n_voxels, np.bool_) if among is None else among
     keys, pitch = cell_keys(grid.cells, grid.size)
     places, counts = grid.warped / grid.size, np.zeros(len(voxels), np.int64)
+    around = _Places(keys[voxels], places[voxels])
+    sought = _Places(keys, places) if among is None else _Places(keys[among], places[among])
     nothing: NDArray[np.int32] = np.empty(0, np.int32)
-    in_blocks(_within, len(voxels), voxels, keys, pitch, places, reach, among, counts, counts, nothing)
+    in_blocks(_within, len(voxels), around, sought, pitch, reach, later, counts, counts, nothing)
     indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     found = np.empty(indptr[-1], np.int32)
     if len(found):
-        in_blocks(_within, len(voxels), voxels, keys, pitch, places, reach, among, counts, indptr, found)
-    return Neighbourhood(indptr, found)
+        in_blocks(_within, len(voxels), around, sought, pitch, reach, later, counts, indptr, found)
+    return Neighbourhood(indptr, found if among is None else among.astype(np.int32)[found])
+
+
+class _Places(NamedTuple):
+    """Keys of voxels' cells, (n,) int64, ascending, and means of their points in voxel edges, (n, 3) float64."""
+
+    keys: NDArray[np.int64]
+    means: NDArray[np.float64]
 
 
 @kernel
 def _within(
     start: int,
     stop: int,
-    voxels: NDArray[np.int64],
-    keys: NDArray[np.int64],
+    around: _Places,
+    sought: _Places,
     pitch: tuple[int, int],
-    places: NDArray[np.float64],
     reach: float,
-    among: NDArray[np.bool_],
+    later: bool,
     counts: NDArray[np.int64],
     indptr: NDArray[np.int64],
     found: NDArray[np.int32],
 ) -> None:
     """Count the voxels around, or list them where there is room: pointers gallop along the sorted keys, one per row."""
+    keys, places = sought.keys, sought.means
     n, cells = len(keys), int(np.ceil(reach))
     rows = 2 * cells + 1
-    pointers = np.zeros(rows * rows, np.int64)
+    first_row = rows * rows // 2 if later else 0
+    pointers = np.empty(rows * rows, np.int64)
+    for row in range(rows * rows):
+        pointers[row] = 0
     for v in range(start, stop):
-        i, count = voxels[v], 0
-        for row in range(rows * rows):
-            first = keys[i] + (row // rows - cells) * pitch[0] + (row % rows - cells) * pitch[1] - cells
+        own, mean, count = around.keys[v], around.means[v], 0
+        for row in range(first_row, rows * rows):
+            middle = own + (row // rows - cells) * pitch[0] + (row % rows - cells) * pitch[1]
+            first = own + 1 if later and row == first_row else middle - cells
             at, step = pointers[row], 1
             while at + step < n and keys[at + step] < first:
                 at += step
@@ -458,10 +477,9 @@ def _within(
             if at < n and keys[at] < first:
                 at += 1
             pointers[row] = at
-            while at < n and keys[at] <= first + 2 * cells:
-                if at != i and among[at]:
-                    x, y = places[at, 0] - places[i, 0], places[at, 1] - places[i, 1]
-                    z = places[at, 2] - places[i, 2]
+            while at < n and keys[at] <= middle + cells:
+                if keys[at] != own:
+                    x, y, z = places[at, 0] - mean[0], places[at, 1] - mean[1], places[at, 2] - mean[2]
                     if x * x + y * y + z * z <= reach * reach:
                         if len(found):
                             found[indptr[v] + count] = at

@@ -109,7 +109,7 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     few = np.flatnonzero((degrees < _PIECE) & (grid.counts < _PIECE))
     if not len(few) or int(grid.counts.sum()) < _MIN_POINTS:
         return detached
-    near = voxels_within(grid, few, MAX_GAP, boundary_voxels(grid))
+    near = voxels_within(grid, few, MAX_GAP, np.flatnonzero(boundary_voxels(grid)))
     of, to = [np.repeat(few, np.diff(near.indptr))], [near.neighbours]
     for slot in range(_PIECE - 1):  # touching voxels may have centroids farther apart
         some = few[degrees[few] > slot]
