@@ -95,6 +95,27 @@ def test_a_part_of_a_charuco_board_is_enough():
     assert np.abs(view.pixels - expected).max() < 0.1
 
 
+@pytest.mark.parametrize("beside_px", [4, 6, 8])
+def test_a_corner_at_the_edge_of_the_light_is_left_out_and_no_other_moves(beside_px):
+    """The edge in its window would draw it away by pixels: it ruined two of ten rendered calibrations."""
+    cv2 = pytest.importorskip("cv2")
+    n, turn = 26, cv2.getRotationMatrix2D((160, 120), 25.0, 0.9)
+    large = cv2.resize(BOARD.image(4 * n), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    image = cv2.warpAffine(large, turn, (420, 380), borderValue=0.0)
+    image = 20 + 200 * image + np.random.default_rng(0).normal(0, 1, image.shape)
+    corners = (BOARD.points[:, :2] / BOARD.spacing_m + BOARD.margin) * n - 0.5  # OpenCV's, centres at integers
+    expected = corners @ turn[:, :2].T + turn[:, 2] + 0.5
+    whole = BOARD.find(image)
+    assert len(whole.indices) == 54
+    assert np.abs(whole.pixels - expected).max() < 0.1
+    right = int(expected[:, 0].argmax())
+    image[:, int(expected[right, 0]) + beside_px :] = 20
+    view = BOARD.find(image)
+    assert right not in view.indices
+    assert len(view.indices) >= 52
+    assert np.abs(view.pixels - expected[view.indices]).max() < 0.15
+
+
 def test_an_image_without_the_board_says_so():
     with pytest.raises(ValueError, match="Checkerboard of 9 x 6 points in the image, found none"):
         BOARD.find(np.random.default_rng(0).random((200, 300)))

@@ -45,6 +45,7 @@ ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
     "rectification": ["rectification.png", "--width", "160"],
     "segmentation": ["--width", "320"],
+    "tof_calibration": ["tof.png", "--targets", "14", "--width", "120"],
     "two_cameras": ["--width", "80"],
 }
 """Of the examples that can be had smaller."""

@@ -41,11 +41,13 @@ from rangesim.sensors.amcw import TAPS_DEG, AmcwToF
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 
 MULTIPLES = 4
-"""Of the number of taps: the orders of the wiggling that are looked for. That of square waves is left to 1.9 %."""
-ROUNDS = 4
+"""Of the number of taps: the orders of the wiggling that are looked for. Of square waves', 1.9 % is left."""
+ROUNDS = 5
 """Of weighing the targets by their noise and leaving outliers out."""
 OUTLIER = 5.0
 """Robust standard deviations of its image beyond which a reading is left out: flying pixels, light by other ways."""
+SERIES_REST = 0.02
+"""Of the wiggling, what orders beyond those of the series may leave."""
 MAX_DEVIATION = 1.0
 """Standard deviation of the correction over the noise of a reading, above which targets do not determine it."""
 BETWEEN = 1000
@@ -158,7 +160,8 @@ class ToFCalibration:
     A path length m (there and back) that a pixel reads is too long by its offset and by the sum over frequencies f and
     orders k of cosines cos(2 pi k f m / c) + sines sin(2 pi k f m / c).
 
-    rig : Rig of the camera and its lamp. sensor : AmcwToF and decoder : Decoder, whose readings these are.
+    rig : Rig of the camera and its lamp, at the world's origin. sensor : AmcwToF and decoder : Decoder, whose readings
+    these are.
     orders : of the wiggling. cosines_m, sines_m : (f, k) float64, metres of path length, by frequency and order.
     offset_m : (h, w) float64, metres of path length; NaN of pixels that saw no target.
     shortest_m, longest_m : path lengths of the targets; nothing is known beyond. noise_m : standard deviation of a path
@@ -303,9 +306,9 @@ def calibrate_tof(
 
     Parameters
     ----------
-    captures : of `AmcwToF`, all with one rig and sensor, of matte targets that light reaches by one way: walls or
-        boards at many distances. Distances that lie evenly over a period of the wiggling (c / 8 f of range for four
-        taps) or more determine it best.
+    captures : of `AmcwToF`, all with one rig (wherever it stands) and one sensor, of matte targets that light reaches
+        by one way: walls or boards at many distances. Distances that lie evenly over a period of the wiggling (c / 8 f
+        of range for four taps) or more determine it best.
     true_range_m : (h, w) each, metres from the camera centre; NaN beside the target. See `board_range`.
     decoder : of the readings; None: the sensor's own, with `correct_wiggling` off, so that nothing is presumed.
     orders : of the wiggling; None: `MULTIPLES` of the number of taps. Others come of pixels that are not linear.
@@ -384,15 +387,20 @@ def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any]) -> tuple[
             raise ValueError(f"capture {k}: expected one of AmcwToF, got one of {type(capture.sensor).__name__}.")
         if capture.rig is None:
             raise ValueError(f"capture {k}: expected a rig: its camera, and where the lamp is.")
-        if capture.sensor != sensor or capture.rig != rig:
+        if capture.sensor != sensor or _at_origin(capture.rig) != _at_origin(rig):
             raise ValueError(f"capture {k}: expected the sensor and the rig of capture 0, got another.")
         if np.shape(truth) != capture.frames.shape[1:]:
             raise ValueError(f"capture {k}: expected true ranges {capture.frames.shape[1:]}, got {np.shape(truth)}.")
         if not (np.isnan(truth) | (np.asarray(truth) > 0)).all():
             raise ValueError(f"capture {k}: expected true ranges in positive metres, or NaN beside the target.")
     assert isinstance(sensor, AmcwToF)
+    return sensor, _at_origin(rig)
+
+
+def _at_origin(rig: Rig | None) -> Rig:
+    """The rig wherever it stands: the camera may move as well as the targets."""
     assert rig is not None
-    return sensor, rig
+    return replace(rig, T_world_camera=np.eye(4))
 
 
 def _waves(sensor: AmcwToF, orders: tuple[int, ...]) -> Array:
@@ -429,7 +437,9 @@ def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
     c = 2 * len(waves)
     spread = np.ones(len(readings))
     kept = [np.ones(len(r.pixel), bool) for r in readings]
-    residuals = []
+    seen = np.zeros(n_pixels, bool)
+    for r in readings:
+        seen[r.pixel] = True
     for _ in range(ROUNDS):
         total = np.zeros(n_pixels)
         sums = np.zeros((n_pixels, c + 1))
@@ -448,13 +458,26 @@ def _fit(readings: list[_Readings], waves: Array, n_pixels: int) -> _Fit:
         inverse = (axes / np.maximum(values, ROUNDING * values[-1])) @ axes.T / np.outer(size, size)
         coefficients = inverse @ normal[:c, c]
         offset = means[:, c] - means[:, :c] @ coefficients
-        residuals = [r.off - _series(waves, r.length) @ coefficients - offset[r.pixel] for r in readings]
-        for k, residual in enumerate(residuals):
-            spread[k] = max(1.4826 * float(np.nanmedian(np.abs(residual - np.nanmedian(residual)))), 1e-9)
-            kept[k] = np.abs(residual) <= OUTLIER * spread[k]
+        over = np.full((len(readings), n_pixels), np.nan)
+        for row, r in zip(over, readings, strict=True):
+            row[r.pixel] = r.off - _series(waves, r.length) @ coefficients
+        middle = np.full(n_pixels, np.nan)  # no outlier moves a pixel's median
+        middle[seen] = np.nanmedian(over[:, seen], axis=0)
+        for k, r in enumerate(readings):
+            residual = over[k, r.pixel] - middle[r.pixel]
+            spread[k] = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
+        # what orders beyond the series' leave is no noise, and no outlier
+        wiggled = [float(np.mean(r.off - row[r.pixel])) for row, r in zip(over, readings, strict=True)]
+        rest = SERIES_REST * float(np.std(wiggled))
+        spread = np.maximum(np.hypot(spread, rest), 1e-9)
+        for k, r in enumerate(readings):
+            kept[k] = np.abs(over[k, r.pixel] - middle[r.pixel]) <= OUTLIER * spread[k]
     count = sum(int(keep.sum()) for keep in kept)
     freedom = count - int(some.sum()) - c
-    squares = [np.square(r[keep] / sigma).sum() for r, keep, sigma in zip(residuals, kept, spread, strict=True)]
+    squares = [
+        np.square((row - offset)[r.pixel][keep] / sigma).sum()
+        for row, r, keep, sigma in zip(over, readings, kept, spread, strict=True)
+    ]
     scale = float(np.sqrt(np.sum(squares) / freedom)) if freedom > 0 else np.inf
     # an offset absorbs a constant: what matters is how the correction differs from its mean over the targets
     lengths = [r.length[keep] for r, keep in zip(readings, kept, strict=True) if keep.any()]

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rangesim.cli.decode import load_frames, structured_light
+from rangesim.cli.decode import TOF_SUFFIX, load_frames, structured_light
 
 if TYPE_CHECKING:
     from rangesim.calibration import Board, RigCalibration
+    from rangesim.capture import Capture
 
 KINDS = ("checkerboard", "charuco", "circles")
 
@@ -26,7 +27,9 @@ def calibrate_command(
     ],
     points: Annotated[str, typer.Option(help="Inner corners (discs) of the board, such as 9x6.")] = ...,  # type: ignore[assignment]
     spacing: Annotated[float, typer.Option(help="Metres between neighbouring corners (discs).")] = ...,  # type: ignore[assignment]
-    out: Annotated[Path, typer.Option("--out", "-o", help="The rig: .json, or .yml, .yaml, .xml for OpenCV.")] = ...,  # type: ignore[assignment]
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The rig: .json, or .yml, .yaml, .xml for OpenCV; time of flight: .npz.")
+    ] = ...,  # type: ignore[assignment]
     board: Annotated[str, typer.Option(help="checkerboard, charuco or circles.")] = "checkerboard",
     marker: Annotated[
         float | None, typer.Option(help="Metres: a charuco marker's side, or a disc's diameter.", show_default=False)
@@ -47,23 +50,61 @@ def calibrate_command(
 
     Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good one.
 
+    Of captures by a time-of-flight camera (AMCW) whose lens is known: what its ranges are off by, to a file .npz. The
+    board should stand at twenty distances or more, large in the image.
+
     Examples:
 
       rangesim calibrate pose_*/ --points 9x6 --spacing 0.025 --projector 1280x800 --out rig.json
 
       rangesim decode scan --projector 1280x800 --calibration rig.json --out out/scan
+
+      rangesim calibrate board_*/ --points 6x5 --spacing 0.12 --out tof.npz
     """
     from rangesim.calibration import calibrate_rig
     from rangesim.calibration.opencv_files import SUFFIXES, save_opencv
     from rangesim.rig.calibration_files import save_calibration
+    from rangesim.sensors import AmcwToF
 
-    if out.suffix.lower() not in (".json", *SUFFIXES):
-        raise ValueError(f"expected --out to end in .json, {', '.join(SUFFIXES)}, got {out.name!r}.")
+    if out.suffix.lower() not in (".json", TOF_SUFFIX, *SUFFIXES):
+        raise ValueError(
+            f"expected --out to end in .json, {', '.join(SUFFIXES)}, or {TOF_SUFFIX} for time of flight, got "
+            f"{out.name!r}."
+        )
     target = _board(board, points, spacing, marker, dictionary)
     sensor = None if projector is None else structured_light(code, projector, "columns,rows", period, steps)
-    found = calibrate_rig(target, [load_frames(path, sensor, bits) for path in captures], coefficients=coefficients)
+    taken = [load_frames(path, sensor, bits) for path in captures]
+    of_tof = any(isinstance(capture.sensor, AmcwToF) for capture in taken)
+    if of_tof != (out.suffix.lower() == TOF_SUFFIX):
+        raise ValueError(
+            f"expected --out to end in {TOF_SUFFIX} for captures by time of flight, and for no others, got "
+            f"{out.name!r}."
+        )
+    if of_tof:
+        _time_of_flight(target, taken, out)
+        return
+    found = calibrate_rig(target, taken, coefficients=coefficients)
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
+    typer.echo(f"{out}: written.")
+
+
+def _time_of_flight(board: Board, captures: list[Capture], out: Path) -> None:
+    """Calibrate a time-of-flight camera and write the file."""
+    import numpy as np
+
+    from rangesim.calibration import calibrate_tof, find_board_ranges
+
+    found = calibrate_tof(captures, find_board_ranges(board, captures))
+    found.save(out)
+    lengths = np.linspace(found.shortest_m, found.longest_m, 1000)
+    unseen = 100 * float(np.isnan(found.offset_m).mean())
+    typer.echo(
+        f"wiggling {500 * np.ptp(found.wiggling_m(lengths)):.2f} mm of range from least to largest; offsets of pixels "
+        f"{500 * np.nanstd(found.offset_m):.2f} mm (standard deviation), {unseen:.1f} % of the pixels saw no board; "
+        f"noise of a reading {500 * found.noise_m:.2f} mm; ranges from {found.shortest_m / 2:.2f} to "
+        f"{found.longest_m / 2:.2f} m."
+    )
     typer.echo(f"{out}: written.")
 
 
