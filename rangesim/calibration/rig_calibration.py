@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,6 +37,20 @@ OUTLIER = 4.0
 """Robust standard deviations beyond which a decoded pixel is left out."""
 
 
+SUSPECT = 6.0
+"""Robust standard deviations of a coordinate: noise goes beyond once in 10^8 points."""
+
+
+class Suspect(NamedTuple):
+    """A point that does not fit. device : "camera" or "projector". view : of the captures. point : of
+    `Board.points`. error_px : of reprojection."""
+
+    device: str
+    view: int
+    point: int
+    error_px: float
+
+
 @dataclass(frozen=True, eq=False)
 class RigCalibration:
     """A rig, how well it is known, and where the boards were.
@@ -44,7 +59,8 @@ class RigCalibration:
     projector_deviations : (9,) standard deviations of fx, fy, cx, cy in pixels and of k1, k2, p1, p2, k3; 0 for those
     held. baseline_m, baseline_deviation_m : distance of the two centres, and its standard deviation, metres.
     T_camera_board : (k, 4, 4), metres. camera_residuals, projector_residuals : k arrays (m, 2), pixels, projected less
-    seen. camera_rms_px, projector_rms_px : root mean square of the reprojection errors, over points.
+    seen. camera_rms_px, projector_rms_px : root mean square of the reprojection errors, over points. camera_views,
+    projector_views : k BoardView, the points that were seen.
     """
 
     rig: Rig
@@ -57,6 +73,25 @@ class RigCalibration:
     projector_residuals: tuple[Array, ...]
     camera_rms_px: float
     projector_rms_px: float
+    camera_views: tuple[BoardView, ...]
+    projector_views: tuple[BoardView, ...]
+
+    @property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """Points whose error is so far beyond the others' of the device (`SUSPECT`) that they are no noise: a corner
+        taken for another, or drawn away by an edge beside it. They weigh on the result; the worst first."""
+        found = []
+        for device, residuals, views in (
+            ("camera", self.camera_residuals, self.camera_views),
+            ("projector", self.projector_residuals, self.projector_views),
+        ):
+            limit = SUSPECT * 1.4826 * float(np.median(np.abs(np.concatenate(residuals))))
+            for k, (residual, view) in enumerate(zip(residuals, views, strict=True)):
+                errors = np.linalg.norm(residual, axis=-1)
+                found += [
+                    Suspect(device, k, int(view.indices[i]), float(errors[i])) for i in np.flatnonzero(errors > limit)
+                ]
+        return tuple(sorted(found, key=lambda suspect: -suspect.error_px))
 
 
 def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> BoardView:
@@ -184,8 +219,16 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
         bundle.T_first_board,
         of_camera,
         of_projector,
-        *(float(np.sqrt((np.concatenate(some) ** 2).sum(axis=1).mean())) for some in (of_camera, of_projector)),
+        _rms(of_camera),
+        _rms(of_projector),
+        tuple(views),
+        tuple(projector_views),
     )
+
+
+def _rms(residuals: tuple[Array, ...]) -> float:
+    """Root mean square over all points."""
+    return float(np.sqrt(np.square(np.concatenate(residuals)).sum(axis=1).mean()))
 
 
 def _views(board: Board, capture: Capture) -> tuple[BoardView, BoardView]:

@@ -15,6 +15,20 @@ if TYPE_CHECKING:
     from rangesim.calibration import Board, RigCalibration
     from rangesim.capture import Capture
 
+MAX_HEAD = 4096
+"""Bytes of a file that say whose it is."""
+_OPENCV = (b"camera_matrix", b"camera_width")
+MARKS = {
+    ".json": (b'"camera"',),
+    ".yml": _OPENCV,
+    ".yaml": _OPENCV,
+    ".xml": _OPENCV,
+    ".npz": (b"cosines_m.npy",),
+    ".html": (b"Calibration of a camera and a projector",),
+}
+"""What the files of this command begin with, by suffix."""
+MAX_SUSPECTS = 5
+"""Corners that are named."""
 KINDS = ("checkerboard", "charuco", "circles")
 
 
@@ -30,6 +44,9 @@ def calibrate_command(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="The rig: .json, or .yml, .yaml, .xml for OpenCV; time of flight: .npz.")
     ] = ...,  # type: ignore[assignment]
+    report: Annotated[
+        Path | None, typer.Option(help="A page with plots of the errors, .html.", show_default=False)
+    ] = None,
     board: Annotated[str, typer.Option(help="checkerboard, charuco or circles.")] = "checkerboard",
     marker: Annotated[
         float | None, typer.Option(help="Metres: a charuco marker's side, or a disc's diameter.", show_default=False)
@@ -55,22 +72,29 @@ def calibrate_command(
 
     Examples:
 
-      rangesim calibrate pose_*/ --points 9x6 --spacing 0.025 --projector 1280x800 --out rig.json
+      rangesim calibrate pose_*/ --points 9x6 --spacing 0.025 --projector 1280x800 --out rig.json --report rig.html
 
       rangesim decode scan --projector 1280x800 --calibration rig.json --out out/scan
 
       rangesim calibrate board_*/ --points 6x5 --spacing 0.12 --out tof.npz
     """
+    from pcgraph.plain_files import write_file
     from rangesim.calibration import calibrate_rig
     from rangesim.calibration.opencv_files import SUFFIXES, save_opencv
+    from rangesim.errors import FileFormatError
+    from rangesim.report.calibration_page import render_calibration
     from rangesim.rig.calibration_files import save_calibration
     from rangesim.sensors import AmcwToF
+    from rangesim.sensors.structured_light import WHITE
 
     if out.suffix.lower() not in (".json", TOF_SUFFIX, *SUFFIXES):
         raise ValueError(
             f"expected --out to end in .json, {', '.join(SUFFIXES)}, or {TOF_SUFFIX} for time of flight, got "
             f"{out.name!r}."
         )
+    if report is not None and report.suffix.lower() != ".html":
+        raise ValueError(f"expected --report to end in .html, got {report.name!r}.")
+    check_places(out, report)
     target = _board(board, points, spacing, marker, dictionary)
     sensor = None if projector is None else structured_light(code, projector, "columns,rows", period, steps)
     taken = [load_frames(path, sensor, bits) for path in captures]
@@ -81,12 +105,43 @@ def calibrate_command(
             f"{out.name!r}."
         )
     if of_tof:
+        if report is not None:
+            raise ValueError("expected --report with structured light; there is no page for time of flight yet.")
         _time_of_flight(target, taken, out)
         return
     found = calibrate_rig(target, taken, coefficients=coefficients)
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
+    if report is not None:
+        page = render_calibration(found, [str(path) for path in captures], [c.frames[WHITE] for c in taken])
+        write_file(report, page.encode(), FileFormatError, make_parents=True)
+        typer.echo(f"{report}: written.")
     typer.echo(f"{out}: written.")
+
+
+def check_places(out: Path, report: Path | None) -> None:
+    """Refuse what could not be written, or would be lost, before anything is computed.
+
+    Raises
+    ------
+    FileFormatError
+        A place is a directory, or holds a file that is neither a calibration nor a page of this command.
+    """
+    from rangesim.errors import FileFormatError
+
+    for path in (out, *((report,) if report else ())):
+        if not path.exists():
+            continue
+        if not path.is_file():
+            raise FileFormatError(f"cannot write {path}: it exists and is no plain file; choose another path.")
+        with path.open("rb") as file:
+            start = file.read(MAX_HEAD)
+        marks = MARKS[path.suffix.lower()]
+        if start and not any(mark in start for mark in marks):
+            raise FileFormatError(
+                f"cannot write {path}: it holds something else than rangesim calibrate writes, and would be lost; "
+                "choose another path or move it."
+            )
 
 
 def _time_of_flight(board: Board, captures: list[Capture], out: Path) -> None:
@@ -146,4 +201,12 @@ def _table(found: RigCalibration, captures: list[Path]) -> str:
     lines.append("reprojection, pixels, root mean square in camera and projector:")
     for path, *both in zip(captures, found.camera_residuals, found.projector_residuals, strict=True):
         lines.append(f"  {path}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
-    return "\n".join([*lines, f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}"])
+    lines.append(f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}")
+    for suspect in found.suspects[:MAX_SUSPECTS]:
+        lines.append(
+            f"corner {suspect.point} of {captures[suspect.view]} is off by {suspect.error_px:.1f} px in the "
+            f"{suspect.device}, more than noise can explain: leave that capture out, or see --report."
+        )
+    if len(found.suspects) > MAX_SUSPECTS:
+        lines.append(f"and {len(found.suspects) - MAX_SUSPECTS} more corners.")
+    return "\n".join(lines)
