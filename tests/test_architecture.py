@@ -183,6 +183,7 @@ GEOMETRY = {
     "lines_in_first lines_in_second poses_from_essential sampson_distance seven_point",
     "two_view_triangulation": "CorrectedPixels TriangulatedPoints correct_pixels point_covariance triangulate_linear "
     "triangulate_midpoint triangulate_optimal",
+    "uncalibrated_rectification": "UncalibratedPair rectify_uncalibrated",
 }
 
 
