@@ -89,7 +89,7 @@ def adjust(start: Bundle, observations: Sequence[Observation], coefficients: int
                 R = bundle.T_second_first[:3, :3]
                 X = X @ R.T + bundle.T_second_first[:3, 3]
                 by_board, by_second = R @ by_board, _by_pose(X)
-            pixels, by_point, by_lens = _projection(device, X)
+            pixels, by_point, by_lens = projection(device, X)
             jacobian = np.zeros((len(X), 2, size))
             jacobian[:, :, seen.device * lens : (seen.device + 1) * lens] = by_lens[:, :, :lens]
             if by_second is not None:
@@ -143,7 +143,7 @@ def _by_pose(X: Array) -> Array:
     return result
 
 
-def _projection(device: Intrinsics, X: Array) -> tuple[Array, Array, Array]:
+def projection(device: Intrinsics, X: Array) -> tuple[Array, Array, Array]:
     """(m, 2) pixels of points (m, 3), and their derivatives by the point (m, 2, 3) and by the lens (m, 2, 9)."""
     x, y, inverse = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], 1.0 / X[:, 2]
     image = distort(device.coefficients, x, y)

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board, BoardView
 from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
-from rangesim.calibration.zhang import calibrate_camera, check_views, judged
+from rangesim.calibration.zhang import Suspect, check_views, find_suspects, first_camera, judged, warn_of_suspects
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.geometry.correspondences import Array
@@ -35,20 +34,6 @@ MAX_GAP = 2.8
 """Radians."""
 OUTLIER = 4.0
 """Robust standard deviations beyond which a decoded pixel is left out."""
-
-
-SUSPECT = 6.0
-"""Robust standard deviations of a coordinate: noise goes beyond once in 10^8 points."""
-
-
-class Suspect(NamedTuple):
-    """A point that does not fit. device : "camera" or "projector". view : of the captures. point : of
-    `Board.points`. error_px : of reprojection."""
-
-    device: str
-    view: int
-    point: int
-    error_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +63,12 @@ class RigCalibration:
 
     @property
     def suspects(self) -> tuple[Suspect, ...]:
-        """Points whose error is so far beyond the others' of the device (`SUSPECT`) that they are no noise: a corner
-        taken for another, or drawn away by an edge beside it. They weigh on the result; the worst first."""
-        found = []
-        for device, residuals, views in (
-            ("camera", self.camera_residuals, self.camera_views),
-            ("projector", self.projector_residuals, self.projector_views),
-        ):
-            limit = SUSPECT * 1.4826 * float(np.median(np.abs(np.concatenate(residuals))))
-            for k, (residual, view) in enumerate(zip(residuals, views, strict=True)):
-                errors = np.linalg.norm(residual, axis=-1)
-                found += [
-                    Suspect(device, k, int(view.indices[i]), float(errors[i])) for i in np.flatnonzero(errors > limit)
-                ]
-        return tuple(sorted(found, key=lambda suspect: -suspect.error_px))
+        """Points whose error is beyond all noise, the worst first; they weigh on the result."""
+        both = (
+            *find_suspects("camera", self.camera_views, self.camera_residuals),
+            *find_suspects("projector", self.projector_views, self.projector_residuals),
+        )
+        return tuple(sorted(both, key=lambda suspect: -suspect.error_px))
 
 
 def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> BoardView:
@@ -151,7 +128,9 @@ def _surrounds(offsets: Array) -> bool:
     return float(np.diff(angles, append=angles[0] + 2 * np.pi).max()) < MAX_GAP
 
 
-def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: int = 5) -> RigCalibration:
+def calibrate_rig(
+    board: Board, captures: Sequence[Capture], *, coefficients: int = 5, names: Sequence[str] | None = None
+) -> RigCalibration:
     """A camera and a projector from structured light on a board, each capture with the board in another pose.
 
     The corners are found in the white frames, the projector's coordinates decoded without a rig (whatever rig a capture
@@ -162,41 +141,49 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
     ----------
     captures : three or more, of `StructuredLight` with columns and rows.
     coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for pinholes.
+    names : of the captures, for messages; None: their numbers.
+
+    Warns of points that do not fit (`RigCalibration.suspects`), and of a lens that is unknown in a corner of its image,
+    or folds there.
 
     Raises
     ------
     ValueError
-        A capture of another sensor or size; a board that is not found (which one, is said); fewer than three; or views
-        that do not determine the rig.
+        A capture of another sensor or size; a board that is not found (which one, is said); fewer than three; one
+        twice; or views that do not determine the rig.
     """
+    names = [f"capture {k}" for k in range(len(captures))] if names is None else [str(name) for name in names]
+    if len(names) != len(captures):
+        raise ValueError(f"expected a name for each of the {len(captures)} captures, got {len(names)}.")
     views, projector_views = [], []
-    for k, capture in enumerate(captures):
+    for name, capture in zip(names, captures, strict=True):
         try:
             view, seen = _views(board, capture)
         except ValueError as error:
-            raise ValueError(f"capture {k}: {error}") from error
+            raise ValueError(f"{name}: {error}") from error
         if capture.frames.shape != captures[0].frames.shape or capture.sensor != captures[0].sensor:
-            raise ValueError(f"capture {k}: expected the sensor and the size of capture 0, got another.")
+            raise ValueError(
+                f"{name}: expected the sensor and the size of {names[0]}, {_kind(captures[0])}, got {_kind(capture)}."
+            )
         views.append(view)
         projector_views.append(seen)
-    check_views(board, views, coefficients)
+    check_views(board, views, coefficients, names)
     sensor = captures[0].sensor
     assert isinstance(sensor, StructuredLight)
     height, width = captures[0].frames.shape[1:]
-    camera = calibrate_camera(board, views, width, height, coefficients=coefficients)
-    projector = calibrate_camera(
-        board, projector_views, sensor.projector_width, sensor.projector_height, coefficients=coefficients
-    )
+    camera, T_camera_board, camera_noise = first_camera(board, views, width, height, coefficients, names)
+    size = sensor.projector_width, sensor.projector_height
+    projector, T_projector_board, projector_noise = first_camera(board, projector_views, *size, coefficients, names)
     observations = [
-        Observation(device, k, board.points[view.indices], view.pixels, alone.noise_px)
-        for device, alone, some in ((0, camera, views), (1, projector, projector_views))
+        Observation(device, k, board.points[view.indices], view.pixels, noise)
+        for device, noise, some in ((0, camera_noise, views), (1, projector_noise, projector_views))
         for k, view in enumerate(some)
     ]
-    between = projector.T_camera_board @ np.linalg.inv(camera.T_camera_board)
+    between = T_projector_board @ np.linalg.inv(T_camera_board)
     T = np.eye(4)
     T[:3, :3] = Rotation.from_matrix(between[:, :3, :3]).mean().as_matrix()
     T[:3, 3] = np.median(between[:, :3, 3], axis=0)
-    start = Bundle((camera.camera, projector.camera), T, camera.T_camera_board)
+    start = Bundle((camera, projector), T, T_camera_board)
     found = adjust(start, observations, coefficients)
     _, deviations = judged(found, observations)
     bundle, lens = found.state, 4 + coefficients
@@ -210,7 +197,7 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
     of_camera, of_projector = tuple(residuals[: len(views)]), tuple(residuals[len(views) :])
     by_device = np.zeros((2, LENS))
     by_device[:, :lens] = deviations[: 2 * lens].reshape(2, lens)
-    return RigCalibration(
+    result = RigCalibration(
         Rig(camera_found, projector_found, T_camera_projector=np.linalg.inv(bundle.T_second_first)),
         by_device[0],
         by_device[1],
@@ -224,6 +211,13 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
         tuple(views),
         tuple(projector_views),
     )
+    warn_of_suspects(result.suspects, names)
+    return result
+
+
+def _kind(capture: Capture) -> str:
+    """Sensor and size of a capture, for messages."""
+    return f"{capture.sensor.details} of {capture.frames.shape[2]} x {capture.frames.shape[1]} pixels"
 
 
 def _rms(residuals: tuple[Array, ...]) -> float:

@@ -12,8 +12,11 @@ import typer
 from rangesim.cli.decode import TOF_SUFFIX, load_frames, structured_light
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from rangesim.calibration import Board, RigCalibration
     from rangesim.capture import Capture
+    from rangesim.rig import Intrinsics
 
 MAX_HEAD = 4096
 """Bytes of a file that say whose it is."""
@@ -27,8 +30,6 @@ MARKS = {
     ".html": (b"Calibration of a camera and a projector",),
 }
 """What the files of this command begin with, by suffix."""
-MAX_SUSPECTS = 5
-"""Corners that are named."""
 KINDS = ("checkerboard", "charuco", "circles")
 
 
@@ -36,7 +37,8 @@ def calibrate_command(
     captures: Annotated[
         list[Path],
         typer.Argument(
-            help="Three or more, each a capture that rangesim wrote or a folder of images.", show_default=False
+            help="Three or more, each a capture that rangesim wrote or a folder of images; images, for a camera alone.",
+            show_default=False,
         ),
     ],
     points: Annotated[str, typer.Option(help="Inner corners (discs) of the board, such as 9x6.")] = ...,  # type: ignore[assignment]
@@ -76,6 +78,8 @@ def calibrate_command(
 
       rangesim decode scan --projector 1280x800 --calibration rig.json --out out/scan
 
+      rangesim calibrate photos/*.jpg --points 9x6 --spacing 0.025 --out camera.yml
+
       rangesim calibrate board_*/ --points 6x5 --spacing 0.12 --out tof.npz
     """
     from pcgraph.plain_files import write_file
@@ -96,6 +100,9 @@ def calibrate_command(
         raise ValueError(f"expected --report to end in .html, got {report.name!r}.")
     check_places(out, report)
     target = _board(board, points, spacing, marker, dictionary)
+    if any(path.is_file() for path in captures):
+        _camera_alone(target, captures, out, coefficients, projector, report)
+        return
     sensor = None if projector is None else structured_light(code, projector, "columns,rows", period, steps)
     taken = [load_frames(path, sensor, bits) for path in captures]
     of_tof = any(isinstance(capture.sensor, AmcwToF) for capture in taken)
@@ -109,7 +116,7 @@ def calibrate_command(
             raise ValueError("expected --report with structured light; there is no page for time of flight yet.")
         _time_of_flight(target, taken, out)
         return
-    found = calibrate_rig(target, taken, coefficients=coefficients)
+    found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
     if report is not None:
@@ -142,6 +149,45 @@ def check_places(out: Path, report: Path | None) -> None:
                 f"cannot write {path}: it holds something else than rangesim calibrate writes, and would be lost; "
                 "choose another path or move it."
             )
+
+
+def _camera_alone(
+    board: Board, images: list[Path], out: Path, coefficients: int, projector: str | None, report: Path | None
+) -> None:
+    """Calibrate a camera from images of the board, one for each pose, and write the file."""
+    from rangesim.calibration import calibrate_camera
+    from rangesim.calibration.opencv_files import SUFFIXES, save_opencv_camera
+    from rangesim.files.image_files import read_grey
+
+    if projector is not None or report is not None:
+        raise ValueError("expected folders of images with --projector and --report; images are of a camera alone.")
+    if out.suffix.lower() not in SUFFIXES:
+        raise ValueError(
+            f"expected --out to end in {', '.join(SUFFIXES)} for a camera alone, got {out.name!r}; for camera and "
+            "projector give a folder of images for each pose."
+        )
+    views, sizes = [], []
+    for path in images:
+        image = read_grey(path)
+        sizes.append(image.shape)
+        if image.shape != sizes[0]:
+            raise ValueError(
+                f"{path}: expected the size of {images[0]}, {sizes[0][1]} x {sizes[0][0]}, got {image.shape[1]} x "
+                f"{image.shape[0]}."
+            )
+        try:
+            views.append(board.find(image))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+    height, width = sizes[0]
+    found = calibrate_camera(
+        board, views, width, height, coefficients=coefficients, names=[str(path) for path in images]
+    )
+    save_opencv_camera(found.camera, out)
+    lines = [_device_line("camera", found.camera, found.deviations), "reprojection, pixels, root mean square:"]
+    for path, residual in zip(images, found.residuals, strict=True):
+        lines.append(f"  {path}  {(residual**2).sum(axis=1).mean() ** 0.5:.3f}")
+    typer.echo("\n".join([*lines, f"  all  {found.rms_px:.3f}", f"{out}: written."]))
 
 
 def _time_of_flight(board: Board, captures: list[Capture], out: Path) -> None:
@@ -193,20 +239,17 @@ def _table(found: RigCalibration, captures: list[Path]) -> str:
         ("camera", found.rig.camera, found.camera_deviations),
         ("projector", found.rig.projector, found.projector_deviations),
     ):
-        values = (device.fx, device.fy, device.cx, device.cy, *device.coefficients)
-        labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-        shown = (f"{a} {v:.6g} ± {d:.2g}" for a, v, d in zip(labels, values, deviations, strict=True))
-        lines.append(f"{name:10s}{', '.join(shown)}")
+        lines.append(_device_line(name, device, deviations))
     lines.append(f"{'baseline':10s}{1e3 * found.baseline_m:.4f} ± {1e3 * found.baseline_deviation_m:.2g} mm")
     lines.append("reprojection, pixels, root mean square in camera and projector:")
     for path, *both in zip(captures, found.camera_residuals, found.projector_residuals, strict=True):
         lines.append(f"  {path}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
     lines.append(f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}")
-    for suspect in found.suspects[:MAX_SUSPECTS]:
-        lines.append(
-            f"corner {suspect.point} of {captures[suspect.view]} is off by {suspect.error_px:.1f} px in the "
-            f"{suspect.device}, more than noise can explain: leave that capture out, or see --report."
-        )
-    if len(found.suspects) > MAX_SUSPECTS:
-        lines.append(f"and {len(found.suspects) - MAX_SUSPECTS} more corners.")
     return "\n".join(lines)
+
+
+def _device_line(name: str, device: Intrinsics, deviations: np.ndarray) -> str:
+    values = (device.fx, device.fy, device.cx, device.cy, *device.coefficients)
+    labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    shown = (f"{a} {v:.6g} ± {d:.2g}" for a, v, d in zip(labels, values, deviations, strict=True))
+    return f"{name:10s}{', '.join(shown)}"

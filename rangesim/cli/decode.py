@@ -48,7 +48,10 @@ def decode_command(
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Calibration: .json (time of flight: .npz) of rangesim, or .xml of procam-calibration."),
+        typer.Option(
+            help="Calibration: what rangesim calibrate wrote (.json, .yml, .xml; time of flight: .npz), or .xml of "
+            "procam-calibration."
+        ),
     ] = None,
 ) -> None:
     """Decode a capture. Needs no scene and no renderer.
@@ -145,8 +148,22 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
     """The capture with the rig of a calibration file."""
     from rangesim.rig.calibration_files import load_calibration
 
+    if _is_opencv(calibration):
+        from rangesim.calibration.opencv_files import load_opencv
+
+        return replace(capture, rig=load_opencv(calibration))
     size = capture.sensor.emitter.size
     return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
+
+
+def _is_opencv(calibration: Path) -> bool:
+    """Whether a file is one that `rangesim calibrate` writes for OpenCV; another .xml is procam-calibration's."""
+    from pcgraph.plain_files import read_file
+    from rangesim.errors import FileFormatError
+
+    if calibration.suffix.lower() in (".yml", ".yaml"):
+        return True
+    return calibration.suffix.lower() == ".xml" and b"camera_matrix" in read_file(calibration, FileFormatError)
 
 
 def _calibrated_tof(capture: Capture, calibration: Path) -> RangeImage:
