@@ -528,6 +528,7 @@ def test_the_command_calibrates_a_camera_from_photographs(rendered, tmp_path, ca
         (["--board", "charco"], "did you mean 'charuco'"),
         (["--board", "circles"], "--marker METRES"),
         (["--marker", "0.02"], "a checkerboard has none"),
+        (["--spacing", "25"], "--spacing in metres"),
         (["--out", "rig.txt"], "end in .json"),
     ],
 )

@@ -117,9 +117,10 @@ def test_names_and_images_of_each_capture_are_needed():
 def test_a_file_of_the_users_is_not_replaced(tmp_path: Path, name: str):
     place = tmp_path / name
     check_places(place, None)
-    place.write_text("my notes of ten years")
-    with pytest.raises(FileFormatError, match="would be lost"):
-        check_places(place, None)
+    for mine in ("my notes of ten years", '{"camera": "mine"}', "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n"):
+        place.write_text(mine)
+        with pytest.raises(FileFormatError, match="would be lost"):
+            check_places(place, None)
     place.unlink()
     place.mkdir()
     with pytest.raises(FileFormatError, match="no plain file"):

@@ -129,11 +129,11 @@ def board_range(board: Board, camera: Intrinsics, T_camera_board: ArrayLike) -> 
     return np.asarray(np.where(inside, distance, np.nan))
 
 
-def find_board_ranges(board: Board, captures: Sequence[Capture]) -> list[Array]:
+def find_board_ranges(board: Board, captures: Sequence[Capture], names: Sequence[str] | None = None) -> list[Array]:
     """(h, w) metres to the board, NaN beside it, for each capture by a calibrated camera.
 
     The board is found in the mean of the frames, and its pose from its corners and the camera of the capture's rig: no
-    stage that moves it is needed.
+    stage that moves it is needed. `names` of the captures go into messages; None: their numbers.
 
     Raises
     ------
@@ -141,14 +141,14 @@ def find_board_ranges(board: Board, captures: Sequence[Capture]) -> list[Array]:
         A capture has no rig, or no board is found in it (which one, is said).
     """
     ranges = []
-    for k, capture in enumerate(captures):
+    for name, capture in zip(_named(names, len(captures)), captures, strict=True):
         if capture.rig is None:
-            raise ValueError(f"capture {k}: expected a rig with the calibrated camera, got none.")
+            raise ValueError(f"{name}: expected a rig with the calibrated camera, got none.")
         try:
             view = board.find(capture.frames.mean(axis=0))
             found = fit_camera_pose(board.points[view.indices], view.pixels, capture.rig.camera)
         except ValueError as error:
-            raise ValueError(f"capture {k}: {error}") from error
+            raise ValueError(f"{name}: {error}") from error
         ranges.append(board_range(board, capture.rig.camera, found.T_camera_object))
     return ranges
 
@@ -298,6 +298,7 @@ def calibrate_tof(
     *,
     decoder: Decoder | None = None,
     orders: tuple[int, ...] | None = None,
+    names: Sequence[str] | None = None,
 ) -> ToFCalibration:
     """Wiggling and offsets of a camera, from captures of targets whose range is known.
 
@@ -312,6 +313,7 @@ def calibrate_tof(
     true_range_m : (h, w) each, metres from the camera centre; NaN beside the target. See `board_range`.
     decoder : of the readings; None: the sensor's own, with `correct_wiggling` off, so that nothing is presumed.
     orders : of the wiggling; None: `MULTIPLES` of the number of taps. Others come of pixels that are not linear.
+    names : of the captures, for messages; None: their numbers.
 
     Raises
     ------
@@ -319,7 +321,8 @@ def calibrate_tof(
         Captures of another sensor, without a rig, or with different ones; ranges of another shape; or targets that
         leave the correction open: too few, or all at nearly one distance.
     """
-    sensor, rig = _checked(captures, true_range_m)
+    names = _named(names, len(captures))
+    sensor, rig = _checked(captures, true_range_m, names)
     if decoder is None:
         decoder = replace(sensor.default_decoder, correct_wiggling=False)
     if orders is None:
@@ -332,12 +335,12 @@ def calibrate_tof(
         image = decoder.decode(capture)
         seen = image.valid & np.isfinite(truth)
         if not seen.any():
-            raise ValueError(f"capture {k}: expected readings on the target, got none; is it lit, and in range?")
+            raise ValueError(f"{names[k]}: expected readings on the target, got none; is it lit, and in range?")
         read = path_length(image.range_m[seen], rays[seen], rig)
         true = path_length(np.asarray(truth)[seen], rays[seen], rig)
-        if np.median(np.abs(read - true)) > SPEED_OF_LIGHT / (2 * max(sensor.modulation_hz)):
+        if np.median(np.abs(read - true)) > sensor.searched_m / 2:
             raise ValueError(
-                f"capture {k}: expected readings within half a period of the highest frequency of the true range, got "
+                f"{names[k]}: expected readings near the true range, got "
                 f"{np.median(image.range_m[seen]):.3g} m of {np.median(np.asarray(truth)[seen]):.3g} m; leave out "
                 f"targets beyond the {sensor.unambiguous_range_m:.3g} m up to which the camera is unambiguous, and "
                 "check that its rig is the one that took them."
@@ -375,7 +378,14 @@ class _Readings:
     off: Array
 
 
-def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any]) -> tuple[AmcwToF, Rig]:
+def _named(names: Sequence[str] | None, n: int) -> list[str]:
+    result = [f"capture {k}" for k in range(n)] if names is None else [str(name) for name in names]
+    if len(result) != n:
+        raise ValueError(f"expected a name for each of the {n} captures, got {len(result)}.")
+    return result
+
+
+def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any], names: Sequence[str]) -> tuple[AmcwToF, Rig]:
     if len(captures) < 2 or len(captures) != len(true_range_m):
         raise ValueError(
             f"expected captures of two or more targets and the range of each, got {len(captures)} and "
@@ -384,15 +394,15 @@ def _checked(captures: Sequence[Capture], true_range_m: Sequence[Any]) -> tuple[
     sensor, rig = captures[0].sensor, captures[0].rig
     for k, (capture, truth) in enumerate(zip(captures, true_range_m, strict=True)):
         if not isinstance(capture.sensor, AmcwToF):
-            raise ValueError(f"capture {k}: expected one of AmcwToF, got one of {type(capture.sensor).__name__}.")
+            raise ValueError(f"{names[k]}: expected one of AmcwToF, got one of {type(capture.sensor).__name__}.")
         if capture.rig is None:
-            raise ValueError(f"capture {k}: expected a rig: its camera, and where the lamp is.")
+            raise ValueError(f"{names[k]}: expected a rig: its camera, and where the lamp is.")
         if capture.sensor != sensor or _at_origin(capture.rig) != _at_origin(rig):
-            raise ValueError(f"capture {k}: expected the sensor and the rig of capture 0, got another.")
+            raise ValueError(f"{names[k]}: expected the sensor and the rig of {names[0]}, got another.")
         if np.shape(truth) != capture.frames.shape[1:]:
-            raise ValueError(f"capture {k}: expected true ranges {capture.frames.shape[1:]}, got {np.shape(truth)}.")
+            raise ValueError(f"{names[k]}: expected true ranges {capture.frames.shape[1:]}, got {np.shape(truth)}.")
         if not (np.isnan(truth) | (np.asarray(truth) > 0)).all():
-            raise ValueError(f"capture {k}: expected true ranges in positive metres, or NaN beside the target.")
+            raise ValueError(f"{names[k]}: expected true ranges in positive metres, or NaN beside the target.")
     assert isinstance(sensor, AmcwToF)
     return sensor, _at_origin(rig)
 

@@ -20,16 +20,18 @@ if TYPE_CHECKING:
 
 MAX_HEAD = 4096
 """Bytes of a file that say whose it is."""
-_OPENCV = (b"camera_matrix", b"camera_width")
+_OPENCV = (b"camera_width", b"camera_matrix")
 MARKS = {
-    ".json": (b'"camera"',),
+    ".json": (b'"camera"', b'"projector"', b'"fx"'),
     ".yml": _OPENCV,
     ".yaml": _OPENCV,
     ".xml": _OPENCV,
     ".npz": (b"cosines_m.npy",),
     ".html": (b"Calibration of a camera and a projector",),
 }
-"""What the files of this command begin with, by suffix."""
+"""What the files of this command have in their beginning, by suffix."""
+MAX_BOARD_M = 20.0
+"""Larger boards are taken for millimetres."""
 KINDS = ("checkerboard", "charuco", "circles")
 
 
@@ -114,7 +116,7 @@ def calibrate_command(
     if of_tof:
         if report is not None:
             raise ValueError("expected --report with structured light; there is no page for time of flight yet.")
-        _time_of_flight(target, taken, out)
+        _time_of_flight(target, taken, [str(path) for path in captures], out)
         return
     found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
@@ -144,7 +146,7 @@ def check_places(out: Path, report: Path | None) -> None:
         with path.open("rb") as file:
             start = file.read(MAX_HEAD)
         marks = MARKS[path.suffix.lower()]
-        if start and not any(mark in start for mark in marks):
+        if start and not all(mark in start for mark in marks):
             raise FileFormatError(
                 f"cannot write {path}: it holds something else than rangesim calibrate writes, and would be lost; "
                 "choose another path or move it."
@@ -190,13 +192,13 @@ def _camera_alone(
     typer.echo("\n".join([*lines, f"  all  {found.rms_px:.3f}", f"{out}: written."]))
 
 
-def _time_of_flight(board: Board, captures: list[Capture], out: Path) -> None:
+def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out: Path) -> None:
     """Calibrate a time-of-flight camera and write the file."""
     import numpy as np
 
     from rangesim.calibration import calibrate_tof, find_board_ranges
 
-    found = calibrate_tof(captures, find_board_ranges(board, captures))
+    found = calibrate_tof(captures, find_board_ranges(board, captures, names), names=names)
     found.save(out)
     lengths = np.linspace(found.shortest_m, found.longest_m, 1000)
     unseen = 100 * float(np.isnan(found.offset_m).mean())
@@ -219,6 +221,11 @@ def _board(kind: str, points: str, spacing: float, marker: float | None, diction
     if kind not in KINDS:
         raise ValueError(f"expected --board out of {', '.join(KINDS)}, got {kind!r}{nearest(kind, KINDS)}.")
     columns, rows = int(size[1]), int(size[2])
+    if spacing * max(columns, rows) > MAX_BOARD_M:
+        raise ValueError(
+            f"expected --spacing in metres, got {spacing:g}, which makes the board {spacing * max(columns, rows):g} m "
+            "large; 25 mm are 0.025."
+        )
     if kind == "checkerboard":
         if marker is not None:
             raise ValueError("expected --marker with --board charuco or circles alone; a checkerboard has none.")
