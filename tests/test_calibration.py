@@ -22,6 +22,7 @@ from rangesim.calibration import (
     calibrate_rig,
     intrinsics_from_homographies,
 )
+from rangesim.calibration.suspects import find_suspects
 from rangesim.capture.capture_files import import_capture
 from rangesim.rig import Intrinsics
 from rangesim.rig.calibration_files import load_calibration
@@ -365,6 +366,28 @@ def test_a_rendered_rig_is_calibrated_to_what_it_says(rendered):
     assert found.camera_rms_px < 0.1
     assert found.projector_rms_px < 0.2
     assert np.abs(found.rig.T_camera_projector[:3, :3] - rig.T_camera_projector[:3, :3]).max() < 5e-3
+
+
+def test_a_board_that_moved_while_it_was_taken_is_named_and_no_other(rendered):
+    """It bends the rig until other captures have errors as well."""
+    _, rig = rendered
+    rng = np.random.default_rng(7)
+    T = poses(9, rng, rig.camera, tilt=35.0)
+    T_projector_camera = np.linalg.inv(rig.T_camera_projector)
+    between = Bundle((rig.camera, rig.projector), T_projector_camera, T)
+    observations = [Observation(d, k, BOARD.points, np.zeros((54, 2))) for d in (0, 1) for k in range(9)]
+    noisy = [replace(o, pixels=between.project(o) + rng.normal(0, 0.05, (54, 2))) for o in observations]
+    noisy[9 + 4] = replace(noisy[9 + 4], pixels=noisy[9 + 4].pixels + np.array([0.0, 3.0]))
+    found = adjust(between, noisy, 2)
+    seen = [BoardView(np.arange(54), o.pixels) for o in noisy]
+    suspects = find_suspects(found.state, noisy, seen, 1.0, 2)
+    assert {s.view for s in suspects} == {4}
+    off = [np.linalg.norm(found.state.project(o) - o.pixels, axis=-1).max() for o in noisy]
+    assert sorted(off)[-3] > 0.3  # by least squares others have errors too
+    clean = [o for o in noisy if o.view != 4]
+    renumbered = [replace(o, view=o.view - (o.view > 4)) for o in clean]
+    good = adjust(replace(between, T_first_board=np.delete(T, 4, axis=0)), renumbered, 2)
+    assert find_suspects(good.state, renumbered, [s for k, s in enumerate(seen) if k % 9 != 4], 1.0, 2) == ()
 
 
 def test_a_capture_that_does_not_do_is_named(rendered):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rangesim.calibration.rig_calibration import RigCalibration as RigCalibration
     from rangesim.calibration.rig_calibration import calibrate_rig as calibrate_rig
     from rangesim.calibration.rig_calibration import projector_view as projector_view
+    from rangesim.calibration.suspects import Suspect as Suspect
     from rangesim.calibration.time_of_flight import ToFCalibration as ToFCalibration
     from rangesim.calibration.time_of_flight import board_range as board_range
     from rangesim.calibration.time_of_flight import calibrate_tof as calibrate_tof
@@ -40,6 +41,7 @@ else:
             "bundle": ["Bundle", "Observation", "adjust"],
             "rendered": ["RenderedSet", "default_rig", "render_set"],
             "rig_calibration": ["RigCalibration", "calibrate_rig", "projector_view"],
+            "suspects": ["Suspect"],
             "time_of_flight": [
                 "ToFCalibration",
                 "board_range",

@@ -24,6 +24,8 @@ LENS = 9
 POSE = 6
 """Of a pose: a rotation vector applied after the rotation, and a translation."""
 
+REWEIGHTINGS = 8
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
@@ -112,6 +114,23 @@ def adjust(start: Bundle, observations: Sequence[Observation], coefficients: int
         return Bundle(devices, second, np.stack(poses))
 
     return minimise(residuals, step, start)
+
+
+def reweighted(start: Bundle, observations: Sequence[Observation], coefficients: int) -> Bundle:
+    """The bundle when each view of each device is weighed by its own scatter, again and again.
+
+    One view that contradicts the others bends the solution of least squares until all have errors; here it is left
+    with them, so that it can be told which it is.
+    """
+    bundle = start
+    for _ in range(REWEIGHTINGS):
+        scatter = np.array([np.sqrt(np.square(bundle.project(o) - o.pixels).mean()) for o in observations])
+        for device in range(len(start.devices)):
+            of_device = np.array([o.device == device for o in observations])
+            scatter[of_device] = np.maximum(scatter[of_device], np.median(scatter[of_device]))
+        weighed = [replace(o, noise_px=max(float(s), 1e-9)) for o, s in zip(observations, scatter, strict=True)]
+        bundle = adjust(bundle, weighed, coefficients).state
+    return bundle
 
 
 def _complete(device: Intrinsics) -> Intrinsics:

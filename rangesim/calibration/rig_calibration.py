@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board, BoardView
 from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
-from rangesim.calibration.zhang import Suspect, check_views, find_suspects, first_camera, judged, warn_of_suspects
+from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
+from rangesim.calibration.zhang import check_views, first_camera, judged
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.geometry.correspondences import Array
@@ -45,7 +46,8 @@ class RigCalibration:
     held. baseline_m, baseline_deviation_m : distance of the two centres, and its standard deviation, metres.
     T_camera_board : (k, 4, 4), metres. camera_residuals, projector_residuals : k arrays (m, 2), pixels, projected less
     seen. camera_rms_px, projector_rms_px : root mean square of the reprojection errors, over points. camera_views,
-    projector_views : k BoardView, the points that were seen.
+    projector_views : k BoardView, the points that were seen. suspects : points whose error is beyond all noise, the
+    worst first, when each view is weighed by its own scatter; they weigh on the result.
     """
 
     rig: Rig
@@ -60,15 +62,7 @@ class RigCalibration:
     projector_rms_px: float
     camera_views: tuple[BoardView, ...]
     projector_views: tuple[BoardView, ...]
-
-    @property
-    def suspects(self) -> tuple[Suspect, ...]:
-        """Points whose error is beyond all noise, the worst first; they weigh on the result."""
-        both = (
-            *find_suspects("camera", self.camera_views, self.camera_residuals),
-            *find_suspects("projector", self.projector_views, self.projector_residuals),
-        )
-        return tuple(sorted(both, key=lambda suspect: -suspect.error_px))
+    suspects: tuple[Suspect, ...] = ()
 
 
 def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> BoardView:
@@ -197,7 +191,11 @@ def calibrate_rig(
     of_camera, of_projector = tuple(residuals[: len(views)]), tuple(residuals[len(views) :])
     by_device = np.zeros((2, LENS))
     by_device[:, :lens] = deviations[: 2 * lens].reshape(2, lens)
-    result = RigCalibration(
+    suspects = find_suspects(
+        bundle, observations, [*views, *projector_views], found.noise(found.jacobian.shape[1]), coefficients
+    )
+    warn_of_suspects(suspects, names)
+    return RigCalibration(
         Rig(camera_found, projector_found, T_camera_projector=np.linalg.inv(bundle.T_second_first)),
         by_device[0],
         by_device[1],
@@ -210,9 +208,8 @@ def calibrate_rig(
         _rms(of_projector),
         tuple(views),
         tuple(projector_views),
+        suspects,
     )
-    warn_of_suspects(result.suspects, names)
-    return result
 
 
 def _kind(capture: Capture) -> str:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim.calibration.boards import Board, BoardView
 from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust, projection
+from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
 from rangesim.errors import warn
 from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, checked_array, unit_norm
@@ -35,18 +35,6 @@ MAX_CORNER_PX = 5.0
 """Standard deviation of where a ray meets a corner of the image, above which the lens counts as unknown there."""
 BORDER_POINTS = 9
 """Along each side of an image, whose rays must exist."""
-SUSPECT = 6.0
-"""Robust standard deviations of a coordinate: noise goes beyond once in 10^8 points."""
-
-
-class Suspect(NamedTuple):
-    """A point that does not fit. device : "camera" or "projector". view : its number. point : of `Board.points`.
-    error_px : of reprojection."""
-
-    device: str
-    view: int
-    point: int
-    error_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +133,10 @@ def calibrate_camera(
     names = [f"view {k}" for k in range(len(views))] if names is None else [str(name) for name in names]
     if len(names) != len(views):
         raise ValueError(f"expected a name for each of the {len(views)} views, got {len(names)}.")
-    found, noise, deviations, residuals = _calibrated(board, views, width, height, coefficients, names)
-    suspects = find_suspects("camera", views, residuals)
+    found, observations, noise, deviations = _calibrated(board, views, width, height, coefficients, names)
+    suspects = find_suspects(found.state, observations, views, 1.0, coefficients)
     warn_of_suspects(suspects, names)
+    residuals = tuple(found.state.project(seen) - seen.pixels for seen in observations)
     everywhere = np.concatenate(residuals)
     lens = np.zeros(LENS)
     lens[: 4 + coefficients] = deviations[: 4 + coefficients]
@@ -166,7 +155,7 @@ def first_camera(
     board: Board, views: Sequence[BoardView], width: int, height: int, coefficients: int, names: Sequence[str]
 ) -> tuple[Intrinsics, Array, float]:
     """Camera, poses (k, 4, 4) of the boards and noise of a coordinate, to start a bundle of several devices from."""
-    found, noise, _, _ = _calibrated(board, views, width, height, coefficients, names, says=False)
+    found, _, noise, _ = _calibrated(board, views, width, height, coefficients, names, says=False)
     return found.state.devices[0], found.state.T_first_board, noise
 
 
@@ -178,8 +167,8 @@ def _calibrated(
     coefficients: int,
     names: Sequence[str],
     says: bool = True,
-) -> tuple[Minimum[Bundle], float, Array, tuple[Array, ...]]:
-    """The bundle of one camera, its noise, deviations and residuals."""
+) -> tuple[Minimum[Bundle], list[Observation], float, Array]:
+    """The bundle of one camera, what it rests on, its noise and deviations."""
     check_views(board, views, coefficients, names)
     homographies = []
     for k, view in enumerate(views):
@@ -198,30 +187,7 @@ def _calibrated(
     observations = [Observation(0, k, board.points[view.indices], view.pixels) for k, view in enumerate(views)]
     found = adjust(Bundle((start,), np.eye(4), board_poses(start, observations)), observations, coefficients)
     noise, deviations = judged(found, observations, says)
-    return found, noise, deviations, tuple(found.state.project(seen) - seen.pixels for seen in observations)
-
-
-def find_suspects(device: str, views: Sequence[BoardView], residuals: Sequence[Array]) -> tuple[Suspect, ...]:
-    """Points whose error is so far beyond the others' (`SUSPECT`) that it is no noise, the worst first: a corner taken
-    for another, or drawn away by an edge beside it; a board that moved; an image of another size."""
-    limit = SUSPECT * 1.4826 * float(np.median(np.abs(np.concatenate(residuals))))
-    found = []
-    for k, (residual, view) in enumerate(zip(residuals, views, strict=True)):
-        errors = np.linalg.norm(residual, axis=-1)
-        found += [Suspect(device, k, int(view.indices[i]), float(errors[i])) for i in np.flatnonzero(errors > limit)]
-    return tuple(sorted(found, key=lambda suspect: -suspect.error_px))
-
-
-def warn_of_suspects(suspects: Sequence[Suspect], names: Sequence[str]) -> None:
-    """A warning that names the worst of them, if there are any."""
-    if suspects:
-        worst = suspects[0]
-        views = sorted({suspect.view for suspect in suspects})
-        more = f" ({len(suspects)} points of {len(views)} views in all)" if len(suspects) > 1 else ""
-        warn(
-            f"point {worst.point} of {names[worst.view]} is off by {worst.error_px:.1f} px in the {worst.device}, more "
-            f"than noise can explain{more}; leave such views out."
-        )
+    return found, observations, noise, deviations
 
 
 def check_views(board: Board, views: Sequence[BoardView], coefficients: int, names: Sequence[str]) -> None:
