@@ -202,6 +202,32 @@ def test_the_public_surface_of_geometry_is_this() -> None:
         assert getattr(geometry, name).__doc__ or name.isupper()
 
 
+CALIBRATION = {
+    "boards": "Board BoardView CharucoBoard Checkerboard CircleGrid",
+    "bundle": "Bundle Observation adjust",
+    "rendered": "RenderedSet default_rig render_set",
+    "rig_calibration": "RigCalibration calibrate_rig projector_view",
+    "suspects": "Suspect",
+    "time_of_flight": "ToFCalibration board_range calibrate_tof find_board_ranges load_tof_calibration plane_range "
+    "triangle_harmonics wiggling",
+    "zhang": "CameraCalibration calibrate_camera intrinsics_from_homographies",
+}
+
+
+def test_the_public_surface_of_calibration_is_this() -> None:
+    """And type checkers see the same names."""
+    import rangesim.calibration as calibration
+
+    wanted = {n: f"rangesim.calibration.{chapter}" for chapter, names in CALIBRATION.items() for n in names.split()}
+    assert set(calibration.__all__) == set(wanted)
+    tree = ast.parse((ROOT / "rangesim" / "calibration" / "__init__.py").read_text())
+    block = next(n for n in tree.body if isinstance(n, ast.If))
+    seen = {a.asname: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names if a.asname}
+    assert seen == wanted
+    for name in wanted:
+        assert getattr(calibration, name).__doc__
+
+
 def test_geometry_loads_neither_opencv_nor_open3d_until_they_are_used() -> None:
     code = (
         "from rangesim.geometry import classify, fundamental_from_cameras, rectify, icp, eye_in_hand; "
