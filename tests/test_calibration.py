@@ -207,6 +207,27 @@ def test_coefficients_are_free_as_told():
         calibrate_camera(BOARD, views(poses(3, rng), pinhole, 0.1, rng), 640, 480, coefficients=6)
 
 
+def test_the_middles_of_discs_do_not_bend_the_camera():
+    """Centroids of the images of discs, without noise: taken for images of the middles they would."""
+    board = CircleGrid(9, 6, 0.025, 0.016)
+    rng = np.random.default_rng(8)
+    T = poses(10, rng)
+    angle = np.arange(4000) * (2 * np.pi / 4000)
+    edge = 0.5 * board.diameter_m * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    seen = []
+    for P in T:
+        x = CAMERA.project((board.points[:, None] + edge) @ P[:3, :3].T + P[:3, 3])
+        y = np.roll(x, -1, axis=1)
+        area = x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]
+        middles = ((x + y) * area[..., None]).sum(axis=1) / (3 * area.sum(axis=1))[:, None]
+        seen.append(BoardView(np.arange(54), middles))
+    found = calibrate_camera(board, seen, 640, 480)
+    assert np.abs(lens(found.camera) - lens(CAMERA))[:4].max() < 1e-3
+    assert np.abs(found.T_camera_board - T).max() < 1e-6
+    bent = calibrate_camera(Checkerboard(9, 6, 0.025), seen, 640, 480)
+    assert np.abs(lens(bent.camera) - lens(CAMERA))[:4].max() > 0.15
+
+
 def spoilt(seed, change):
     """Views of which one is changed."""
     rng = np.random.default_rng(seed)

@@ -15,11 +15,13 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangesim.rig import pose
+from rangesim.rig import Intrinsics, pose
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 Array = NDArray[np.float64]
 
+EDGE_POINTS = 64
+"""Of a disc: its polygon's centroid is the disc's to rounding, as far as a lens bends no edge within a side."""
 BLACK, WHITE = 0.05, 0.8
 """Reflectances of ink and of the board."""
 MAX_MOVE, LEAST_MOVE_PX = 8.0, 0.15
@@ -64,6 +66,11 @@ class Board(ABC):
         """(columns * rows, 3) float64, metres, board coordinates, row by row; z = 0."""
         y, x = np.mgrid[: self.rows, : self.columns].reshape(2, -1) * self.spacing_m
         return np.stack([x, y, np.zeros(len(x))], axis=-1)
+
+    def seen_points(self, camera: Intrinsics, T_camera_board: ArrayLike) -> Array:
+        """(columns * rows, 3) the places on the board that a camera takes for its points: `points`, where what is found
+        in an image has no size."""
+        return self.points
 
     @property
     @abstractmethod
@@ -264,8 +271,9 @@ class CharucoBoard(Board):
 class CircleGrid(Board):
     """A grid of discs; its points are their centres.
 
-    The centre of a disc's image is not the image of its centre: seen at a slant it lies farther off by about
-    (r / z)^2 / 2 of the tilt (Heikkilae 2000), which is left in. Corners have no such error.
+    The middle of a disc's image is not the image of its middle (Heikkilae: "Geometric camera calibration using circular
+    control points", PAMI 2000); `seen_points` says of which place it is, and calibration takes that. Corners have no
+    such error.
 
     columns, rows : discs. distance_m : between centres of neighbours. diameter_m : of a disc.
     """
@@ -287,6 +295,25 @@ class CircleGrid(Board):
     def margin(self) -> int:
         """One spacing."""
         return 1
+
+    def seen_points(self, camera: Intrinsics, T_camera_board: ArrayLike) -> Array:
+        """(columns * rows, 3) where on the board the rays through the middles of the discs' images meet it.
+
+        The middle of an image is the centroid of its area, that of a polygon of `EDGE_POINTS` on the disc's edge as the
+        lens shows it. NaN where a disc is not seen as a whole.
+        """
+        T = pose(T_camera_board, "T_camera_board")
+        angle = np.arange(EDGE_POINTS) * (2 * np.pi / EDGE_POINTS)
+        around = np.stack([np.cos(angle), np.sin(angle), np.zeros(EDGE_POINTS)], axis=-1)
+        edge = self.points[:, None] + 0.5 * self.diameter_m * around
+        image = camera.project(edge @ T[:3, :3].T + T[:3, 3])
+        about = image - image.mean(axis=1, keepdims=True)  # small numbers, for the sake of rounding
+        following = np.roll(about, -1, axis=1)
+        area = about[..., 0] * following[..., 1] - about[..., 1] * following[..., 0]
+        middle = ((about + following) * area[..., None]).sum(axis=1) / (3 * area.sum(axis=1))[:, None]
+        rays = camera.directions(middle + image.mean(axis=1))
+        X = rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None]
+        return np.asarray((X - T[:3, 3]) @ T[:3, :3])
 
     def image(self, pixels_per_spacing: int = 64) -> Array:
         """(h, w) float64, 0 ink, 1 board."""

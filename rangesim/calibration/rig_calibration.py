@@ -16,9 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board, BoardView
-from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
+from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation
 from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
-from rangesim.calibration.zhang import check_views, first_camera, judged
+from rangesim.calibration.zhang import adjust_as_seen, check_views, first_camera, judged
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.geometry.correspondences import Array
@@ -178,7 +178,8 @@ def calibrate_rig(
     T[:3, :3] = Rotation.from_matrix(between[:, :3, :3]).mean().as_matrix()
     T[:3, 3] = np.median(between[:, :3, 3], axis=0)
     start = Bundle((camera, projector), T, T_camera_board)
-    found = adjust(start, observations, coefficients)
+    every = [*views, *projector_views]
+    found, observations = adjust_as_seen(board, start, observations, every, coefficients)
     _, deviations = judged(found, observations)
     bundle, lens = found.state, 4 + coefficients
     camera_found, projector_found = bundle.devices
@@ -191,9 +192,7 @@ def calibrate_rig(
     of_camera, of_projector = tuple(residuals[: len(views)]), tuple(residuals[len(views) :])
     by_device = np.zeros((2, LENS))
     by_device[:, :lens] = deviations[: 2 * lens].reshape(2, lens)
-    suspects = find_suspects(
-        bundle, observations, [*views, *projector_views], found.noise(found.jacobian.shape[1]), coefficients
-    )
+    suspects = find_suspects(bundle, observations, every, found.noise(found.jacobian.shape[1]), coefficients)
     warn_of_suspects(suspects, names)
     return RigCalibration(
         Rig(camera_found, projector_found, T_camera_projector=np.linalg.inv(bundle.T_second_first)),

@@ -15,6 +15,8 @@ from rangesim.geometry.correspondences import Array
 
 LIMIT = 6.0
 """Robust standard deviations of a coordinate: noise goes beyond once in 10^8 points."""
+LEAST_PX = 0.1
+"""Errors below harm nobody, however little noise there is."""
 MAX_NOISE = 1.5
 """Noise of a bundle over that of its devices by themselves, above which views contradict each other."""
 DEVICES = ("camera", "projector")
@@ -57,7 +59,8 @@ def _beyond(
     found = []
     for device in {seen.device for seen in observations}:
         of_device = [k for k, seen in enumerate(observations) if seen.device == device]
-        limit = LIMIT * 1.4826 * float(np.median(np.abs(np.concatenate([residuals[k] for k in of_device]))))
+        robust = 1.4826 * float(np.median(np.abs(np.concatenate([residuals[k] for k in of_device]))))
+        limit = max(LIMIT * robust, LEAST_PX)
         for k in of_device:
             errors = np.linalg.norm(residuals[k], axis=-1)
             found += [

@@ -10,7 +10,7 @@ front), that is an error.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +33,8 @@ MAX_DEVIATION = 0.1
 """Standard deviation of a focal length, relative, above which the views do not determine it."""
 MAX_CORNER_PX = 5.0
 """Standard deviation of where a ray meets a corner of the image, above which the lens counts as unknown there."""
+AGAIN = 2
+"""Adjustments after the first, for boards whose points look as if they were elsewhere."""
 BORDER_POINTS = 9
 """Along each side of an image, whose rays must exist."""
 
@@ -185,9 +187,36 @@ def _calibrated(
     K = intrinsics_from_homographies(homographies)
     start = Intrinsics(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     observations = [Observation(0, k, board.points[view.indices], view.pixels) for k, view in enumerate(views)]
-    found = adjust(Bundle((start,), np.eye(4), board_poses(start, observations)), observations, coefficients)
+    bundle = Bundle((start,), np.eye(4), board_poses(start, observations))
+    found, observations = adjust_as_seen(board, bundle, observations, views, coefficients)
     noise, deviations = judged(found, observations, says)
     return found, observations, noise, deviations
+
+
+def adjust_as_seen(
+    board: Board, start: Bundle, observations: Sequence[Observation], views: Sequence[BoardView], coefficients: int
+) -> tuple[Minimum[Bundle], list[Observation]]:
+    """`bundle.adjust`; and again with the places that the camera takes for the board's points, once it is known.
+
+    A second device is told what the first one sees, so it sees the same places.
+
+    Parameters
+    ----------
+    views : the points of each observation.
+    """
+    found, taken = adjust(start, observations, coefficients), list(observations)
+    for _ in range(AGAIN):
+        camera = found.state.devices[0]
+        seen = [board.seen_points(camera, T) for T in found.state.T_first_board]
+        if all(np.array_equal(points, board.points) for points in seen):
+            break
+        shift = [np.nan_to_num(points - board.points) for points in seen]
+        taken = [
+            replace(o, points=o.points + shift[o.view][view.indices])
+            for o, view in zip(observations, views, strict=True)
+        ]
+        found = adjust(found.state, taken, coefficients)
+    return found, taken
 
 
 def check_views(board: Board, views: Sequence[BoardView], coefficients: int, names: Sequence[str]) -> None:
