@@ -197,7 +197,7 @@ class ToFCalibration:
         return np.asarray(_series(_waves(self.sensor, self.orders), np.asarray(length_m, np.float64)) @ coefficients)
 
     def correct(self, image: RangeImage) -> RangeImage:
-        """The range image with wiggling and offsets taken off z and range.
+        """The range image with wiggling and offsets taken off z and range: once, of an image decoded with this rig.
 
         Pixels that saw no target, and readings beyond the path lengths of the targets, are refused with
         `Status.OUT_OF_RANGE`: nothing is known of their error.
