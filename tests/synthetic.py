@@ -34,9 +34,17 @@ def plane_depth(rig: Rig, distance_m: float = 1.0, normal: tuple[float, float, f
 
 
 def signals_of_depth(
-    rig: Rig, z: np.ndarray, sensors: Sequence[Sensor], albedo: float = 0.5, ambient: float = 0.0
+    rig: Rig,
+    z: np.ndarray,
+    sensors: Sequence[Sensor],
+    albedo: float = 0.5,
+    ambient: float = 0.0,
+    delay_m: np.ndarray | float = 0.0,
 ) -> StillSignals:
-    """Signals of a matte surface at depth z (h, w), NaN for nothing, direct light only, no shadows."""
+    """Signals of a matte surface at depth z (h, w), NaN for nothing, direct light only, no shadows.
+
+    delay_m : (h, w) metres of path that the electronics of each pixel add.
+    """
     points = rig.camera.directions(rig.camera.pixel_centres()) * z[..., None]
     in_projector = (points - rig.T_camera_projector[:3, 3]) @ rig.T_camera_projector[:3, :3]
     uv = rig.projector.project(in_projector)
@@ -45,7 +53,8 @@ def signals_of_depth(
     with np.errstate(invalid="ignore"):
         visible = ((uv >= 0) & (uv <= [rig.projector.width, rig.projector.height])).all(axis=-1)
     radiance = np.where(visible, albedo / np.pi * rig.projector_irradiance / in_projector[..., 2] ** 2, 0.0)
-    path = LightPath(*(np.nan_to_num(a) * visible for a in (uv[..., 0], uv[..., 1], length)), visible)
+    seen_m = length + delay_m
+    path = LightPath(*(np.nan_to_num(a) * visible for a in (uv[..., 0], uv[..., 1], seen_m)), visible)
     responses = {r for s in sensors for r in s.responses()}
     channels = {r: _channels(r, path, radiance) for r in responses}
     zero = np.zeros(z.shape, dtype=np.float32)

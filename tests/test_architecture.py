@@ -183,6 +183,7 @@ GEOMETRY = {
     "lines_in_first lines_in_second poses_from_essential sampson_distance seven_point",
     "two_view_triangulation": "CorrectedPixels TriangulatedPoints correct_pixels point_covariance triangulate_linear "
     "triangulate_midpoint triangulate_optimal",
+    "uncalibrated_rectification": "UncalibratedPair rectify_uncalibrated",
 }
 
 
@@ -199,6 +200,32 @@ def test_the_public_surface_of_geometry_is_this() -> None:
     assert seen == wanted
     for name in wanted:
         assert getattr(geometry, name).__doc__ or name.isupper()
+
+
+CALIBRATION = {
+    "boards": "Board BoardView CharucoBoard Checkerboard CircleGrid",
+    "bundle": "Bundle Observation adjust",
+    "rendered": "RenderedSet default_rig render_set",
+    "rig_calibration": "RigCalibration calibrate_rig projector_view",
+    "suspects": "Suspect",
+    "time_of_flight": "ToFCalibration board_range calibrate_tof find_board_ranges load_tof_calibration plane_range "
+    "triangle_harmonics wiggling",
+    "zhang": "CameraCalibration calibrate_camera intrinsics_from_homographies",
+}
+
+
+def test_the_public_surface_of_calibration_is_this() -> None:
+    """And type checkers see the same names."""
+    import rangesim.calibration as calibration
+
+    wanted = {n: f"rangesim.calibration.{chapter}" for chapter, names in CALIBRATION.items() for n in names.split()}
+    assert set(calibration.__all__) == set(wanted)
+    tree = ast.parse((ROOT / "rangesim" / "calibration" / "__init__.py").read_text())
+    block = next(n for n in tree.body if isinstance(n, ast.If))
+    seen = {a.asname: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names if a.asname}
+    assert seen == wanted
+    for name in wanted:
+        assert getattr(calibration, name).__doc__
 
 
 def test_geometry_loads_neither_opencv_nor_open3d_until_they_are_used() -> None:

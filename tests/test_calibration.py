@@ -22,6 +22,7 @@ from rangesim.calibration import (
     calibrate_rig,
     intrinsics_from_homographies,
 )
+from rangesim.calibration.suspects import find_suspects
 from rangesim.capture.capture_files import import_capture
 from rangesim.rig import Intrinsics
 from rangesim.rig.calibration_files import load_calibration
@@ -95,6 +96,27 @@ def test_a_part_of_a_charuco_board_is_enough():
     assert np.abs(view.pixels - expected).max() < 0.1
 
 
+@pytest.mark.parametrize("beside_px", [4, 6, 8])
+def test_a_corner_at_the_edge_of_the_light_is_left_out_and_no_other_moves(beside_px):
+    """The edge in its window would draw it away by pixels: it ruined two of ten rendered calibrations."""
+    cv2 = pytest.importorskip("cv2")
+    n, turn = 26, cv2.getRotationMatrix2D((160, 120), 25.0, 0.9)
+    large = cv2.resize(BOARD.image(4 * n), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    image = cv2.warpAffine(large, turn, (420, 380), borderValue=0.0)
+    image = 20 + 200 * image + np.random.default_rng(0).normal(0, 1, image.shape)
+    corners = (BOARD.points[:, :2] / BOARD.spacing_m + BOARD.margin) * n - 0.5  # OpenCV's, centres at integers
+    expected = corners @ turn[:, :2].T + turn[:, 2] + 0.5
+    whole = BOARD.find(image)
+    assert len(whole.indices) == 54
+    assert np.abs(whole.pixels - expected).max() < 0.1
+    right = int(expected[:, 0].argmax())
+    image[:, int(expected[right, 0]) + beside_px :] = 20
+    view = BOARD.find(image)
+    assert right not in view.indices
+    assert len(view.indices) >= 52
+    assert np.abs(view.pixels - expected[view.indices]).max() < 0.15
+
+
 def test_an_image_without_the_board_says_so():
     with pytest.raises(ValueError, match="Checkerboard of 9 x 6 points in the image, found none"):
         BOARD.find(np.random.default_rng(0).random((200, 300)))
@@ -152,6 +174,7 @@ def test_views_that_are_parallel_do_not(turn):
         calibrate_camera(BOARD, views(T, CAMERA, 0.05, rng), 640, 480)
 
 
+@pytest.mark.filterwarnings("ignore:.*in a corner of its image")
 def test_a_camera_is_found_to_the_bound_and_as_opencv_finds_it():
     cv2 = pytest.importorskip("cv2")
     rng = np.random.default_rng(2)
@@ -182,6 +205,97 @@ def test_coefficients_are_free_as_told():
     assert np.abs(lens(found.camera) - lens(pinhole))[:4].max() < 4
     with pytest.raises(ValueError, match="0 to 5 coefficients"):
         calibrate_camera(BOARD, views(poses(3, rng), pinhole, 0.1, rng), 640, 480, coefficients=6)
+
+
+def test_the_middles_of_discs_do_not_bend_the_camera():
+    """Centroids of the images of discs, without noise: taken for images of the middles they would."""
+    board = CircleGrid(9, 6, 0.025, 0.016)
+    rng = np.random.default_rng(8)
+    T = poses(10, rng)
+    angle = np.arange(4000) * (2 * np.pi / 4000)
+    edge = 0.5 * board.diameter_m * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    seen = []
+    for P in T:
+        x = CAMERA.project((board.points[:, None] + edge) @ P[:3, :3].T + P[:3, 3])
+        y = np.roll(x, -1, axis=1)
+        area = x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]
+        middles = ((x + y) * area[..., None]).sum(axis=1) / (3 * area.sum(axis=1))[:, None]
+        seen.append(BoardView(np.arange(54), middles))
+    found = calibrate_camera(board, seen, 640, 480)
+    assert np.abs(lens(found.camera) - lens(CAMERA))[:4].max() < 1e-3
+    assert np.abs(found.T_camera_board - T).max() < 1e-6
+    bent = calibrate_camera(Checkerboard(9, 6, 0.025), seen, 640, 480)
+    assert np.abs(lens(bent.camera) - lens(CAMERA))[:4].max() > 0.15
+
+
+def spoilt(seed, change):
+    """Views of which one is changed."""
+    rng = np.random.default_rng(seed)
+    seen = views(poses(10, rng), CAMERA, 0.1, rng)
+    seen[2] = change(seen[2])
+    return seen
+
+
+def moved(view, point, off):
+    pixels = view.pixels.copy()
+    pixels[point] += off
+    return BoardView(view.indices, pixels)
+
+
+@pytest.mark.filterwarnings("ignore:.*in a corner of its image")
+@pytest.mark.parametrize(
+    ("change", "number"),
+    [
+        (lambda v: moved(v, 17, (1.5, -1.0)), 1),  # a corner drawn away by an edge
+        (lambda v: BoardView(v.indices, 0.5 * v.pixels), 20),  # an image of half the size
+    ],
+)
+def test_views_that_do_not_fit_are_warned_about_and_named(change, number):
+    with pytest.warns(rangesim.errors.RangesimWarning, match="of view 2 is off by .* more than noise can explain"):
+        found = calibrate_camera(BOARD, spoilt(6, change), 640, 480, coefficients=2)
+    assert len(found.suspects) >= number or number > 1
+    assert found.suspects[0].view == 2
+    if number == 1:
+        assert [s.point for s in found.suspects] == [17]
+        assert 1.3 < found.suspects[0].error_px < 1.9
+
+
+def test_views_that_cannot_be_are_named():
+    with pytest.raises(ValueError, match="view 2: expected points in an image of 640 x 480 pixels, got some outside"):
+        calibrate_camera(BOARD, spoilt(6, lambda v: BoardView(v.indices, 2 * v.pixels)), 640, 480)
+    with pytest.raises(ValueError, match="view 2: expected second to be finite"):
+        calibrate_camera(BOARD, spoilt(6, lambda v: moved(v, 3, np.nan)), 640, 480)
+    with pytest.raises(ValueError, match="view 2: expected at least 4 points"):
+        calibrate_camera(BOARD, spoilt(6, lambda v: BoardView(v.indices[:3], v.pixels[:3])), 640, 480)
+    seen = spoilt(6, lambda v: v)
+    with pytest.raises(ValueError, match="view 10: expected another pose of the board, got view 4 once more"):
+        calibrate_camera(BOARD, [*seen, seen[4]], 640, 480)
+
+
+def test_a_lens_is_not_made_up_where_no_board_was():
+    """Boards in the middle of the image alone: five coefficients fit them, and fold or miss the corners by far."""
+    rng = np.random.default_rng(11)
+    device = replace(CAMERA, distortion=(-0.3, 0.1))
+    for n in (4, 5, 6, 8):
+        T = np.stack([pose(rng.uniform(-30, 30, 3), (0, 0, 0.9)) for _ in range(n)])
+        with pytest.warns(rangesim.errors.RangesimWarning, match=r"px only in a corner|folds within its image"):
+            calibrate_camera(BOARD, views(T, device, 0.2, rng), 640, 480)
+
+
+@pytest.mark.filterwarnings("ignore:.*folds within its image")  # the first one does
+@pytest.mark.parametrize("k", [(-0.45, 0.25, 0.0, 0.0, -0.08), (0.3, -0.1), (-0.35, 0.15)])
+def test_a_lens_of_much_distortion_is_found(k):
+    rng = np.random.default_rng(12)
+    device = Intrinsics(640, 480, 420.0, 421.0, 322.0, 238.0, k)
+    T = []
+    while len(T) < 14:
+        P = pose(rng.uniform(-35, 35, 3), rng.uniform([-0.25, -0.18, 0.22], [0.25, 0.18, 0.4]))
+        pixels = device.project(BOARD.points @ P[:3, :3].T + P[:3, 3])
+        if np.isfinite(pixels).all() and (pixels > 2).all() and (pixels < [638, 478]).all():
+            T.append(P)
+    found = calibrate_camera(BOARD, views(np.stack(T), device, 0.1, rng), 640, 480)
+    assert np.abs((lens(found.camera) - lens(device)) / found.deviations).max() < 4
+    assert 0.12 < found.rms_px < 0.16
 
 
 # ------------------------------------------------------------------------------------------- bundles
@@ -275,12 +389,41 @@ def test_a_rendered_rig_is_calibrated_to_what_it_says(rendered):
     assert np.abs(found.rig.T_camera_projector[:3, :3] - rig.T_camera_projector[:3, :3]).max() < 5e-3
 
 
+def test_a_board_that_moved_while_it_was_taken_is_named_and_no_other(rendered):
+    """It bends the rig until other captures have errors as well."""
+    _, rig = rendered
+    rng = np.random.default_rng(7)
+    T = poses(9, rng, rig.camera, tilt=35.0)
+    T_projector_camera = np.linalg.inv(rig.T_camera_projector)
+    between = Bundle((rig.camera, rig.projector), T_projector_camera, T)
+    observations = [Observation(d, k, BOARD.points, np.zeros((54, 2))) for d in (0, 1) for k in range(9)]
+    noisy = [replace(o, pixels=between.project(o) + rng.normal(0, 0.05, (54, 2))) for o in observations]
+    noisy[9 + 4] = replace(noisy[9 + 4], pixels=noisy[9 + 4].pixels + np.array([0.0, 3.0]))
+    found = adjust(between, noisy, 2)
+    seen = [BoardView(np.arange(54), o.pixels) for o in noisy]
+    suspects = find_suspects(found.state, noisy, seen, 1.0, 2)
+    assert {s.view for s in suspects} == {4}
+    off = [np.linalg.norm(found.state.project(o) - o.pixels, axis=-1).max() for o in noisy]
+    assert sorted(off)[-3] > 0.3  # by least squares others have errors too
+    clean = [o for o in noisy if o.view != 4]
+    renumbered = [replace(o, view=o.view - (o.view > 4)) for o in clean]
+    good = adjust(replace(between, T_first_board=np.delete(T, 4, axis=0)), renumbered, 2)
+    assert find_suspects(good.state, renumbered, [s for k, s in enumerate(seen) if k % 9 != 4], 1.0, 2) == ()
+
+
 def test_a_capture_that_does_not_do_is_named(rendered):
     captures, _ = rendered
     with pytest.raises(ValueError, match="at least 3 views"):
         calibrate_rig(BOARD, captures[:2])
     with pytest.raises(ValueError, match="capture 0: expected a Checkerboard of 7 x 5"):
         calibrate_rig(Checkerboard(7, 5, 0.025), captures)
+    with pytest.raises(ValueError, match="left: expected a Checkerboard of 7 x 5"):
+        calibrate_rig(Checkerboard(7, 5, 0.025), captures, names=["left", "right", "up", "down"])
+    with pytest.raises(ValueError, match="capture 4: expected another pose of the board, got capture 1 once more"):
+        calibrate_rig(BOARD, [*captures, captures[1]])
+    other = replace(captures[1], frames=captures[1].frames[:, :350], rig=None)
+    with pytest.raises(ValueError, match=r"capture 1: .* of 480 x 360 pixels, got .* of 480 x 350 pixels"):
+        calibrate_rig(BOARD, [captures[0], other, captures[2]])
     columns_only = rangesim.StructuredLight(projector_width=512, projector_height=384)
     frames = captures[0].frames[[*range(len(columns_only.frame_names()) - 2), -2, -1]]
     with pytest.raises(ValueError, match="capture 0: expected columns and rows"):
@@ -338,6 +481,90 @@ def test_the_command_writes_what_calibration_reads_and_opencv_too(rendered, tmp_
     assert np.abs(np.einsum("ni,ij,nj->n", ends[0], F, ends[1])).max() < 1e-9
 
 
+def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
+    from rangesim.calibration.opencv_files import load_opencv, save_opencv
+    from rangesim.cli import app
+    from rangesim.decoding.range_image_files import load_range_image
+
+    captures, rig = rendered
+    for name in ("rig.yml", "rig.xml"):
+        save_opencv(rig, tmp_path / name)
+        back = load_opencv(tmp_path / name)
+        for one, other in ((back.camera, rig.camera), (back.projector, rig.projector)):
+            assert (one.width, one.height) == (other.width, other.height)
+            assert np.allclose(lens(one), lens(other), rtol=1e-12)
+        assert np.allclose(back.T_camera_projector, rig.T_camera_projector, atol=1e-12)
+    captures[0].save(tmp_path / "capture")
+    depths = []
+    for name in ("rig.yml", "rig.xml"):
+        arguments = ["--calibration", str(tmp_path / name), "--out", str(tmp_path / name.replace(".", "_"))]
+        app(["decode", str(tmp_path / "capture"), *arguments], standalone_mode=False)
+        depths.append(load_range_image(tmp_path / name.replace(".", "_") / "range.npz").z)
+    expected = rangesim.decode(captures[0]).z
+    for z in depths:
+        assert np.allclose(z, expected, atol=1e-5, equal_nan=True)
+
+
+def test_broken_files_of_opencv_are_refused(rendered, tmp_path):
+    from rangesim.calibration.opencv_files import load_opencv, save_opencv, save_opencv_camera
+    from rangesim.errors import FileFormatError
+
+    _, rig = rendered
+    place = tmp_path / "rig.yml"
+    with pytest.raises(FileFormatError, match="cannot read"):
+        load_opencv(place)
+    save_opencv_camera(rig.camera, place)
+    with pytest.raises(FileFormatError, match="matrix 'R'"):
+        load_opencv(place)
+    save_opencv(rig, place)
+    text = place.read_text()
+    for wrong in (
+        "",
+        "%YAML:1.0\n---\nR: [",
+        "not yaml at all",
+        text[: len(text) // 2],
+        text.replace("rows: 3", "rows: 2"),
+    ):
+        place.write_text(wrong)
+        with pytest.raises(FileFormatError):
+            load_opencv(place)
+    place.write_bytes(bytes(range(256)))
+    with pytest.raises(FileFormatError):
+        load_opencv(place)
+
+
+def test_the_command_calibrates_a_camera_from_photographs(rendered, tmp_path, capsys):
+    import cv2
+
+    from rangesim.cli import app
+
+    captures, rig = rendered
+    for k, capture in enumerate(captures):
+        frame = capture.frames[-2].astype(float)
+        cv2.imwrite(str(tmp_path / f"photo_{k}.png"), np.clip(255 * frame / np.quantile(frame, 0.999), 0, 255))
+    photos = [str(tmp_path / f"photo_{k}.png") for k in range(4)]
+    options = ["--points", "9x6", "--spacing", "0.025", "--coefficients", "2"]
+    app(["calibrate", *photos, *options, "--out", str(tmp_path / "camera.yml")], standalone_mode=False)
+    assert "photo_3.png" in capsys.readouterr().out
+    file = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_READ)
+    K = file.getNode("camera_matrix").mat()
+    assert abs(K[0, 0] / rig.camera.fx - 1) < 0.01
+    assert abs(K[0, 2] + 0.5 - rig.camera.cx) < 5
+    for more, says in (
+        (["--out", str(tmp_path / "camera.json")], "for a camera alone"),
+        (["--out", str(tmp_path / "c.yml"), "--projector", "512x384"], "folders of images with --projector"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            app(["calibrate", *photos, *options, *more], standalone_mode=False)
+    cv2.imwrite(photos[2], np.zeros((100, 120), np.uint8))
+    with pytest.raises(ValueError, match=r"photo_2.png: expected the size of .*photo_0.png, 480 x 360, got 120 x 100"):
+        app(["calibrate", *photos, *options, "--out", str(tmp_path / "c.yml")], standalone_mode=False)
+    cv2.imwrite(photos[2], np.full((360, 480), 100, np.uint8))
+    with pytest.raises(ValueError, match=r"photo_2.png: expected a Checkerboard .* found none"):
+        app(["calibrate", *photos, *options, "--out", str(tmp_path / "c.yml")], standalone_mode=False)
+    assert not (tmp_path / "c.yml").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -345,6 +572,7 @@ def test_the_command_writes_what_calibration_reads_and_opencv_too(rendered, tmp_
         (["--board", "charco"], "did you mean 'charuco'"),
         (["--board", "circles"], "--marker METRES"),
         (["--marker", "0.02"], "a checkerboard has none"),
+        (["--spacing", "25"], "--spacing in metres"),
         (["--out", "rig.txt"], "end in .json"),
     ],
 )

@@ -43,8 +43,10 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 
 ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
+    "part_pose": ["part.png", "--width", "400"],
     "rectification": ["rectification.png", "--width", "160"],
     "segmentation": ["--width", "320"],
+    "tof_calibration": ["tof.png", "--targets", "14", "--width", "120"],
     "two_cameras": ["--width", "80"],
 }
 """Of the examples that can be had smaller."""

@@ -19,6 +19,15 @@ if TYPE_CHECKING:
     from rangesim.calibration.rig_calibration import RigCalibration as RigCalibration
     from rangesim.calibration.rig_calibration import calibrate_rig as calibrate_rig
     from rangesim.calibration.rig_calibration import projector_view as projector_view
+    from rangesim.calibration.suspects import Suspect as Suspect
+    from rangesim.calibration.time_of_flight import ToFCalibration as ToFCalibration
+    from rangesim.calibration.time_of_flight import board_range as board_range
+    from rangesim.calibration.time_of_flight import calibrate_tof as calibrate_tof
+    from rangesim.calibration.time_of_flight import find_board_ranges as find_board_ranges
+    from rangesim.calibration.time_of_flight import load_tof_calibration as load_tof_calibration
+    from rangesim.calibration.time_of_flight import plane_range as plane_range
+    from rangesim.calibration.time_of_flight import triangle_harmonics as triangle_harmonics
+    from rangesim.calibration.time_of_flight import wiggling as wiggling
     from rangesim.calibration.zhang import CameraCalibration as CameraCalibration
     from rangesim.calibration.zhang import calibrate_camera as calibrate_camera
     from rangesim.calibration.zhang import intrinsics_from_homographies as intrinsics_from_homographies
@@ -32,6 +41,17 @@ else:
             "bundle": ["Bundle", "Observation", "adjust"],
             "rendered": ["RenderedSet", "default_rig", "render_set"],
             "rig_calibration": ["RigCalibration", "calibrate_rig", "projector_view"],
+            "suspects": ["Suspect"],
+            "time_of_flight": [
+                "ToFCalibration",
+                "board_range",
+                "calibrate_tof",
+                "find_board_ranges",
+                "load_tof_calibration",
+                "plane_range",
+                "triangle_harmonics",
+                "wiggling",
+            ],
             "zhang": ["CameraCalibration", "calibrate_camera", "intrinsics_from_homographies"],
         },
     )

@@ -24,6 +24,8 @@ LENS = 9
 POSE = 6
 """Of a pose: a rotation vector applied after the rotation, and a translation."""
 
+REWEIGHTINGS = 8
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
@@ -89,7 +91,7 @@ def adjust(start: Bundle, observations: Sequence[Observation], coefficients: int
                 R = bundle.T_second_first[:3, :3]
                 X = X @ R.T + bundle.T_second_first[:3, 3]
                 by_board, by_second = R @ by_board, _by_pose(X)
-            pixels, by_point, by_lens = _projection(device, X)
+            pixels, by_point, by_lens = projection(device, X)
             jacobian = np.zeros((len(X), 2, size))
             jacobian[:, :, seen.device * lens : (seen.device + 1) * lens] = by_lens[:, :, :lens]
             if by_second is not None:
@@ -112,6 +114,23 @@ def adjust(start: Bundle, observations: Sequence[Observation], coefficients: int
         return Bundle(devices, second, np.stack(poses))
 
     return minimise(residuals, step, start)
+
+
+def reweighted(start: Bundle, observations: Sequence[Observation], coefficients: int) -> Bundle:
+    """The bundle when each view of each device is weighed by its own scatter, again and again.
+
+    One view that contradicts the others bends the solution of least squares until all have errors; here it is left
+    with them, so that it can be told which it is.
+    """
+    bundle = start
+    for _ in range(REWEIGHTINGS):
+        scatter = np.array([np.sqrt(np.square(bundle.project(o) - o.pixels).mean()) for o in observations])
+        for device in range(len(start.devices)):
+            of_device = np.array([o.device == device for o in observations])
+            scatter[of_device] = np.maximum(scatter[of_device], np.median(scatter[of_device]))
+        weighed = [replace(o, noise_px=max(float(s), 1e-9)) for o, s in zip(observations, scatter, strict=True)]
+        bundle = adjust(bundle, weighed, coefficients).state
+    return bundle
 
 
 def _complete(device: Intrinsics) -> Intrinsics:
@@ -143,7 +162,7 @@ def _by_pose(X: Array) -> Array:
     return result
 
 
-def _projection(device: Intrinsics, X: Array) -> tuple[Array, Array, Array]:
+def projection(device: Intrinsics, X: Array) -> tuple[Array, Array, Array]:
     """(m, 2) pixels of points (m, 3), and their derivatives by the point (m, 2, 3) and by the lens (m, 2, 9)."""
     x, y, inverse = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], 1.0 / X[:, 2]
     image = distort(device.coefficients, x, y)

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board, BoardView
-from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
-from rangesim.calibration.zhang import calibrate_camera, check_views, judged
+from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation
+from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
+from rangesim.calibration.zhang import adjust_as_seen, check_views, first_camera, judged
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.geometry.correspondences import Array
@@ -44,7 +45,9 @@ class RigCalibration:
     projector_deviations : (9,) standard deviations of fx, fy, cx, cy in pixels and of k1, k2, p1, p2, k3; 0 for those
     held. baseline_m, baseline_deviation_m : distance of the two centres, and its standard deviation, metres.
     T_camera_board : (k, 4, 4), metres. camera_residuals, projector_residuals : k arrays (m, 2), pixels, projected less
-    seen. camera_rms_px, projector_rms_px : root mean square of the reprojection errors, over points.
+    seen. camera_rms_px, projector_rms_px : root mean square of the reprojection errors, over points. camera_views,
+    projector_views : k BoardView, the points that were seen. suspects : points whose error is beyond all noise, the
+    worst first, when each view is weighed by its own scatter; they weigh on the result.
     """
 
     rig: Rig
@@ -57,6 +60,9 @@ class RigCalibration:
     projector_residuals: tuple[Array, ...]
     camera_rms_px: float
     projector_rms_px: float
+    camera_views: tuple[BoardView, ...]
+    projector_views: tuple[BoardView, ...]
+    suspects: tuple[Suspect, ...] = ()
 
 
 def projector_view(view: BoardView, decoded: RangeImage, spacing_px: float) -> BoardView:
@@ -116,7 +122,9 @@ def _surrounds(offsets: Array) -> bool:
     return float(np.diff(angles, append=angles[0] + 2 * np.pi).max()) < MAX_GAP
 
 
-def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: int = 5) -> RigCalibration:
+def calibrate_rig(
+    board: Board, captures: Sequence[Capture], *, coefficients: int = 5, names: Sequence[str] | None = None
+) -> RigCalibration:
     """A camera and a projector from structured light on a board, each capture with the board in another pose.
 
     The corners are found in the white frames, the projector's coordinates decoded without a rig (whatever rig a capture
@@ -127,42 +135,51 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
     ----------
     captures : three or more, of `StructuredLight` with columns and rows.
     coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for pinholes.
+    names : of the captures, for messages; None: their numbers.
+
+    Warns of points that do not fit (`RigCalibration.suspects`), and of a lens that is unknown in a corner of its image,
+    or folds there.
 
     Raises
     ------
     ValueError
-        A capture of another sensor or size; a board that is not found (which one, is said); fewer than three; or views
-        that do not determine the rig.
+        A capture of another sensor or size; a board that is not found (which one, is said); fewer than three; one
+        twice; or views that do not determine the rig.
     """
+    names = [f"capture {k}" for k in range(len(captures))] if names is None else [str(name) for name in names]
+    if len(names) != len(captures):
+        raise ValueError(f"expected a name for each of the {len(captures)} captures, got {len(names)}.")
     views, projector_views = [], []
-    for k, capture in enumerate(captures):
+    for name, capture in zip(names, captures, strict=True):
         try:
             view, seen = _views(board, capture)
         except ValueError as error:
-            raise ValueError(f"capture {k}: {error}") from error
+            raise ValueError(f"{name}: {error}") from error
         if capture.frames.shape != captures[0].frames.shape or capture.sensor != captures[0].sensor:
-            raise ValueError(f"capture {k}: expected the sensor and the size of capture 0, got another.")
+            raise ValueError(
+                f"{name}: expected the sensor and the size of {names[0]}, {_kind(captures[0])}, got {_kind(capture)}."
+            )
         views.append(view)
         projector_views.append(seen)
-    check_views(board, views, coefficients)
+    check_views(board, views, coefficients, names)
     sensor = captures[0].sensor
     assert isinstance(sensor, StructuredLight)
     height, width = captures[0].frames.shape[1:]
-    camera = calibrate_camera(board, views, width, height, coefficients=coefficients)
-    projector = calibrate_camera(
-        board, projector_views, sensor.projector_width, sensor.projector_height, coefficients=coefficients
-    )
+    camera, T_camera_board, camera_noise = first_camera(board, views, width, height, coefficients, names)
+    size = sensor.projector_width, sensor.projector_height
+    projector, T_projector_board, projector_noise = first_camera(board, projector_views, *size, coefficients, names)
     observations = [
-        Observation(device, k, board.points[view.indices], view.pixels, alone.noise_px)
-        for device, alone, some in ((0, camera, views), (1, projector, projector_views))
+        Observation(device, k, board.points[view.indices], view.pixels, noise)
+        for device, noise, some in ((0, camera_noise, views), (1, projector_noise, projector_views))
         for k, view in enumerate(some)
     ]
-    between = projector.T_camera_board @ np.linalg.inv(camera.T_camera_board)
+    between = T_projector_board @ np.linalg.inv(T_camera_board)
     T = np.eye(4)
     T[:3, :3] = Rotation.from_matrix(between[:, :3, :3]).mean().as_matrix()
     T[:3, 3] = np.median(between[:, :3, 3], axis=0)
-    start = Bundle((camera.camera, projector.camera), T, camera.T_camera_board)
-    found = adjust(start, observations, coefficients)
+    start = Bundle((camera, projector), T, T_camera_board)
+    every = [*views, *projector_views]
+    found, observations = adjust_as_seen(board, start, observations, every, coefficients)
     _, deviations = judged(found, observations)
     bundle, lens = found.state, 4 + coefficients
     camera_found, projector_found = bundle.devices
@@ -175,6 +192,8 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
     of_camera, of_projector = tuple(residuals[: len(views)]), tuple(residuals[len(views) :])
     by_device = np.zeros((2, LENS))
     by_device[:, :lens] = deviations[: 2 * lens].reshape(2, lens)
+    suspects = find_suspects(bundle, observations, every, found.noise(found.jacobian.shape[1]), coefficients)
+    warn_of_suspects(suspects, names)
     return RigCalibration(
         Rig(camera_found, projector_found, T_camera_projector=np.linalg.inv(bundle.T_second_first)),
         by_device[0],
@@ -184,8 +203,22 @@ def calibrate_rig(board: Board, captures: Sequence[Capture], *, coefficients: in
         bundle.T_first_board,
         of_camera,
         of_projector,
-        *(float(np.sqrt((np.concatenate(some) ** 2).sum(axis=1).mean())) for some in (of_camera, of_projector)),
+        _rms(of_camera),
+        _rms(of_projector),
+        tuple(views),
+        tuple(projector_views),
+        suspects,
     )
+
+
+def _kind(capture: Capture) -> str:
+    """Sensor and size of a capture, for messages."""
+    return f"{capture.sensor.details} of {capture.frames.shape[2]} x {capture.frames.shape[1]} pixels"
+
+
+def _rms(residuals: tuple[Array, ...]) -> float:
+    """Root mean square over all points."""
+    return float(np.sqrt(np.square(np.concatenate(residuals)).sum(axis=1).mean()))
 
 
 def _views(board: Board, capture: Capture) -> tuple[BoardView, BoardView]:

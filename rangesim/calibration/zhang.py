@@ -10,13 +10,15 @@ front), that is an error.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim.calibration.boards import Board, BoardView
-from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
+from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust, projection
+from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
+from rangesim.errors import warn
 from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, checked_array, unit_norm
 from rangesim.geometry.homography import fit_homography
@@ -29,6 +31,12 @@ DETERMINED = 1e-4
 are parallel to each other, to what noise allows to tell."""
 MAX_DEVIATION = 0.1
 """Standard deviation of a focal length, relative, above which the views do not determine it."""
+MAX_CORNER_PX = 5.0
+"""Standard deviation of where a ray meets a corner of the image, above which the lens counts as unknown there."""
+AGAIN = 2
+"""Adjustments after the first, for boards whose points look as if they were elsewhere."""
+BORDER_POINTS = 9
+"""Along each side of an image, whose rays must exist."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +46,8 @@ class CameraCalibration:
     camera : Intrinsics, with five coefficients of distortion. deviations : (9,) standard deviations of fx, fy, cx, cy
     in pixels and of k1, k2, p1, p2, k3; 0 for those held. T_camera_board : (k, 4, 4) maps the board's coordinates to
     the camera's, metres. residuals : k arrays (m, 2), pixels, projected less seen. noise_px : standard deviation of a
-    coordinate, from the residuals. rms_px : root mean square of the reprojection errors, over points.
+    coordinate, from the residuals. rms_px : root mean square of the reprojection errors, over points. suspects : points
+    whose error is beyond all noise, the worst first; they weigh on the result.
     """
 
     camera: Intrinsics
@@ -47,6 +56,7 @@ class CameraCalibration:
     residuals: tuple[Array, ...]
     noise_px: float
     rms_px: float
+    suspects: tuple[Suspect, ...] = ()
 
 
 def intrinsics_from_homographies(homographies: ArrayLike) -> Array:
@@ -97,7 +107,13 @@ def intrinsics_from_homographies(homographies: ArrayLike) -> Array:
 
 
 def calibrate_camera(
-    board: Board, views: Sequence[BoardView], width: int, height: int, *, coefficients: int = 5
+    board: Board,
+    views: Sequence[BoardView],
+    width: int,
+    height: int,
+    *,
+    coefficients: int = 5,
+    names: Sequence[str] | None = None,
 ) -> CameraCalibration:
     """A camera from views of a board: `intrinsics_from_homographies`, then all parameters by `bundle.adjust`.
 
@@ -106,20 +122,22 @@ def calibrate_camera(
     views : of `board.find`, three or more, under different tilts, ten to twenty all over the image for a good one.
     width, height : of the images, pixels.
     coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for a pinhole.
+    names : of the views, for messages; None: their numbers.
+
+    Warns of points that do not fit (`suspects`), and of a lens that is unknown in a corner of the image, or folds
+    there.
 
     Raises
     ------
     ValueError
-        Fewer than three views, or views that do not determine the camera.
+        Fewer than three views, one view twice, points outside the image, or views that do not determine the camera.
     """
-    check_views(board, views, coefficients)
-    K = intrinsics_from_homographies(
-        [fit_homography(board.points[view.indices, :2], view.pixels, noisy="second").matrix for view in views]
-    )
-    start = Intrinsics(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    observations = [Observation(0, k, board.points[view.indices], view.pixels) for k, view in enumerate(views)]
-    found = adjust(Bundle((start,), np.eye(4), board_poses(start, observations)), observations, coefficients)
-    noise, deviations = judged(found, observations)
+    names = [f"view {k}" for k in range(len(views))] if names is None else [str(name) for name in names]
+    if len(names) != len(views):
+        raise ValueError(f"expected a name for each of the {len(views)} views, got {len(names)}.")
+    found, observations, noise, deviations = _calibrated(board, views, width, height, coefficients, names)
+    suspects = find_suspects(found.state, observations, views, 1.0, coefficients)
+    warn_of_suspects(suspects, names)
     residuals = tuple(found.state.project(seen) - seen.pixels for seen in observations)
     everywhere = np.concatenate(residuals)
     lens = np.zeros(LENS)
@@ -131,10 +149,77 @@ def calibrate_camera(
         residuals,
         noise,
         float(np.sqrt((everywhere**2).sum(axis=1).mean())),
+        suspects,
     )
 
 
-def check_views(board: Board, views: Sequence[BoardView], coefficients: int) -> None:
+def first_camera(
+    board: Board, views: Sequence[BoardView], width: int, height: int, coefficients: int, names: Sequence[str]
+) -> tuple[Intrinsics, Array, float]:
+    """Camera, poses (k, 4, 4) of the boards and noise of a coordinate, to start a bundle of several devices from."""
+    found, _, noise, _ = _calibrated(board, views, width, height, coefficients, names, says=False)
+    return found.state.devices[0], found.state.T_first_board, noise
+
+
+def _calibrated(
+    board: Board,
+    views: Sequence[BoardView],
+    width: int,
+    height: int,
+    coefficients: int,
+    names: Sequence[str],
+    says: bool = True,
+) -> tuple[Minimum[Bundle], list[Observation], float, Array]:
+    """The bundle of one camera, what it rests on, its noise and deviations."""
+    check_views(board, views, coefficients, names)
+    homographies = []
+    for k, view in enumerate(views):
+        try:
+            plane = fit_homography(board.points[view.indices, :2], view.pixels, noisy="second")
+        except ValueError as error:
+            raise ValueError(f"{names[k]}: {error}") from error
+        if not ((view.pixels >= 0) & (view.pixels <= [width, height])).all():
+            raise ValueError(
+                f"{names[k]}: expected points in an image of {width} x {height} pixels, got some outside; is it of "
+                "another size?"
+            )
+        homographies.append(plane.matrix)
+    K = intrinsics_from_homographies(homographies)
+    start = Intrinsics(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    observations = [Observation(0, k, board.points[view.indices], view.pixels) for k, view in enumerate(views)]
+    bundle = Bundle((start,), np.eye(4), board_poses(start, observations))
+    found, observations = adjust_as_seen(board, bundle, observations, views, coefficients)
+    noise, deviations = judged(found, observations, says)
+    return found, observations, noise, deviations
+
+
+def adjust_as_seen(
+    board: Board, start: Bundle, observations: Sequence[Observation], views: Sequence[BoardView], coefficients: int
+) -> tuple[Minimum[Bundle], list[Observation]]:
+    """`bundle.adjust`; and again with the places that the camera takes for the board's points, once it is known.
+
+    A second device is told what the first one sees, so it sees the same places.
+
+    Parameters
+    ----------
+    views : the points of each observation.
+    """
+    found, taken = adjust(start, observations, coefficients), list(observations)
+    for _ in range(AGAIN):
+        camera = found.state.devices[0]
+        seen = [board.seen_points(camera, T) for T in found.state.T_first_board]
+        if all(np.array_equal(points, board.points) for points in seen):
+            break
+        shift = [np.nan_to_num(points - board.points) for points in seen]
+        taken = [
+            replace(o, points=o.points + shift[o.view][view.indices])
+            for o, view in zip(observations, views, strict=True)
+        ]
+        found = adjust(found.state, taken, coefficients)
+    return found, taken
+
+
+def check_views(board: Board, views: Sequence[BoardView], coefficients: int, names: Sequence[str]) -> None:
     """Raise ValueError unless there are enough views of this board, and a number of coefficients from 0 to 5."""
     if len(views) < MIN_VIEWS:
         raise ValueError(
@@ -145,9 +230,12 @@ def check_views(board: Board, views: Sequence[BoardView], coefficients: int) -> 
     for k, view in enumerate(views):
         if len(view.indices) and not 0 <= view.indices.min() <= view.indices.max() < n_points:
             raise ValueError(
-                f"view {k}: expected indices of the board's {n_points} points, got {view.indices.min()} to "
+                f"{names[k]}: expected indices of the board's {n_points} points, got {view.indices.min()} to "
                 f"{view.indices.max()}; is it a view of another board?"
             )
+        for other in range(k):
+            if np.array_equal(views[other].pixels, view.pixels) and np.array_equal(views[other].indices, view.indices):
+                raise ValueError(f"{names[k]}: expected another pose of the board, got {names[other]} once more.")
     if coefficients not in range(6):
         raise ValueError(f"expected 0 to 5 coefficients of distortion, got {coefficients!r}.")
 
@@ -157,8 +245,10 @@ def board_poses(camera: Intrinsics, observations: Sequence[Observation]) -> Arra
     return np.stack([fit_camera_pose(seen.points, seen.pixels, camera).T_camera_object for seen in observations])
 
 
-def judged(found: Minimum[Bundle], observations: Sequence[Observation]) -> tuple[float, Array]:
+def judged(found: Minimum[Bundle], observations: Sequence[Observation], says: bool = True) -> tuple[float, Array]:
     """Noise of a coordinate, pixels, and standard deviations of the parameters.
+
+    says : warns of lenses that are unknown in a corner of their image.
 
     Raises
     ------
@@ -172,7 +262,8 @@ def judged(found: Minimum[Bundle], observations: Sequence[Observation]) -> tuple
             "points, or free fewer coefficients."
         )
     noise = found.noise(parameters)
-    deviations = np.sqrt(np.diag(found.covariance(max(noise, 1e-12))))
+    covariance = found.covariance(max(noise, 1e-12))
+    deviations = np.sqrt(np.diag(covariance))
     n_devices, n_views = len(found.state.devices), len(found.state.T_first_board)
     lens = (parameters - POSE * (n_views + n_devices - 1)) // n_devices
     for k, device in enumerate(found.state.devices):
@@ -182,7 +273,36 @@ def judged(found: Minimum[Bundle], observations: Sequence[Observation]) -> tuple
                 "expected views that determine the focal length, got some that leave it open (standard deviation "
                 f"{100 * relative:.3g} %): tilt the board more, in different directions."
             )
+        part = slice(k * lens, (k + 1) * lens)
+        _check_corners(device, covariance[part, part], NAMES[k] if n_devices > 1 else "lens", says)
     return noise, deviations
+
+
+NAMES = ("camera", "projector")
+
+
+def _check_corners(device: Intrinsics, covariance: Array, name: str, says: bool) -> None:
+    """Warn if a lens folds within its image, or is unknown in a corner of it."""
+    s = np.linspace(0, 1, BORDER_POINTS)
+    zero, one = np.zeros_like(s), np.ones_like(s)
+    sides = [np.stack(side, axis=-1) for side in ((s, zero), (s, one), (zero, s), (one, s))]
+    rays = device.directions(np.concatenate(sides) * [device.width, device.height])
+    if not np.isfinite(rays).all():
+        if says:
+            warn(
+                f"the distortion found of the {name} folds within its image, which has no rays there: it is unknown "
+                "where no board was; show boards up to the corners of the image, or free fewer coefficients."
+            )
+        return
+    corners = device.directions(np.array([[0, 0], [1, 0], [0, 1], [1, 1.0]]) * [device.width, device.height])
+    _, _, by_lens = projection(device, corners)
+    J = by_lens[:, :, : len(covariance)]
+    off = float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ np.swapaxes(J, 1, 2))[:, -1].max()))
+    if says and off > MAX_CORNER_PX:
+        warn(
+            f"the {name} is known to {off:.3g} px only in a corner of its image: show boards there, or free fewer "
+            "coefficients."
+        )
 
 
 def _conic_row(a: Array, b: Array) -> Array:

@@ -9,11 +9,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rangesim.cli.decode import load_frames, structured_light
+from rangesim.cli.decode import TOF_SUFFIX, load_frames, structured_light
 
 if TYPE_CHECKING:
-    from rangesim.calibration import Board, RigCalibration
+    import numpy as np
 
+    from rangesim.calibration import Board, RigCalibration
+    from rangesim.capture import Capture
+    from rangesim.rig import Intrinsics
+
+MAX_HEAD = 4096
+"""Bytes of a file that say whose it is."""
+_OPENCV = (b"camera_width", b"camera_matrix")
+MARKS = {
+    ".json": (b'"camera"', b'"projector"', b'"fx"'),
+    ".yml": _OPENCV,
+    ".yaml": _OPENCV,
+    ".xml": _OPENCV,
+    ".npz": (b"cosines_m.npy",),
+    ".html": (b"Calibration of a camera and a projector",),
+}
+"""What the files of this command have in their beginning, by suffix."""
+MAX_BOARD_M = 20.0
+"""Larger boards are taken for millimetres."""
 KINDS = ("checkerboard", "charuco", "circles")
 
 
@@ -21,12 +39,18 @@ def calibrate_command(
     captures: Annotated[
         list[Path],
         typer.Argument(
-            help="Three or more, each a capture that rangesim wrote or a folder of images.", show_default=False
+            help="Three or more, each a capture that rangesim wrote or a folder of images; images, for a camera alone.",
+            show_default=False,
         ),
     ],
     points: Annotated[str, typer.Option(help="Inner corners (discs) of the board, such as 9x6.")] = ...,  # type: ignore[assignment]
     spacing: Annotated[float, typer.Option(help="Metres between neighbouring corners (discs).")] = ...,  # type: ignore[assignment]
-    out: Annotated[Path, typer.Option("--out", "-o", help="The rig: .json, or .yml, .yaml, .xml for OpenCV.")] = ...,  # type: ignore[assignment]
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The rig: .json, or .yml, .yaml, .xml for OpenCV; time of flight: .npz.")
+    ] = ...,  # type: ignore[assignment]
+    report: Annotated[
+        Path | None, typer.Option(help="A page with plots of the errors, .html.", show_default=False)
+    ] = None,
     board: Annotated[str, typer.Option(help="checkerboard, charuco or circles.")] = "checkerboard",
     marker: Annotated[
         float | None, typer.Option(help="Metres: a charuco marker's side, or a disc's diameter.", show_default=False)
@@ -47,23 +71,143 @@ def calibrate_command(
 
     Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good one.
 
+    Of captures by a time-of-flight camera (AMCW) whose lens is known: what its ranges are off by, to a file .npz. The
+    board should stand at twenty distances or more, large in the image.
+
     Examples:
 
-      rangesim calibrate pose_*/ --points 9x6 --spacing 0.025 --projector 1280x800 --out rig.json
+      rangesim calibrate pose_*/ --points 9x6 --spacing 0.025 --projector 1280x800 --out rig.json --report rig.html
 
       rangesim decode scan --projector 1280x800 --calibration rig.json --out out/scan
+
+      rangesim calibrate photos/*.jpg --points 9x6 --spacing 0.025 --out camera.yml
+
+      rangesim calibrate board_*/ --points 6x5 --spacing 0.12 --out tof.npz
     """
+    from pcgraph.plain_files import write_file
     from rangesim.calibration import calibrate_rig
     from rangesim.calibration.opencv_files import SUFFIXES, save_opencv
+    from rangesim.errors import FileFormatError
+    from rangesim.report.calibration_page import render_calibration
     from rangesim.rig.calibration_files import save_calibration
+    from rangesim.sensors import AmcwToF
+    from rangesim.sensors.structured_light import WHITE
 
-    if out.suffix.lower() not in (".json", *SUFFIXES):
-        raise ValueError(f"expected --out to end in .json, {', '.join(SUFFIXES)}, got {out.name!r}.")
+    if out.suffix.lower() not in (".json", TOF_SUFFIX, *SUFFIXES):
+        raise ValueError(
+            f"expected --out to end in .json, {', '.join(SUFFIXES)}, or {TOF_SUFFIX} for time of flight, got "
+            f"{out.name!r}."
+        )
+    if report is not None and report.suffix.lower() != ".html":
+        raise ValueError(f"expected --report to end in .html, got {report.name!r}.")
+    check_places(out, report)
     target = _board(board, points, spacing, marker, dictionary)
+    if any(path.is_file() for path in captures):
+        _camera_alone(target, captures, out, coefficients, projector, report)
+        return
     sensor = None if projector is None else structured_light(code, projector, "columns,rows", period, steps)
-    found = calibrate_rig(target, [load_frames(path, sensor, bits) for path in captures], coefficients=coefficients)
+    taken = [load_frames(path, sensor, bits) for path in captures]
+    of_tof = any(isinstance(capture.sensor, AmcwToF) for capture in taken)
+    if of_tof != (out.suffix.lower() == TOF_SUFFIX):
+        raise ValueError(
+            f"expected --out to end in {TOF_SUFFIX} for captures by time of flight, and for no others, got "
+            f"{out.name!r}."
+        )
+    if of_tof:
+        if report is not None:
+            raise ValueError("expected --report with structured light; there is no page for time of flight yet.")
+        _time_of_flight(target, taken, [str(path) for path in captures], out)
+        return
+    found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
+    if report is not None:
+        page = render_calibration(found, [str(path) for path in captures], [c.frames[WHITE] for c in taken])
+        write_file(report, page.encode(), FileFormatError, make_parents=True)
+        typer.echo(f"{report}: written.")
+    typer.echo(f"{out}: written.")
+
+
+def check_places(out: Path, report: Path | None) -> None:
+    """Refuse what could not be written, or would be lost, before anything is computed.
+
+    Raises
+    ------
+    FileFormatError
+        A place is a directory, or holds a file that is neither a calibration nor a page of this command.
+    """
+    from rangesim.errors import FileFormatError
+
+    for path in (out, *((report,) if report else ())):
+        if not path.exists():
+            continue
+        if not path.is_file():
+            raise FileFormatError(f"cannot write {path}: it exists and is no plain file; choose another path.")
+        with path.open("rb") as file:
+            start = file.read(MAX_HEAD)
+        marks = MARKS[path.suffix.lower()]
+        if start and not all(mark in start for mark in marks):
+            raise FileFormatError(
+                f"cannot write {path}: it holds something else than rangesim calibrate writes, and would be lost; "
+                "choose another path or move it."
+            )
+
+
+def _camera_alone(
+    board: Board, images: list[Path], out: Path, coefficients: int, projector: str | None, report: Path | None
+) -> None:
+    """Calibrate a camera from images of the board, one for each pose, and write the file."""
+    from rangesim.calibration import calibrate_camera
+    from rangesim.calibration.opencv_files import SUFFIXES, save_opencv_camera
+    from rangesim.files.image_files import read_grey
+
+    if projector is not None or report is not None:
+        raise ValueError("expected folders of images with --projector and --report; images are of a camera alone.")
+    if out.suffix.lower() not in SUFFIXES:
+        raise ValueError(
+            f"expected --out to end in {', '.join(SUFFIXES)} for a camera alone, got {out.name!r}; for camera and "
+            "projector give a folder of images for each pose."
+        )
+    views, sizes = [], []
+    for path in images:
+        image = read_grey(path)
+        sizes.append(image.shape)
+        if image.shape != sizes[0]:
+            raise ValueError(
+                f"{path}: expected the size of {images[0]}, {sizes[0][1]} x {sizes[0][0]}, got {image.shape[1]} x "
+                f"{image.shape[0]}."
+            )
+        try:
+            views.append(board.find(image))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+    height, width = sizes[0]
+    found = calibrate_camera(
+        board, views, width, height, coefficients=coefficients, names=[str(path) for path in images]
+    )
+    save_opencv_camera(found.camera, out)
+    lines = [_device_line("camera", found.camera, found.deviations), "reprojection, pixels, root mean square:"]
+    for path, residual in zip(images, found.residuals, strict=True):
+        lines.append(f"  {path}  {(residual**2).sum(axis=1).mean() ** 0.5:.3f}")
+    typer.echo("\n".join([*lines, f"  all  {found.rms_px:.3f}", f"{out}: written."]))
+
+
+def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out: Path) -> None:
+    """Calibrate a time-of-flight camera and write the file."""
+    import numpy as np
+
+    from rangesim.calibration import calibrate_tof, find_board_ranges
+
+    found = calibrate_tof(captures, find_board_ranges(board, captures, names), names=names)
+    found.save(out)
+    lengths = np.linspace(found.shortest_m, found.longest_m, 1000)
+    unseen = 100 * float(np.isnan(found.offset_m).mean())
+    typer.echo(
+        f"wiggling {500 * np.ptp(found.wiggling_m(lengths)):.2f} mm of range from least to largest; offsets of pixels "
+        f"{500 * np.nanstd(found.offset_m):.2f} mm (standard deviation), {unseen:.1f} % of the pixels saw no board; "
+        f"noise of a reading {500 * found.noise_m:.2f} mm; ranges from {found.shortest_m / 2:.2f} to "
+        f"{found.longest_m / 2:.2f} m."
+    )
     typer.echo(f"{out}: written.")
 
 
@@ -77,6 +221,11 @@ def _board(kind: str, points: str, spacing: float, marker: float | None, diction
     if kind not in KINDS:
         raise ValueError(f"expected --board out of {', '.join(KINDS)}, got {kind!r}{nearest(kind, KINDS)}.")
     columns, rows = int(size[1]), int(size[2])
+    if spacing * max(columns, rows) > MAX_BOARD_M:
+        raise ValueError(
+            f"expected --spacing in metres, got {spacing:g}, which makes the board {spacing * max(columns, rows):g} m "
+            "large; 25 mm are 0.025."
+        )
     if kind == "checkerboard":
         if marker is not None:
             raise ValueError("expected --marker with --board charuco or circles alone; a checkerboard has none.")
@@ -97,12 +246,17 @@ def _table(found: RigCalibration, captures: list[Path]) -> str:
         ("camera", found.rig.camera, found.camera_deviations),
         ("projector", found.rig.projector, found.projector_deviations),
     ):
-        values = (device.fx, device.fy, device.cx, device.cy, *device.coefficients)
-        labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-        shown = (f"{a} {v:.6g} ± {d:.2g}" for a, v, d in zip(labels, values, deviations, strict=True))
-        lines.append(f"{name:10s}{', '.join(shown)}")
+        lines.append(_device_line(name, device, deviations))
     lines.append(f"{'baseline':10s}{1e3 * found.baseline_m:.4f} ± {1e3 * found.baseline_deviation_m:.2g} mm")
     lines.append("reprojection, pixels, root mean square in camera and projector:")
     for path, *both in zip(captures, found.camera_residuals, found.projector_residuals, strict=True):
         lines.append(f"  {path}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
-    return "\n".join([*lines, f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}"])
+    lines.append(f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}")
+    return "\n".join(lines)
+
+
+def _device_line(name: str, device: Intrinsics, deviations: np.ndarray) -> str:
+    values = (device.fx, device.fy, device.cx, device.cy, *device.coefficients)
+    labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    shown = (f"{a} {v:.6g} ± {d:.2g}" for a, v, d in zip(labels, values, deviations, strict=True))
+    return f"{name:10s}{', '.join(shown)}"

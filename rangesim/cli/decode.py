@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 OF_PATTERNS = ("code", "projector", "axes", "period", "steps")
 OF_BARE_IMAGES = (*OF_PATTERNS, "bits")
+TOF_SUFFIX = ".npz"
+"""Of what `rangesim calibrate` writes of time-of-flight cameras."""
 OF_XML_CALIBRATIONS = ("code_step", "unit")
 
 
@@ -45,7 +47,11 @@ def decode_command(
         int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration: .json of rangesim, or .xml of procam-calibration.")
+        Path | None,
+        typer.Option(
+            help="Calibration: what rangesim calibrate wrote (.json, .yml, .xml; time of flight: .npz), or .xml of "
+            "procam-calibration."
+        ),
     ] = None,
 ) -> None:
     """Decode a capture. Needs no scene and no renderer.
@@ -75,9 +81,10 @@ def decode_command(
     loaded = load_frames(capture, taken_with, bits)
     if taken_with is not None and type(loaded.sensor) is not type(taken_with):
         raise ValueError(f"expected --sensor to name the sensor of {capture}, {loaded.sensor.type_name}.")
-    if calibration:
-        loaded = _calibrated(loaded, calibration, code_step, unit)
-    image = rangesim.decode(loaded)
+    if calibration and calibration.suffix.lower() == TOF_SUFFIX:
+        image = _calibrated_tof(loaded, calibration)
+    else:
+        image = rangesim.decode(_calibrated(loaded, calibration, code_step, unit) if calibration else loaded)
     write_decoded(image, loaded, out)
     typer.echo(_summary(image, out))
 
@@ -141,8 +148,33 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
     """The capture with the rig of a calibration file."""
     from rangesim.rig.calibration_files import load_calibration
 
+    if _is_opencv(calibration):
+        from rangesim.calibration.opencv_files import load_opencv
+
+        return replace(capture, rig=load_opencv(calibration))
     size = capture.sensor.emitter.size
     return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
+
+
+def _is_opencv(calibration: Path) -> bool:
+    """Whether a file is one that `rangesim calibrate` writes for OpenCV; another .xml is procam-calibration's."""
+    from pcgraph.plain_files import read_file
+    from rangesim.errors import FileFormatError
+
+    if calibration.suffix.lower() in (".yml", ".yaml"):
+        return True
+    return calibration.suffix.lower() == ".xml" and b"camera_matrix" in read_file(calibration, FileFormatError)
+
+
+def _calibrated_tof(capture: Capture, calibration: Path) -> RangeImage:
+    """The range image of a capture, wiggling and offsets taken off."""
+    from rangesim.calibration import load_tof_calibration
+
+    found = load_tof_calibration(calibration)
+    if capture.sensor != found.sensor:
+        raise ValueError(f"expected a capture of the sensor that {calibration} is of, {found.sensor}.")
+    rig = found.rig if capture.rig is None else replace(found.rig, T_world_camera=capture.rig.T_world_camera)
+    return found.correct(found.decoder.decode(replace(capture, rig=rig)))
 
 
 def _own_sensor(name: str) -> Sensor:

@@ -76,6 +76,8 @@ if TYPE_CHECKING:
     from rangesim.geometry.two_view_triangulation import triangulate_linear as triangulate_linear
     from rangesim.geometry.two_view_triangulation import triangulate_midpoint as triangulate_midpoint
     from rangesim.geometry.two_view_triangulation import triangulate_optimal as triangulate_optimal
+    from rangesim.geometry.uncalibrated_rectification import UncalibratedPair as UncalibratedPair
+    from rangesim.geometry.uncalibrated_rectification import rectify_uncalibrated as rectify_uncalibrated
 else:
     import lazy_loader
 
@@ -147,5 +149,6 @@ else:
                 "triangulate_midpoint",
                 "triangulate_optimal",
             ],
+            "uncalibrated_rectification": ["UncalibratedPair", "rectify_uncalibrated"],
         },
     )

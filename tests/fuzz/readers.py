@@ -187,6 +187,18 @@ def _calibration(path: Path, _: Arguments) -> Any:
     return rangesim.load_calibration(path, (32, 48) if path.suffix == ".xml" else None)
 
 
+def _opencv_rig(path: Path, _: Arguments) -> Any:
+    from rangesim.calibration.opencv_files import load_opencv
+
+    return load_opencv(path)
+
+
+def _tof_calibration(path: Path, _: Arguments) -> Any:
+    from rangesim.calibration import load_tof_calibration
+
+    return load_tof_calibration(path)
+
+
 def _result(path: Path, _: Arguments) -> Any:
     from rangesim.experiment.result_files import load_result
 
@@ -522,6 +534,8 @@ READERS = {
             "calibration-xml", _calibration, seeds.opencv_files, by_hand=(hostile.opencv_calibrations,),
             check=_rig_is_finite,
         ),
+        Reader("opencv-rig", _opencv_rig, seeds.opencv_rig_files, share=0.3, check=_rig_is_finite),
+        Reader("tof-calibration", _tof_calibration, seeds.tof_calibrations, by_hand=(hostile.npz_files,), share=0.3),
         Reader("signals", _signals, seeds.signals_files, by_hand=(hostile.npz_files,), share=0.3),
         Reader("range-image", _range_image, seeds.range_image_files, by_hand=(hostile.npz_files,), share=0.3),
         *(

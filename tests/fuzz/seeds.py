@@ -186,6 +186,33 @@ def opencv_files() -> Seeds:
     return {"procam": of_file("calibration.xml", text.encode())}
 
 
+def opencv_rig_files() -> Seeds:
+    """Rigs as OpenCV's stereo calibration has them, YAML and XML."""
+    from synthetic import stereo_rig
+
+    from rangesim.calibration.opencv_files import save_opencv
+
+    rig = stereo_rig(32, 24)
+    return {name: of_file(name, written(name, lambda path: save_opencv(rig, path))) for name in ("rig.yml", "rig.xml")}
+
+
+def tof_calibrations() -> Seeds:
+    """The calibration of a time-of-flight camera."""
+    import numpy as np
+    from synthetic import stereo_rig
+
+    from rangesim import AmcwToF
+    from rangesim.calibration import ToFCalibration
+
+    sensor = AmcwToF((20e6, 50e6))
+    series = np.full((2, 2), 1e-3)
+    numbers = {"shortest_m": 1.0, "longest_m": 5.0, "noise_m": 1e-3}
+    found = ToFCalibration(
+        stereo_rig(12, 8), sensor, sensor.default_decoder, (4, 8), series, -series, np.zeros((8, 12)), **numbers
+    )
+    return {"tof": of_file("tof.npz", written("tof.npz", found.save))}
+
+
 def edge_models() -> Seeds:
     """A model of edges as `EdgeModel.save` writes it."""
     from pcgraph.tree.learned import EdgeModel
