@@ -16,13 +16,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board, BoardView
-from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
+from rangesim.calibration.bundle import Bundle, Observation, adjust
 from rangesim.calibration.zhang import calibrate_camera, check_views, judged
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
 from rangesim.geometry.correspondences import Array
 from rangesim.geometry.homography import homography_dlt
 from rangesim.geometry.projective_plane import map_points
+from rangesim.geometry.reprojection import LENS, POSE
 from rangesim.rig import Rig
 from rangesim.sensors.structured_light import WHITE, StructuredLight, StructuredLightDecoder
 

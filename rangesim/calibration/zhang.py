@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim.calibration.boards import Board, BoardView
-from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust
+from rangesim.calibration.bundle import Bundle, Observation, adjust
 from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, checked_array, unit_norm
 from rangesim.geometry.homography import fit_homography
 from rangesim.geometry.least_squares import Minimum
+from rangesim.geometry.reprojection import LENS, POSE
 from rangesim.rig import Intrinsics
 
 MIN_VIEWS = 3
