@@ -250,7 +250,7 @@ def _freedom(some: Tracks, sizes: Sizes, held: Sequence[int]) -> int:
 
 
 def _refuse_undetermined(covariance: Array, T: Array, sizes: Sizes, is_free: np.ndarray, noise: float) -> None:
-    """Raise ValueError where poses are known worse than within `MAX_ROTATION_DEVIATION`, or than the cameras' extent."""
+    """Raise ValueError where poses are known worse than to `MAX_ROTATION_DEVIATION`, or than the cameras' extent."""
     of_images = np.diag(covariance)[sizes.shared :].reshape(-1, POSE)
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()

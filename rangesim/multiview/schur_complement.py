@@ -101,25 +101,32 @@ class NormalEquations:
         return [np.searchsorted(term.point, numbers) for term in self.terms]
 
     @cached_property
-    def _undamped(self) -> tuple[Array, Array, Array, Array]:
-        """U, g of shared and images; V, g of points."""
+    def _of_points(self) -> tuple[Array, Array]:
+        """V and g of the points."""
         sizes = self.sizes
-        U, g = np.zeros((sizes.eliminated, sizes.eliminated)), np.zeros(sizes.eliminated)
         V, h = np.zeros((sizes.points, sizes.of_point, sizes.of_point)), np.zeros((sizes.points, sizes.of_point))
         for term, starts in zip(self.terms, self._starts, strict=True):
-            _add_images(term.values, term.images, term.by_images, term.by_shared, U, g)
             in_blocks(_add_points, sizes.points, starts, term.values, term.by_point, V, h, smallest=256)
+        return V, h
+
+    @cached_property
+    def _of_images(self) -> tuple[Array, Array]:
+        """U and g of shared and image parameters."""
+        sizes = self.sizes
+        U, g = np.zeros((sizes.eliminated, sizes.eliminated)), np.zeros(sizes.eliminated)
+        for term in self.terms:
+            _add_images(term.values, term.images, term.by_images, term.by_shared, U, g)
         if self.prior is not None:
             U += self.prior.by_step.T @ self.prior.by_step
             g += self.prior.by_step.T @ self.prior.values
-        return U, g, V, h
+        return U, g
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array, Array, list[Array]] | None:
         """S, its right side, and for the points: L^-1, L^-1 g, and the terms' by_point L^-T; None where V is singular.
 
         damping : relative, of all parameters.
         """
-        U, g, V, h = self._undamped
+        (U, g), (V, h) = self._of_images, self._of_points
         sizes = self.sizes
         block = np.arange(sizes.of_point)
         V = V.copy()
@@ -197,11 +204,33 @@ class NormalEquations:
             arrays = term.images, term.by_images, term.by_shared, by_point, shared, images, scaled_h
             in_blocks(_substitute, sizes.points, starts, *arrays, smallest=256)
         points = -(np.swapaxes(inverse, 1, 2) @ scaled_h[:, :, None])[:, :, 0]
-        U, g, V, h = self._undamped
+        (U, g), (V, h) = self._of_images, self._of_points
         block = np.arange(sizes.of_point)
         slope = float(of_images @ g + (points * h).sum())
         damped = float((of_images**2 * np.diag(U)).sum() + (points**2 * V[:, block, block]).sum())
         return Step(shared, images, points), -slope + damping * damped
+
+    def step_of_points(self) -> Array:
+        """(n_points, p) the step of the points alone, images held; exact where residuals are linear in the points.
+
+        Points that the residuals leave open take the smallest such step.
+        """
+        V, h = self._of_points
+        return -(np.linalg.pinv(V, rcond=1e-12, hermitian=True) @ h[:, :, None])[:, :, 0]
+
+    def free_covariance(self, gauge: int) -> Array:
+        """(k, k) as `covariance`, with `gauge` freedoms spread over all parameters: S^+ less its `gauge` least
+        eigenvalues, that of smallest trace (inner constraints). Infinite if more are open."""
+        size = self.sizes.eliminated
+        found = self.reduced(1e-13)
+        if found is None:
+            return np.full((size, size), np.inf)
+        scale = 1 / np.sqrt(np.maximum(np.diag(self._of_images[0]), 1e-300))
+        values, axes = np.linalg.eigh(found[0] * np.outer(scale, scale))
+        if not values[gauge] > 1e-11 * values[-1]:
+            return np.full((size, size), np.inf)
+        half = scale[:, None] * (axes[:, gauge:] / np.sqrt(values[gauge:]))
+        return np.asarray(half @ half.T)
 
     def covariance(self, gauge: Array) -> Array:
         """(k, k) inverse of S where gauge @ step = 0, k = `Sizes.eliminated`: of shared and image parameters, for
@@ -217,8 +246,8 @@ class NormalEquations:
         if found is None:
             return np.full((size, size), np.inf)
         S = found[0]
-        scale = 1 / np.sqrt(np.maximum(np.diag(self._undamped[0]), 1e-300))
-        scale[np.diag(self._undamped[0]) == 0] = 1
+        scale = 1 / np.sqrt(np.maximum(np.diag(self._of_images[0]), 1e-300))
+        scale[np.diag(self._of_images[0]) == 0] = 1
         basis = np.eye(size)
         if len(gauge):
             basis = np.linalg.qr((gauge * scale).T, mode="complete")[0][:, len(gauge) :]

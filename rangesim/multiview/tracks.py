@@ -26,7 +26,7 @@ class Tracks:
     """Observations of points in images, as parallel arrays sorted by point, then by image.
 
     image : (m,) int64, 0 to n_images - 1. point : (m,) int64, 0 to n_points - 1. pixels : (m, 2) float64, (x, y), pixel
-    centres at integer + 0.5. n_images, n_points : how many there are; None: as many as the largest numbers say.
+    centres at integer + 0.5. n_images, n_points : how many there are; -1: as many as the largest numbers say.
 
     The dense form is (n_images, n_points, 2) with NaN where a point is not seen: `from_dense` and `dense`.
 
@@ -40,8 +40,8 @@ class Tracks:
     image: np.ndarray
     point: np.ndarray
     pixels: Array
-    n_images: int | None = None  # type: ignore[assignment]
-    n_points: int | None = None  # type: ignore[assignment]
+    n_images: int = -1
+    n_points: int = -1
 
     def __post_init__(self) -> None:
         pixels = checked_array("pixels", self.pixels, None, 2)
@@ -56,10 +56,10 @@ class Tracks:
                     f"{array.shape} of {array.dtype}."
                 )
             array = array.astype(np.int64)
-            if count is not None and (not isinstance(count, (int, np.integer)) or count < 0):
+            if not isinstance(count, (int, np.integer)) or count < -1:
                 raise ValueError(f"expected n_{name}s as a number of {name}s, got {shown(count)}.")
             most = int(array.max(initial=-1)) + 1
-            size = most if count is None else int(count)
+            size = most if count == -1 else int(count)
             if array.min(initial=0) < 0 or most > size:
                 raise ValueError(f"expected numbers of {name}s from 0 to {size - 1}, got {array.min()} to {most - 1}.")
             object.__setattr__(self, f"n_{name}s", size)
