@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesim.geometry.consensus import refuse_misfit
+from rangesim.geometry.consensus import SIGNIFICANCE, refuse_misfit
 from rangesim.geometry.correspondences import (
     ROUNDING,
     Array,
@@ -47,8 +47,6 @@ RANDOM_STARTS = 4
 SAME_COST = 1e-6
 """Relative difference of the sums of squares of two starts that found the same minimum."""
 LEAST_DAMPING = 1e-12
-NOISE_MARGIN = 1.5
-"""Times the largest singular value of noise alone that a component of the shape must have."""
 MAX_ROTATION_DEVIATION = 0.3
 """Radians; rotations known worse than this are none."""
 
@@ -157,23 +155,23 @@ def factorise_affine(
         Too few images or points; images that share no points; or a rank that is not there: points on a plane, or
         images that do not turn against each other.
     """
-    some, points = _determined(tracks, -(-rank // 2), rank + 1, 0.5 * (rank + 1), f"a factorisation of rank {rank}")
+    some, points = determined(tracks, -(-rank // 2), rank + 1, 0.5 * (rank + 1), f"a factorisation of rank {rank}")
     check_noise(noise_px)
-    cameras = _low_rank(some, rank, seed)
+    cameras = low_rank(some, rank, seed)
     residuals = cameras.project()[some.image, some.point] - some.pixels
     n, p = some.n_images, some.n_points
     freedom = residuals.size - (n * (2 * rank + 2) + p * rank - rank * (rank + 1))
     refuse_misfit(float((residuals**2).sum()), freedom, noise_px, f"a matrix of rank {rank}")
-    noise = _noise(residuals, freedom, noise_px)
-    cameras, values = _whitened(cameras)
-    _refuse_rank(values, some, noise, 2 * n - 1, p - 1, "points on a plane, or images that do not turn")
-    everywhere = _everywhere(tracks, points, residuals)
+    noise = noise_of(residuals, freedom, noise_px)
+    cameras, values = whitened(cameras)
+    refuse_rank(values, some, noise, 2 * n - 1, p - 1, "points on a plane, or images that do not turn")
+    all_residuals = everywhere(tracks, points, residuals)
     return AffineFactorisation(
-        cameras.M, cameras.t, _scattered(tracks, points, cameras.X), everywhere, noise, values / np.sqrt(len(some))
+        cameras.M, cameras.t, scattered(tracks, points, cameras.X), all_residuals, noise, values / np.sqrt(len(some))
     )
 
 
-def _determined(
+def determined(
     tracks: Tracks, least_images: int, least_points: int, images_needed: float, purpose: str
 ) -> tuple[Tracks, np.ndarray]:
     """The tracks of points in at least `least_images` images, numbered anew, and their numbers before."""
@@ -181,16 +179,12 @@ def _determined(
         raise ValueError(
             f"expected at least {int(np.ceil(images_needed))} images for {purpose}, got {tracks.n_images}."
         )
-    points = np.flatnonzero(tracks.images_per_point >= max(least_images, 2))
+    some, points = renumbered(tracks, max(least_images, 2))
     if len(points) < least_points:
         raise ValueError(
             f"expected at least {least_points} points in {max(least_images, 2)} images or more for {purpose}, got "
             f"{len(points)} of {tracks.n_points}; track them through more images."
         )
-    place = np.full(tracks.n_points, -1)
-    place[points] = np.arange(len(points))
-    kept = place[tracks.point] >= 0
-    some = Tracks(tracks.image[kept], place[tracks.point[kept]], tracks.pixels[kept], tracks.n_images, len(points))
     check_connected(some)
     few = np.flatnonzero(some.points_per_image < least_points)
     if len(few):
@@ -201,7 +195,17 @@ def _determined(
     return some, points
 
 
-def _low_rank(tracks: Tracks, rank: int, seed: int) -> AffineCameras:
+def renumbered(tracks: Tracks, least_images: int) -> tuple[Tracks, np.ndarray]:
+    """The tracks of points in at least `least_images` images, numbered anew, and their numbers before."""
+    points = np.flatnonzero(tracks.images_per_point >= least_images)
+    place = np.full(tracks.n_points, -1)
+    place[points] = np.arange(len(points))
+    kept = place[tracks.point] >= 0
+    some = Tracks(tracks.image[kept], place[tracks.point[kept]], tracks.pixels[kept], tracks.n_images, len(points))
+    return some, points
+
+
+def low_rank(tracks: Tracks, rank: int, seed: int) -> AffineCameras:
     """Cameras and points of least squared error over the observations."""
     dense = tracks.dense()
     missing = np.isnan(dense)
@@ -261,7 +265,7 @@ def _affine_descent(tracks: Tracks, start: AffineCameras) -> tuple[AffineCameras
     return found.state, found.here.cost
 
 
-def _whitened(cameras: AffineCameras) -> tuple[AffineCameras, Array]:
+def whitened(cameras: AffineCameras) -> tuple[AffineCameras, Array]:
     """The same with points of zero mean and unit covariance along the principal axes, and the singular values."""
     middle = cameras.X.mean(axis=0)
     t = cameras.t + cameras.M @ middle
@@ -273,34 +277,37 @@ def _whitened(cameras: AffineCameras) -> tuple[AffineCameras, Array]:
     return AffineCameras(M, t, q @ vt.T * root), values
 
 
-def _refuse_rank(values: Array, tracks: Tracks, noise: float, rows: int, columns: int, why: str) -> None:
-    """Raise ValueError where the least singular value is no larger than noise alone would have.
+def refuse_rank(values: Array, tracks: Tracks, noise: float, rows: int, columns: int, why: str) -> None:
+    """Raise ValueError where the least of r singular values is no larger than noise alone would have.
 
-    The largest of a matrix of noise is about noise (sqrt(rows) + sqrt(columns)) (Marchenko, Pastur 1967).
+    Of a matrix of noise, the largest exceeds noise (sqrt(rows) + sqrt(columns) + u) with a probability below
+    exp(-u^2 / 2) (Davidson, Szarek 2001); r - 1 components have taken as many rows and columns before it.
     """
     full = len(tracks) / (tracks.n_images * tracks.n_points)
-    of_noise = 0.0 if np.isnan(noise) else noise * (np.sqrt(rows) + np.sqrt(columns)) / np.sqrt(full)
-    if not values[-1] > max(NOISE_MARGIN * of_noise, ROUNDING * values[0]):
+    before = len(values) - 1
+    spread = np.sqrt(max(rows - before, 0)) + np.sqrt(max(columns - before, 0)) + np.sqrt(-2 * np.log(SIGNIFICANCE))
+    of_noise = 0.0 if np.isnan(noise) else noise * spread / np.sqrt(full)
+    if not values[-1] > max(of_noise, ROUNDING * values[0]):
         raise ValueError(
             f"expected tracks of rank {len(values)}, got singular values {', '.join(f'{v:.3g}' for v in values)} px of "
-            f"which the last is no more than noise ({of_noise:.3g}): {why}; add points or views of other kinds."
+            f"which the last may be noise (up to {of_noise:.3g}): {why}; add points or views of other kinds."
         )
 
 
-def _noise(residuals: Array, freedom: int, noise_px: float | None) -> float:
+def noise_of(residuals: Array, freedom: int, noise_px: float | None) -> float:
     if noise_px is not None:
         return float(noise_px)
     return float(np.sqrt((residuals**2).sum() / freedom)) if freedom > 0 else float("nan")
 
 
-def _everywhere(tracks: Tracks, points: np.ndarray, residuals: Array) -> Array:
+def everywhere(tracks: Tracks, points: np.ndarray, residuals: Array) -> Array:
     """(m, 2) of all observations, from those of some points."""
     result = np.full((len(tracks), 2), np.nan)
     result[np.isin(tracks.point, points)] = residuals
     return result
 
 
-def _scattered(tracks: Tracks, points: np.ndarray, X: Array) -> Array:
+def scattered(tracks: Tracks, points: np.ndarray, X: Array) -> Array:
     result = np.full((tracks.n_points, X.shape[1]), np.nan)
     result[points] = X
     return result
@@ -336,8 +343,8 @@ def factorise_orthographic(
             "open (Ullman 1979)."
         )
     affine = factorise_affine(tracks, noise_px=noise_px, seed=seed)
-    some, points = _determined(tracks, 2, 4, 3, "an orthographic factorisation")
-    start = _metric_upgrade(affine.M, affine.t, affine.points[points], has_scale)
+    some, points = determined(tracks, 2, 4, 3, "an orthographic factorisation")
+    start = metric_upgrade(affine.M, affine.t, affine.points[points], has_scale)
     found = orthographic.adjust(some, start, has_scale=has_scale)
     shapes = found.state
     residuals = shapes.project()[some.image, some.point] - some.pixels
@@ -345,20 +352,20 @@ def factorise_orthographic(
     gauge = 6 + int(has_scale)
     freedom = residuals.size - (n * (5 + int(has_scale)) + 3 * p - gauge)
     refuse_misfit(float((residuals**2).sum()), freedom, noise_px, "one rigid shape without perspective")
-    noise = _noise(residuals, freedom, noise_px)
+    noise = noise_of(residuals, freedom, noise_px)
     refuse_open_rotations(found.here, gauge, noise)
     shapes = first_upright(shapes)
     return OrthographicFactorisation(
         shapes.R,
         shapes.t,
         shapes.scale,
-        _scattered(tracks, points, shapes.basis[:, 0]),
-        _everywhere(tracks, points, residuals),
+        scattered(tracks, points, shapes.basis[:, 0]),
+        everywhere(tracks, points, residuals),
         noise,
     )
 
 
-def _metric_upgrade(M: Array, t: Array, X: Array, has_scale: bool) -> Shapes:
+def metric_upgrade(M: Array, t: Array, X: Array, has_scale: bool) -> Shapes:
     n = len(M)
     first, second = M[:, 0], M[:, 1]
 
@@ -455,7 +462,7 @@ def factorise_projective(tracks: Tracks, *, noise_px: float | None = None, seed:
         Too few images or points; images that share no points; a rank below 4: points on a plane, cameras in one place;
         or depths that stay of different signs: the pairs are wrong, or the start was too far off.
     """
-    some, points = _determined(tracks, 2, 7, 2, "a projective factorisation")
+    some, points = determined(tracks, 2, 7, 2, "a projective factorisation")
     check_noise(noise_px)
     n, p = some.n_images, some.n_points
     to_unit = np.stack([normalising_transform(some.pixels[some.image == i]) for i in range(n)])
@@ -472,29 +479,27 @@ def factorise_projective(tracks: Tracks, *, noise_px: float | None = None, seed:
     residuals = (image[:, :2] / image[:, 2:] - unit_pixels) / weights[:, None]
     freedom = residuals.size - (11 * n + 3 * p - 15)
     refuse_misfit(float((residuals**2).sum()), freedom, noise_px, "one rigid scene")
-    noise = _noise(residuals, freedom, noise_px)
+    noise = noise_of(residuals, freedom, noise_px)
     _refuse_projective_rank(P, X, unit, noise * scale)
     cameras = np.linalg.inv(to_unit) @ P
     cameras /= np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
-    return ProjectiveFactorisation(
-        cameras, _scattered(tracks, points, X), _everywhere(tracks, points, residuals), noise
-    )
+    return ProjectiveFactorisation(cameras, scattered(tracks, points, X), everywhere(tracks, points, residuals), noise)
 
 
 def _projective_start(tracks: Tracks, seed: int) -> tuple[Array, Array]:
     dense = tracks.dense()
     missing = np.isnan(dense[..., 0])
     if missing.any():
-        dense[missing] = _low_rank(tracks, AFFINE_RANK, seed).project()[missing]
+        dense[missing] = low_rank(tracks, AFFINE_RANK, seed).project()[missing]
     depths = np.ones(missing.shape)
     homogeneous = np.concatenate([dense, np.ones((*missing.shape, 1))], axis=2)
+    n, p = depths.shape
     for _ in range(DEPTH_ROUNDS):
         for _ in range(2):  # images and points to one size
             size = depths**2 * (homogeneous**2).sum(axis=2)
             depths /= np.sqrt(size.mean(axis=0))
             size = depths**2 * (homogeneous**2).sum(axis=2)
             depths /= np.sqrt(size.mean(axis=1, keepdims=True))
-        n, p = depths.shape
         matrix = (depths[..., None] * homogeneous).transpose(0, 2, 1).reshape(3 * n, p)
         u, values, vt = np.linalg.svd(matrix, full_matrices=False)
         P, X = (u[:, :4] * values[:4]).reshape(n, 3, -1), vt[:4].T
@@ -560,4 +565,4 @@ def _refuse_projective_rank(P: Array, X: Array, tracks: Tracks, noise: float) ->
     image = np.einsum("nab,pb->npa", P, X)
     matrix = np.nan_to_num(image / image[..., 2:] * depths[..., None]).transpose(0, 2, 1).reshape(3 * n, p)
     values = np.linalg.svd(matrix, compute_uv=False)[:PROJECTIVE_RANK]
-    _refuse_rank(values, tracks, noise, 2 * n, p, "points on a plane, or cameras in one place")
+    refuse_rank(values, tracks, noise, 2 * n, p, "points on a plane, or cameras in one place")

@@ -48,19 +48,21 @@ class Shapes:
 
 @dataclass(frozen=True)
 class TemporalPrior:
-    """How much may change from an image to the next, as standard deviations of a Gaussian prior.
+    """How smoothly a shape deforms and a camera turns, as standard deviations of a Gaussian prior; None: as it likes.
 
-    shape_step_px : of a coordinate of a point of the shape, in its own frame, pixels. turn_step_rad : of a rotation
-    vector's coordinate. None: anything. The prior is on what is seen of the shape, the sum over points of
-    |sum_k (c_ik - c_i-1,k) B_kj|^2, and not on coefficients, whose units the gauge leaves open: a prior on these alone
-    would be met by making them small and the basis large.
+    shape_bend_px : of a coordinate of S_i-1 - 2 S_i + S_i+1, S_i a point of the shape in image i, in the world, pixels:
+    how far, twice, it may lie off the middle between before and after. turn_step_rad : of the rotation vector between
+    consecutive images. The prior is on the shape, the sum over points of |sum_k (c_i-1,k - 2 c_ik + c_i+1,k) B_kj|^2,
+    and not on the coefficients, whose units the gauge leaves open: a prior on these alone would be met by making them
+    small and the basis large. It is on bends and not on steps, since a deformation that goes on for some images has
+    large steps, and a prior that takes them for chance makes it smaller.
     """
 
-    shape_step_px: float | None = None
+    shape_bend_px: float | None = None
     turn_step_rad: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("shape_step_px", "turn_step_rad"):
+        for name in ("shape_bend_px", "turn_step_rad"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ValueError(f"expected {name} to be positive, or None for no prior, got {value!r}.")
@@ -74,6 +76,7 @@ def adjust(
     start: Shapes,
     *,
     has_scale: bool = False,
+    has_translation: bool = True,
     prior: TemporalPrior = NO_PRIOR,
     noise_px: float = 1.0,
     max_steps: int = 300,
@@ -81,13 +84,13 @@ def adjust(
 ) -> Descended[Shapes, NormalEquations]:
     """The shapes of least squared error, over the noise, plus those of the prior, from a start downwards.
 
-    has_scale : whether the scales are free; all points that `tracks` number must be seen.
+    has_scale, has_translation : whether scales and translations are free; else they stay.
     """
     n, p, K = *start.coefficients.shape[:1], len(start.basis), start.coefficients.shape[1]
     sizes = Sizes(0, n, 5 + int(has_scale) + K - 1, p, 3 * K)
 
     def look(shapes: Shapes) -> NormalEquations:
-        return _look(shapes, tracks, sizes, has_scale, prior, noise_px)
+        return _look(shapes, tracks, sizes, has_scale, has_translation, prior, noise_px)
 
     def move(shapes: Shapes, step: Step) -> Shapes:
         return settled(_moved(shapes, step, has_scale))
@@ -112,7 +115,13 @@ def _moved(shapes: Shapes, step: Step, has_scale: bool) -> Shapes:
 
 
 def _look(
-    shapes: Shapes, tracks: Tracks, sizes: Sizes, has_scale: bool, prior: TemporalPrior, noise_px: float
+    shapes: Shapes,
+    tracks: Tracks,
+    sizes: Sizes,
+    has_scale: bool,
+    has_translation: bool,
+    prior: TemporalPrior,
+    noise_px: float,
 ) -> NormalEquations:
     image, point = tracks.image, tracks.point
     m, K = len(tracks), shapes.coefficients.shape[1]
@@ -125,15 +134,15 @@ def _look(
     by_images = np.zeros((m, 2, 1, sizes.of_image))
     by_images[:, 0, 0, 1], by_images[:, 0, 0, 2] = y[:, 2], -y[:, 1]
     by_images[:, 1, 0, 0], by_images[:, 1, 0, 2] = -y[:, 2], y[:, 0]
-    by_images[:, 0, 0, 3] = by_images[:, 1, 0, 4] = 1
+    by_images[:, 0, 0, 3] = by_images[:, 1, 0, 4] = float(has_translation)
     by_images[:, :, 0, 5 : 4 + K] = np.swapaxes(seen[:, 1:, :2], 1, 2)
     if has_scale:
         by_images[:, :, 0, -1] = y[:, :2]
     by_point = c[:, None, :, None] * (scale[:, None, None] * R[:, :2])[:, :, None, :]
     none = np.empty((m, 2, 0))
     terms = [Term(values / noise_px, point, image[:, None], by_images / noise_px, _flat(by_point) / noise_px, none)]
-    if prior.shape_step_px is not None:
-        terms.append(_shape_steps(shapes, sizes, prior.shape_step_px))
+    if prior.shape_bend_px is not None:
+        terms.append(_shape_bends(shapes, sizes, prior.shape_bend_px))
     of_images = None if prior.turn_step_rad is None else _turn_steps(shapes, sizes, prior.turn_step_rad)
     cost = sum(float((term.values**2).sum()) for term in terms)
     if of_images is not None:
@@ -145,19 +154,19 @@ def _flat(by_point: Array) -> Array:
     return np.ascontiguousarray(by_point.reshape(*by_point.shape[:2], -1))
 
 
-def _shape_steps(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
-    """Residuals (p (n - 1), 3) of the change of each point's shape between consecutive images."""
+def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
+    """Residuals (p (n - 2), 3) of each point of the shape, second differences over the images."""
     n, K = shapes.coefficients.shape
     p = len(shapes.basis)
-    point, later = (a.ravel() for a in np.meshgrid(np.arange(p), np.arange(1, n), indexing="ij"))
-    change = (shapes.coefficients[1:] - shapes.coefficients[:-1])[later - 1]
+    point, middle = (a.ravel() for a in np.meshgrid(np.arange(p), np.arange(1, n - 1), indexing="ij"))
+    images = middle[:, None] + np.arange(-1, 2)
+    weights = np.array([1.0, -2.0, 1.0])
+    change = np.einsum("mek,e->mk", shapes.coefficients[images], weights)
     basis = shapes.basis[point]
-    by_images = np.zeros((len(point), 3, 2, sizes.of_image))
-    by_images[:, :, 0, 5 : 4 + K] = np.swapaxes(basis[:, 1:], 1, 2)
-    by_images[:, :, 1] = -by_images[:, :, 0]
+    by_images = np.zeros((len(point), 3, 3, sizes.of_image))
+    by_images[..., 5 : 4 + K] = np.swapaxes(basis[:, 1:], 1, 2)[:, :, None] * weights[:, None]
     by_point = change[:, None, :, None] * np.eye(3)[:, None, :]
     values = np.einsum("mk,mkd->md", change, basis)
-    images = np.stack([later, later - 1], axis=1)
     none = np.empty((len(point), 3, 0))
     return Term(values / deviation, point, images, by_images / deviation, _flat(by_point) / deviation, none)
 

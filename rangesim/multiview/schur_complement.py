@@ -218,6 +218,17 @@ class NormalEquations:
         V, h = self._of_points
         return -(np.linalg.pinv(V, rcond=1e-12, hermitian=True) @ h[:, :, None])[:, :, 0]
 
+    def covariance_of_points(self) -> Array:
+        """(n_points, p, p) V^-1: of each point given the images, for residuals of unit variance; infinite where the
+        residuals leave it open."""
+        V, _ = self._of_points
+        values, axes = np.linalg.eigh(V)
+        sound = values[:, 0] > 1e-13 * values[:, -1]
+        half = axes / np.sqrt(np.where(sound[:, None], values, 1.0))[:, None, :]
+        result = half @ np.swapaxes(half, 1, 2)
+        result[~sound] = np.inf
+        return np.asarray(result)
+
     def free_covariance(self, gauge: int) -> Array:
         """(k, k) as `covariance`, with `gauge` freedoms spread over all parameters: S^+ less its `gauge` least
         eigenvalues, that of smallest trace (inner constraints). Infinite if more are open."""
