@@ -75,7 +75,9 @@ class BundleAdjustment:
         return float(np.sqrt((self.residuals_px[self.used] ** 2).sum(axis=1).mean()))
 
 
-class _State(NamedTuple):
+class Views(NamedTuple):
+    """camera : of all images. T : (n_images, 4, 4) T_camera_world. X : (n_points, 3) world."""
+
     camera: Intrinsics
     T: Array
     X: Array
@@ -119,19 +121,19 @@ def bundle_adjust(
     is_free = np.ones(tracks.n_images, dtype=bool)
     is_free[list(held)] = False
 
-    def look(state: _State) -> NormalEquations:
-        return _look(state, some, sizes, columns, is_free, loss, loss_scale_px)
+    def look(state: Views) -> NormalEquations:
+        return normal_equations(state, some, sizes, columns, is_free, loss, loss_scale_px)
 
-    def move(state: _State, step: Step) -> _State:
+    def move(state: Views, step: Step) -> Views:
         lens = np.zeros(len(LENS_NAMES))
         lens[columns] = step.shared
         moved = moved_lens(state.camera, lens) if columns else state.camera
-        return _State(moved, moved_pose(state.T, step.images), state.X + step.points)
+        return Views(moved, moved_pose(state.T, step.images), state.X + step.points)
 
     found = descend(look, move, state, max_steps=max_steps, converged=CONVERGED, least_damping=LEAST_DAMPING)
     T, X, gauge = _in_gauge(state.T, found.state.T, found.state.X, list(held), len(columns))
-    equations = look(_State(found.state.camera, T, X))
-    residuals = _residuals(_State(found.state.camera, T, X), some)
+    equations = look(Views(found.state.camera, T, X))
+    residuals = reprojection_errors(Views(found.state.camera, T, X), some)
     noise = noise_px if noise_px is not None else _noise(residuals, loss, _freedom(some, sizes, held))
     covariance = equations.covariance(gauge) * max(noise, 1e-300) ** 2
     _refuse_undetermined(covariance, T, sizes, is_free, noise)
@@ -172,7 +174,7 @@ def _checked(
     loss: str,
     loss_scale_px: float,
     noise_px: float | None,
-) -> tuple[Sizes, Tracks, _State]:
+) -> tuple[Sizes, Tracks, Views]:
     if tracks.n_images < MIN_IMAGES:
         raise ValueError(
             f"expected at least {MIN_IMAGES} images for a bundle adjustment, got {tracks.n_images}: one image has no "
@@ -197,8 +199,8 @@ def _checked(
     known = np.isfinite(X).all(axis=1) & (tracks.images_per_point >= MIN_IMAGES)
     some = tracks.keep(known[tracks.point])
     check_connected(some)
-    state = _State(with_all_coefficients(camera), T, np.where(known[:, None], X, 0.0))
-    hidden = np.flatnonzero(~np.isfinite(_residuals(state, some)).all(axis=1))
+    state = Views(with_all_coefficients(camera), T, np.where(known[:, None], X, 0.0))
+    hidden = np.flatnonzero(~np.isfinite(reprojection_errors(state, some)).all(axis=1))
     if len(hidden):
         i = hidden[0]
         raise ValueError(
@@ -268,19 +270,19 @@ def _refuse_undetermined(covariance: Array, T: Array, sizes: Sizes, is_free: np.
 # ------------------------------------------------------------------------------------------- the sum of squares
 
 
-def _in_cameras(state: _State, tracks: Tracks) -> Array:
+def in_cameras(state: Views, tracks: Tracks) -> Array:
     """(m, 3) the observed points in coordinates of the cameras that observe them."""
     R, X = state.T[tracks.image, :3, :3], state.X[tracks.point]
     return np.asarray((R @ X[:, :, None])[:, :, 0] + state.T[tracks.image, :3, 3])
 
 
-def _residuals(state: _State, tracks: Tracks) -> Array:
+def reprojection_errors(state: Views, tracks: Tracks) -> Array:
     """(m, 2) projected less seen, pixels; NaN behind the camera."""
-    return state.camera.project(_in_cameras(state, tracks)) - tracks.pixels
+    return state.camera.project(in_cameras(state, tracks)) - tracks.pixels
 
 
-def _look(
-    state: _State,
+def normal_equations(
+    state: Views,
     tracks: Tracks,
     sizes: Sizes,
     columns: list[int],
@@ -288,7 +290,9 @@ def _look(
     loss: str,
     scale: float,
 ) -> NormalEquations:
-    seen = _in_cameras(state, tracks)
+    """The sum of the loss over all observations, with the lens's parameters `columns` and the images `is_free` free;
+    infinite with a point behind a camera."""
+    seen = in_cameras(state, tracks)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         pixels, by_seen, appears = reproject(state.camera, seen)
     if not appears.all():

@@ -58,11 +58,13 @@ from rangesim.settings.config import shown
 
 STARTS, START_STEPS = 20, 120
 """Starts of the upgrade before it is given up, and steps of each."""
-MAX_TURN = 0.5
-"""Radians by which the last start turns the images of the first."""
+TURN = 0.3
+"""Radians by which starts turn the images of the first."""
 SAME_COST = 1e-4
 """Relative difference of the sums of squares of starts that agree."""
-LEAST_NOISE = 1e-6
+MAX_SHAPE_DEVIATION = 0.5
+"""Of the shape's extent; a shape whose median coordinate is known worse is none."""
+LEAST_NOISE = 1e-4
 """Of the extent of the tracks, beside a prior: less is numerically none."""
 
 
@@ -119,8 +121,8 @@ class NonRigidShape:
     the first 1, the others uncorrelated, of zero mean and unit variance over the images. basis : (n_points, K, 3), the
     mean shape, its mean at 0, and the principal deformations, largest first, pixels; NaN of points seen in too few
     images. shapes : (n_images, n_points, 3) what they make in each image. shape_deviation_px : (n_images, n_points)
-    standard deviation of a coordinate of these, root mean square over the three, given the cameras; look at it before
-    you trust a point that few images see. residuals_px : (m, 2) predicted less seen; NaN of what was left out.
+    standard deviation of a coordinate of the shape as its camera sees it, root mean square over the three; look at it
+    before you trust a point that few images see. residuals_px : (m, 2) predicted less seen; NaN of what was left out.
     noise_px : standard deviation of a pixel's coordinate. prior : that was used.
 
     As a rigid shape without perspective, it has a mirror image that looks the same: `reversed`.
@@ -246,7 +248,7 @@ def _upgraded(tracks: Tracks, K: int, seed: int, has_translation: bool) -> Shape
     """The shapes of least squared error, from one start after another until two agree.
 
     The first start is the best rigid shape, with the largest deformations that explain what it leaves; the others turn
-    its images at random, ever more.
+    its images at random.
     """
     n, p = tracks.n_images, tracks.n_points
     if has_translation:
@@ -261,7 +263,7 @@ def _upgraded(tracks: Tracks, K: int, seed: int, has_translation: bool) -> Shape
     floor = (ROUNDING * float(np.std(tracks.pixels))) ** 2 * len(tracks)
     best, least = rigid, np.inf
     for attempt in range(STARTS):
-        R = Rotation.from_rotvec(random.normal(0, MAX_TURN * attempt / STARTS, (n, 3))).as_matrix() @ rigid.R
+        R = Rotation.from_rotvec(random.normal(0, TURN * min(attempt, 1), (n, 3))).as_matrix() @ rigid.R
         left = np.nan_to_num(tracks.dense() - replace(rigid, R=R).project())
         modes = np.linalg.svd(np.einsum("nad,npa->npd", R[:, :2], left).reshape(n, -1), full_matrices=False)[0]
         coefficients = np.concatenate([np.ones((n, 1)), modes[:, : K - 1] * np.sqrt(n)], axis=1)
@@ -273,11 +275,11 @@ def _upgraded(tracks: Tracks, K: int, seed: int, has_translation: bool) -> Shape
         agrees = abs(cost - least) <= SAME_COST * least
         if cost < least:
             best, least = found.state, cost
-        if agrees or least <= floor:
+        if (agrees and attempt > 1) or least <= floor:
             return best
     raise ValueError(
-        f"expected tracks of {K} basis shapes, got some for which no two of {STARTS} starts agree: the shape deforms in "
-        "fewer ways, or the images turn too little; try fewer basis shapes."
+        f"expected tracks of {K} basis shapes, got some for which no two of {STARTS} starts agree: the shape deforms "
+        "in fewer ways, or the images turn too little; try fewer basis shapes."
     )
 
 
@@ -288,21 +290,35 @@ def _lifted(virtual: Shapes, cameras: AffineCameras) -> Shapes:
 
 def _estimated(found: Descended[Shapes, NormalEquations]) -> TemporalPrior:
     """The prior that the best determined half of the points suggests."""
-    deviation = _deviations(found, 1.0).max(axis=0)
+    deviation = _deviations(found, count_unknowns(1, 1, found.state.basis.shape[1]).gauge).max(axis=0)
     best = np.argsort(deviation)[: -(-len(deviation) // 2)]
     bends = np.diff(found.state.shapes[:, best], n=2, axis=0)
     size = float(np.sqrt(((bends - bends.mean(axis=1, keepdims=True)) ** 2).mean()))
     return TemporalPrior(shape_bend_px=size if size > 0 else None)
 
 
-def _deviations(found: Descended[Shapes, NormalEquations], unit: float) -> Array:
-    """(n, p) root mean square standard deviation of a shape's coordinates, given the cameras. unit : of a residual."""
-    covariance = found.here.covariance_of_points() * unit**2
-    K = found.state.basis.shape[1]
-    blocks = np.einsum("pkdld->pkl", covariance.reshape(-1, K, 3, K, 3))  # the trace over the coordinates
-    c = found.state.coefficients
-    with np.errstate(invalid="ignore"):
-        return np.nan_to_num(np.sqrt(np.einsum("nk,pkl,nl->np", c, blocks, c) / 3), nan=np.inf)
+def _deviations(found: Descended[Shapes, NormalEquations], gauge: int) -> Array:
+    """(n, p) root mean square standard deviation of the coordinates of the shape as its camera sees it, for residuals
+    of unit variance: what the points leave open, and what the images do, whose errors the points follow."""
+    shapes, sizes = found.state, found.here.sizes
+    n, K = shapes.coefficients.shape
+    p, c = len(shapes.basis), sizes.of_image
+    of_points = found.here.covariance_of_points().reshape(p, K, 3, K, 3)
+    weights = shapes.coefficients
+    variance = np.einsum("nk,pkdld,nl->np", weights, of_points, weights)
+    values, axes = np.linalg.eigh(found.here.free_covariance(gauge))
+    half = axes * np.sqrt(np.maximum(values, 0))
+    response = found.here.response_of_points().reshape(p, K, 3, n * c) @ half
+    for i in range(n):
+        seen = shapes.basis @ shapes.R[i].T  # (p, K, 3)
+        moved = np.einsum("ad,pkdg,k->pag", shapes.R[i], response, weights[i])
+        y = np.einsum("k,pkd->pd", weights[i], seen)
+        mine = half[i * c : (i + 1) * c]
+        moved += np.cross(mine[:3].T[None], y[:, None]).transpose(0, 2, 1)
+        moved += np.einsum("pkd,kg->pdg", seen[:, 1:], mine[5 : 4 + K])
+        moved -= moved.mean(axis=0)  # where the whole shape stands is no part of it
+        variance[i] += (moved**2).sum(axis=(1, 2))
+    return np.asarray(np.sqrt(variance / 3))
 
 
 def _judged(
@@ -319,8 +335,16 @@ def _judged(
     # a prior on bends of the shape fixes where the deformations have their middle
     gauge = 3 + 3 * (K if prior.shape_bend_px is None else 1) + K * (K - 1)
     refuse_open_rotations(found.here, gauge, noise / unit)
-    deviations = _deviations(found, noise / unit)
+    deviations = _deviations(found, gauge) * noise / unit
     shapes = _principal(found.state)
+    extent = float(np.sqrt((shapes.basis[:, 0] ** 2).mean()))
+    open_px = float(np.median(deviations))
+    if not open_px <= MAX_SHAPE_DEVIATION * extent:
+        raise ValueError(
+            f"expected tracks that determine the shape, got some that leave its coordinates open by {open_px:.3g} px "
+            f"of an extent of {extent:.3g} at a noise of {noise:.3g} px: give a prior (adjust_nonrigid), fewer basis "
+            "shapes, or more images that turn."
+        )
     residuals = shapes.project()[some.image, some.point] - some.pixels
     basis = np.full((tracks.n_points, K, 3), np.nan)
     basis[points] = shapes.basis

@@ -218,6 +218,19 @@ class NormalEquations:
         V, h = self._of_points
         return -(np.linalg.pinv(V, rcond=1e-12, hermitian=True) @ h[:, :, None])[:, :, 0]
 
+    def response_of_points(self) -> Array:
+        """(n_points, p, k) d points / d (shared, images) at the minimum over the points: -V^-1 W^T."""
+        sizes = self.sizes
+        found = self.reduced(1e-13)
+        if found is None:
+            return np.full((sizes.points, sizes.of_point, sizes.eliminated), np.inf)
+        _, _, inverse, _, by_points = found
+        Y = np.zeros((sizes.points, sizes.of_point, sizes.eliminated))
+        for term, starts, by_point in zip(self.terms, self._starts, by_points, strict=True):
+            place = np.arange(sizes.images)
+            _fill(0, sizes.points, 0, starts, place, term.images, term.by_images, term.by_shared, by_point, Y)
+        return np.asarray(-np.swapaxes(inverse, 1, 2) @ Y)
+
     def covariance_of_points(self) -> Array:
         """(n_points, p, p) V^-1: of each point given the images, for residuals of unit variance; infinite where the
         residuals leave it open."""
