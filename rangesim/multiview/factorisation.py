@@ -493,7 +493,7 @@ def _projective_start(tracks: Tracks, seed: int) -> tuple[Array, Array]:
         dense[missing] = low_rank(tracks, AFFINE_RANK, seed).project()[missing]
     depths = np.ones(missing.shape)
     homogeneous = np.concatenate([dense, np.ones((*missing.shape, 1))], axis=2)
-    n, p = depths.shape
+    n, p = dense.shape[:2]
     for _ in range(DEPTH_ROUNDS):
         for _ in range(2):  # images and points to one size
             size = depths**2 * (homogeneous**2).sum(axis=2)
@@ -506,11 +506,8 @@ def _projective_start(tracks: Tracks, seed: int) -> tuple[Array, Array]:
         image = np.einsum("nab,pb->npa", P, X)
         better = (image * homogeneous).sum(axis=2) / (homogeneous**2).sum(axis=2)
         depths = np.where(better > 0, better, depths)
-        predicted = image[..., :2] / image[..., 2:]
         fill = missing & (image[..., 2] > 0)
-        homogeneous[fill, :2] = predicted[fill]
-    if P.shape[2] < PROJECTIVE_RANK:
-        raise ValueError("expected a matrix of rank 4, got fewer rows or columns.")
+        homogeneous[fill, :2] = image[fill, :2] / image[fill, 2:]
     return P, X / np.linalg.norm(X, axis=1, keepdims=True)
 
 

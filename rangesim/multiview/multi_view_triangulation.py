@@ -62,7 +62,7 @@ def triangulate_many(
     T = np.asarray(T_camera_world, dtype=np.float64)
     if T.shape != (tracks.n_images, 4, 4):
         raise ValueError(f"expected T_camera_world of shape ({tracks.n_images}, 4, 4), got {T.shape}.")
-    known = np.isfinite(T).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(T).all(axis=(1, 2)))
     if known.sum() < 2:
         raise ValueError(f"expected at least two images with a pose, got {int(known.sum())}.")
     checked_array("T_camera_world", T[known], 4, 4)
@@ -113,7 +113,7 @@ def _solved(tracks: Tracks, rays: Array, camera: Intrinsics, T: Array, noise_px:
     held = np.zeros(tracks.n_images, dtype=bool)
     deviation = np.full(tracks.n_points, np.nan)
     for _ in range(GAUSS_NEWTON_STEPS):
-        some = tracks.keep(np.isfinite(X).all(axis=1)[tracks.point])
+        some = tracks.keep(np.isfinite(X[tracks.point]).all(axis=1))
         views = Views(camera, T, np.nan_to_num(X))
         equations = normal_equations(views, some, sizes, [], held, "linear", 1.0)
         moved = X + equations.step_of_points()
@@ -135,7 +135,9 @@ def _solved(tracks: Tracks, rays: Array, camera: Intrinsics, T: Array, noise_px:
 def _costs(tracks: Tracks, views: Views) -> Array:
     """(n_points,) sums of squares; infinite behind a camera."""
     square = (reprojection_errors(views, tracks) ** 2).sum(axis=1)
-    return np.bincount(tracks.point, np.nan_to_num(square, nan=np.inf), minlength=tracks.n_points)
+    return np.asarray(
+        np.bincount(tracks.point, np.nan_to_num(square, nan=np.inf), minlength=tracks.n_points), dtype=np.float64
+    )
 
 
 def _in_front(tracks: Tracks, camera: Intrinsics, T: Array, X: Array) -> Array:

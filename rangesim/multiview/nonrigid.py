@@ -269,8 +269,9 @@ def _upgraded(tracks: Tracks, K: int, seed: int, has_translation: bool) -> Shape
         coefficients = np.concatenate([np.ones((n, 1)), modes[:, : K - 1] * np.sqrt(n)], axis=1)
         basis = np.concatenate([rigid.basis, np.zeros((p, K - 1, 3))], axis=1)
         start = Shapes(R, rigid.t, rigid.scale, coefficients, basis)
-        settings = {"max_steps": START_STEPS, "converged": 1e-9}
-        found = orthographic.adjust(tracks, start, has_translation=has_translation, **settings)
+        found = orthographic.adjust(
+            tracks, start, has_translation=has_translation, max_steps=START_STEPS, converged=1e-9
+        )
         cost = found.here.cost
         agrees = abs(cost - least) <= SAME_COST * least
         if cost < least:

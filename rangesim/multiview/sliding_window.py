@@ -92,7 +92,7 @@ def adjust_online(
 
 
 def _placed(past: Tracks, camera: Intrinsics, X: Array, image: int) -> Array:
-    mine = np.flatnonzero((past.image == image) & np.isfinite(X).all(axis=1)[past.point])
+    mine = np.flatnonzero((past.image == image) & np.isfinite(X[past.point]).all(axis=1))
     if len(mine) < MIN_KNOWN:
         raise ValueError(
             f"expected at least {MIN_KNOWN} points in each image that earlier ones see too, got {len(mine)} in image "
@@ -112,7 +112,7 @@ def _adjusted(
     images = np.flatnonzero(live.points_per_image > 0)
     some = live.of_images(images)
     anew = triangulate_many(some, camera, T[images], noise_px=noise_px)
-    sound = np.isfinite(anew.points).all(axis=1)  # in front of all, and not too far to tell
+    sound = np.asarray(np.isfinite(anew.points).all(axis=1))  # in front of all, and not too far to tell
     known = np.where(sound[:, None], anew.points, np.nan)
     some = some.keep(sound[some.point])
     used = images[some.points_per_image > 0]

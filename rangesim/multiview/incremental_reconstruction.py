@@ -164,7 +164,7 @@ def _with_next(
     tracks: Tracks, camera: Intrinsics, T: Array, X: Array, waiting: np.ndarray, noise_px: float, seed: int
 ) -> Array:
     """The poses with that of one more image: of those that wait, the one that sees most known points."""
-    known = np.isfinite(X).all(axis=1)
+    known = np.asarray(np.isfinite(X).all(axis=1))
     counts = np.bincount(tracks.image[known[tracks.point]], minlength=tracks.n_images)
     refusal = ""
     for image in waiting[np.argsort(-counts[waiting], kind="stable")]:
