@@ -74,7 +74,9 @@ def around(views: int, points: int, *, fraction: float = 1.0, noise: float = NOI
     places = np.stack([5 * np.cos(angles), 5 * np.sin(angles), 1.5 + 0.5 * np.sin(3 * angles)], axis=1)
     T = np.stack([np.linalg.inv(look_at(place, (0, 0, 0))) for place in places])
     pixels = observed(camera, T, X)
-    image, point = np.nonzero(random.random((views, points)) < fraction)
+    seen = random.random((views, points)) < fraction
+    seen[:3, seen.sum(axis=0) < 3] = True  # in three images at least
+    image, point = np.nonzero(seen)
     x = pixels[image, point] + random.normal(0, noise, (len(image), 2))
     return Scene(camera, T, X, Tracks(image, point, x, views, points))
 
@@ -159,7 +161,9 @@ def deforming(
         seen *= np.exp(random.normal(0, 0.1, (images, 1, 1)))
     exact = seen[..., :2] + random.normal(320, 20, (images, 1, 2))
     x = exact + random.normal(0, noise, exact.shape)
-    x[random.random((images, points)) < missing] = np.nan
+    gone = random.random((images, points)) < missing
+    gone[:3, (~gone).sum(axis=0) < 3] = False  # in three images at least
+    x[gone] = np.nan
     return Deforming(seen - seen.mean(axis=1, keepdims=True), exact, Tracks.from_dense(x))
 
 

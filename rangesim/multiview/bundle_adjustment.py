@@ -42,6 +42,8 @@ CONVERGED = 1e-8
 one."""
 MAX_ROTATION_DEVIATION = 0.3
 """Radians; a pose known worse than this is no pose."""
+MAX_RELATIVE_DEVIATION = 0.5
+"""Standard deviation of a point over its distance from the nearest camera beyond which it has no depth."""
 MIN_IMAGES = 2
 
 
@@ -137,6 +139,7 @@ def bundle_adjust(
     noise = noise_px if noise_px is not None else _noise(residuals, loss, _freedom(some, sizes, held))
     covariance = equations.covariance(gauge) * max(noise, 1e-300) ** 2
     _refuse_undetermined(covariance, T, sizes, is_free, noise)
+    _refuse_no_depth(equations, some, T, X, noise)
     blocks = covariance[len(columns) :, len(columns) :].reshape(tracks.n_images, POSE, tracks.n_images, POSE)
     of_images = np.stack([blocks[i, :, i] for i in range(tracks.n_images)])
     of_images[~is_free] = 0
@@ -264,6 +267,22 @@ def _refuse_undetermined(covariance: Array, T: Array, sizes: Sizes, is_free: np.
             f"expected tracks that determine the cameras, got some that leave {len(bad)} of {len(T)} poses open at a "
             f"noise of {noise:.3g} px, such as that of image {bad[0]}: too few points, points on a line, or a camera "
             "that only rotates; add points or views from other places."
+        )
+
+
+def _refuse_no_depth(equations: NormalEquations, some: Tracks, T: Array, X: Array, noise: float) -> None:
+    """Raise ValueError where most points are known worse, given the cameras, than to half their distance."""
+    deviation = noise * np.sqrt(np.trace(equations.covariance_of_points(), axis1=1, axis2=2))
+    centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+    distance = np.full(len(X), np.inf)
+    np.minimum.at(distance, some.point, np.linalg.norm(X[some.point] - centres[some.image], axis=1))
+    known = np.unique(some.point)
+    with np.errstate(invalid="ignore"):
+        relative = float(np.median(deviation[known] / distance[known]))
+    if relative > MAX_RELATIVE_DEVIATION:
+        raise ValueError(
+            f"expected images with parallax, got some whose points are known to {relative:.0%} of their distance at a "
+            f"noise of {noise:.3g} px: the camera only rotates, or moves too little; add views from other places."
         )
 
 

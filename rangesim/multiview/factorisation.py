@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesim.geometry.consensus import SIGNIFICANCE, refuse_misfit
+from rangesim.geometry.consensus import SIGNIFICANCE, refuse_misfit, simpler_model_suffices
 from rangesim.geometry.correspondences import (
     ROUNDING,
     Array,
@@ -466,27 +466,38 @@ def factorise_projective(tracks: Tracks, *, noise_px: float | None = None, seed:
     check_noise(noise_px)
     n, p = some.n_images, some.n_points
     to_unit = np.stack([normalising_transform(some.pixels[some.image == i]) for i in range(n)])
-    scale = float(np.median(to_unit[:, 0, 0]))
     unit_pixels = some.pixels.copy()
     for i in range(n):
         mine = some.image == i
         unit_pixels[mine] = apply_similarity(to_unit[i], some.pixels[mine])
     unit = replace(some, pixels=unit_pixels)
     weights = to_unit[some.image, 0, 0]  # a pixel in these units
-    P, X = _projective_start(unit, seed)
-    P, X = _projective_descent(unit, P, X, weights)
+    P, X, cost = _projective_descent(unit, *_projective_start(unit, seed, PROJECTIVE_RANK), weights)
+    if not np.isfinite(cost):
+        raise ValueError(
+            "expected tracks of one rigid scene in front of all cameras, got some whose depths stay of different "
+            "signs: some tracks are wrong, too much is missing, or points lie on a plane."
+        )
     image = (P[some.image] @ X[some.point][:, :, None])[:, :, 0]
     residuals = (image[:, :2] / image[:, 2:] - unit_pixels) / weights[:, None]
     freedom = residuals.size - (11 * n + 3 * p - 15)
-    refuse_misfit(float((residuals**2).sum()), freedom, noise_px, "one rigid scene")
+    refuse_misfit(cost, freedom, noise_px, "one rigid scene")
     noise = noise_of(residuals, freedom, noise_px)
-    _refuse_projective_rank(P, X, unit, noise * scale)
+    # with homographies alone, P_i and X_j of three entries: a plane, or cameras in one place
+    flat = _projective_descent(unit, *_projective_start(unit, seed, PROJECTIVE_RANK - 1), weights)[2]
+    simple = flat, residuals.size - (8 * n + 2 * p - 8)
+    if simpler_model_suffices(simple, (cost, freedom), noise_px, ROUNDING * float(np.std(some.pixels))):
+        raise ValueError(
+            f"expected tracks of rank 4, got some that homographies between the images explain to "
+            f"{np.sqrt(flat / simple[1]):.3g} px: points on a plane, or cameras in one place; add points at other "
+            "depths or move the camera."
+        )
     cameras = np.linalg.inv(to_unit) @ P
     cameras /= np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
     return ProjectiveFactorisation(cameras, scattered(tracks, points, X), everywhere(tracks, points, residuals), noise)
 
 
-def _projective_start(tracks: Tracks, seed: int) -> tuple[Array, Array]:
+def _projective_start(tracks: Tracks, seed: int, rank: int) -> tuple[Array, Array]:
     dense = tracks.dense()
     missing = np.isnan(dense[..., 0])
     if missing.any():
@@ -502,7 +513,7 @@ def _projective_start(tracks: Tracks, seed: int) -> tuple[Array, Array]:
             depths /= np.sqrt(size.mean(axis=1, keepdims=True))
         matrix = (depths[..., None] * homogeneous).transpose(0, 2, 1).reshape(3 * n, p)
         u, values, vt = np.linalg.svd(matrix, full_matrices=False)
-        P, X = (u[:, :4] * values[:4]).reshape(n, 3, -1), vt[:4].T
+        P, X = (u[:, :rank] * values[:rank]).reshape(n, 3, rank), vt[:rank].T
         image = np.einsum("nab,pb->npa", P, X)
         better = (image * homogeneous).sum(axis=2) / (homogeneous**2).sum(axis=2)
         depths = np.where(better > 0, better, depths)
@@ -511,12 +522,13 @@ def _projective_start(tracks: Tracks, seed: int) -> tuple[Array, Array]:
     return P, X / np.linalg.norm(X, axis=1, keepdims=True)
 
 
-def _projective_descent(tracks: Tracks, P: Array, X: Array, weights: Array) -> tuple[Array, Array]:
-    """The minimum of the squared errors over the weights."""
-    sizes = Sizes(0, len(P), 12, len(X), 3)
+def _projective_descent(tracks: Tracks, P: Array, X: Array, weights: Array) -> tuple[Array, Array, float]:
+    """P, X and their sum of squared errors over the weights, at its minimum; infinite where depths are not positive."""
+    rank = X.shape[1]
+    sizes = Sizes(0, len(P), 3 * rank, len(X), rank - 1)
 
     def tangents(X: Array) -> Array:
-        """(p, 4, 3) orthonormal directions in which unit vectors X can move."""
+        """(p, r, r - 1) orthonormal directions in which unit vectors X can move."""
         return np.linalg.svd(X[:, None, :])[2][:, 1:].transpose(0, 2, 1)
 
     def look(state: tuple[Array, Array]) -> NormalEquations:
@@ -531,7 +543,7 @@ def _projective_descent(tracks: Tracks, P: Array, X: Array, weights: Array) -> t
         by_plane = np.zeros((len(tracks), 2, 3))
         by_plane[:, 0, 0] = by_plane[:, 1, 1] = 1 / (w * weights)
         by_plane[:, :, 2] = -xy / (w * weights)[:, None]
-        by_images = (by_plane[:, :, :, None] * Xo[:, None, None, :]).reshape(len(tracks), 2, 1, 12)
+        by_images = (by_plane[:, :, :, None] * Xo[:, None, None, :]).reshape(len(tracks), 2, 1, 3 * rank)
         by_point = by_plane @ Po @ tangents(X)[tracks.point]
         term = Term(values, tracks.point, tracks.image[:, None], by_images, by_point, np.empty((len(tracks), 2, 0)))
         return NormalEquations(float((values**2).sum()), sizes, [term])
@@ -544,22 +556,5 @@ def _projective_descent(tracks: Tracks, P: Array, X: Array, weights: Array) -> t
         return P / size, X / np.linalg.norm(X, axis=1, keepdims=True)
 
     P = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
-    if not np.isfinite(look((P, X)).cost):
-        raise ValueError(
-            "expected tracks of one rigid scene in front of all cameras, got some whose depths stay of different "
-            "signs: some tracks are wrong, too much is missing, or points lie on a plane."
-        )
-    return descend(look, move, (P, X), max_steps=300, least_damping=LEAST_DAMPING).state
-
-
-def _refuse_projective_rank(P: Array, X: Array, tracks: Tracks, noise: float) -> None:
-    n, p = len(P), len(X)
-    depths = np.einsum("nb,pb->np", P[:, 2], X)
-    depths = np.where(depths > 0, depths, np.nan)
-    for _ in range(3):
-        depths = depths / np.sqrt(np.nanmean(depths**2, axis=0))
-        depths = depths / np.sqrt(np.nanmean(depths**2, axis=1, keepdims=True))
-    image = np.einsum("nab,pb->npa", P, X)
-    matrix = np.nan_to_num(image / image[..., 2:] * depths[..., None]).transpose(0, 2, 1).reshape(3 * n, p)
-    values = np.linalg.svd(matrix, compute_uv=False)[:PROJECTIVE_RANK]
-    refuse_rank(values, tracks, noise, 2 * n, p, "points on a plane, or cameras in one place")
+    found = descend(look, move, (P, X), max_steps=300, least_damping=LEAST_DAMPING)
+    return *found.state, found.here.cost

@@ -14,14 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim.geometry.correspondences import Array, checked_array
-from rangesim.multiview.bundle_adjustment import Views, normal_equations, reprojection_errors
+from rangesim.multiview.bundle_adjustment import (
+    MAX_RELATIVE_DEVIATION,
+    Views,
+    normal_equations,
+    reprojection_errors,
+)
 from rangesim.multiview.schur_complement import Sizes
 from rangesim.multiview.tracks import Tracks
 from rangesim.rig import Intrinsics
 
 GAUSS_NEWTON_STEPS = 5
-MAX_RELATIVE_DEVIATION = 0.5
-"""Standard deviation of a point over its distance from the nearest camera beyond which it is nowhere."""
 MAX_DROPS = 4
 """Observations of a point that may be wrong."""
 
