@@ -99,10 +99,10 @@ def test_degenerate_rigid_motion_is_refused(noise: float) -> None:
     R = Rotation.random(6, random_state=random).as_matrix()
     with pytest.raises(ValueError, match="plane"):
         factorise_orthographic(tracks_of(R, X * [1, 1, 0], noise))
-    with pytest.raises(ValueError, match="plane|turn"):
+    with pytest.raises(ValueError, match=r"plane|turn"):
         factorise_orthographic(tracks_of(np.repeat(R[:1], 6, axis=0), X, noise))  # one view again and again
     about_z = Rotation.from_rotvec(np.outer(np.arange(6) * 0.2, [0, 0, 1])).as_matrix()
-    with pytest.raises(ValueError, match="plane|turn"):
+    with pytest.raises(ValueError, match=r"plane|turn"):
         factorise_orthographic(tracks_of(about_z, X, noise))
     with pytest.raises(ValueError, match="turn"):
         factorise_orthographic(tracks_of(R[[0, 1, 0, 1, 0, 1]], X, noise))  # two views, again and again
@@ -118,7 +118,7 @@ def test_tracks_without_overlap_and_residuals_over_the_noise_are_refused() -> No
     with pytest.raises(ValueError, match="share no point"):
         factorise_affine(true.tracks.keep(halves))
     noisy = rigid(2, noise=5.0)
-    with pytest.raises(ValueError, match="0.5 px"):
+    with pytest.raises(ValueError, match=r"0\.5 px"):
         factorise_orthographic(noisy.tracks, noise_px=0.5)
 
 

@@ -12,7 +12,8 @@ of the first image, or of the one that is held, and its distance from the image 
 held images leave no freedom.
 
 Degenerate: an image, or a group of images, that shares too few points with the rest; a camera that only rotates (the
-points have no depth). These are errors, told by the covariance.
+points have no depth). These are errors, told by the covariance, and by a start in one place; that a small baseline of
+the start is none, only `structure_from_motion` tells, which tests each pair for it.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ MAX_ROTATION_DEVIATION = 0.3
 """Radians; a pose known worse than this is no pose."""
 MAX_RELATIVE_DEVIATION = 0.5
 """Standard deviation of a point over its distance from the nearest camera beyond which it has no depth."""
+ONE_PLACE = 1e-6
+"""Extent of the cameras of a start over the distance of the points below which they stand in one place."""
 MIN_IMAGES = 2
 
 
@@ -210,6 +213,13 @@ def _checked(
             f"expected points in front of the cameras that see them, got {len(hidden)} of {len(some)} observations "
             f"behind them or beyond the fold of the lens, such as point {some.point[i]} in image {some.image[i]}; set "
             "these points to NaN, or mend the start."
+        )
+    centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+    depth = float(np.median(np.linalg.norm(in_cameras(state, some), axis=1)))
+    if not np.linalg.norm(centres - centres.mean(axis=0), axis=1).max() > ONE_PLACE * depth:
+        raise ValueError(
+            f"expected cameras in different places, got {tracks.n_images} in one: a camera that only rotates sees no "
+            "depth; add views from other places."
         )
     sizes = Sizes(len(free), tracks.n_images, POSE, tracks.n_points, 3)
     if _freedom(some, sizes, held) < 0:

@@ -75,7 +75,7 @@ class UnknownCount(NamedTuple):
     perspective, else 0. coefficients : (K - 1) n, for the mean shape's is 1. shapes : 3 K p. gauge : how many of the
     unknowns change nothing that is seen: 3 (a rotation of the world), 3 K (a translation of each basis shape, made up
     for by those of the images), K (K - 1) (an affinity of the coefficients: other deformations that span the same, and
-    another mean), and 1 under weak perspective (the size of everything).
+    another mean), and K under weak perspective, where scales and coefficients together are known up to any linear map.
     """
 
     equations: int
@@ -109,7 +109,7 @@ def count_unknowns(n_images: int, n_points: int, n_basis: int, *, has_scale: boo
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"expected {name} as a number from 1 on, got {shown(value)}.")
     n, p, K = int(n_images), int(n_points), int(n_basis)
-    gauge = 3 + 3 * K + K * (K - 1) + int(has_scale)
+    gauge = 3 + 3 * K + K * (K - 1) + K * int(has_scale)
     return UnknownCount(2 * n * p, 3 * n, 2 * n, n * int(has_scale), (K - 1) * n, 3 * K * p, gauge)
 
 
