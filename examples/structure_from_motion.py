@@ -68,10 +68,11 @@ def deforming() -> tuple[np.ndarray, Tracks]:
     """(10, 50, 3) a waving sheet of points in the frames of ten cameras, pixels, and noisy tracks with gaps."""
     random = np.random.default_rng(2)
     flat = np.stack(np.meshgrid(np.linspace(-100, 100, 10), np.linspace(-60, 60, 5)), axis=-1).reshape(-1, 2)
-    bases = [np.sin(np.pi * flat[:, 0] / 100), np.cos(np.pi * flat[:, 0] / 100), np.sin(np.pi * flat[:, 1] / 60)]
-    waves = random.normal(0, 30, (10, 3)) @ np.stack(bases)
-    dome = 40 * np.cos(flat[:, 0] / 80) * np.cos(flat[:, 1] / 50)
-    shapes = np.concatenate([np.repeat(flat[None], 10, axis=0), (dome + waves)[:, :, None]], axis=2)
+    x, y = (flat / [100, 60]).T
+    dome = np.stack([*flat.T, 60 * np.cos(1.3 * x) * np.cos(1.2 * y)], axis=1)
+    twist = np.stack([-0.4 * y * x, 0.5 * x**2 - 0.3, x * y], axis=1)
+    wave = np.stack([0.4 * np.cos(2 * y), 0.3 * x * y, np.sin(np.pi * x)], axis=1)
+    shapes = dome + np.einsum("nk,kpd->npd", random.normal(0, 30, (10, 2)), np.stack([twist, wave]))
     R = Rotation.from_rotvec(random.uniform(-0.8, 0.8, (10, 3))).as_matrix()
     seen = np.einsum("npd,ned->npe", shapes, R)
     dense = seen[..., :2] + 300 + random.normal(0, 0.3, (10, 50, 2))
