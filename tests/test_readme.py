@@ -45,6 +45,7 @@ ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
     "rectification": ["rectification.png", "--width", "160"],
     "segmentation": ["--width", "320"],
+    "structure_from_motion": ["structure_from_motion.png", "--views", "10", "--points", "300"],
     "two_cameras": ["--width", "80"],
 }
 """Of the examples that can be had smaller."""
