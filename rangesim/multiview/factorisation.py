@@ -406,10 +406,10 @@ def metric_upgrade(M: Array, t: Array, X: Array, has_scale: bool) -> Shapes:
     return Shapes(u @ vt, t, unit, np.ones((n, 1)), (X @ np.linalg.inv(A).T)[:, None])
 
 
-def refuse_open_rotations(equations: NormalEquations, gauge: int, noise: float) -> None:
+def refuse_open_rotations(equations: NormalEquations, gauge: int, noise: float, unit: float = 1.0) -> None:
     """Raise ValueError where rotations, the first parameters of each image, are known worse than within
-    `MAX_ROTATION_DEVIATION`, the gauge spread over all of them."""
-    covariance = equations.free_covariance(gauge) * (0.0 if np.isnan(noise) else max(noise, 1e-300)) ** 2
+    `MAX_ROTATION_DEVIATION`, the gauge spread over all of them. unit : pixels by which residuals were divided."""
+    covariance = equations.free_covariance(gauge) * (0.0 if np.isnan(noise) else max(noise / unit, 1e-300)) ** 2
     size = equations.sizes.of_image
     with np.errstate(invalid="ignore"):
         turn = np.sqrt(np.diag(covariance).reshape(-1, size)[:, :3].sum(axis=1))

@@ -335,7 +335,7 @@ def _judged(
     K = found.state.basis.shape[1]
     # a prior on bends of the shape fixes where the deformations have their middle
     gauge = 3 + 3 * (K if prior.shape_bend_px is None else 1) + K * (K - 1)
-    refuse_open_rotations(found.here, gauge, noise / unit)
+    refuse_open_rotations(found.here, gauge, noise, unit)
     deviations = _deviations(found, gauge) * noise / unit
     shapes = _principal(found.state)
     extent = float(np.sqrt((shapes.basis[:, 0] ** 2).mean()))
