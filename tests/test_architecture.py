@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -187,19 +188,39 @@ GEOMETRY = {
 }
 
 
-def test_the_public_surface_of_geometry_is_this() -> None:
-    """And type checkers see the same names."""
-    import rangesim.geometry as geometry
+MULTIVIEW = {
+    "bundle_adjustment": "BundleAdjustment bundle_adjust",
+    "factorisation": "AffineFactorisation OrthographicFactorisation ProjectiveFactorisation factorise_affine "
+    "factorise_orthographic factorise_projective",
+    "incremental_reconstruction": "StructureFromMotion structure_from_motion",
+    "multi_view_triangulation": "ManyViewPoints triangulate_many",
+    "nonrigid": "NonRigidShape UnknownCount adjust_nonrigid count_unknowns factorise_nonrigid",
+    "orthographic": "TemporalPrior",
+    "sliding_window": "OnlineAdjustment adjust_online",
+    "tracks": "CommonPoints Tracks",
+}
 
-    wanted = {name: f"rangesim.geometry.{chapter}" for chapter, names in GEOMETRY.items() for name in names.split()}
-    assert set(geometry.__all__) == set(wanted)
-    assert not set(wanted) & set(GEOMETRY)  # a module would take the place of a function of its name
-    tree = ast.parse((ROOT / "rangesim" / "geometry" / "__init__.py").read_text())
+
+@pytest.mark.parametrize(("room", "chapters"), [("geometry", GEOMETRY), ("multiview", MULTIVIEW)])
+def test_the_public_surface_of_a_room_is_this(room: str, chapters: dict[str, str]) -> None:
+    """And type checkers see the same names."""
+    loaded = importlib.import_module(f"rangesim.{room}")
+    wanted = {name: f"rangesim.{room}.{chapter}" for chapter, names in chapters.items() for name in names.split()}
+    assert set(loaded.__all__) == set(wanted)
+    assert not set(wanted) & set(chapters)  # a module would take the place of a function of its name
+    tree = ast.parse((ROOT / "rangesim" / room / "__init__.py").read_text())
     block = next(n for n in tree.body if isinstance(n, ast.If))
     seen = {a.asname: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names if a.asname}
     assert seen == wanted
     for name in wanted:
-        assert getattr(geometry, name).__doc__ or name.isupper()
+        assert getattr(loaded, name).__doc__ or name.isupper()
+
+
+@pytest.mark.parametrize("path", modules("rangesim/multiview"), ids=relative)
+def test_multiview_stands_on_geometry_alone(path: Path) -> None:
+    allowed = ("rangesim.multiview", "rangesim.geometry", "rangesim.rig", "rangesim.settings", "pcgraph.parallel")
+    inside = {name for name in imports(path) if name.startswith(("rangesim", "pcgraph"))}
+    assert all(name.startswith(allowed) for name in inside)
 
 
 CALIBRATION = {
@@ -231,6 +252,7 @@ def test_the_public_surface_of_calibration_is_this() -> None:
 def test_geometry_loads_neither_opencv_nor_open3d_until_they_are_used() -> None:
     code = (
         "from rangesim.geometry import classify, fundamental_from_cameras, rectify, icp, eye_in_hand; "
+        "from rangesim.multiview import Tracks, bundle_adjust, factorise_nonrigid, structure_from_motion; "
         "import sys; print(*sys.modules)"
     )
     assert not (RENDERER | {"open3d", "cv2"}) & set(run(code).split())

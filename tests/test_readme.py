@@ -46,6 +46,7 @@ ARGUMENTS = {
     "part_pose": ["part.png", "--width", "400"],
     "rectification": ["rectification.png", "--width", "160"],
     "segmentation": ["--width", "320"],
+    "structure_from_motion": ["structure_from_motion.png", "--views", "10", "--points", "300"],
     "tof_calibration": ["tof.png", "--targets", "14", "--width", "120"],
     "two_cameras": ["--width", "80"],
 }

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board, BoardView
-from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation
+from rangesim.calibration.bundle import Bundle, Observation
 from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
 from rangesim.calibration.zhang import adjust_as_seen, check_views, first_camera, judged
 from rangesim.capture import Capture
@@ -24,6 +24,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.geometry.correspondences import Array
 from rangesim.geometry.homography import homography_dlt
 from rangesim.geometry.projective_plane import map_points
+from rangesim.geometry.reprojection import LENS, POSE
 from rangesim.rig import Rig
 from rangesim.sensors.structured_light import WHITE, StructuredLight, StructuredLightDecoder
 

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim.calibration.boards import Board, BoardView
-from rangesim.calibration.bundle import LENS, POSE, Bundle, Observation, adjust, projection
+from rangesim.calibration.bundle import Bundle, Observation, adjust
 from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
 from rangesim.errors import warn
 from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, checked_array, unit_norm
 from rangesim.geometry.homography import fit_homography
 from rangesim.geometry.least_squares import Minimum
+from rangesim.geometry.reprojection import LENS, POSE, by_lens
 from rangesim.rig import Intrinsics
 
 MIN_VIEWS = 3
@@ -295,8 +296,7 @@ def _check_corners(device: Intrinsics, covariance: Array, name: str, says: bool)
             )
         return
     corners = device.directions(np.array([[0, 0], [1, 0], [0, 1], [1, 1.0]]) * [device.width, device.height])
-    _, _, by_lens = projection(device, corners)
-    J = by_lens[:, :, : len(covariance)]
+    J = by_lens(device, corners)[:, :, : len(covariance)]
     off = float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ np.swapaxes(J, 1, 2))[:, -1].max()))
     if says and off > MAX_CORNER_PX:
         warn(

@@ -25,8 +25,8 @@ from rangesim.geometry.correspondences import (
     right_singular_vectors,
 )
 from rangesim.geometry.least_squares import Minimum, minimise
+from rangesim.geometry.reprojection import reproject
 from rangesim.rig import Intrinsics
-from rangesim.rig.distortion import distort
 
 PARAMETERS = 6
 PLANAR = 1e-3
@@ -195,22 +195,8 @@ def _moved(T: Array, delta: Array) -> Array:
 def _residuals(T: Array, X: Array, x: Array, camera: Intrinsics) -> tuple[Array, Array]:
     """(2n,) reprojection errors in pixels, and (2n, 6) their derivatives by the step of `_moved`."""
     turned = X @ T[:3, :3].T
-    seen = turned + T[:3, 3]
-    z = seen[:, 2]
-    u, v = seen[:, 0] / z, seen[:, 1] / z
-    image = distort(camera.coefficients, u, v)
-    appears = (z > 0) & (u * u + v * v < camera.fold_radius2) & (image.jacobian > 0)
-    off = np.stack([camera.fx * image.x + camera.cx, camera.fy * image.y + camera.cy], axis=-1) - x
-    by_plane = np.stack(
-        [
-            np.stack([camera.fx * image.xx, camera.fx * image.xy], axis=-1),
-            np.stack([camera.fy * image.xy, camera.fy * image.yy], axis=-1),
-        ],
-        axis=1,
-    )
-    one, zero = 1 / z, np.zeros_like(z)
-    by_point = np.stack([np.stack([one, zero, -u / z], axis=-1), np.stack([zero, one, -v / z], axis=-1)], axis=1)
-    by_point = by_plane @ by_point
+    pixels, by_point, appears = reproject(camera, turned + T[:3, 3])
+    off = pixels - x
     by_turn = np.cross(turned[:, None, :], by_point)  # p . (w x q) = w . (q x p)
     jacobian = np.concatenate([by_turn, by_point], axis=-1)
     off[~appears] = np.inf

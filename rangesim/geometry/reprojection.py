@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The image of points through a lens, and its derivatives by the points, the pose and the lens, in closed form.
+
+Every adjustment of cameras is made of these: one pose (`camera_pose`), boards (`rangesim.calibration.bundle`), many
+views (`rangesim.multiview.bundle_adjustment`). A step of a pose is a rotation vector w and a translation v, both
+applied after the pose: [R | t] becomes exp([w]_x) [R | t] + [0 | v].
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rangesim.geometry.correspondences import Array
+from rangesim.rig import Intrinsics
+from rangesim.rig.distortion import distort
+
+LENS = 9
+"""Parameters of a device: fx, fy, cx, cy, k1, k2, p1, p2, k3."""
+POSE = 6
+"""Of a pose: a rotation vector applied after the rotation, and a translation."""
+
+
+class Reprojection(NamedTuple):
+    """pixels : (m, 2). by_point : (m, 2, 3) d pixels / d point. appears : (m,) bool, in front of the device and within
+    the fold of its distortion; where it is not, pixels and derivatives mean nothing."""
+
+    pixels: Array
+    by_point: Array
+    appears: np.ndarray
+
+
+def reproject(device: Intrinsics, X: Array) -> Reprojection:
+    """The image of points X (m, 3) in coordinates of the device, metres, with derivatives."""
+    z = X[:, 2]
+    x, y, one = X[:, 0] / z, X[:, 1] / z, 1.0 / z
+    image = distort(device.coefficients, x, y)
+    appears = (z > 0) & (x * x + y * y < device.fold_radius2) & (image.jacobian > 0)
+    by_point = np.empty((len(X), 2, 3))
+    for k, (focal, by_x, by_y) in enumerate(((device.fx, image.xx, image.xy), (device.fy, image.xy, image.yy))):
+        by_point[:, k, 0], by_point[:, k, 1] = focal * by_x * one, focal * by_y * one
+        by_point[:, k, 2] = -(by_point[:, k, 0] * x + by_point[:, k, 1] * y)
+    pixels = np.stack([device.fx * image.x + device.cx, device.fy * image.y + device.cy], axis=-1)
+    return Reprojection(pixels, by_point, appears)
+
+
+def by_lens(device: Intrinsics, X: Array) -> Array:
+    """(m, 2, 9) derivatives of the image of points X (m, 3) by the parameters of the device, in the order of `LENS`."""
+    x, y = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2]
+    image = distort(device.coefficients, x, y)
+    r2 = x * x + y * y
+    result = np.zeros((len(X), 2, LENS))
+    result[:, 0, 0], result[:, 1, 1] = image.x, image.y
+    result[:, 0, 2] = result[:, 1, 3] = 1.0
+    columns = (
+        (4, x * r2, y * r2),
+        (5, x * r2**2, y * r2**2),
+        (6, 2 * x * y, r2 + 2 * y * y),
+        (7, r2 + 2 * x * x, 2 * x * y),
+        (8, x * r2**3, y * r2**3),
+    )
+    for column, along_x, along_y in columns:
+        result[:, 0, column], result[:, 1, column] = device.fx * along_x, device.fy * along_y
+    return result
+
+
+def by_pose(X: Array) -> Array:
+    """(m, 3, 6) derivatives of points X (m, 3), as they are after the pose, by a step of it."""
+    result = np.zeros((len(X), 3, POSE))
+    result[:, 0, 1], result[:, 0, 2] = X[:, 2], -X[:, 1]
+    result[:, 1, 0], result[:, 1, 2] = -X[:, 2], X[:, 0]
+    result[:, 2, 0], result[:, 2, 1] = X[:, 1], -X[:, 0]
+    result[:, :, 3:] = np.eye(3)
+    return result
+
+
+def moved_pose(T: Array, delta: Array) -> Array:
+    """Poses (..., 4, 4) moved by steps (..., 6)."""
+    turn = Rotation.from_rotvec(delta[..., :3]).as_matrix()
+    moved = T.copy()
+    moved[..., :3, :] = turn @ T[..., :3, :]
+    moved[..., :3, 3] += delta[..., 3:]
+    return moved
+
+
+def with_all_coefficients(device: Intrinsics) -> Intrinsics:
+    """The same device with its five coefficients of distortion spelt out."""
+    return replace(device, distortion=device.coefficients)
+
+
+def moved_lens(device: Intrinsics, delta: Array) -> Intrinsics:
+    """A device moved by a step of its first len(delta) parameters, in the order of `LENS`."""
+    moved = np.zeros(LENS)
+    moved[: len(delta)] = delta
+    fx, fy, cx, cy = (float(v) for v in np.array([device.fx, device.fy, device.cx, device.cy]) + moved[:4])
+    coefficients = tuple(float(v) for v in np.array(device.coefficients) + moved[4:])
+    return Intrinsics(device.width, device.height, max(fx, 1.0), max(fy, 1.0), cx, cy, coefficients)
