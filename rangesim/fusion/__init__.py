@@ -5,11 +5,23 @@ from __future__ import annotations
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from rangesim.fusion.computed_tomography import Sinogram as Sinogram
+    from rangesim.fusion.computed_tomography import filtered_back_projection as filtered_back_projection
+    from rangesim.fusion.computed_tomography import project as project
+    from rangesim.fusion.computed_tomography import sampling_angles as sampling_angles
+    from rangesim.fusion.computed_tomography import with_photon_noise as with_photon_noise
+    from rangesim.fusion.coverage import Coverage as Coverage
+    from rangesim.fusion.coverage import Space as Space
+    from rangesim.fusion.coverage import known_space as known_space
+    from rangesim.fusion.coverage import scan_coverage as scan_coverage
     from rangesim.fusion.mesh_error import SurfaceError as SurfaceError
     from rangesim.fusion.mesh_error import surface_error as surface_error
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
     from rangesim.fusion.sdf import signed_distance as signed_distance
+    from rangesim.fusion.solids import Solid as Solid
+    from rangesim.fusion.solids import attenuation_volume as attenuation_volume
+    from rangesim.fusion.solids import occupancy as occupancy
     from rangesim.fusion.truncated_average import FusedSurface as FusedSurface
     from rangesim.fusion.truncated_average import fuse as fuse
     from rangesim.fusion.voxel_grid import VoxelGrid as VoxelGrid
@@ -19,6 +31,15 @@ else:
     __getattr__, __dir__, __all__ = lazy_loader.attach(
         __name__,
         submod_attrs={
+            "computed_tomography": [
+                "Sinogram",
+                "filtered_back_projection",
+                "project",
+                "sampling_angles",
+                "with_photon_noise",
+            ],
+            "coverage": ["Coverage", "Space", "known_space", "scan_coverage"],
+            "solids": ["Solid", "attenuation_volume", "occupancy"],
             "truncated_average": ["FusedSurface", "fuse"],
             "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
             "mesh_error": ["SurfaceError", "surface_error"],
