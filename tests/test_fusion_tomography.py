@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computed tomography against chords in closed form, Beer-Lambert's statistics and scikit-image; solids and their voxels."""
+"""Computed tomography against chords in closed form, Poisson's statistics and scikit-image; solids and their voxels."""
 
 from __future__ import annotations
 
@@ -109,8 +109,8 @@ def test_a_phantom_comes_out_as_by_scikit_image():
     grid = VoxelGrid((64, 50, 3), 0.001, (0.1, -0.3, 2.0))
     at = np.asarray(grid.corner_m) + np.array([0.032, 0.025, 0.0015])
     solids = [
-        Solid("outer", block((0.044, 0.03, 0.1), tuple(at + [0.002, 0.001, 0])), 30.0),
-        Solid("inner", block((0.012, 0.01, 0.1), tuple(at + [-0.006, 0.004, 0])), 10.0),
+        Solid("outer", block((0.044, 0.03, 0.1), tuple(at + np.array([0.002, 0.001, 0.0]))), 30.0),
+        Solid("inner", block((0.012, 0.01, 0.1), tuple(at + np.array([-0.006, 0.004, 0.0]))), 10.0),
     ]
     ours = project(solids, grid)
     n, (nx, ny, _) = ours.values.shape[1], grid.shape
