@@ -5,13 +5,27 @@ from __future__ import annotations
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from rangesim.fusion.joint_registration import refine_jointly as refine_jointly
     from rangesim.fusion.mesh_error import SurfaceError as SurfaceError
     from rangesim.fusion.mesh_error import surface_error as surface_error
+    from rangesim.fusion.multiway_registration import Alignment as Alignment
+    from rangesim.fusion.multiway_registration import PairFit as PairFit
+    from rangesim.fusion.multiway_registration import PoseErrors as PoseErrors
+    from rangesim.fusion.multiway_registration import align as align
+    from rangesim.fusion.multiway_registration import pose_errors as pose_errors
+    from rangesim.fusion.paths import Dome as Dome
+    from rangesim.fusion.paths import HandHeld as HandHeld
+    from rangesim.fusion.paths import Path as Path
+    from rangesim.fusion.paths import PoseList as PoseList
+    from rangesim.fusion.paths import Turntable as Turntable
+    from rangesim.fusion.paths import Viewpoint as Viewpoint
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
     from rangesim.fusion.sdf import signed_distance as signed_distance
     from rangesim.fusion.truncated_average import FusedSurface as FusedSurface
     from rangesim.fusion.truncated_average import fuse as fuse
+    from rangesim.fusion.views import Scan as Scan
+    from rangesim.fusion.views import scan as scan
     from rangesim.fusion.voxel_grid import VoxelGrid as VoxelGrid
 else:
     import lazy_loader
@@ -19,9 +33,13 @@ else:
     __getattr__, __dir__, __all__ = lazy_loader.attach(
         __name__,
         submod_attrs={
-            "truncated_average": ["FusedSurface", "fuse"],
-            "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
+            "joint_registration": ["refine_jointly"],
             "mesh_error": ["SurfaceError", "surface_error"],
+            "multiway_registration": ["Alignment", "PairFit", "PoseErrors", "align", "pose_errors"],
+            "paths": ["Dome", "HandHeld", "Path", "PoseList", "Turntable", "Viewpoint"],
+            "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
+            "truncated_average": ["FusedSurface", "fuse"],
+            "views": ["Scan", "scan"],
             "voxel_grid": ["VoxelGrid"],
         },
     )
