@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What range images saw of solids, against closed forms: the near side of a ball, its inside, what is looked through."""
+"""What range images saw of solids, in closed form: the near side of a ball, its inside, what is looked through."""
 
 from __future__ import annotations
 

@@ -17,9 +17,9 @@ from rangesim.fusion import (
     attenuation_volume,
     filtered_back_projection,
     occupancy,
-    project,
     sampling_angles,
     with_photon_noise,
+    xray_projections,
 )
 from rangesim.triangle_mesh import TriangleMesh
 
@@ -64,7 +64,7 @@ def test_projections_of_a_ball_are_its_chords():
     made = trimesh.creation.icosphere(subdivisions=6, radius=radius)
     solid = Solid("ball", TriangleMesh(made.vertices + centre, made.faces), mu)
     grid = VoxelGrid((50, 50, 40), 0.001, (-0.025, -0.025, -0.02))
-    found = project([solid], grid, np.radians([0, 30, 90, 137, 180, 271]))
+    found = xray_projections([solid], grid, np.radians([0, 30, 90, 137, 180, 271]))
     n = found.values.shape[1]
     across = np.stack([-np.sin(found.angles), np.cos(found.angles)])
     offset = (np.arange(n) - n // 2) * grid.voxel_m - ((centre[:2] - axis(grid)) @ across)[:, None]
@@ -79,7 +79,7 @@ def test_the_line_integrals_of_an_angle_add_up_to_the_matter():
     """Sum over the detector times the area of a pixel = integral of mu over the volume, whatever the angle."""
     solids = [BLOCK, HOLE, CORE]
     expected = 20 * (BLOCK.mesh.volume_m3 - HOLE.mesh.volume_m3) + 90 * CORE.mesh.volume_m3
-    found = project(solids, GRID, np.radians([0, 17, 45, 90, 133]))
+    found = xray_projections(solids, GRID, np.radians([0, 17, 45, 90, 133]))
     totals = found.values.sum(axis=(1, 2)) * GRID.voxel_m**2
     assert totals == pytest.approx(expected, rel=0.03)  # of sharp edges, sampled once per pixel
 
@@ -88,14 +88,14 @@ def test_rays_that_run_along_edges_and_faces_are_measured_all_the_same():
     """At 0 and 90 degrees rays graze faces, and meet the diagonals of the block's sides."""
     cube = Solid("cube", block((0.02, 0.02, 0.02)), 10.0)
     grid = VoxelGrid((21, 21, 21), 0.001, (-0.0105, -0.0105, -0.0105))  # centres at whole millimetres, axis at 0
-    found = project([cube], grid, np.radians([0.0, 90.0, 180.0]))
+    found = xray_projections([cube], grid, np.radians([0.0, 90.0, 180.0]))
     middle = found.values[:, abs(np.arange(found.values.shape[1]) - found.values.shape[1] // 2) < 10, 1:-1]
     assert middle == pytest.approx(10 * 0.02, rel=1e-5)
 
 
 def test_what_was_put_in_comes_out():
     solids = [BLOCK, HOLE, CORE]
-    found, truth = filtered_back_projection(project(solids, GRID)), attenuation_volume(solids, GRID)
+    found, truth = filtered_back_projection(xray_projections(solids, GRID)), attenuation_volume(solids, GRID)
     for mu in (0.0, 20.0, 90.0):
         inner = binary_erosion(truth == mu, iterations=2)
         assert found[inner].mean() == pytest.approx(mu, abs=0.01 * 90)
@@ -112,7 +112,7 @@ def test_a_phantom_comes_out_as_by_scikit_image():
         Solid("outer", block((0.044, 0.03, 0.1), tuple(at + np.array([0.002, 0.001, 0.0]))), 30.0),
         Solid("inner", block((0.012, 0.01, 0.1), tuple(at + np.array([-0.006, 0.004, 0.0]))), 10.0),
     ]
-    ours = project(solids, grid)
+    ours = xray_projections(solids, grid)
     n, (nx, ny, _) = ours.values.shape[1], grid.shape
     fine = VoxelGrid((nx * 4, ny * 4, 1), grid.voxel_m / 4, grid.corner_m)
     slice_ = attenuation_volume(solids, fine)[:, :, 0].reshape(nx, 4, ny, 4).mean(axis=(1, 3))
@@ -145,7 +145,7 @@ def test_photons_are_counted_as_poisson_has_it():
 def test_angles_resolve_as_finely_as_the_detector():
     grid = VoxelGrid((63, 63, 1), 0.001)
     angles = sampling_angles(grid)
-    n = project([Solid("a", block((0.01, 0.01, 0.01)), 1.0)], grid, [0.0, 1.0]).values.shape[1]
+    n = xray_projections([Solid("a", block((0.01, 0.01, 0.01)), 1.0)], grid, [0.0, 1.0]).values.shape[1]
     assert np.diff(angles)[0] * n / 2 <= 1.0  # pixels, along the rim
     assert angles[-1] < np.pi
 
@@ -164,16 +164,16 @@ CROSSING = Solid("other", block((0.06, 0.04, 0.03), (0.03, 0, 0)), 1.0)
         (lambda: Solid("a", OPEN, 1.0), "closed"),
         (lambda: Solid("a", TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)), 1.0), "closed"),
         (lambda: Solid("a", TriangleMesh(BLOCK.mesh.vertices, BLOCK.mesh.faces[:, ::-1]), 1.0), "inside out"),
-        (lambda: project([], GRID), "at least one"),
-        (lambda: project([BLOCK, BLOCK], GRID), "of its own"),
-        (lambda: project([BLOCK, CROSSING], GRID), "crosses"),
-        (lambda: project([BLOCK, Solid("twin", BLOCK.mesh, 1.0)], GRID), "fills"),
-        (lambda: project([BLOCK, Solid("bar", block((0.2, 0.01, 0.01), BLOCK_AT), 1.0)], GRID), "crosses"),
-        (lambda: project([BLOCK], GRID, []), "angles"),
-        (lambda: project([BLOCK], GRID, [0.0, np.inf]), "angles"),
-        (lambda: filtered_back_projection(project([BLOCK], GRID, [0.0])), "two angles"),
-        (lambda: filtered_back_projection(project([BLOCK], GRID, [0.0, 1.0]), "hamm"), "hamming"),
-        (lambda: with_photon_noise(project([BLOCK], GRID, [0.0, 1.0]), 0), "photons"),
+        (lambda: xray_projections([], GRID), "at least one"),
+        (lambda: xray_projections([BLOCK, BLOCK], GRID), "of its own"),
+        (lambda: xray_projections([BLOCK, CROSSING], GRID), "crosses"),
+        (lambda: xray_projections([BLOCK, Solid("twin", BLOCK.mesh, 1.0)], GRID), "fills"),
+        (lambda: xray_projections([BLOCK, Solid("bar", block((0.2, 0.01, 0.01), BLOCK_AT), 1.0)], GRID), "crosses"),
+        (lambda: xray_projections([BLOCK], GRID, []), "angles"),
+        (lambda: xray_projections([BLOCK], GRID, [0.0, np.inf]), "angles"),
+        (lambda: filtered_back_projection(xray_projections([BLOCK], GRID, [0.0])), "two angles"),
+        (lambda: filtered_back_projection(xray_projections([BLOCK], GRID, [0.0, 1.0]), "hamm"), "hamming"),
+        (lambda: with_photon_noise(xray_projections([BLOCK], GRID, [0.0, 1.0]), 0), "photons"),
     ],
 )
 def test_what_is_no_tomography_is_refused(call, message):

@@ -7,15 +7,27 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from rangesim.fusion.computed_tomography import Sinogram as Sinogram
     from rangesim.fusion.computed_tomography import filtered_back_projection as filtered_back_projection
-    from rangesim.fusion.computed_tomography import project as project
     from rangesim.fusion.computed_tomography import sampling_angles as sampling_angles
     from rangesim.fusion.computed_tomography import with_photon_noise as with_photon_noise
+    from rangesim.fusion.computed_tomography import xray_projections as xray_projections
     from rangesim.fusion.coverage import Coverage as Coverage
     from rangesim.fusion.coverage import Space as Space
     from rangesim.fusion.coverage import known_space as known_space
     from rangesim.fusion.coverage import scan_coverage as scan_coverage
+    from rangesim.fusion.joint_registration import refine_jointly as refine_jointly
     from rangesim.fusion.mesh_error import SurfaceError as SurfaceError
     from rangesim.fusion.mesh_error import surface_error as surface_error
+    from rangesim.fusion.multiway_registration import Alignment as Alignment
+    from rangesim.fusion.multiway_registration import PairFit as PairFit
+    from rangesim.fusion.multiway_registration import PoseErrors as PoseErrors
+    from rangesim.fusion.multiway_registration import align as align
+    from rangesim.fusion.multiway_registration import pose_errors as pose_errors
+    from rangesim.fusion.paths import Dome as Dome
+    from rangesim.fusion.paths import HandHeld as HandHeld
+    from rangesim.fusion.paths import Path as Path
+    from rangesim.fusion.paths import PoseList as PoseList
+    from rangesim.fusion.paths import Turntable as Turntable
+    from rangesim.fusion.paths import Viewpoint as Viewpoint
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
     from rangesim.fusion.sdf import signed_distance as signed_distance
@@ -24,6 +36,8 @@ if TYPE_CHECKING:
     from rangesim.fusion.solids import occupancy as occupancy
     from rangesim.fusion.truncated_average import FusedSurface as FusedSurface
     from rangesim.fusion.truncated_average import fuse as fuse
+    from rangesim.fusion.views import Scan as Scan
+    from rangesim.fusion.views import scan as scan
     from rangesim.fusion.voxel_grid import VoxelGrid as VoxelGrid
 else:
     import lazy_loader
@@ -34,15 +48,19 @@ else:
             "computed_tomography": [
                 "Sinogram",
                 "filtered_back_projection",
-                "project",
                 "sampling_angles",
                 "with_photon_noise",
+                "xray_projections",
             ],
             "coverage": ["Coverage", "Space", "known_space", "scan_coverage"],
             "solids": ["Solid", "attenuation_volume", "occupancy"],
-            "truncated_average": ["FusedSurface", "fuse"],
-            "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
+            "joint_registration": ["refine_jointly"],
             "mesh_error": ["SurfaceError", "surface_error"],
+            "multiway_registration": ["Alignment", "PairFit", "PoseErrors", "align", "pose_errors"],
+            "paths": ["Dome", "HandHeld", "Path", "PoseList", "Turntable", "Viewpoint"],
+            "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
+            "truncated_average": ["FusedSurface", "fuse"],
+            "views": ["Scan", "scan"],
             "voxel_grid": ["VoxelGrid"],
         },
     )

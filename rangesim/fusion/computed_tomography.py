@@ -64,7 +64,7 @@ def sampling_angles(grid: VoxelGrid) -> np.ndarray:
     return np.pi * np.arange(count) / count
 
 
-def project(solids: Sequence[Solid], grid: VoxelGrid, angles: ArrayLike | None = None) -> Sinogram:
+def xray_projections(solids: Sequence[Solid], grid: VoxelGrid, angles: ArrayLike | None = None) -> Sinogram:
     """Line integrals through solids, exact for their triangles: the chords of rays, one to the middle of each pixel.
 
     Parameters
