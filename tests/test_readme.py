@@ -45,6 +45,7 @@ ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
     "rectification": ["rectification.png", "--width", "160"],
     "segmentation": ["--width", "320"],
+    "sparse_against_dense": ["page.html", "--views", "2", "--width", "64", "--voxel-mm", "4"],
     "two_cameras": ["--width", "80"],
 }
 """Of the examples that can be had smaller."""
