@@ -152,8 +152,8 @@ know the skin of an opaque thing, and nothing of what is within. Glass they look
 and what is seen in it stands where refraction puts it. X-rays pass, and a CT has all of it.</p>
 <table><tr>{"".join(f"<th>{h}</th>" for h in heads)}</tr>
 {cells}</table>
-<p>Voxels of {args.voxel_mm:g} mm. Surface counts cavities and inner parts too. The CT: parallel beams, {PHOTONS:g} photons
-per pixel, filtered back-projection; its error is the mean over the matter.</p>
+<p>Voxels of {args.voxel_mm:g} mm. Surface counts cavities and inner parts too. The CT: parallel beams,
+{PHOTONS:g} photons per pixel, filtered back-projection; its error is the mean over the matter.</p>
 <img src="{picture}" alt="Sections through the three things">
 </html>
 """
