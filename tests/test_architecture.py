@@ -215,6 +215,8 @@ FUSION = {
     "multiway_registration": "Alignment PairFit PoseErrors align pose_errors",
     "paths": "Dome HandHeld Path PoseList Turntable Viewpoint",
     "sdf": "average_signed_distances reading_weights signed_distance",
+    "seen_volume": "Occupancy SeenOfShape VoxelState occupancy true_occupancy voxel_states",
+    "tomography": "Tomogram filtered_back_projection path_lengths simulate_ct",
     "truncated_average": "FusedSurface fuse",
     "views": "Scan scan",
     "voxel_grid": "VoxelGrid",

@@ -22,6 +22,16 @@ if TYPE_CHECKING:
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
     from rangesim.fusion.sdf import signed_distance as signed_distance
+    from rangesim.fusion.seen_volume import Occupancy as Occupancy
+    from rangesim.fusion.seen_volume import SeenOfShape as SeenOfShape
+    from rangesim.fusion.seen_volume import VoxelState as VoxelState
+    from rangesim.fusion.seen_volume import occupancy as occupancy
+    from rangesim.fusion.seen_volume import true_occupancy as true_occupancy
+    from rangesim.fusion.seen_volume import voxel_states as voxel_states
+    from rangesim.fusion.tomography import Tomogram as Tomogram
+    from rangesim.fusion.tomography import filtered_back_projection as filtered_back_projection
+    from rangesim.fusion.tomography import path_lengths as path_lengths
+    from rangesim.fusion.tomography import simulate_ct as simulate_ct
     from rangesim.fusion.truncated_average import FusedSurface as FusedSurface
     from rangesim.fusion.truncated_average import fuse as fuse
     from rangesim.fusion.views import Scan as Scan
@@ -38,6 +48,8 @@ else:
             "multiway_registration": ["Alignment", "PairFit", "PoseErrors", "align", "pose_errors"],
             "paths": ["Dome", "HandHeld", "Path", "PoseList", "Turntable", "Viewpoint"],
             "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
+            "seen_volume": ["Occupancy", "SeenOfShape", "VoxelState", "occupancy", "true_occupancy", "voxel_states"],
+            "tomography": ["Tomogram", "filtered_back_projection", "path_lengths", "simulate_ct"],
             "truncated_average": ["FusedSurface", "fuse"],
             "views": ["Scan", "scan"],
             "voxel_grid": ["VoxelGrid"],
