@@ -22,6 +22,8 @@ from rangesim.triangle_mesh import TriangleMesh
 
 SAMPLES = 20_000
 """Points on the true surface of each shape."""
+SLANTED = 4.0
+"""Tolerances of depth, at most, that a reading of a slanted face may be off."""
 LEAST_COSINE = 0.05
 """Of the angle of incidence, at which a view may see a surface."""
 
@@ -161,8 +163,8 @@ def seen_surface(
         to_camera = T[:3, 3] - points
         cosine = (to_camera * normals).sum(axis=-1) / np.linalg.norm(to_camera, axis=-1)
         facing = (cosine if closed else np.abs(cosine)) > LEAST_COSINE
-        off = np.abs(signed_distance(points, image, lookup="bilinear") * cosine)
-        seen |= facing & (off <= tolerance_m)
+        off = np.abs(signed_distance(points, image, lookup="bilinear"))
+        seen |= facing & (off * np.abs(cosine) <= tolerance_m) & (off <= SLANTED * tolerance_m)
     return float(seen.mean())
 
 
