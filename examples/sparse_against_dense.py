@@ -19,15 +19,16 @@ import numpy as np
 
 from rangesim import StructuredLight, load_scene
 from rangesim.fusion import (
-    Coverage,
     Dome,
+    Occupancy,
     Scan,
     Solid,
     VoxelGrid,
+    VoxelState,
     attenuation_volume,
     filtered_back_projection,
+    occupancy,
     scan,
-    scan_coverage,
     with_photon_noise,
     xray_projections,
 )
@@ -42,6 +43,7 @@ THINGS = {
     "glass": {"ball": (CLEAR, GLASS), "core": (MATTE, ALUMINIUM)},
 }
 """Parts of each thing: what light sees of it, and X-rays."""
+STATES = VoxelState.SURFACE, VoxelState.FREE, VoxelState.NEVER_SEEN
 MIDDLE, PHOTONS = (0.0, 0.0, 0.045), 1e5
 
 
@@ -72,6 +74,12 @@ def scanned(parts: dict[str, tuple[dict[str, Any], float]], views: int, width: i
     return found, [Solid(name, surfaces[name], attenuation) for name, (_, attenuation) in parts.items()]
 
 
+def seen_surface(seen: Occupancy) -> float:
+    """Of the area of all surfaces, also inner ones."""
+    shapes = seen.shapes.values()
+    return sum(s.surface * s.area_m2 for s in shapes) / sum(s.area_m2 for s in shapes)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", nargs="?", type=Path, default=Path("out/sparse_against_dense.html"))
@@ -86,14 +94,14 @@ def main() -> None:
     for name, parts in THINGS.items():
         found, solids = scanned(parts, args.views, args.width)
         grid = VoxelGrid.around(solids[0].mesh.vertices, args.voxel_mm * 1e-3, 0.01)
-        seen = scan_coverage(found.images, solids, grid)
+        seen = occupancy(found.images, {solid.name: solid.mesh for solid in solids}, grid)
         truth = attenuation_volume(solids, grid)
+        of_matter = [float((seen.states[truth > 0] == state).mean()) for state in STATES]
         tomogram = filtered_back_projection(with_photon_noise(xray_projections(solids, grid), PHOTONS), "hann")
         error = float(np.abs(tomogram - truth)[truth > 0].mean())
-        shares = seen.surface_seen, seen.volume_surface, seen.volume_free, seen.volume_unseen
-        cells = [f"{100 * s:.0f} %" for s in shares]
+        cells = [f"{100 * s:.0f} %" for s in (seen_surface(seen), *of_matter)]
         print(f"{name:8s}{cells[0]:>14s}{cells[1]:>14s}{cells[2]:>13s}{cells[3]:>9s}{error:15.1f}")
-        print(f"{'':8s}of {', '.join(f'{part} {100 * s:.0f} %' for part, s in seen.surface_of.items())}")
+        print(f"{'':8s}of {', '.join(f'{part} {100 * s.surface:.0f} %' for part, s in seen.shapes.items())}")
         rows.append((name, *cells, f"{error:.1f}"))
         columns.append((name, found, seen, truth, tomogram))
     args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +110,7 @@ def main() -> None:
     print(args.out)
 
 
-def draw(out: Path, things: list[tuple[str, Scan, Coverage, np.ndarray, np.ndarray]]) -> None:
+def draw(out: Path, things: list[tuple[str, Scan, Occupancy, np.ndarray, np.ndarray]]) -> None:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
     from matplotlib.colors import ListedColormap
@@ -114,7 +122,7 @@ def draw(out: Path, things: list[tuple[str, Scan, Coverage, np.ndarray, np.ndarr
         h = 1e3 * seen.grid.voxel_m
         nx, _, nz = truth.shape
         box = {"origin": "lower", "extent": (0, nx * h, 0, nz * h)}
-        section = [volume[:, truth.shape[1] // 2].T for volume in (truth, seen.space, tomogram)]
+        section = [volume[:, truth.shape[1] // 2].T for volume in (truth, seen.states, tomogram)]
         picture = found.images[0].intensity
         row[0].imshow(picture, cmap="gray", vmin=0, vmax=np.nanquantile(picture, 0.995))
         row[0].set_axis_off()
@@ -124,7 +132,7 @@ def draw(out: Path, things: list[tuple[str, Scan, Coverage, np.ndarray, np.ndarr
         shown = row[3].imshow(section[2], **box, **scale)
         row[0].set_title(f"{name}: a view")
         row[1].set_title("truth")
-        row[2].set_title(f"{len(found)} range images: {100 * seen.surface_seen:.0f} % of the surface")
+        row[2].set_title(f"{len(found)} range images: {100 * seen_surface(seen):.0f} % of the surface")
         row[3].set_title("CT")
         for axis in row[1:]:
             axis.set(xlabel="mm", xticks=[0, 50], yticks=[0, 50])

@@ -80,6 +80,19 @@ class TriangleMesh(ShortRepr):
         a, b, c = np.moveaxis(self.corners - self.vertices.mean(axis=0), 1, 0)
         return float((a * np.cross(b, c)).sum() / 6)
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether each edge has as many triangles on one side as on the other; vertices at one place are one."""
+        if not len(self.faces):
+            return False
+        scale = max(float(np.ptp(self.vertices, axis=0).max()), 1e-30)
+        places = np.round((self.vertices - self.vertices[0]) / scale * 1e6)
+        number = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+        faces = number[self.faces].astype(np.int64)
+        a, b = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+        count = len(self.vertices)
+        return bool(np.array_equal(np.sort(a * count + b), np.sort(b * count + a)))
+
     def sample(self, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Points that are spread evenly over the area (n, 3) float64, metres, and the face each lies on (n,).
 

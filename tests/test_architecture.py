@@ -211,13 +211,13 @@ def test_geometry_loads_neither_opencv_nor_open3d_until_they_are_used() -> None:
 
 FUSION = {
     "computed_tomography": "Sinogram filtered_back_projection sampling_angles with_photon_noise xray_projections",
-    "coverage": "Coverage Space known_space scan_coverage",
     "joint_registration": "refine_jointly",
     "mesh_error": "SurfaceError surface_error",
     "multiway_registration": "Alignment PairFit PoseErrors align pose_errors",
     "paths": "Dome HandHeld Path PoseList Turntable Viewpoint",
     "sdf": "average_signed_distances reading_weights signed_distance",
-    "solids": "Solid attenuation_volume occupancy",
+    "seen_volume": "Occupancy SeenOfShape VoxelState occupancy true_occupancy voxel_states",
+    "solids": "Solid attenuation_volume inside_voxels",
     "truncated_average": "FusedSurface fuse",
     "views": "Scan scan",
     "voxel_grid": "VoxelGrid",

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import trimesh
@@ -10,13 +12,14 @@ from fusion_scenes import ball, block
 from scipy.ndimage import binary_erosion
 from skimage.transform import iradon, radon
 
+from rangesim.errors import EnvironmentProblem
 from rangesim.fusion import (
     Sinogram,
     Solid,
     VoxelGrid,
     attenuation_volume,
     filtered_back_projection,
-    occupancy,
+    inside_voxels,
     sampling_angles,
     with_photon_noise,
     xray_projections,
@@ -38,23 +41,23 @@ def test_voxels_are_those_whose_centres_lie_within():
     low, high = BLOCK.mesh.vertices.min(axis=0), BLOCK.mesh.vertices.max(axis=0)
     centres = GRID.centres()
     inside = ((centres > low) & (centres < high)).all(axis=-1)
-    assert np.array_equal(occupancy(BLOCK.mesh, GRID), inside)
-    assert not occupancy(BLOCK.mesh, VoxelGrid((3, 3, 3), 0.01, (1.0, 1.0, 1.0))).any()
+    assert np.array_equal(inside_voxels(BLOCK.mesh, GRID), inside)
+    assert not inside_voxels(BLOCK.mesh, VoxelGrid((3, 3, 3), 0.01, (1.0, 1.0, 1.0))).any()
     within = VoxelGrid((4, 4, 4), 0.001, tuple(BLOCK.mesh.vertices.mean(axis=0)))
-    assert occupancy(BLOCK.mesh, within).all()
+    assert inside_voxels(BLOCK.mesh, within).all()
 
 
 def test_the_volume_of_a_ball_in_voxels_is_its_volume():
     radius = 0.03
     grid = VoxelGrid.around(ball(radius).vertices, 0.001)
-    volume = np.count_nonzero(occupancy(ball(radius), grid)) * grid.voxel_volume_m3
+    volume = np.count_nonzero(inside_voxels(ball(radius), grid)) * grid.voxel_volume_m3
     assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.005)
 
 
 def test_the_innermost_solid_counts_in_whatever_order():
     volume = attenuation_volume([CORE, BLOCK, HOLE], GRID)
     assert np.array_equal(volume, attenuation_volume([BLOCK, HOLE, CORE], GRID))
-    parts = [np.count_nonzero(occupancy(s.mesh, GRID)) for s in (BLOCK, HOLE, CORE)]
+    parts = [np.count_nonzero(inside_voxels(s.mesh, GRID)) for s in (BLOCK, HOLE, CORE)]
     assert [np.count_nonzero(volume == v) for v in (20.0, 90.0)] == [parts[0] - parts[1], parts[2]]
 
 
@@ -151,6 +154,9 @@ def test_angles_resolve_as_finely_as_the_detector():
 
 
 OPEN = TriangleMesh(BLOCK.mesh.vertices, BLOCK.mesh.faces[1:])
+BOX = block((0.02, 0.02, 0.02))
+ENDS = np.abs(BOX.face_normals[:, 2]) > 0.5
+TUBE = TriangleMesh(BOX.vertices, BOX.faces[~ENDS])
 BLOCK_AT = (0.004, -0.006, 0.002)
 CROSSING = Solid("other", block((0.06, 0.04, 0.03), (0.03, 0, 0)), 1.0)
 
@@ -162,6 +168,7 @@ CROSSING = Solid("other", block((0.06, 0.04, 0.03), (0.03, 0, 0)), 1.0)
         (lambda: Solid("a", BLOCK.mesh, -1.0), "attenuation"),
         (lambda: Solid("a", BLOCK.mesh, float("nan")), "attenuation"),
         (lambda: Solid("a", OPEN, 1.0), "closed"),
+        (lambda: Solid("tube", TUBE, 1.0), "closed"),
         (lambda: Solid("a", TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)), 1.0), "closed"),
         (lambda: Solid("a", TriangleMesh(BLOCK.mesh.vertices, BLOCK.mesh.faces[:, ::-1]), 1.0), "inside out"),
         (lambda: xray_projections([], GRID), "at least one"),
@@ -179,3 +186,9 @@ CROSSING = Solid("other", block((0.06, 0.04, 0.03), (0.03, 0, 0)), 1.0)
 def test_what_is_no_tomography_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_without_scikit_image_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "skimage.transform", None)
+    with pytest.raises(EnvironmentProblem, match=r"rangesim\[ct\]"):
+        filtered_back_projection(xray_projections([BLOCK], GRID, [0.0, 1.0]))

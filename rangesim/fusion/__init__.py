@@ -10,10 +10,6 @@ if TYPE_CHECKING:
     from rangesim.fusion.computed_tomography import sampling_angles as sampling_angles
     from rangesim.fusion.computed_tomography import with_photon_noise as with_photon_noise
     from rangesim.fusion.computed_tomography import xray_projections as xray_projections
-    from rangesim.fusion.coverage import Coverage as Coverage
-    from rangesim.fusion.coverage import Space as Space
-    from rangesim.fusion.coverage import known_space as known_space
-    from rangesim.fusion.coverage import scan_coverage as scan_coverage
     from rangesim.fusion.joint_registration import refine_jointly as refine_jointly
     from rangesim.fusion.mesh_error import SurfaceError as SurfaceError
     from rangesim.fusion.mesh_error import surface_error as surface_error
@@ -31,9 +27,15 @@ if TYPE_CHECKING:
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
     from rangesim.fusion.sdf import signed_distance as signed_distance
+    from rangesim.fusion.seen_volume import Occupancy as Occupancy
+    from rangesim.fusion.seen_volume import SeenOfShape as SeenOfShape
+    from rangesim.fusion.seen_volume import VoxelState as VoxelState
+    from rangesim.fusion.seen_volume import occupancy as occupancy
+    from rangesim.fusion.seen_volume import true_occupancy as true_occupancy
+    from rangesim.fusion.seen_volume import voxel_states as voxel_states
     from rangesim.fusion.solids import Solid as Solid
     from rangesim.fusion.solids import attenuation_volume as attenuation_volume
-    from rangesim.fusion.solids import occupancy as occupancy
+    from rangesim.fusion.solids import inside_voxels as inside_voxels
     from rangesim.fusion.truncated_average import FusedSurface as FusedSurface
     from rangesim.fusion.truncated_average import fuse as fuse
     from rangesim.fusion.views import Scan as Scan
@@ -52,13 +54,13 @@ else:
                 "with_photon_noise",
                 "xray_projections",
             ],
-            "coverage": ["Coverage", "Space", "known_space", "scan_coverage"],
-            "solids": ["Solid", "attenuation_volume", "occupancy"],
+            "solids": ["Solid", "attenuation_volume", "inside_voxels"],
             "joint_registration": ["refine_jointly"],
             "mesh_error": ["SurfaceError", "surface_error"],
             "multiway_registration": ["Alignment", "PairFit", "PoseErrors", "align", "pose_errors"],
             "paths": ["Dome", "HandHeld", "Path", "PoseList", "Turntable", "Viewpoint"],
             "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
+            "seen_volume": ["Occupancy", "SeenOfShape", "VoxelState", "occupancy", "true_occupancy", "voxel_states"],
             "truncated_average": ["FusedSurface", "fuse"],
             "views": ["Scan", "scan"],
             "voxel_grid": ["VoxelGrid"],

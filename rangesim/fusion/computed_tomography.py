@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim import limits
+from rangesim.errors import EnvironmentProblem
 from rangesim.fusion.mesh_error import raycasting_scene
 from rangesim.fusion.solids import Solid, outermost_first, steps_of_attenuation
 from rangesim.fusion.voxel_grid import VoxelGrid
@@ -114,14 +115,14 @@ def filtered_back_projection(sinogram: Sinogram, filter_name: str = "ramp") -> n
     ------
     ValueError
         Another filter, or fewer than two angles.
-    ImportError
-        scikit-image is not there: pip install 'rangesim[ct]'.
+    EnvironmentProblem
+        scikit-image is not there.
     """
     try:
         from skimage.transform import iradon
     except ModuleNotFoundError as missing:
-        raise ImportError(
-            "filtered back-projection needs scikit-image; pip install 'rangesim[ct]' (or scikit-image itself)"
+        raise EnvironmentProblem(
+            "filtered back-projection needs scikit-image, which is not installed; pip install 'rangesim[ct]'."
         ) from missing
     if filter_name not in FILTERS:
         raise ValueError(

@@ -135,7 +135,8 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
         edges = [e for e in edges if (e.source, e.target) != (wrong.source, wrong.target)]
     _refuse_disagreement(pairs, spacing)
     world = np.asarray(scan.images[0].T_world_camera) @ np.linalg.inv(placed[0])
-    aligned = scan.with_poses(np.stack([_rigid(world @ T) for T in placed]))
+    first = scan.poses[0]
+    aligned = scan.with_poses(np.stack([first, *(_rigid(world @ T) for T in placed[1:])]))
     aligned = scan.with_poses(
         np.stack([_rigid(T) for T in refine_jointly(scan.images, aligned.poses, CONSISTENT * spacing, seed)])
     )

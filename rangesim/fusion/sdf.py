@@ -114,7 +114,8 @@ def reading_weights(image: RangeImage, weighting: Weighting = "confidence") -> n
     inverse variance grows with the confidence; sigma grows with z in time of flight and with z^2 in triangulation, in
     which the confidence holds a factor 1 / z^2 of its own. The cosine is the share of the surface that a pixel's
     footprint is true to (Curless, Levoy 1996). Readings without a normal (single ones, as ghosts and flying pixels are)
-    weigh nothing. Only ratios matter: `fuse` divides by the median of all views.
+    weigh nothing. Only ratios matter: `fuse` divides by the median of all views, and lets
+    none count for more than 1.
 
     Raises
     ------
@@ -137,12 +138,15 @@ def reading_weights(image: RangeImage, weighting: Weighting = "confidence") -> n
 
 
 def relative_weights(images: Sequence[RangeImage], weighting: Weighting) -> list[np.ndarray]:
-    """Weights (h, w) float32 of all images, over the median of those that are positive: 1 is a typical reading."""
+    """Weights (h, w) float32 of all images, over the median of those that are positive, and 1 at most.
+
+    1 is a typical reading. None counts for more, or a highlight that one view mistakes would outvote two others.
+    """
     weights = [reading_weights(image, weighting) for image in images]
     counted = np.concatenate([w[w > 0] for w in weights])
     if not counted.size:
         raise ValueError(f"expected views with readings, got {len(images)} in which no pixel measured anything.")
-    return [w / np.median(counted) for w in weights]
+    return [np.minimum(w / np.median(counted), np.float32(1)) for w in weights]
 
 
 def average_signed_distances(

@@ -13,8 +13,6 @@ from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh
 
-CLOSED = 1e-6
-"""Of a mesh's area: the vector sum of its triangles' areas, above which it has a hole."""
 TOUCHING = 1e-5
 """Of a solid's extent: what is nearer to its surface lies on it."""
 SAMPLES = 2000
@@ -55,10 +53,7 @@ class Solid(ShortRepr):
             raise ValueError(
                 f"expected an attenuation of 0 1/m or more, got {self.attenuation_per_m!r} of {self.name}."
             )
-        a, b, c = np.moveaxis(self.mesh.corners, 1, 0)
-        area = self.mesh.area_m2
-        open_area = float(np.linalg.norm(np.cross(b - a, c - a).sum(axis=0)) / 2)
-        if not area > 0 or open_area > CLOSED * area:
+        if not self.mesh.is_closed:
             raise ValueError(
                 f"expected a closed mesh, which encloses a volume, got {self.name} with {len(self.mesh.faces)} "
                 "triangles and a hole; close it, as with trimesh's fill_holes."
@@ -70,7 +65,7 @@ class Solid(ShortRepr):
             )
 
 
-def occupancy(mesh: TriangleMesh, grid: VoxelGrid) -> np.ndarray:
+def inside_voxels(mesh: TriangleMesh, grid: VoxelGrid) -> np.ndarray:
     """(nx, ny, nz) bool, whether the centre of each voxel lies inside a closed mesh: the parity of crossings (Open3D).
 
     Only voxels within the mesh's bounding box are looked at.
@@ -84,11 +79,11 @@ def occupancy(mesh: TriangleMesh, grid: VoxelGrid) -> np.ndarray:
     if (high <= low).any():
         return found
     scene, middle = raycasting_scene(mesh)
-    axes = [corner[k] + (np.arange(low[k], high[k]) + 0.5) * grid.voxel_m - middle[k] for k in range(3)]
-    slab = max(1, AT_ONCE // (len(axes[1]) * len(axes[2])))
-    for first in range(0, len(axes[0]), slab):
-        centres = np.stack(np.meshgrid(axes[0][first : first + slab], *axes[1:], indexing="ij"), axis=-1)
-        inside = scene.compute_occupancy(o3d.core.Tensor(centres.astype(np.float32)), nsamples=VOTES).numpy() > 0.5
+    box = VoxelGrid(tuple(high - low), grid.voxel_m, tuple(corner + low * grid.voxel_m - middle))
+    slab = max(1, AT_ONCE // (box.shape[1] * box.shape[2]))
+    for first in range(0, box.shape[0], slab):
+        centres = box.centres(slice(first, first + slab)).astype(np.float32)
+        inside = scene.compute_occupancy(o3d.core.Tensor(centres), nsamples=VOTES).numpy() > 0.5
         start = low[0] + first
         found[start : start + inside.shape[0], low[1] : high[1], low[2] : high[2]] = inside
     return found
@@ -98,13 +93,8 @@ def attenuation_volume(solids: Sequence[Solid], grid: VoxelGrid) -> np.ndarray:
     """(nx, ny, nz) float64, 1/m, attenuation at the centre of each voxel: that of the innermost solid; 0 of air."""
     volume = np.zeros(grid.shape)
     for solid in outermost_first(solids):
-        volume[occupancy(solid.mesh, grid)] = solid.attenuation_per_m
+        volume[inside_voxels(solid.mesh, grid)] = solid.attenuation_per_m
     return volume
-
-
-def matter(solids: Sequence[Solid], grid: VoxelGrid) -> np.ndarray:
-    """(nx, ny, nz) bool, whether there is matter at the centre of each voxel: a solid that is no cavity."""
-    return np.asarray(attenuation_volume(solids, grid) > 0)
 
 
 def outermost_first(solids: Sequence[Solid]) -> list[Solid]:

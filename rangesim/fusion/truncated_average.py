@@ -36,9 +36,9 @@ TRUNCATION_VOXELS = 3.0
 """Truncation distance, in voxels, if none is given."""
 FINEST = 0.1
 """Of the distance between neighbouring readings, at least, that a voxel is: in smaller ones surfaces are specks."""
-MIN_VIEWS = 0.1
+MIN_VIEWS = 0.05
 """Fraction of the views that must agree on a surface, in typical readings, if nothing else is said."""
-MAX_MIN_WEIGHT = 2.0
+MAX_MIN_WEIGHT = 1.0
 """Typical readings that are enough in any case."""
 
 
@@ -82,7 +82,7 @@ def fuse(
     truncation_m : metres, at least a voxel; larger than the errors of readings, and smaller than the thinnest wall seen
         from both sides. None: three voxels.
     weights : "confidence" or "uniform", see `reading_weights`.
-    min_weight : least sum of weights, 1 being a typical reading; None: a tenth of the number of views, at most 2.
+    min_weight : least sum of weights, 1 being a typical reading; None: a twentieth of the number of views, at most 1.
     lookup : see `rangesim.fusion.sdf.depth_at`.
 
     Raises

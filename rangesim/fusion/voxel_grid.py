@@ -13,6 +13,8 @@ from rangesim import limits
 from rangesim.settings.bounds import Coordinate, Metres, check_fields, whole
 from rangesim.settings.config import shown
 
+ALL = slice(None)
+
 
 @dataclass(frozen=True)
 class VoxelGrid:
@@ -46,10 +48,10 @@ class VoxelGrid:
         corner = (low + high) / 2 - shape * voxel_m / 2
         return cls(tuple(map(int, shape)), float(voxel_m), tuple(map(float, corner)))  # type: ignore[arg-type]
 
-    def centres(self) -> np.ndarray:
-        """(nx, ny, nz, 3) float64, metres, world, of all voxels."""
+    def centres(self, part: slice = ALL) -> np.ndarray:
+        """(nx, ny, nz, 3) float64, metres, world, of all voxels, or of those in a part of the rows along x."""
         axes = [c + (np.arange(n) + 0.5) * self.voxel_m for c, n in zip(self.corner_m, self.shape, strict=True)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        return np.stack(np.meshgrid(axes[0][part], *axes[1:], indexing="ij"), axis=-1)
 
     def indices(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """(..., 3) int64, the voxels that points (..., 3), world, lie in, and (...) bool, whether they are of the
