@@ -33,6 +33,8 @@ ATTENUATION_PER_M = 50.0
 """Of a shape whose own is not given: about that of glass or of light metal at 100 keV."""
 RAYS = 2
 """Lines across each detector pixel, that are averaged."""
+SAME_PLACE = 1e-6
+"""Fraction of the distance along a line within which two crossings of a kind are one, in single precision."""
 TRIES = 8
 """Shifts of a line that runs along an edge, where entries and exits do not match."""
 
@@ -172,11 +174,11 @@ def _inside(
     lengths, left = np.zeros(len(origins)), np.arange(len(origins))
     for attempt in range(TRIES):
         # Along an edge two triangles may be met, or none; a line a little beside is as good
-        places = origins[left] + shift_m * attempt * (across * 0.7 + np.array([0, 0, 0.3])) - middle
+        places = origins[left] + shift_m * (attempt + 0.37) * (across * 0.7 + np.array([0, 0, 0.3])) - middle
         rays = np.concatenate([places, np.broadcast_to(along, places.shape)], axis=-1).astype(np.float32)
         met = scene.list_intersections(o3d.core.Tensor(rays))
         ray, t, face = (met[key].numpy() for key in ("ray_ids", "t_hit", "primitive_ids"))
-        side = leaves[face]
+        ray, t, side = _once(ray, t, leaves[face])
         balance = np.bincount(ray, side, len(left))
         matches = np.abs(balance) < 0.5
         lengths[left] = np.maximum(np.bincount(ray, side * t, len(left)), 0)
@@ -185,3 +187,12 @@ def _inside(
             return lengths
     lengths[left] = 0.0  # they graze an edge in every one of these places: as good as nothing
     return lengths
+
+
+def _once(ray: np.ndarray, t: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Crossings (k,) of lines, each once: on an edge, both triangles are met in one place."""
+    order = np.lexsort((t, side, ray))
+    ray, t, side = ray[order], t[order], side[order]
+    again = np.zeros(len(ray), bool)
+    again[1:] = (ray[1:] == ray[:-1]) & (side[1:] == side[:-1]) & (np.diff(t) <= SAME_PLACE * np.abs(t[1:]))
+    return ray[~again], t[~again], side[~again]
