@@ -74,13 +74,13 @@ def test_an_older_scan_is_replaced_and_files_beside_it_stay(scanned: Path) -> No
 
 def test_settings_come_from_a_file_and_options_go_first(tmp_path: Path) -> None:
     (tmp_path / "scan.toml").write_text(
-        'scene = "matte"\nwidth = 200\nspp = 4\nvoxel_m = 0.004\n'
+        'scene = "matte"\nwidth = 200\nspp = 4\nvoxel_m = 0.02\n'
         '[instrument]\nsensor = "amcw"\n[path]\ntype = "dome"\nviews = 5\nlowest_deg = 20\n'
     )
     settings = load_scan_settings(tmp_path / "scan.toml")
     assert settings.path == Dome(5, lowest_deg=20.0)
     assert settings.instrument.name == "amcw"
-    assert settings.voxel_m == 0.004
+    assert settings.voxel_m == 0.02
     run("--config", str(tmp_path / "scan.toml"), "--views", "2", "--width", "64", "--out", str(tmp_path / "out"))
     record = json.loads((tmp_path / "out" / "scan.json").read_text())
     assert record["settings"]["path"]["views"] == 2

@@ -44,6 +44,8 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
     "rectification": ["rectification.png", "--width", "160"],
+    "scan": ["--views", "4", "--width", "96", "--out", "out/scan.ply"],
+    "sparse_against_dense": ["sparse.png", "--views", "3", "--width", "64", "--voxel", "0.004"],
     "segmentation": ["--width", "320"],
     "two_cameras": ["--width", "80"],
 }
