@@ -54,7 +54,7 @@ def fusion(small: bool = False) -> dict[str, float]:
     """24 noisy views of `matte` by structured light, fused; best of three."""
     scene = load_scene("matte")
     views, width = (6, 160) if small else (24, 640)
-    rig = scene.rig(width=width)
+    rig = scene.rig(0.05, width=width)  # a baseline as of a hand-held scanner
     path = Dome(views, (0.0, 0.05, 0.05), 0.7, 25.0, 80.0)
     start = time.perf_counter()
     found = scan(scene, rig, Instrument("noisy", StructuredLight(), exposure_s=EXPOSURE_S), path, spp=8)

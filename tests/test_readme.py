@@ -44,6 +44,7 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
     "rectification": ["rectification.png", "--width", "160"],
+    "scan": ["--views", "4", "--width", "96", "--out", "out/scan.ply"],
     "segmentation": ["--width", "320"],
     "sparse_against_dense": ["page.html", "--views", "2", "--width", "64", "--voxel-mm", "4"],
     "two_cameras": ["--width", "80"],

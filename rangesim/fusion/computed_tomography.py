@@ -38,7 +38,7 @@ FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
 RAYS_AT_ONCE = 1 << 19
 SHIFTS = 8
 """Times that a ray which meets an edge of the mesh is moved by a little."""
-SHIFT = 1e-4
+SHIFT = 1e-3
 """Of a voxel."""
 LEAST_COUNT = 0.5
 """Photons that a pixel is taken to have counted which counted none."""
@@ -190,7 +190,7 @@ class _Caster:
         """(m,) metres: sum of the ranges at which a ray leaves, less those at which it enters.
 
         A ray through an edge or a vertex may be told of one triangle twice or not at all; then its crossings do not
-        alternate, and it is shifted by a ten-thousandth of a voxel.
+        alternate, and it is shifted by a thousandth of a voxel.
         """
         found, closed = self._cast(origins, directions)
         for k in range(1, SHIFTS + 1):
