@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many views: does bundle adjustment reach the noise, and how fast; what does online cost; are factorisations at their
-bound; is a deforming shape found?
+bound; is a deforming shape found; how good are fused scans, poses found from readings, and the dense counterpart?
 
-Each part is a function that returns rows of the table and keys of the last line, which is JSON:
+Each part returns rows of the table and keys of the last line, which is JSON:
 
     bundle_s               100 views of 20 000 points, every point in every view, from a perturbed start, seconds
     bundle_ratio_to_noise  standard deviation that the residuals tell over that of the noise
     online_ratio           error of the positions of a moving camera, sliding window over all frames at once
     nonrigid_error         rms error of a shape of 4 basis shapes, 50 points in 10 images, 10 % missing, 0.5 px of
                            noise, over the rms extent of the shape
+    fusion_s, fusion_gain, registration_mm    of `fused_scans.py`
+    ct_error               of `tomography.py`
 
 Usage: python benchmarks/many_views.py [PART ...] [--views 100] [--points 20000] [--trials 20]
 """
@@ -22,7 +24,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from fused_scans import fusion, registration, weights
 from scipy.spatial.transform import Rotation
+from tomography import tomography
 
 from rangesim.geometry.reprojection import moved_pose
 from rangesim.multiview import (
@@ -288,29 +292,49 @@ PARTS: dict[str, Callable[[argparse.Namespace], Part]] = {
     "online": online,
     "factorisation": factorisation,
     "nonrigid": nonrigid,
-    # parts of rangesim.fusion come here: functions that return their rows and keys
 }
+OF_SCANS: dict[str, Callable[[], dict[str, float]]] = {
+    "fusion": fusion,
+    "weights": weights,
+    "registration": registration,
+    "tomography": tomography,
+}
+"""These print what they find themselves."""
+KEYS = (
+    "fusion_s",
+    "fusion_gain",
+    "registration_mm",
+    "bundle_s",
+    "bundle_ratio_to_noise",
+    "online_ratio",
+    "nonrigid_error",
+    "ct_error",
+)
 
 
 def main() -> None:
+    names = [*PARTS, *OF_SCANS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all if none is named")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(names)}; all if none is named")
     parser.add_argument("--views", type=int, default=100)
     parser.add_argument("--points", type=int, default=20_000)
     parser.add_argument("--trials", type=int, default=20)
     options = parser.parse_args()
-    unknown = set(options.parts) - set(PARTS)
+    unknown = set(options.parts) - set(names)
     if unknown:
-        parser.error(f"expected parts of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
-    keys: dict[str, float] = {}
+        parser.error(f"expected parts of {', '.join(names)}, got {', '.join(sorted(unknown))}")
+    chosen, keys = options.parts or names, dict[str, float]()
     print("| what | figure |\n| --- | --- |")
-    for name in options.parts or PARTS:
+    for name in [n for n in chosen if n in PARTS]:
         part = PARTS[name](options)
         for what, figure in part.rows:
             print(f"| {what} | {figure} |", flush=True)
         keys |= part.keys
+    for name in [n for n in chosen if n in OF_SCANS]:
+        print(f"\n{name}", flush=True)
+        keys |= OF_SCANS[name]()
     print()
-    print(json.dumps(keys))
+    print(json.dumps({key: keys[key] for key in KEYS if key in keys}))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ def main() -> None:
     """Run the command line."""
     from pcgraph.interrupts import end_on_signals
 
-    end_on_signals("rangesim", writes=bool({"run", "decode", "report"} & set(sys.argv[1:3])))
+    end_on_signals("rangesim", writes=bool({"run", "scan", "decode", "report"} & set(sys.argv[1:3])))
     from rangesim.cli import main as run
 
     run()

@@ -11,6 +11,7 @@ import re
 import warnings
 
 __all__ = [
+    "AlignmentWarning",
     "EnvironmentProblem",
     "FileFormatError",
     "RangesimError",
@@ -51,6 +52,10 @@ class TruncationWarning(RangesimWarning):
     def __init__(self, message: str, fraction: float) -> None:
         super().__init__(message)
         self.fraction = fraction
+
+
+class AlignmentWarning(RangesimWarning):
+    """Poses of views that nothing confirms."""
 
 
 class SamplingWarning(RangesimWarning):

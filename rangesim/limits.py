@@ -45,6 +45,7 @@ class Limits:
     passes : light-transport passes of one sensor in a scene that moves; bands and samples of its exposures.
     instruments : of one experiment.
     points : vertices, or faces, of one mesh file.
+    voxels : of one grid that views are fused in, or seen and true volume are compared on.
     shapes : of one scene.
     memory : bytes that a run may take by its estimate; unless it is set, what the machine has available.
     bytes : of the arrays that one file holds once it is decompressed.
@@ -65,6 +66,7 @@ class Limits:
     passes: int = 10_000
     instruments: int = 100
     points: int = 100_000_000
+    voxels: int = 200_000_000
     shapes: int = 100_000
     memory: int = 1 << 50
     bytes: int = 4 << 30

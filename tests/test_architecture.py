@@ -258,6 +258,36 @@ def test_geometry_loads_neither_opencv_nor_open3d_until_they_are_used() -> None:
     assert not (RENDERER | {"open3d", "cv2"}) & set(run(code).split())
 
 
+FUSION = {
+    "computed_tomography": "Sinogram filtered_back_projection sampling_angles with_photon_noise xray_projections",
+    "joint_registration": "refine_jointly",
+    "mesh_error": "SurfaceError surface_error",
+    "multiway_registration": "Alignment PairFit PoseErrors align pose_errors",
+    "paths": "Dome HandHeld Path PoseList Turntable Viewpoint",
+    "sdf": "average_signed_distances reading_weights signed_distance",
+    "seen_volume": "Occupancy SeenOfShape VoxelState occupancy true_occupancy voxel_states",
+    "solids": "Solid attenuation_volume inside_voxels",
+    "truncated_average": "FusedSurface fuse",
+    "views": "Scan scan",
+    "voxel_grid": "VoxelGrid",
+}
+
+
+def test_the_public_surface_of_fusion_is_this() -> None:
+    """And type checkers see the same names."""
+    import rangesim.fusion as fusion
+
+    wanted = {name: f"rangesim.fusion.{chapter}" for chapter, names in FUSION.items() for name in names.split()}
+    assert set(fusion.__all__) == set(wanted)
+    assert not set(wanted) & set(FUSION)
+    tree = ast.parse((ROOT / "rangesim" / "fusion" / "__init__.py").read_text())
+    block = next(n for n in tree.body if isinstance(n, ast.If))
+    seen = {a.asname: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names if a.asname}
+    assert seen == wanted
+    for name in wanted:
+        assert getattr(fusion, name).__doc__
+
+
 def test_the_public_surface_is_this() -> None:
     assert rangesim.__all__ == [
         "Ambient",

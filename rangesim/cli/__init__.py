@@ -15,6 +15,7 @@ from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
+from rangesim.cli.scan import scan_command
 from rangesim.environment.doctor import doctor_command
 from rangesim.errors import RangesimError, RangesimWarning, sentence
 
@@ -22,6 +23,7 @@ app = typer.Typer(
     name="rangesim", no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False
 )
 app.command("run")(run_command)
+app.command("scan")(scan_command)
 app.command("decode")(decode_command)
 app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)

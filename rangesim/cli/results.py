@@ -61,7 +61,8 @@ def report_command(
 
 def verify_command(
     directory: Annotated[
-        Path, typer.Argument(help="A directory that rangesim wrote: a result, a capture, or what it decodes to.")
+        Path,
+        typer.Argument(help="A directory that rangesim wrote: a result, a scan, a capture, or what it decodes to."),
     ],
 ) -> None:
     """Compare a directory with its manifest: every file's size and SHA-256.
@@ -78,8 +79,9 @@ def verify_command(
     from rangesim.cli.decoded_files import DECODED
     from rangesim.errors import FileFormatError, visible
     from rangesim.experiment.result_files import RESULT
+    from rangesim.fusion.scan_run import SCAN
 
-    kinds = (RESULT, CAPTURE, DECODED)
+    kinds = (RESULT, SCAN, CAPTURE, DECODED)
     kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)
     if kind is None:
         raise FileFormatError(

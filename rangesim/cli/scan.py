@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rangesim scan`: many views to one surface."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
+
+if TYPE_CHECKING:
+    from rangesim.fusion.paths import Path as ScanPath
+    from rangesim.fusion.scan_run import ScanResult
+    from rangesim.fusion.scan_settings import ScanSettings
+
+PATHS = ("turntable", "dome", "hand-held")
+
+
+def scan_command(
+    scene: Annotated[
+        Path | None,
+        typer.Argument(help="Scene (.xml), mesh, or name of a scene, as for `rangesim run`.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Directory for the results; an older scan is replaced.")
+    ] = ...,  # type: ignore[assignment]
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="Settings of the scan (.toml); other options override them.")
+    ] = None,
+    path: Annotated[
+        str | None,
+        typer.Option(
+            help=f"{', '.join(PATHS)}, or a .json file with poses T_world_camera (n, 4, 4). (default: turntable)"
+        ),
+    ] = None,
+    views: Annotated[int | None, typer.Option(help="Number of views. (default: 12; dome, hand-held: 24)")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option("--sensor", "-s", help="As for `rangesim run`, one of them. (default: gray-phase)"),
+    ] = None,
+    voxel: Annotated[
+        float | None, typer.Option(help="Metres, edge of a voxel. (default: 1.5 times the distance between readings)")
+    ] = None,
+    unknown_poses: Annotated[
+        bool, typer.Option("--unknown-poses", help="Find the poses from the readings instead of taking the path's.")
+    ] = False,
+    uniform: Annotated[bool, typer.Option("--uniform", help="All readings weigh the same.")] = False,
+    spp: Annotated[int | None, typer.Option(help="Light paths per pixel. (default: by the surface)")] = None,
+    width: Annotated[int | None, typer.Option(help="Camera width, pixels. (default: the scene's)")] = None,
+    height: Annotated[int | None, typer.Option(help="Camera height, pixels. (default: the scene's)")] = None,
+    seed: Annotated[int | None, typer.Option(help="The same seed gives the same bytes. (default: 0)")] = None,
+    material: Annotated[
+        str | None, typer.Option(help="Of a bare mesh: matte, glossy, mirror, transparent. (default: matte)")
+    ] = None,
+    unit_m: Annotated[float | None, typer.Option(help="Metres per unit of a bare mesh. (default: 1)")] = None,
+) -> None:
+    """Scan a scene from many sides and fuse the views: mesh.ply, poses, range images, statistics and report.html.
+
+    Examples:
+
+      rangesim scan part.ply --unit-m 0.001 --views 24 --voxel 0.0005 --out out/part
+
+      rangesim scan tabletop --path dome --width 320 --out out/dome
+
+      rangesim scan --config scan.toml --unknown-poses --out out/unknown
+    """
+    from pcgraph.output import check_directory
+    from rangesim.fusion.scan_run import SCAN, run_scan
+
+    given: dict[str, Any] = {"spp": spp, "width": width, "height": height, "seed": seed, "voxel_m": voxel}
+    given |= {"material": material, "unit_m": unit_m}
+    settings = _settings(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
+    if path is not None or views is not None:
+        settings = replace(settings, path=_path(settings.path, path, views))
+    if unknown_poses:
+        settings = replace(settings, registration="unknown")
+    if uniform:
+        settings = replace(settings, weights="uniform")
+    target = check_directory(out, SCAN, inputs=[settings.scene])
+    say_where(out, target)
+    with light_left_out_in_a_line(), progress_bar() as progress:
+        result = run_scan(settings, out, progress)
+    typer.echo(_table(result))
+    typer.echo(f"{out / 'report.html'}")
+
+
+def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
+    from rangesim.experiment.instrument import instrument
+    from rangesim.fusion.scan_settings import ScanSettings, load_scan_settings
+
+    if config is None and scene is None:
+        raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")
+    if sensor is not None:
+        given["instrument"] = instrument(sensor)
+    if config is None:
+        return ScanSettings(scene=str(scene), **given)
+    if scene is not None:
+        given["scene"] = str(scene)
+    return replace(load_scan_settings(config), **given)
+
+
+def _path(before: ScanPath, name: str | None, views: int | None) -> ScanPath:
+    """The path of a name, or the one there is, with another number of views."""
+    from rangesim.files.text_files import read_json
+    from rangesim.fusion.paths import Path as ScanPath
+    from rangesim.fusion.paths import PoseList
+    from rangesim.settings.config import nearest
+
+    if name is not None and name.endswith(".json"):
+        if views is not None:
+            raise ValueError("expected --views without a list of poses, which has its own number.")
+        data = read_json(Path(name))
+        return PoseList(data["T_world_camera"] if isinstance(data, dict) and "T_world_camera" in data else data)
+    if name is not None and name not in PATHS:
+        raise ValueError(
+            f"expected --path out of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
+        )
+    chosen = before if name in (None, before.type_name) else ScanPath.known[name]()
+    if views is None:
+        return chosen
+    if isinstance(chosen, PoseList):
+        raise ValueError("expected --views without a list of poses, which has its own number.")
+    return replace(chosen, views=views)  # type: ignore[type-var]
+
+
+def _table(result: ScanResult) -> str:
+    """Errors of the shapes, and of poses that were found."""
+    lines = [f"{'shape':20s}{'material':14s}{'accuracy':>10s}{'complete':>10s}{'seen':>8s}"]
+    for name in result.things:
+        error = result.errors[name]
+        accuracy = "-" if error is None else f"{1e3 * error.accuracy_m:.3f} mm"
+        recall = "-" if error is None else f"{error.recall:.1%}"
+        seen = "-" if result.seen is None else f"{result.seen.shapes[name].surface:.1%}"
+        lines.append(f"{name[:19]:20s}{result.materials[name]:14s}{accuracy:>10s}{recall:>10s}{seen:>8s}")
+    if result.poses is not None:
+        angle, centre = result.poses.angle_deg.max(), 1e3 * result.poses.centre_m.max()
+        lines.append(f"poses found: off by at most {angle:.3f} degrees, camera centres {centre:.3f} mm")
+    return "\n".join(lines)

@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many views to one surface: the weighted truncated average of `sdf`, on sparse blocks of voxels.
+
+Open3D's voxel-block grid (Niessner et al.: "Real-time 3D reconstruction at scale using voxel hashing", SIGGRAPH Asia
+2013) holds the blocks near some view's readings and makes the mesh by marching cubes. Its own `integrate` counts all
+readings alike, in front positive, and updates the blocks of each view alone, so that no view can refute another's
+ghost; here a loop of our own fills the grid: weights, distortion, and every view over every block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pcgraph.parallel import in_blocks, kernel, routine
+from rangesim import limits
+from rangesim.decoding.range_image import RangeImage
+from rangesim.fusion.sdf import (
+    SAME_SURFACE,
+    Lookup,
+    Weighting,
+    check_lookup,
+    placed,
+    relative_weights,
+)
+from rangesim.settings.bounds import MAX_COORDINATE_M
+from rangesim.settings.config import ShortRepr, shown
+from rangesim.triangle_mesh import TriangleMesh
+
+BLOCK = 8
+"""Voxels along the edge of a block."""
+TRUNCATION_VOXELS = 3.0
+"""Truncation distance, in voxels, if none is given."""
+FINEST = 0.1
+"""Of the distance between neighbouring readings, at least, that a voxel is: in smaller ones surfaces are specks."""
+MIN_VIEWS = 0.05
+"""Fraction of the views that must agree on a surface, in typical readings, if nothing else is said."""
+MAX_MIN_WEIGHT = 1.0
+"""Typical readings that are enough in any case."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FusedSurface(ShortRepr):
+    """A surface that views were fused to.
+
+    mesh : TriangleMesh, world; its normals point to where the cameras were. voxel_m, truncation_m : metres.
+    vertex_weights : (n,) float32, of each vertex the sum of its readings' weights, where 1 is a typical reading.
+    min_weight : least weight of the voxels that the surface was taken from. voxels : number that were held.
+    """
+
+    mesh: TriangleMesh
+    voxel_m: float
+    truncation_m: float
+    vertex_weights: np.ndarray
+    min_weight: float
+    voxels: int
+
+
+def fuse(
+    images: Sequence[RangeImage],
+    voxel_m: float,
+    *,
+    truncation_m: float | None = None,
+    weights: Weighting = "confidence",
+    min_weight: float | None = None,
+    lookup: Lookup = "bilinear",
+) -> FusedSurface:
+    """Fuses range images, each with its own `T_world_camera`, to a mesh.
+
+    The formula, with its source, is that of `rangesim.fusion.sdf`. What a sensor reads wrong on glass and
+    mirrors differs from view to view: such readings are faint, or stand alone, or are refuted by views that see through
+    them, so they end below `min_weight` and leave holes. The same wrong reading in many views (the table seen through
+    glass, refracted a little) is a surface like any other.
+
+    Parameters
+    ----------
+    images : one or more; of one view the result is its readings, smoothed to the voxel.
+    voxel_m : metres, edge of a voxel: details smaller than two of them are lost.
+    truncation_m : metres, at least a voxel; larger than the errors of readings, and smaller than the thinnest wall seen
+        from both sides. None: three voxels.
+    weights : "confidence" or "uniform", see `reading_weights`.
+    min_weight : least sum of weights, 1 being a typical reading; None: a twentieth of the number of views, at most 1.
+    lookup : see `rangesim.fusion.sdf.depth_at`.
+
+    Raises
+    ------
+    ValueError
+        No views or readings, one without a camera, voxels so small that a limit is passed, or no surface that reaches
+        `min_weight`.
+    """
+    truncation = _checked(images, voxel_m, truncation_m, lookup)
+    least = min(MIN_VIEWS * len(images), MAX_MIN_WEIGHT) if min_weight is None else min_weight
+    if not least >= 0:
+        raise ValueError(f"expected min_weight of 0 or more typical readings, got {shown(min_weight)}.")
+    relative = relative_weights(images, weights)
+    _check_fineness(images, voxel_m)
+    grid = _Blocks.near(images, relative, voxel_m, truncation)
+    for image, weight in zip(images, relative, strict=True):
+        grid.add(image, weight, truncation, lookup)
+    mesh, of_vertices = grid.surface(least, truncation)
+    if not len(mesh.faces):
+        raise ValueError(
+            f"expected a surface that readings of weight {least:g} agree on, found none in {len(images)} views; check "
+            "their poses, or take larger voxels or a smaller min_weight."
+        )
+    return FusedSurface(mesh, float(voxel_m), truncation, of_vertices, float(least), grid.voxels)
+
+
+def _checked(images: Sequence[RangeImage], voxel_m: float, truncation_m: float | None, lookup: str) -> float:
+    """The truncation distance; ValueError on what cannot be fused."""
+    if not len(images):
+        raise ValueError("expected one view or more to fuse, got none.")
+    for number, image in enumerate(images):
+        if not isinstance(image, RangeImage):
+            raise ValueError(f"expected range images to fuse, got {shown(image)} as number {number}.")
+        placed(image)
+    if not 0 < voxel_m <= MAX_COORDINATE_M:
+        raise ValueError(f"expected a positive voxel_m in metres, got {shown(voxel_m)}.")
+    check_lookup(lookup)
+    truncation = TRUNCATION_VOXELS * voxel_m if truncation_m is None else truncation_m
+    if not voxel_m <= truncation <= MAX_COORDINATE_M:
+        raise ValueError(
+            f"expected truncation_m of at least a voxel of {voxel_m:g} m, and finite, got {shown(truncation_m)}."
+        )
+    return float(truncation)
+
+
+def _check_fineness(images: Sequence[RangeImage], voxel_m: float) -> None:
+    spacings = [float(np.median(i.z[i.valid])) / i.camera.fx for i in images if i.camera is not None and i.valid.any()]
+    if voxel_m < FINEST * min(spacings):
+        raise ValueError(
+            f"expected voxel_m of at least {FINEST * min(spacings):.2g}, a tenth of the distance between readings, got "
+            f"{voxel_m:g} m."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Open3D's grid with all blocks that will be needed, whose arrays are filled in place.
+
+    origin : (3,) metres, world: where the grid has its zero, near the readings, for single precision.
+    keys : (k, 3) int32, places of the blocks. rows : (k,) where their voxels stand in `total` and `weight`,
+    (capacity, 8, 8, 8) float32, indexed [block, z, y, x]; first the sums, at the end the average in Open3D's sign.
+    """
+
+    grid: Any
+    origin: np.ndarray
+    voxel_m: float
+    keys: np.ndarray
+    rows: np.ndarray
+    total: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def near(
+        cls, images: Sequence[RangeImage], weights: Sequence[np.ndarray], voxel_m: float, truncation_m: float
+    ) -> _Blocks:
+        """All blocks within the truncation distance of a reading that weighs something."""
+        import open3d as o3d
+
+        core, edge = o3d.core, BLOCK * voxel_m
+        places = [np.zeros((0, 3), np.int32)]
+        origin = None
+        for image, weight in zip(images, weights, strict=True):
+            camera, T = placed(image)
+            rays = camera.directions(camera.pixel_centres())
+            counts = (weight > 0) & np.isfinite(image.z)
+            points = (rays[counts] * image.z[counts, None].astype(np.float64)) @ T[:3, :3].T + T[:3, 3]
+            if not len(points):
+                continue
+            if origin is None:
+                origin = np.round(np.median(points, axis=0) / edge) * edge
+            local = _thinned(points - origin, voxel_m)
+            extent = np.abs(local).max() + truncation_m
+            if extent / edge >= 2**30:
+                raise ValueError(f"expected readings within 2^30 blocks of {edge:g} m, got one {extent:.3g} m away.")
+            grid = o3d.t.geometry.VoxelBlockGrid(
+                ("tsdf",), (core.float32,), ((1,),), voxel_size=voxel_m, block_resolution=BLOCK, block_count=1
+            )
+            cloud = o3d.t.geometry.PointCloud(core.Tensor(local.astype(np.float32)))
+            places.append(grid.compute_unique_block_coordinates(cloud, truncation_m / voxel_m).numpy())
+            places = [np.unique(np.concatenate(places), axis=0)]
+            limits.check("voxels", len(places[0]) * BLOCK**3, f"voxels of {voxel_m:g} m")
+        keys = places[0]
+        assert origin is not None  # some readings weigh something: see `relative_weights`
+        grid = o3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight"),
+            (core.float32, core.float32),
+            ((1,), (1,)),
+            voxel_size=voxel_m,
+            block_resolution=BLOCK,
+            block_count=len(keys),
+        )
+        rows, _ = grid.hashmap().activate(core.Tensor(keys))
+        total, weight = (grid.attribute(name).numpy()[..., 0] for name in ("tsdf", "weight"))
+        total[...], weight[...] = 0, 0
+        return cls(grid, origin, float(voxel_m), keys, rows.numpy(), total, weight)
+
+    @property
+    def voxels(self) -> int:
+        """Number of voxels held."""
+        return len(self.keys) * BLOCK**3
+
+    def add(self, image: RangeImage, weight: np.ndarray, truncation_m: float, lookup: Lookup) -> None:
+        """Add one view to the sums."""
+        camera, T = placed(image)
+        # World to camera, of the grid's coordinates
+        R, t = T[:3, :3].T, T[:3, :3].T @ (self.origin - T[:3, 3])
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients, camera.fold_radius2])
+        in_blocks(
+            _add_view, len(self.keys), self.keys, self.rows, self.total, self.weight, self.voxel_m, truncation_m,
+            np.ascontiguousarray(R), t, lens, np.ascontiguousarray(image.z), np.ascontiguousarray(weight),
+            lookup == "bilinear", smallest=64,
+        )  # fmt: skip
+
+    def surface(self, least: float, truncation_m: float) -> tuple[TriangleMesh, np.ndarray]:
+        """Mesh where the average is zero between voxels of weight at least `least`, and the weights of its vertices."""
+        import open3d as o3d
+
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Open3D's sign, positive in front, and in fractions of the truncation distance
+            np.divide(self.total, -truncation_m * self.weight, out=self.total)
+        np.nan_to_num(self.total, copy=False)
+        try:
+            above = float(np.nextafter(np.float32(least), np.float32(-1)))  # Open3D takes what is larger
+            made = self.grid.extract_triangle_mesh(weight_threshold=above)
+        except RuntimeError as error:
+            if "Tensor has shape {0}" not in str(error):
+                raise
+            made = o3d.t.geometry.TriangleMesh()  # it has no word for a grid without a surface
+        if "indices" not in made.triangle or not made.triangle.indices.shape[0]:
+            return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), np.zeros(0, np.float32)
+        vertices = made.vertex.positions.numpy().astype(np.float64)
+        faces = made.triangle.indices.numpy()
+        corners = vertices[faces]
+        has_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1) > 0
+        used, number = np.unique(faces[has_area], return_inverse=True)
+        order = np.lexsort(vertices[used].T)  # Open3D numbers vertices as its threads come to them
+        place = np.empty(len(order), np.int32)
+        place[order] = np.arange(len(order))
+        kept = vertices[used][order]
+        triangles = place[number.reshape(-1, 3)]
+        first = triangles.argmin(axis=1)  # each from its lowest vertex on
+        triangles = np.take_along_axis(triangles, (first[:, None] + np.arange(3)) % 3, axis=1)
+        triangles = triangles[np.lexsort(triangles.T[::-1])]
+        return TriangleMesh(kept + self.origin, triangles), self._weights_at(kept)
+
+    def _weights_at(self, points: np.ndarray) -> np.ndarray:
+        """(n,) float32, weight of the voxel nearest to each point (n, 3), in the grid's coordinates."""
+        import open3d as o3d
+
+        voxel = np.rint(points / self.voxel_m).astype(np.int64)
+        block = np.floor_divide(voxel, BLOCK)
+        rows, found = self.grid.hashmap().find(o3d.core.Tensor(block.astype(np.int32)))
+        x, y, z = np.moveaxis(voxel - BLOCK * block, -1, 0)
+        row, has = rows.numpy(), found.numpy()
+        return np.where(has, self.weight[np.where(has, row, 0), z, y, x], 0).astype(np.float32)
+
+
+def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
+    """One of the points in each voxel of half the size, roughly: more tell nothing new of the blocks."""
+    if len(points) < 10_000:
+        return points
+    place = np.floor(points / (2 * voxel_m)).astype(np.int64)
+    place -= place.min(axis=0)
+    size = place.max(axis=0) + 1
+    number = (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
+    return np.asarray(points[np.unique(number, return_index=True)[1]])
+
+
+# ---- One view over all blocks --------------------------------------------------------------------------------------
+
+
+@kernel
+def _add_view(  # type: ignore[no-untyped-def]
+    start, stop, keys, rows, total, weight, voxel_m, truncation_m, R, t, lens, z, weights, interpolate
+):
+    """Add w max(-t, sdf) and w of one view to the voxels of blocks `start` to `stop`."""
+    for block in range(start, stop):
+        row = rows[block]
+        for k in range(BLOCK):
+            for j in range(BLOCK):
+                px = keys[block, 0] * BLOCK * voxel_m
+                py = (keys[block, 1] * BLOCK + j) * voxel_m
+                pz = (keys[block, 2] * BLOCK + k) * voxel_m
+                x0 = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
+                y0 = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
+                z0 = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
+                for i in range(BLOCK):
+                    zc = z0 + R[2, 0] * i * voxel_m
+                    if zc <= 0:
+                        continue
+                    a = (x0 + R[0, 0] * i * voxel_m) / zc
+                    b = (y0 + R[1, 0] * i * voxel_m) / zc
+                    u, v = _pixel(a, b, lens)
+                    if not (u >= 0 and u < z.shape[1] and v >= 0 and v < z.shape[0]):
+                        continue
+                    w = weights[int(v), int(u)]
+                    if not w > 0:
+                        continue
+                    distance = zc - _depth(u, v, z, interpolate)
+                    if distance <= truncation_m:  # False with NaN
+                        if distance > voxel_m:  # so truncation_m is larger, too
+                            w *= (truncation_m - distance) / (truncation_m - voxel_m)
+                        total[row, k, j, i] += w * max(distance, -truncation_m)
+                        weight[row, k, j, i] += w
+
+
+@routine
+def _pixel(a, b, lens):  # type: ignore[no-untyped-def]
+    """Pixel of an image-plane point; NaN beyond the fold of the distortion. See `rangesim.rig.distortion`."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, fold = lens
+    r2 = a * a + b * b
+    if not r2 < fold:
+        return np.nan, np.nan
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    y = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    return fx * x + cx, fy * y + cy
+
+
+@routine
+def _depth(u, v, z, interpolate):  # type: ignore[no-untyped-def]
+    """Depth at a pixel inside the image; see `rangesim.fusion.sdf.depth_at`."""
+    depth = z[int(v), int(u)]
+    if not interpolate:
+        return float(depth)
+    left, top = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
+    if left < 0 or top < 0 or left >= z.shape[1] - 1 or top >= z.shape[0] - 1:
+        return float(depth)
+    z00, z01, z10, z11 = z[top, left], z[top, left + 1], z[top + 1, left], z[top + 1, left + 1]
+    low, high = min(min(z00, z01), min(z10, z11)), max(max(z00, z01), max(z10, z11))
+    if not (high - low <= SAME_SURFACE * low) or np.isnan(z00 + z01 + z10 + z11):
+        return float(depth)
+    a, b = u - 0.5 - left, v - 0.5 - top
+    return 1 / ((1 - a) * (1 - b) / z00 + a * (1 - b) / z01 + (1 - a) * b / z10 + a * b / z11)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several views of a scene in one call: poses of a rig, a range image from each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rangesim.decoding.range_image import RangeImage
+from rangesim.experiment.instrument import Instrument
+from rangesim.fusion.paths import Path, PoseList, Viewpoint
+from rangesim.rig import Array, Rig, pose
+from rangesim.sensor import Sensor
+from rangesim.settings.config import ShortRepr, shown
+from rangesim.settings.seeds import check_seed, derived_seed
+
+if TYPE_CHECKING:
+    from rangesim.electronics.ambient import Ambient
+    from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings
+    from rangesim.scene import Scene
+    from rangesim.signals import GroundTruth
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scan(ShortRepr):
+    """Range images of one scene from several places.
+
+    images : one for each view, each with `camera`, `T_world_camera` and the `confidence` of its readings. `fuse` takes
+    them as they are. truths : ground truth of each; empty where there is none. true_poses : (n, 4, 4) float64,
+    T_world_camera that the views were rendered from; None of a real scan.
+    """
+
+    images: tuple[RangeImage, ...]
+    truths: tuple[GroundTruth, ...] = ()
+    true_poses: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def poses(self) -> Array:
+        """(n, 4, 4) float64, T_world_camera of each view as its image has it: known, or found by `align`."""
+        return np.stack([np.asarray(i.T_world_camera) for i in self.images])
+
+    def with_poses(self, poses: ArrayLike) -> Scan:
+        """The same readings, taken from other places (n, 4, 4)."""
+        matrices = np.asarray(poses, dtype=np.float64)
+        if matrices.shape != (len(self.images), 4, 4):
+            raise ValueError(f"expected poses of shape ({len(self.images)}, 4, 4), got {matrices.shape}.")
+        placed = [
+            replace(i, T_world_camera=pose(T, f"pose {k}"))
+            for k, (i, T) in enumerate(zip(self.images, matrices, strict=True))
+        ]
+        return replace(self, images=tuple(placed))
+
+    def points(self) -> list[Array]:
+        """(n, 3) float64, metres, camera coordinates of each view's readings."""
+        clouds = (image.to_point_cloud().points.reshape(-1, 3).astype(np.float64) for image in self.images)
+        return [p[np.isfinite(p).all(axis=1)] for p in clouds]
+
+
+def scan(
+    scene: Scene,
+    rig: Rig,
+    sensor: Sensor | Instrument,
+    path: Path | ArrayLike,
+    settings: TransportSettings | None = None,
+    *,
+    ambient: Ambient | None = None,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+    **options: Any,
+) -> Scan:
+    """Range images of a scene from each pose of a path, one `transport` each; the scene is loaded once and shared.
+
+    Parameters
+    ----------
+    rig : camera and emitter, which move together; its own pose does not count, but where a path names no centre: then
+        that is what the rig looks at, at the scene's working distance.
+    sensor : Sensor with its default electronics and decoder, or an Instrument with its own.
+    path : Path, or poses (n, 4, 4) T_world_camera.
+    settings, options : of the light transport, as for `transport`; the seed is derived, other noise in each view.
+    ambient : as for `expose`.
+    seed : of light transport and noise, 0 to 2^64 - 1.
+    progress : called with the number of views done.
+
+    Raises
+    ------
+    ValueError
+        Poses that are not rigid, or as `transport`, `expose` and `decode`.
+    """
+    import rangesim
+    from rangesim.light_transport.transport_settings import chosen
+
+    if not isinstance(sensor, (Sensor, Instrument)):
+        raise ValueError(f"expected a sensor or an instrument, got {shown(sensor)}.")
+    check_seed(seed)
+    instrument = sensor if isinstance(sensor, Instrument) else Instrument("scan", sensor)
+    poses = poses_of(path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
+    chosen_settings = chosen(settings, cast("TransportOptions", options))
+    images, truths = [], []
+    for number, T in enumerate(poses):
+        placed = replace(rig, T_world_camera=T)
+        here = replace(chosen_settings, seed=derived_seed(seed, number, 0))
+        signals = rangesim.transport(scene, placed, [instrument.sensor], here)
+        noise_seed = derived_seed(seed, number, 1)
+        capture = rangesim.expose(
+            signals, instrument.sensor, instrument.detector, instrument.exposure_s, noise_seed, ambient
+        )
+        images.append(rangesim.decode(capture, instrument.decoder))
+        truths.append(signals.truth)
+        if progress is not None:
+            progress(number + 1)
+    return Scan(tuple(images), tuple(truths), poses)
+
+
+def poses_of(path: Path | ArrayLike | Sequence[ArrayLike], viewpoint: Viewpoint | None = None) -> Array:
+    """(n, 4, 4) poses of a path, or as they are given."""
+    return (path if isinstance(path, Path) else PoseList(np.asarray(path))).poses(viewpoint)

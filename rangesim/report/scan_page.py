@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The HTML page of a fused scan: the mesh, its error, what was seen; one file that opens offline."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from rangesim.fusion.mesh_error import distances_to, nearest_on
+from rangesim.fusion.sdf import signed_distance
+from rangesim.fusion.seen_volume import SLANTED, VoxelState
+from rangesim.report import figures, palette
+from rangesim.report.build import _asset
+from rangesim.report.mesh_pictures import mesh_picture
+from rangesim.report.policy import StyleRules, content_policy, visible_text
+from rangesim.rig import Intrinsics
+from rangesim.triangle_mesh import TriangleMesh
+
+if TYPE_CHECKING:
+    from rangesim.fusion.scan_run import ScanResult
+
+PICTURES = 3
+"""Places along the path that the pictures are taken from."""
+WIDTH_PX = 480
+SAMPLES = 20_000
+"""Points on the mesh that the first sentence is about."""
+SEEN, UNSEEN = (94, 147, 190), (222, 122, 60)
+STATE_COLORS = {VoxelState.NEVER_SEEN: (90, 90, 96), VoxelState.FREE: (240, 240, 236), VoxelState.SURFACE: SEEN}
+STATE_NAMES = {
+    VoxelState.SURFACE: "a surface was measured",
+    VoxelState.FREE: "seen to be free",
+    VoxelState.NEVER_SEEN: "never seen",
+}
+SOLID = (196, 160, 96)
+
+
+def render_scan_page(result: ScanResult) -> str:
+    """The page of a scan as HTML."""
+    environment = Environment(
+        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_asset("scan.html.j2")).render(context(result))
+
+
+def context(result: ScanResult) -> dict[str, Any]:
+    """Everything the template shows."""
+    error = palette.color_table("RdBu_r")
+    truth = TriangleMesh.joined(list(result.surfaces.values()))
+    camera = result.scan.images[0].camera
+    assert camera is not None
+    camera = camera.resized(WIDTH_PX, max(1, round(WIDTH_PX * camera.height / camera.width)))
+    number = len(result.scan)
+    places = _places(result)
+    fused = result.fused
+    return {
+        "css": Markup(_asset("style.css")),  # our own file
+        "rules": StyleRules(),
+        "content_policy": content_policy,
+        "scene": result.settings.scene,
+        "line": _line(result),
+        "verdict": _verdict(result),
+        "rows": [_row(result, places, camera, truth, error, which) for which in ("shaded", "error", "seen")],
+        "error_bar": {"uri": figures.color_bar(error), "ticks": palette.error_ticks()},
+        "slices": _slices(result),
+        "states": [(STATE_NAMES[s], palette.hexadecimal(np.array(STATE_COLORS[s]))) for s in STATE_NAMES]
+        + [("solid", palette.hexadecimal(np.array(SOLID)))],
+        "shapes": [_shape_cells(result, name) for name in result.errors],
+        "views": [_view_cells(result, k) for k in range(number)],
+        "poses_found": result.poses is not None,
+        "voxel_mm": f"{1e3 * fused.voxel_m:.3g}",
+        "grid_mm": "-" if result.seen is None else f"{1e3 * result.seen.grid.voxel_m:.3g}",
+        "fractions": []
+        if result.seen is None
+        else [(STATE_NAMES[s], _percent(result.seen.fraction(s))) for s in STATE_NAMES],
+        "times": [(name, f"{seconds:.1f} s") for name, seconds in result.times_s.items()],
+        "seen_color": palette.hexadecimal(np.array(SEEN)),
+        "unseen_color": palette.hexadecimal(np.array(UNSEEN)),
+    }
+
+
+def _places(result: ScanResult) -> list[int]:
+    """Numbers of views that measured much, spread over the path."""
+    readings = np.array([image.valid.sum() for image in result.scan.images])
+    good = np.nonzero(readings >= 0.5 * readings.max())[0]
+    return sorted({int(good[round(k * len(good) / PICTURES) % len(good)]) for k in range(PICTURES)})
+
+
+def _line(result: ScanResult) -> str:
+    camera = result.scan.images[0].camera
+    assert camera is not None
+    s, fused = result.settings, result.fused
+    known = "poses known" if s.registration == "known" else "poses found from the readings"
+    return (
+        f"{len(result.scan)} views of {camera.width} × {camera.height} pixels, {s.path.type_name} · "
+        f"{s.instrument.sensor.title} · {known} · voxels of {1e3 * fused.voxel_m:.3g} mm, truncation "
+        f"{1e3 * fused.truncation_m:.3g} mm, weights by {s.weights}"
+    )
+
+
+def _verdict(result: ScanResult) -> list[str]:
+    """Sentences: how right, how complete, what was never seen."""
+    truth = TriangleMesh.joined(list(result.surfaces.values()))
+    off = distances_to(result.fused.mesh.sample(SAMPLES)[0], truth)
+    within = float((off <= result.fused.voxel_m).mean())
+    said = [
+        f"Half of the fused surface lies within {1e3 * float(np.median(off)):.2g} mm of the true one, "
+        f"{_percent(within)} within a voxel."
+    ]
+    if result.seen is not None:
+        areas = {n: s.area_m2 for n, s in result.seen.shapes.items()}
+        seen = sum(areas[n] * s.surface for n, s in result.seen.shapes.items()) / sum(areas.values())
+        said.append(f"The views measured {_percent(seen)} of the true surface of {_count(len(areas), 'thing')}.")
+        lost = [n for n, s in result.seen.shapes.items() if s.volume_m3 > 0 and s.volume_free > 0.5]
+        if lost:
+            said.append(f"Taken for empty space by more than half: {', '.join(lost)}.")
+    blind = [str(k + 1) for k, image in enumerate(result.scan.images) if not image.valid.any()]
+    if blind:
+        said.append(f"No reading in view {', '.join(blind)}: something stands before the camera, or nothing does.")
+    if result.poses is not None:
+        said.append(
+            f"Poses were found from the readings alone, to {result.poses.angle_deg.max():.2g}° and "
+            f"{1e3 * result.poses.centre_m.max():.2g} mm at worst."
+        )
+    return said
+
+
+def _row(
+    result: ScanResult, places: list[int], camera: Intrinsics, truth: TriangleMesh, error: np.ndarray, which: str
+) -> list[dict[str, str]]:
+    mesh = truth if which == "seen" else result.fused.mesh
+    colors = None
+
+    def by_error(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        place = palette.error_fraction(_signed_error(points, truth, mesh.face_normals[faces]))
+        return np.asarray(error[np.rint(255 * place).astype(int)], dtype=np.float64)
+
+    def by_seen(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        return np.where(_seen(result, points, truth.face_normals[faces])[:, None], SEEN, UNSEEN)
+
+    colors = {"shaded": None, "error": by_error, "seen": by_seen}[which]
+    pictures = []
+    for k in places:
+        uri = figures.png(mesh_picture(mesh, camera, result.scan.poses[k], colors))
+        pictures.append({"uri": uri, "alt": f"{which}, view {k + 1}", "note": f"from view {k + 1}"})
+    return pictures
+
+
+def _signed_error(points: np.ndarray, truth: TriangleMesh, normals: np.ndarray) -> np.ndarray:
+    """(n,) metres, positive where the mesh lies outside of the true surface, by the mesh's own normals."""
+    off = points - nearest_on(points, truth)
+    length = np.linalg.norm(off, axis=-1)
+    return np.where((off * np.nan_to_num(normals)).sum(axis=-1) >= 0, length, -length)
+
+
+def _seen(result: ScanResult, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(n,) bool, whether some view measured the true surface there."""
+    tolerance = result.fused.voxel_m if result.seen is None else result.seen.tolerance_m
+    seen = np.zeros(len(points), bool)
+    for image in result.scan.images:
+        assert image.T_world_camera is not None
+        to_camera = image.T_world_camera[:3, 3] - points
+        cosine = np.abs((to_camera * np.nan_to_num(normals)).sum(axis=-1)) / np.linalg.norm(to_camera, axis=-1)
+        off = np.abs(signed_distance(points, image, lookup="bilinear"))
+        seen |= (off * cosine <= tolerance) & (off <= SLANTED * tolerance)
+    return seen
+
+
+def _slices(result: ScanResult) -> list[dict[str, str]]:
+    """What is there and what the views know of it, in the level and the upright middle plane of the things."""
+    if result.seen is None:
+        return []
+    states, truth = result.seen.states, result.seen.truth
+    solid = truth >= 0
+    if solid.any():
+        middle = [int(np.argmax(solid.sum(axis=tuple(j for j in range(3) if j != axis)))) for axis in (2, 1)]
+    else:
+        middle = [states.shape[2] // 2, states.shape[1] // 2]
+    made = []
+    for name, axis, place in (("level", 2, middle[0]), ("upright", 1, middle[1])):
+        filled, known_states = (np.asarray(volume.take(place, axis)) for volume in (solid, states))
+        there = np.where(filled.T[::-1, :, None], SOLID, (240, 240, 236)).astype(np.uint8)
+        table = np.array([STATE_COLORS[VoxelState(k)] for k in range(3)], np.uint8)
+        known = table[known_states.T[::-1]]
+        for title, picture in ((f"what is there, {name} slice", there), (f"what the views know, {name} slice", known)):
+            larger = max(1, round(WIDTH_PX / picture.shape[1]))
+            picture = picture.repeat(larger, axis=0).repeat(larger, axis=1)
+            made.append({"uri": figures.png(picture), "alt": title, "note": title})
+    return made
+
+
+def _shape_cells(result: ScanResult, name: str) -> list[str]:
+    error = result.errors[name]
+    cells = [name, result.materials[name]]
+    if error is None:
+        cells += ["-"] * 5
+    else:
+        cells += [f"{1e3 * v:.3f}" for v in (error.accuracy_m, error.accuracy_rms_m, error.accuracy_p95_m)]
+        cells += [f"{1e3 * error.chamfer_m:.2f}", f"{error.f_score:.3f}"]
+    seen = None if result.seen is None else result.seen.shapes.get(name)
+    if seen is None:
+        return [*cells, *["background"] * 4] if name not in result.things else [*cells, *["-"] * 4]
+    return [*cells, *(_percent(v) for v in (seen.surface, seen.volume_surface, seen.volume_never, seen.volume_free))]
+
+
+def _view_cells(result: ScanResult, number: int) -> list[str]:
+    image = result.scan.images[number]
+    cells = [str(number + 1), str(int(image.valid.sum())), _percent(float(image.valid.mean()))]
+    if result.poses is not None:
+        cells += [f"{result.poses.angle_deg[number]:.4f}", f"{1e3 * result.poses.centre_m[number]:.3f}"]
+    return cells
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
+
+
+def _percent(value: float) -> str:
+    return "-" if np.isnan(value) else f"{100 * value:.1f} %"

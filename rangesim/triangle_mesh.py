@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangle meshes: the true surface of a scene, and what views are fused to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rangesim.settings.config import ShortRepr, shown
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TriangleMesh(ShortRepr):
+    """Triangles over shared vertices.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64, metres, world.
+    faces : (m, 3) int32, indices of vertices, counter-clockwise as seen from outside.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, vertices that are not finite, or indices of vertices that are not there.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+    def __post_init__(self) -> None:
+        vertices, faces = np.asarray(self.vertices, dtype=np.float64), np.asarray(self.faces)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+            raise ValueError(f"expected finite vertices of shape (n, 3), got {shown(vertices)}.")
+        if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and faces.dtype.kind not in "iu"):
+            raise ValueError(f"expected faces of shape (m, 3) with indices of vertices, got {shown(faces)}.")
+        if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+            raise ValueError(f"expected faces with indices from 0 to {len(vertices) - 1}, got {faces.max()}.")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces.astype(np.int32))
+
+    @classmethod
+    def joined(cls, meshes: list[TriangleMesh]) -> TriangleMesh:
+        """All triangles of several meshes; no vertices are merged."""
+        starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+        vertices = [np.zeros((0, 3)), *(m.vertices for m in meshes)]
+        faces = [np.zeros((0, 3), np.int32), *(m.faces + s for m, s in zip(meshes, starts, strict=False))]
+        return cls(np.concatenate(vertices), np.concatenate(faces))
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(m, 3, 3) float64, metres, the corners of each triangle."""
+        return np.asarray(self.vertices[self.faces])
+
+    @property
+    def face_areas_m2(self) -> np.ndarray:
+        """(m,) float64."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1))
+
+    @property
+    def face_normals(self) -> np.ndarray:
+        """(m, 3) float64, unit, outward; NaN of triangles without an area."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        n = np.cross(b - a, c - a)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
+
+    @property
+    def area_m2(self) -> float:
+        """Of all triangles together."""
+        return float(self.face_areas_m2.sum())
+
+    @property
+    def volume_m3(self) -> float:
+        """Enclosed volume of a closed mesh, by the divergence theorem: the sum of a . (b x c) / 6 over its
+        triangles."""
+        a, b, c = np.moveaxis(self.corners - self.vertices.mean(axis=0), 1, 0)
+        return float((a * np.cross(b, c)).sum() / 6)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether each edge has as many triangles on one side as on the other; vertices at one place are one."""
+        if not len(self.faces):
+            return False
+        scale = max(float(np.ptp(self.vertices, axis=0).max()), 1e-30)
+        places = np.round((self.vertices - self.vertices[0]) / scale * 1e6)
+        number = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+        faces = number[self.faces].astype(np.int64)
+        a, b = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+        count = len(self.vertices)
+        return bool(np.array_equal(np.sort(a * count + b), np.sort(b * count + a)))
+
+    def sample(self, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Points that are spread evenly over the area (n, 3) float64, metres, and the face each lies on (n,).
+
+        Stratified in area: the k-th point lies in the k-th n-th of it.
+
+        Raises
+        ------
+        ValueError
+            The mesh has no area.
+        """
+        areas = self.face_areas_m2
+        if not areas.sum() > 0:
+            raise ValueError("expected a mesh with triangles that have an area, got none.")
+        random = np.random.default_rng(seed)
+        place = (np.arange(n) + random.random(n)) / n * areas.sum()
+        face = np.minimum(np.searchsorted(np.cumsum(areas), place, side="right"), len(areas) - 1)
+        s, t = np.sqrt(random.random((n, 1))), random.random((n, 1))  # Osada et al., 2002
+        a, b, c = np.moveaxis(self.corners[face], 1, 0)
+        return (1 - s) * a + s * (1 - t) * b + s * t * c, face
+
+    def moved(self, T: ArrayLike) -> TriangleMesh:
+        """The mesh under a rigid transform (4, 4)."""
+        matrix = np.asarray(T, dtype=np.float64)
+        return TriangleMesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
+
+    def save(self, path: str | Path) -> None:
+        """Write a binary `.ply` file, which appears when it is complete; vertices in double precision.
+
+        Raises
+        ------
+        ValueError
+            The file name ends in something else.
+        FileFormatError
+            The place cannot be written.
+        """
+        from pcgraph.plain_files import write_file
+        from rangesim.errors import FileFormatError
+
+        path = Path(path)
+        if path.suffix.lower() != ".ply":
+            raise ValueError(f"expected a file name ending in .ply, got {path.name!r}.")
+        table = np.empty(len(self.faces), [("n", "u1"), ("v", "<i4", 3)])
+        table["n"], table["v"] = 3, self.faces
+        head = (
+            "ply\nformat binary_little_endian 1.0\ncomment coordinates world, metres\n"
+            f"element vertex {len(self.vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
+            f"element face {len(self.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        write_file(path, head.encode() + self.vertices.astype("<f8").tobytes() + table.tobytes(), FileFormatError)

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rangesim scan`: what it writes, what it refuses, and its page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from browser import BROWSER, browser
+from typer.testing import CliRunner
+
+from rangesim import load_range_image
+from rangesim.cli import app
+from rangesim.errors import FileFormatError
+from rangesim.fusion import Dome, Turntable
+from rangesim.fusion.scan_settings import (
+    ScanSettings,
+    load_scan_settings,
+    scan_settings_from_dict,
+    scan_settings_to_dict,
+)
+
+Run = Callable[..., str]
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(app, ["scan", *arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("scan") / "out"
+    run("matte", "--views", "4", "--width", "96", "--spp", "4", "--out", str(out))
+    return out
+
+
+def test_a_scan_writes_mesh_poses_views_and_statistics(scanned: Path) -> None:
+    mesh = trimesh.load_mesh(scanned / "mesh.ply", process=False)
+    assert len(mesh.faces) > 1000
+    record = json.loads((scanned / "scan.json").read_text())
+    assert record["format"] == "rangesim-scan"
+    assert record["statistics"]["triangles"] == len(mesh.faces)
+    assert record["statistics"]["shapes"]["large_ball"]["accuracy_m"] < 3e-3
+    assert 0.3 < record["statistics"]["shapes"]["large_ball"]["seen"]["surface"] <= 1
+    assert len(record["statistics"]["views"]) == 4
+    poses = json.loads((scanned / "poses.json").read_text())
+    assert np.array_equal(poses["T_world_camera"], poses["true"])
+    image = load_range_image(scanned / "view_03" / "range.npz")
+    assert np.array_equal(image.T_world_camera, poses["T_world_camera"][2])
+    again = scan_settings_from_dict(record["settings"])
+    assert again.path == Turntable(4)
+    assert scan_settings_to_dict(again) == record["settings"]
+    result = CliRunner().invoke(app, ["verify", str(scanned)])
+    assert result.exit_code == 0, result.output
+
+
+def test_an_older_scan_is_replaced_and_files_beside_it_stay(scanned: Path) -> None:
+    (scanned / "notes.txt").write_text("mine")
+    poses = scanned.parent / "poses.json"
+    given = json.loads((scanned / "poses.json").read_text())
+    poses.write_text(json.dumps(given["true"][:2]))
+    output = run("matte", "--path", str(poses), "--width", "80", "--spp", "4", "--voxel", "0.02", "--out", str(scanned))
+    assert "large_ball" in output
+    assert (scanned / "notes.txt").read_text() == "mine"
+    assert not (scanned / "view_03").exists()
+    assert json.loads((scanned / "scan.json").read_text())["statistics"]["voxel_m"] == 0.02
+
+
+def test_settings_come_from_a_file_and_options_go_first(tmp_path: Path) -> None:
+    (tmp_path / "scan.toml").write_text(
+        'scene = "matte"\nwidth = 200\nspp = 4\nvoxel_m = 0.02\n'
+        '[instrument]\nsensor = "amcw"\n[path]\ntype = "dome"\nviews = 5\nlowest_deg = 20\n'
+    )
+    settings = load_scan_settings(tmp_path / "scan.toml")
+    assert settings.path == Dome(5, lowest_deg=20.0)
+    assert settings.instrument.name == "amcw"
+    assert settings.voxel_m == 0.02
+    run("--config", str(tmp_path / "scan.toml"), "--views", "2", "--width", "64", "--out", str(tmp_path / "out"))
+    record = json.loads((tmp_path / "out" / "scan.json").read_text())
+    assert record["settings"]["path"]["views"] == 2
+    assert record["settings"]["path"]["lowest_deg"] == 20
+    assert record["settings"]["width"] == 64
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('scene = "matte"\nvoxel = 1', "did you mean 'voxel_m'"),
+        ('scene = "matte"\n[path]\ntype = "turntabel"', "did you mean 'turntable'"),
+        ('scene = "matte"\n[path]\ntype = "turntable"\nviews = 0', "views"),
+        ('scene = "matte"\nregistration = "perhaps"', "known, unknown"),
+        ('scene = "matte"\nvoxel_m = -1', "voxel_m"),
+        ("width = 3", "missing 'scene'"),
+        ('scene = "matte"\n[[instrument]]\nsensor = "amcw"', "table of settings"),
+    ],
+)
+def test_bad_settings_are_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "scan.toml").write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        load_scan_settings(tmp_path / "scan.toml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.xml"], "does not exist"),
+        (["matte", "--path", "spiral"], "turntable, dome, hand-held"),
+        (["matte", "--path", "poses.json"], r"poses\.json"),
+        (["matte", "--sensor", "lidar"], "lidar"),
+        (["matte", "--voxel", "0.00001", "--views", "1", "--width", "32", "--spp", "2"], "tenth of the distance"),
+        (["plane", "--views", "2", "--width", "48", "--spp", "2", "--unknown-poses"], "cannot be aligned|slide"),
+    ],
+)
+def test_bad_input_leaves_nothing_behind(tmp_path: Path, arguments: list[str], message: str) -> None:
+    with pytest.raises((ValueError, FileFormatError), match=message):
+        CliRunner().invoke(app, ["scan", *arguments, "--out", str(tmp_path / "out")], catch_exceptions=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_result_of_another_kind_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "experiment.json").write_text("{}")
+    with pytest.raises(FileFormatError):
+        run("matte", "--out", str(tmp_path))
+
+
+def test_settings_refuse_what_is_no_scene() -> None:
+    with pytest.raises(ValueError, match="scene"):
+        ScanSettings("")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser")
+def test_the_page_shows_its_pictures_and_breaks_none_of_its_rules(scanned: Path, tmp_path: Path) -> None:
+    with browser(tmp_path) as page:
+        page.open(scanned / "report.html")
+        broken = page.evaluate("[...document.images].filter((i) => !i.naturalWidth).length")
+        assert broken == 0
+        assert page.evaluate("document.images.length") >= 9
+        assert page.evaluate("violations.length") == 0
+        assert "measured" in page.evaluate("document.querySelector('.verdict').textContent")
+        assert page.said == []
