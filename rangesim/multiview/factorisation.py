@@ -556,5 +556,7 @@ def _projective_descent(tracks: Tracks, P: Array, X: Array, weights: Array) -> t
         return P / size, X / np.linalg.norm(X, axis=1, keepdims=True)
 
     P = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
+    if not np.isfinite(look((P, X)).cost):
+        return P, X, np.inf
     found = descend(look, move, (P, X), max_steps=300, least_damping=LEAST_DAMPING)
     return *found.state, found.here.cost
