@@ -251,6 +251,25 @@ def test_a_wrong_observation_is_dropped_and_the_point_kept() -> None:
     assert np.linalg.norm(found.points - scene.X, axis=1).max() < 0.02
 
 
+def test_a_quarter_of_wrong_observations_is_dropped_also_beside_images_without_a_pose() -> None:
+    scene = around(24, 40)
+    random = np.random.default_rng(2)
+    bad = random.random(len(scene.tracks)) < 0.25
+    pixels = scene.tracks.pixels.copy()
+    pixels[bad] += random.uniform(30, 200, (bad.sum(), 2))
+    T = scene.T.copy()
+    T[12:] = np.nan
+    found = triangulate_many(
+        Tracks(scene.tracks.image, scene.tracks.point, pixels, 24, 40), scene.camera, T, max_error_px=4.0
+    )
+    posed = scene.tracks.image < 12
+    assert not found.agrees[bad | ~posed].any()
+    assert found.agrees[posed & ~bad].mean() > 0.9
+    known = np.isfinite(found.points).all(axis=1)
+    assert known.mean() > 0.9
+    assert np.linalg.norm(found.points[known] - scene.X[known], axis=1).max() < 0.02
+
+
 def test_points_whose_rays_are_parallel_are_nowhere() -> None:
     scene = around(2, 10)
     T = np.stack([scene.T[0], scene.T[0]])

@@ -140,5 +140,7 @@ def test_degenerate_projective_scenes_are_refused(noise: float) -> None:
         factorise_projective(seen(T, scene.X))
     with pytest.raises(ValueError, match="at least 7 points"):
         factorise_projective(seen(scene.T, scene.X[:6]))
+    with pytest.raises(ValueError, match="one place"):
+        factorise_projective(Tracks.from_dense(np.ones((5, 10, 2))))  # all points in one
     with pytest.raises(ValueError, match="at least 2 images"):
         factorise_projective(seen(scene.T[:1], scene.X))

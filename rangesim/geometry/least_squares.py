@@ -106,8 +106,6 @@ def descend(
     converged : relative decrease of the cost at which it ends.
     """
     state, here = start, look(start)
-    if not np.isfinite(here.cost):
-        return Descended(state, here, 0, False)
     damping, growth = max(1e-6, least_damping), 2.0
     taken = 0
     for _ in range(max_steps):

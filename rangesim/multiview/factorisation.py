@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesim.geometry.consensus import SIGNIFICANCE, refuse_misfit, simpler_model_suffices
+from rangesim.geometry.consensus import SIGNIFICANCE, refuse_misfit, rounding_of, simpler_model_suffices
 from rangesim.geometry.correspondences import (
     ROUNDING,
     Array,
@@ -486,7 +486,7 @@ def factorise_projective(tracks: Tracks, *, noise_px: float | None = None, seed:
     # with homographies alone, P_i and X_j of three entries: a plane, or cameras in one place
     flat = _projective_descent(unit, *_projective_start(unit, seed, PROJECTIVE_RANK - 1), weights)[2]
     simple = flat, residuals.size - (8 * n + 2 * p - 8)
-    if simpler_model_suffices(simple, (cost, freedom), noise_px, ROUNDING * float(np.std(some.pixels))):
+    if simpler_model_suffices(simple, (cost, freedom), noise_px, rounding_of(some.pixels)):
         raise ValueError(
             f"expected tracks of rank 4, got some that homographies between the images explain to "
             f"{np.sqrt(flat / simple[1]):.3g} px: points on a plane, or cameras in one place; add points at other "
@@ -556,5 +556,7 @@ def _projective_descent(tracks: Tracks, P: Array, X: Array, weights: Array) -> t
         return P / size, X / np.linalg.norm(X, axis=1, keepdims=True)
 
     P = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
+    if not np.isfinite(look((P, X)).cost):
+        return P, X, np.inf
     found = descend(look, move, (P, X), max_steps=300, least_damping=LEAST_DAMPING)
     return *found.state, found.here.cost

@@ -25,8 +25,10 @@ from rangesim.multiview.tracks import Tracks
 from rangesim.rig import Intrinsics
 
 GAUSS_NEWTON_STEPS = 5
-MAX_DROPS = 4
-"""Observations of a point that may be wrong."""
+MAX_DROPS = 20
+"""Rounds in which the worst observation of a point is left out."""
+MAX_WRONG = 0.5
+"""Fraction of a point's observations that may be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +57,7 @@ def triangulate_many(
     T_camera_world : (n_images, 4, 4); NaN of images whose pose is not known, which are left out.
     noise_px : standard deviation of a coordinate, for the deviations.
     max_error_px : distance of a projected from a seen pixel; the worst observation of a point with a larger one is
-        left out, up to four times, and the point if this does not mend it.
+        left out, then the next, and the point if half of its observations do not agree.
 
     Raises
     ------
@@ -74,6 +76,7 @@ def triangulate_many(
     rays[known[tracks.image]] = camera.normalise(tracks.pixels[known[tracks.image]])
     agrees = np.isfinite(rays).all(axis=1)
     points, deviation = np.full((tracks.n_points, 3), np.nan), np.full(tracks.n_points, np.nan)
+    total = np.bincount(tracks.point[agrees], minlength=tracks.n_points)
     todo = np.ones(tracks.n_points, dtype=bool)
     for drop in range(MAX_DROPS + 1):
         chosen = np.flatnonzero(agrees & todo[tracks.point])
@@ -90,9 +93,10 @@ def triangulate_many(
         todo = worst > max_error_px
         if not todo.any():
             break
-        if drop == MAX_DROPS:
-            points[todo], deviation[todo] = np.nan, np.nan
-            break
+        kept = np.bincount(tracks.point[chosen], minlength=tracks.n_points) - 1
+        hopeless = todo & ((kept < (1 - MAX_WRONG) * total) | (drop == MAX_DROPS))
+        points[hopeless], deviation[hopeless] = np.nan, np.nan
+        todo &= ~hopeless
         order = np.lexsort((error, tracks.point))
         last = order[np.flatnonzero(np.diff(tracks.point[order], append=-1))]  # the worst of each point
         agrees[last[todo[tracks.point[last]]]] = False
