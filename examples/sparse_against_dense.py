@@ -33,6 +33,8 @@ from rangesim.triangle_mesh import TriangleMesh
 MATTE = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.6}}
 GLASS = {"type": "dielectric", "int_ior": "bk7"}
 ATTENUATION_PER_M = {"core": 120.0}
+TINT = np.array([[140, 140, 140], [236, 196, 120]])
+"""Of the table, and of what stands on it."""
 STATES = ListedColormap(["#5a5a60", "#f0f0ec", "#5e93be"])
 """Never seen, free, surface."""
 
@@ -119,9 +121,8 @@ def main() -> None:
         middle = grid.indices([0.0, 0.0, 0.02])[0][1]
         whole = TriangleMesh.joined(list(true_surfaces(scene).values()))
         of_table = len(true_surfaces(scene)["table"].faces)  # it comes first
-        tint = np.array([[140, 140, 140], [236, 196, 120]])
         picture = mesh_picture(
-            whole, scene.camera, scene.T_world_camera, lambda _, face, n=of_table: tint[(face >= n).astype(int)]
+            whole, scene.camera, scene.T_world_camera, lambda _, face, n=of_table: TINT[(face >= n).astype(int)]
         )
         axes[0].imshow(picture)
         grey = {"cmap": "gray", "vmin": 0, "vmax": 130}
