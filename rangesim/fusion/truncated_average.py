@@ -281,8 +281,8 @@ def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
 
 
 def _farthest(z: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(k, l) float64, metres, largest depth of the readings that weigh something in each tile, and of the pixels next to
-    it, which an interpolated depth may come from; -infinity of none."""
+    """(k, l) float64, metres, largest depth of the readings that weigh something in each tile and of the pixels next to
+    them, which an interpolated depth may come from; -infinity of none."""
     from scipy.ndimage import maximum_filter
 
     depth = np.where((weight > 0) & np.isfinite(z), z, -np.inf)
