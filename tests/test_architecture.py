@@ -159,6 +159,13 @@ def test_opencv_is_imported_only_inside_functions_of_geometry_and_calibration(pa
     assert relative(path).startswith(rooms) or "cv2" not in {n.split(".")[0] for n in imports(path)}
 
 
+@pytest.mark.parametrize("path", modules("rangesim"), ids=relative)
+def test_scikit_image_is_imported_only_inside_functions_of_fusion(path: Path) -> None:
+    assert "skimage" not in {name.split(".")[0] for name in imports(path, top_level_only=True)}
+    inside = "skimage" in {name.split(".")[0] for name in imports(path)}
+    assert not inside or relative(path).startswith("rangesim/fusion/")
+
+
 @pytest.mark.parametrize("path", modules("rangesim/geometry"), ids=relative)
 def test_geometry_knows_cameras_and_arrays_alone(path: Path) -> None:
     inside = {name for name in imports(path) if name.startswith(("rangesim", "pcgraph"))}

@@ -26,7 +26,7 @@ from rangesim.fusion import (
     scan,
     surface_error,
 )
-from rangesim.fusion.multiway_registration import _unchecked
+from rangesim.fusion.multiway_registration import _unchecked, _without_planes
 from rangesim.rig import Intrinsics, look_at, translation
 from rangesim.scene.triangles import true_surfaces
 from rangesim.triangle_mesh import TriangleMesh
@@ -200,6 +200,17 @@ def test_poses_are_found_from_the_readings() -> None:
     assert np.array_equal(found.poses[0], np.eye(4))  # the first view's pose is the world
     assert found.unchecked == ()
     assert any(pair.is_loop for pair in found.pairs)
+
+
+def test_a_table_is_set_aside_and_the_faces_of_a_part_are_not() -> None:
+    random = np.random.default_rng(0)
+    thing = part().sample(3000)[0] + [0, 0, 0.5]
+    table = np.column_stack([random.uniform(-0.3, 0.3, (20_000, 2)), random.normal(0.479, 1e-4, 20_000)])
+    left = _without_planes(np.concatenate([thing, table]), 4e-3, 0)
+    assert 1500 < len(left) < 3500  # but for the thing's underside, and little of the table
+    assert (left[:, 2] > 0.482).mean() > 0.95
+    assert len(_without_planes(thing, 4e-3, 0)) == 3000
+    assert len(_without_planes(table, 4e-3, 0)) == 20_000  # nothing would be left: registration says why
 
 
 def test_pose_errors_do_not_depend_on_the_world() -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the views of a scan were taken from, when nobody knows: pairs of views, and a pose graph over all of them.
 
+0. Planes that hold more than half of a view's readings (a table, a wall) are set aside: they slide on themselves.
 1. Each view is registered to the one before without a first guess (`rangesim.geometry.register`), or, where that fails,
    to one of the three before: a chain.
 2. Every other pair that overlaps by the chain is refined by `rangesim.geometry.icp`: loops.
@@ -44,6 +45,9 @@ POINTS = 4000
 """Of each view, about, that are registered, if no spacing is given."""
 LEAST_POINTS = 200
 """Of a view."""
+DOMINANT = 0.5
+"""Fraction of a view's readings from which a plane is set aside."""
+MAX_PLANES = 3
 BACK = 3
 """Views before, that a view is registered to."""
 MIN_OVERLAP = 0.3
@@ -122,7 +126,7 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
     if len(scan) < 2:
         raise ValueError(f"expected two views or more to align, got {len(scan)}.")
     check_number("seed", seed, whole_number(0))
-    clouds, spacing = _thinned(scan, spacing_m)
+    clouds, spacing = _thinned(scan, spacing_m, seed)
     chain = _chain(clouds, seed)
     placed = _placed(chain, len(clouds))
     edges = chain + _loops(clouds, placed, spacing, {(e.source, e.target) for e in chain})
@@ -185,36 +189,62 @@ def pose_errors(poses: ArrayLike, true_poses: ArrayLike) -> PoseErrors:
 # ---- Steps ---------------------------------------------------------------------------------------------------------
 
 
-def _thinned(scan: Scan, spacing_m: float | None) -> tuple[list[Array], float]:
-    """Points of each view, one in each cube of the spacing, in its camera's coordinates."""
-    import open3d as o3d
-
-    clouds = scan.points()
-    for number, cloud in enumerate(clouds):
+def _thinned(scan: Scan, spacing_m: float | None, seed: int) -> tuple[list[Array], float]:
+    """Points of each view without dominant planes, one in each cube of the spacing, in its camera's coordinates."""
+    if spacing_m is not None and not 0 < spacing_m < np.inf:
+        raise ValueError(f"expected a positive spacing_m in metres, got {shown(spacing_m)}.")
+    every = scan.points()
+    for number, cloud in enumerate(every):
         if len(cloud) < LEAST_POINTS:
             raise ValueError(
                 f"expected {LEAST_POINTS} readings or more in each view to align, got {len(cloud)} in view {number}."
             )
+    # The area that readings stand for is their number times that of a pixel's footprint
+    pixels = [
+        float(np.median(i.z[i.valid])) ** 2 / (i.camera.fx * i.camera.fy) for i in scan.images if i.camera is not None
+    ]
+    coarse = float(np.sqrt(np.median([a * len(c) for a, c in zip(pixels, every, strict=True)]) / POINTS))
+    clouds = [_without_planes(cloud, spacing_m or coarse, seed) for cloud in every]
     if spacing_m is None:
-        # The area that readings stand for is their number times that of a pixel's footprint
-        areas = [
-            np.median(i.z[i.valid].astype(np.float64)) ** 2 / (i.camera.fx * i.camera.fy) * i.valid.sum()
-            for i in scan.images
-            if i.camera is not None
-        ]
-        spacing_m = float(np.sqrt(np.median(areas) / POINTS))
-    if not 0 < spacing_m < np.inf:
-        raise ValueError(f"expected a positive spacing_m in metres, got {shown(spacing_m)}.")
+        spacing_m = float(np.sqrt(np.median([a * len(c) for a, c in zip(pixels, clouds, strict=True)]) / POINTS))
     thinned = []
     for number, cloud in enumerate(clouds):
-        found = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud)).voxel_down_sample(spacing_m)
-        thinned.append(np.asarray(found.points))
+        thinned.append(_one_in_each(cloud, spacing_m))
         if len(thinned[-1]) < LEAST_POINTS:
             raise ValueError(
                 f"expected a spacing_m that leaves {LEAST_POINTS} points or more of each view, got {spacing_m:g} m, "
                 f"which leaves {len(thinned[-1])} of view {number}."
             )
     return thinned, spacing_m
+
+
+def _without_planes(cloud: Array, spacing_m: float, seed: int) -> Array:
+    """The points (n, 3) that lie on no plane that holds most of them; all, if too few would be left."""
+    import open3d as o3d
+
+    left = cloud
+    for _ in range(MAX_PLANES):
+        few = _one_in_each(left, spacing_m)
+        if len(few) < LEAST_POINTS:
+            return cloud
+        o3d.utility.random.seed(seed)
+        packed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(few))
+        (*normal, offset), on_it = packed.segment_plane(0.5 * spacing_m, 3, 500)
+        if len(on_it) < DOMINANT * len(few):
+            return left
+        beside = left[np.abs(left @ np.array(normal) + offset) > 1.5 * spacing_m]
+        if len(beside) < LEAST_POINTS:
+            return cloud
+        left = beside
+    return left
+
+
+def _one_in_each(cloud: Array, spacing_m: float) -> Array:
+    """(m, 3) the middle of the points in each cube of the spacing."""
+    import open3d as o3d
+
+    packed = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud))
+    return np.asarray(packed.voxel_down_sample(spacing_m).points)
 
 
 def _chain(clouds: list[Array], seed: int) -> list[PairFit]:

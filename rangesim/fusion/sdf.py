@@ -44,6 +44,8 @@ Lookup = Literal["bilinear", "nearest"]
 """How the depth at a projection is read: see `depth_at`."""
 SAME_SURFACE = 0.02
 """Fraction of depth within which four neighbouring pixels lie on one surface, and may be interpolated between."""
+ENOUGH = 20_000
+"""Readings of a view, about, that their median is taken from."""
 LEAST_COSINE = 0.1
 """Of the angle of incidence: readings beyond 84 degrees weigh nothing."""
 
@@ -143,7 +145,7 @@ def relative_weights(images: Sequence[RangeImage], weighting: Weighting) -> list
     1 is a typical reading. None counts for more, or a highlight that one view mistakes would outvote two others.
     """
     weights = [reading_weights(image, weighting) for image in images]
-    counted = np.concatenate([w[w > 0] for w in weights])
+    counted = np.concatenate([w[w > 0][:: max(1, w.size // ENOUGH)] for w in weights])
     if not counted.size:
         raise ValueError(f"expected views with readings, got {len(images)} in which no pixel measured anything.")
     return [np.minimum(w / np.median(counted), np.float32(1)) for w in weights]

@@ -32,8 +32,14 @@ from rangesim.triangle_mesh import TriangleMesh
 
 BLOCK = 8
 """Voxels along the edge of a block."""
+TILE = 8
+"""Pixels along the edge of the tiles whose farthest reading tells what is hidden."""
+KEY = 1 << 21
+"""Blocks along an axis, at most: three such numbers make one of 63 bits."""
 TRUNCATION_VOXELS = 3.0
 """Truncation distance, in voxels, if none is given."""
+ENOUGH = 7
+"""One reading of so many tells the distance between readings."""
 FINEST = 0.1
 """Of the distance between neighbouring readings, at least, that a voxel is: in smaller ones surfaces are specks."""
 MIN_VIEWS = 0.05
@@ -129,7 +135,7 @@ def _checked(images: Sequence[RangeImage], voxel_m: float, truncation_m: float |
 
 
 def _check_fineness(images: Sequence[RangeImage], voxel_m: float) -> None:
-    spacings = [float(np.median(i.z[i.valid])) / i.camera.fx for i in images if i.camera is not None and i.valid.any()]
+    spacings = [float(np.median(i.z[i.valid][::ENOUGH])) / i.camera.fx for i in images if i.camera and i.valid.any()]
     if voxel_m < FINEST * min(spacings):
         raise ValueError(
             f"expected voxel_m of at least {FINEST * min(spacings):.2g}, a tenth of the distance between readings, got "
@@ -162,8 +168,7 @@ class _Blocks:
         import open3d as o3d
 
         core, edge = o3d.core, BLOCK * voxel_m
-        places = [np.zeros((0, 3), np.int32)]
-        origin = None
+        places, origin = [np.zeros(0, np.int64)], None
         for image, weight in zip(images, weights, strict=True):
             camera, T = placed(image)
             rays = camera.directions(camera.pixel_centres())
@@ -175,16 +180,20 @@ class _Blocks:
                 origin = np.round(np.median(points, axis=0) / edge) * edge
             local = _thinned(points - origin, voxel_m)
             extent = np.abs(local).max() + truncation_m
-            if extent / edge >= 2**30:
-                raise ValueError(f"expected readings within 2^30 blocks of {edge:g} m, got one {extent:.3g} m away.")
+            if extent / edge >= KEY // 2 - 2:
+                raise ValueError(
+                    f"expected readings within {KEY // 2} blocks of {edge:g} m, got one {extent:.3g} m away."
+                )
             grid = o3d.t.geometry.VoxelBlockGrid(
                 ("tsdf",), (core.float32,), ((1,),), voxel_size=voxel_m, block_resolution=BLOCK, block_count=1
             )
             cloud = o3d.t.geometry.PointCloud(core.Tensor(local.astype(np.float32)))
-            places.append(grid.compute_unique_block_coordinates(cloud, truncation_m / voxel_m).numpy())
-            places = [np.unique(np.concatenate(places), axis=0)]
+            near = grid.compute_unique_block_coordinates(cloud, truncation_m / voxel_m).numpy().astype(np.int64)
+            x, y, z = near.T + KEY // 2
+            places = [np.unique(np.concatenate([*places, (x * KEY + y) * KEY + z]))]
             limits.check("voxels", len(places[0]) * BLOCK**3, f"voxels of {voxel_m:g} m")
-        keys = places[0]
+        number = places[0]
+        keys = (np.stack([number // KEY**2, number // KEY % KEY, number % KEY], axis=-1) - KEY // 2).astype(np.int32)
         assert origin is not None  # some readings weigh something: see `relative_weights`
         grid = o3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight"),
@@ -213,7 +222,7 @@ class _Blocks:
         in_blocks(
             _add_view, len(self.keys), self.keys, self.rows, self.total, self.weight, self.voxel_m, truncation_m,
             np.ascontiguousarray(R), t, lens, np.ascontiguousarray(image.z), np.ascontiguousarray(weight),
-            lookup == "bilinear", smallest=64,
+            lookup == "bilinear", _farthest(image.z, weight), smallest=64,
         )  # fmt: skip
 
     def surface(self, least: float, truncation_m: float) -> tuple[TriangleMesh, np.ndarray]:
@@ -271,15 +280,31 @@ def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
     return np.asarray(points[np.unique(number, return_index=True)[1]])
 
 
+def _farthest(z: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(k, l) float64, metres, largest depth of the readings that weigh something in each tile and of the pixels next to
+    them, which an interpolated depth may come from; -infinity of none."""
+    from scipy.ndimage import maximum_filter
+
+    depth = np.where((weight > 0) & np.isfinite(z), z, -np.inf)
+    # Their neighbours may weigh nothing and yet be interpolated with
+    depth = np.where(maximum_filter(depth, 3) > -np.inf, np.nan_to_num(z, nan=-np.inf), -np.inf)
+    h, w = (-(-n // TILE) * TILE for n in z.shape)
+    padded = np.full((h, w), -np.inf)
+    padded[: z.shape[0], : z.shape[1]] = maximum_filter(depth, 3)
+    return np.asarray(padded.reshape(h // TILE, TILE, w // TILE, TILE).max(axis=(1, 3)))
+
+
 # ---- One view over all blocks --------------------------------------------------------------------------------------
 
 
 @kernel
 def _add_view(  # type: ignore[no-untyped-def]
-    start, stop, keys, rows, total, weight, voxel_m, truncation_m, R, t, lens, z, weights, interpolate
+    start, stop, keys, rows, total, weight, voxel_m, truncation_m, R, t, lens, z, weights, interpolate, farthest
 ):
     """Add w max(-t, sdf) and w of one view to the voxels of blocks `start` to `stop`."""
     for block in range(start, stop):
+        if _is_hidden(keys[block], voxel_m, truncation_m, R, t, lens, farthest, z.shape):
+            continue
         row = rows[block]
         for k in range(BLOCK):
             for j in range(BLOCK):
@@ -307,6 +332,36 @@ def _add_view(  # type: ignore[no-untyped-def]
                             w *= (truncation_m - distance) / (truncation_m - voxel_m)
                         total[row, k, j, i] += w * max(distance, -truncation_m)
                         weight[row, k, j, i] += w
+
+
+@routine
+def _is_hidden(key, voxel_m, truncation_m, R, t, lens, farthest, shape):  # type: ignore[no-untyped-def]
+    """Whether no reading of a view can say anything of a block: it is behind all of them by more than the truncation
+    distance, or the view does not look there. By the block's sphere; False if in doubt."""
+    half = (BLOCK - 1) / 2 * voxel_m
+    radius = np.sqrt(3.0) * half
+    px, py, pz = key[0] * BLOCK * voxel_m + half, key[1] * BLOCK * voxel_m + half, key[2] * BLOCK * voxel_m + half
+    x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
+    y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
+    z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
+    if z + radius <= 0:
+        return True
+    if z <= 4 * radius or lens[4] != 0 or lens[5] != 0 or lens[6] != 0 or lens[7] != 0 or lens[8] != 0:
+        return False
+    a, b = x / z, y / z
+    # A point of the sphere is off by dx / z - x dz / z^2, with z at least z - radius
+    reach = radius / (z - radius)
+    wide, high = lens[0] * reach * (1 + abs(a)) + 1, lens[1] * reach * (1 + abs(b)) + 1
+    u, v = lens[0] * a + lens[2], lens[1] * b + lens[3]
+    left, right = max(u - wide, 0.0), min(u + wide, shape[1] - 1.0)
+    top, bottom = max(v - high, 0.0), min(v + high, shape[0] - 1.0)
+    if left > right or top > bottom:
+        return True
+    for i in range(int(top) // TILE, int(bottom) // TILE + 1):
+        for j in range(int(left) // TILE, int(right) // TILE + 1):
+            if z - radius - farthest[i, j] <= truncation_m:
+                return False
+    return True
 
 
 @routine

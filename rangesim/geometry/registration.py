@@ -251,7 +251,7 @@ def _judged(source: Array, surface: _Surface, T: Array) -> Registration:
     distance, partner = surface.tree.query(moved, distance_upper_bound=reach)
     has = np.isfinite(distance)
     other = np.isfinite(cKDTree(moved).query(surface.points, distance_upper_bound=reach)[0])
-    if not has.any():
+    if has.sum() < 3:  # nothing that holds a pose, nor a size to measure turns by
         return Registration(T, 0.0, float(other.mean()), float("nan"), 0.0, 0.0)
     n = np.asarray(surface.cloud.normals)[partner[has]]
     off = ((moved[has] - surface.points[partner[has]]) * n).sum(axis=-1)
