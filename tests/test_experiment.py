@@ -24,6 +24,7 @@ from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_
 from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument
 from rangesim.experiment.pipeline import group_by_rig, noise_seed, run
 from rangesim.experiment.result_files import load_result
+from rangesim.fusion.scan_settings import scan_settings_from_dict
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.rig import Lens
 from rangesim.sensors import DirectToF, IdealToF
@@ -242,7 +243,8 @@ def test_a_detector_table_changes_the_usual_detector_of_the_sensor() -> None:
 
 def test_the_experiment_of_the_docs_is_one() -> None:
     text = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
-    (snippet,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    snippet, of_scan = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    assert scan_settings_from_dict(tomllib.loads(of_scan)).path.views == 12
     experiment = experiment_from_dict({"scene": "x.xml", **tomllib.loads(snippet)})
     assert experiment.ambient is not None
     assert experiment.motion is not None

@@ -233,12 +233,13 @@ def test_images_with_holes_rows_and_columns_missing(rng, h, w, camera):
 
 def test_images_seen_from_one_viewpoint_per_point():
     image = np.random.default_rng(0).random((20, 10, 3)) + 1.0
-    result = pcgraph.segment(image, viewpoint=np.zeros_like(image))
+    viewpoints = 0.1 * image  # of a camera that moved
+    result = pcgraph.segment(image, viewpoint=viewpoints)
     assert not result.camera
     assert_covered_and_connected(image, result)
     for wrong in ({"camera": True}, {"range_growth": 0.5}):
         with pytest.raises(ValueError, match="one viewpoint"):
-            pcgraph.segment(image, viewpoint=np.zeros_like(image), **wrong)
+            pcgraph.segment(image, viewpoint=viewpoints, **wrong)
 
 
 @quick

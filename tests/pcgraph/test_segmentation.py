@@ -51,7 +51,10 @@ def test_the_front_plate_hides_the_wall_behind_it():
 
 def test_occlusions_need_one_viewpoint():
     points, _, viewpoint = two_boxes_on_a_plane()
-    result = pcgraph.segment(points, viewpoint=np.tile(viewpoint, (len(points), 1)))
+    viewpoints = np.tile(viewpoint, (len(points), 1))
+    assert pcgraph.segment(points, viewpoint=viewpoints).occlusions() is not None  # all one
+    viewpoints[::2, 0] += 0.5
+    result = pcgraph.segment(points, viewpoint=viewpoints)
     with pytest.raises(ValueError, match="one viewpoint"):
         result.occlusions()
 
