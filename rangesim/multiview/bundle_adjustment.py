@@ -12,21 +12,24 @@ of the first image, or of the one that is held, and its distance from the image 
 held images leave no freedom.
 
 Degenerate: an image, or a group of images, that shares too few points with the rest; a camera that only rotates (the
-points have no depth). These are errors, told by the covariance, and by a start in one place; that a small baseline of
-the start is none, only `structure_from_motion` tells, which tests each pair for it.
+points have no depth), or moves so little, or sees so little perspective, that the shape stays open. These are errors,
+told by the covariance, and by an F test of the cameras that were found against cameras that only rotate: noise can be
+explained by depths, and a covariance at such depths looks well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rangesim.geometry.consensus import rounding_of, simpler_model_suffices
 from rangesim.geometry.correspondences import Array, check_noise, checked_array
 from rangesim.geometry.least_squares import descend
 from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose, reproject, with_all_coefficients
@@ -48,6 +51,15 @@ MAX_RELATIVE_DEVIATION = 0.5
 ONE_PLACE = 1e-6
 """Extent of the cameras of a start over the distance of the points below which they stand in one place."""
 MIN_IMAGES = 2
+MAX_SHAPE_DEVIATION = 0.5
+"""Of the points' extent; a shape whose median point is known worse is none."""
+SHAPE_SAMPLE = 200
+"""Points by which the deviation of the shape is judged."""
+TESTED_OBSERVATIONS = 30_000
+"""By which cameras that move are told from cameras that only rotate."""
+ROTATION_ROUNDS, ROTATION_STEPS = 10, 30
+RIGHT = 4.0
+"""Standard deviations that a right observation is off at most, beside a robust loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +71,10 @@ class BundleAdjustment:
     used : (m,) bool, the observations that took part. residuals_px : (m, 2) projected less seen; NaN of others.
     noise_px : standard deviation of a coordinate, as given or from the residuals. covariance : (n_images, 6, 6) of
     (rotation vector, rad, translation) both applied after T_camera_world, in the gauge (see the module): 0 of what is
-    held. lens_deviations : (9,) standard deviations of fx, fy, cx, cy, k1, k2, p1, p2, k3; 0 of what is held. steps :
-    that were taken. has_converged : whether no step lowered the cost any more.
+    held. lens_deviations : (9,) standard deviations of fx, fy, cx, cy, k1, k2, p1, p2, k3; 0 of what is held.
+    shape_deviation : standard deviation of a point, the median, over the points' extent (their median distance from
+    the middle), after the best similarity; what cameras and points leave open together. NaN if the noise is unknown.
+    steps : that were taken. has_converged : whether no step lowered the cost any more.
     """
 
     camera: Intrinsics
@@ -71,6 +85,7 @@ class BundleAdjustment:
     noise_px: float
     covariance: Array
     lens_deviations: Array
+    shape_deviation: float
     steps: int
     has_converged: bool
 
@@ -119,8 +134,28 @@ def bundle_adjust(
     ------
     ValueError
         Fewer than two images; poses or points of other shapes; an image without points; images in groups that share no
-        points; points behind the cameras; fewer equations than unknowns; or cameras that the tracks do not determine.
+        points; poses that are not rigid; points behind the cameras; fewer equations than unknowns; cameras or a shape
+        that the tracks do not determine; or cameras that explain the tracks no better than one that only rotates.
     """
+    found = adjusted_views(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px, max_steps)
+    _refuse_open_shape(found)
+    _refuse_rotation_alone(tracks, found, free, held, loss)
+    return found
+
+
+def adjusted_views(
+    tracks: Tracks,
+    camera: Intrinsics,
+    T_camera_world: ArrayLike,
+    points: ArrayLike,
+    free: Sequence[str] = (),
+    held: Sequence[int] = (),
+    loss: Loss = "linear",
+    loss_scale_px: float = 1.0,
+    noise_px: float | None = None,
+    max_steps: int = MAX_STEPS,
+) -> BundleAdjustment:
+    """As `bundle_adjust`, of views to which others are still to come: a shape that is open yet is no error."""
     sizes, some, state = _checked(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px)
     columns = [LENS_NAMES.index(name) for name in free]
     is_free = np.ones(tracks.n_images, dtype=bool)
@@ -162,6 +197,7 @@ def bundle_adjust(
         float(noise),
         of_images,
         lens,
+        noise * _shape_deviation(Views(found.state.camera, T, X), some, sizes, columns, is_free, covariance, noise),
         found.steps,
         found.has_converged,
     )
@@ -189,13 +225,14 @@ def _checked(
     T = checked_array("T_camera_world", T_camera_world, 4, 4)
     if T.shape != (tracks.n_images, 4, 4):
         raise ValueError(f"expected T_camera_world of shape ({tracks.n_images}, 4, 4), got {T.shape}.")
+    check_rigid(T)
     X = np.array(points, dtype=np.float64)
     if X.shape != (tracks.n_points, 3) or np.isinf(X).any():
         raise ValueError(f"expected points as ({tracks.n_points}, 3) finite numbers or NaN, got shape {X.shape}.")
     unknown = [name for name in free if name not in LENS_NAMES]
     if unknown or len(set(free)) != len(free):
         raise ValueError(f"expected free as different names of {', '.join(LENS_NAMES)}, got {shown(list(free))}.")
-    if any(not 0 <= i < tracks.n_images for i in held):
+    if any(not isinstance(i, (int, np.integer)) or not 0 <= i < tracks.n_images for i in held):
         raise ValueError(f"expected held as images from 0 to {tracks.n_images - 1}, got {shown(list(held))}.")
     if loss not in LOSSES:
         raise ValueError(f"expected a loss out of {', '.join(LOSSES)}, got {shown(loss)}.")
@@ -229,6 +266,19 @@ def _checked(
             f"{len(np.unique(some.point))} points; add observations."
         )
     return sizes, some, state
+
+
+def check_rigid(T: Array) -> None:
+    """Raise ValueError unless poses (n, 4, 4) are rotations and translations."""
+    R = T[:, :3, :3]
+    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    sound = (off <= 1e-4) & (np.linalg.det(R) > 0) & (np.abs(T[:, 3] - [0, 0, 0, 1]) <= 1e-9).all(axis=1)
+    if not sound.all():
+        i = int(np.argmin(sound))
+        raise ValueError(
+            f"expected rigid poses T_camera_world, a rotation and a translation each, got {int((~sound).sum())} that "
+            f"are not, such as that of image {i}: {T[i].tolist()}."
+        )
 
 
 def check_connected(tracks: Tracks) -> None:
@@ -294,6 +344,132 @@ def _refuse_no_depth(equations: NormalEquations, some: Tracks, T: Array, X: Arra
             f"expected images with parallax, got some whose points are known to {relative:.0%} of their distance at a "
             f"noise of {noise:.3g} px: the camera only rotates, or moves too little; add views from other places."
         )
+
+
+def _refuse_open_shape(found: BundleAdjustment) -> None:
+    if found.shape_deviation > MAX_SHAPE_DEVIATION:
+        raise ValueError(
+            f"expected views that determine the shape, got some that leave its points open by "
+            f"{found.shape_deviation:.0%} of their extent at a noise of {found.noise_px:.3g} px: views from nearly one "
+            "direction, or too narrow a lens; add views from other sides."
+        )
+
+
+def _refuse_rotation_alone(
+    tracks: Tracks, found: BundleAdjustment, free: Sequence[str], held: Sequence[int], loss: str
+) -> None:
+    """Raise ValueError where a camera that only rotates explains the tracks to their noise as the cameras found do.
+
+    The F test of nested models on some of the points: a rotation for each image and a direction for each point.
+    """
+    if len(set(held)) > 1:
+        return  # a baseline that was given is no question
+    chosen = found.used.copy()
+    if loss != "linear":
+        chosen &= (np.abs(np.nan_to_num(found.residuals_px, nan=np.inf)) <= RIGHT * found.noise_px).all(axis=1)
+    stride = max(1, int(np.ceil(chosen.sum() / TESTED_OBSERVATIONS)))
+    chosen &= np.cumsum(np.diff(tracks.point, prepend=-1) != 0) % stride == 0
+    some = tracks.keep(chosen)
+    some = some.keep(some.images_per_point[some.point] >= MIN_IMAGES)
+    points, images = len(np.unique(some.point)), len(np.unique(some.image))
+    residuals = reprojection_errors(Views(found.camera, found.T_camera_world, np.nan_to_num(found.points)), some)
+    cost = float((residuals**2).sum())
+    freedom = 2 * len(some) - (len(free) + POSE * images + 3 * points - 7)
+    turning = 2 * len(some) - (len(free) + 3 * images + 2 * points - 3)
+    if freedom <= 0:
+        return
+    simple = _cost_of_rotations(found.camera, found.T_camera_world, some)
+    if simpler_model_suffices((simple, turning), (cost, freedom), None, rounding_of(some.pixels)):
+        raise ValueError(
+            f"expected images with parallax, got some that a camera which only rotates explains within "
+            f"{np.sqrt(simple / turning):.3g} px, no worse than the poses found: depths would be fitted to the noise; "
+            "add views from other places."
+        )
+
+
+def _cost_of_rotations(camera: Intrinsics, T: Array, tracks: Tracks) -> float:
+    """Sum of squares in px^2 of the best rotations, about one centre, and directions of points."""
+    rays = np.concatenate([camera.normalise(tracks.pixels), np.ones((len(tracks), 1))], axis=1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    R = _rotations_alone(T[:, :3, :3], rays, tracks)
+    X = np.zeros((tracks.n_points, 3))
+    np.add.at(X, tracks.point, np.einsum("mji,mj->mi", R[tracks.image], rays))
+    size = np.linalg.norm(X, axis=1, keepdims=True)
+    start = np.tile(np.eye(4), (len(T), 1, 1))
+    start[:, :3, :3] = R
+    sizes = Sizes(0, tracks.n_images, 3, tracks.n_points, 3)
+    everyone = np.ones(tracks.n_images, dtype=bool)
+
+    def look(state: Views) -> NormalEquations:
+        found = normal_equations(state, tracks, sizes, [], everyone, "linear", 1.0)
+        found.terms = [term._replace(by_images=term.by_images[..., :3]) for term in found.terms]
+        return found
+
+    def move(state: Views, step: Step) -> Views:
+        turns = np.concatenate([step.images, np.zeros((len(step.images), 3))], axis=1)
+        X = state.X + step.points
+        return Views(state.camera, moved_pose(state.T, turns), X / np.linalg.norm(X, axis=1, keepdims=True))
+
+    X = np.where(size > 0, X / np.where(size > 0, size, 1.0), [0.0, 0.0, 1.0])
+    first = Views(with_all_coefficients(camera), start, X)
+    return descend(look, move, first, max_steps=ROTATION_STEPS, converged=1e-4, least_damping=LEAST_DAMPING).here.cost
+
+
+def _rotations_alone(R: Array, rays: Array, tracks: Tracks) -> Array:
+    """Rotations (n, 3, 3) under which rays of the same point are parallel, from R on in turns with the points' mean
+    directions (Wahba's problem for each image)."""
+    for _ in range(ROTATION_ROUNDS):
+        X = np.zeros((tracks.n_points, 3))
+        np.add.at(X, tracks.point, np.einsum("mji,mj->mi", R[tracks.image], rays))
+        X /= np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300)
+        B = np.zeros((len(R), 3, 3))
+        np.add.at(B, tracks.image, rays[:, :, None] * X[tracks.point][:, None, :])
+        u, _, vt = np.linalg.svd(B)
+        u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+        R = u @ vt
+    return R
+
+
+def _shape_deviation(
+    state: Views,
+    some: Tracks,
+    sizes: Sizes,
+    columns: list[int],
+    is_free: np.ndarray,
+    covariance: Array,
+    noise: float,
+) -> float:
+    """Deviation of the median point after the best similarity, over the points' extent, for a noise of 1 px.
+
+    Of some points X: with the response J = dX / d(lens, poses), cov X = J C J^T + diag(V^-1), less the components along
+    translation, rotation and scale of all of them.
+    """
+    numbers = np.unique(some.point)
+    chosen = numbers[:: max(1, len(numbers) // SHAPE_SAMPLE)]
+    place = np.full(some.n_points, -1)
+    place[chosen] = np.arange(len(chosen))
+    mine = place[some.point] >= 0
+    part = Tracks(some.image[mine], place[some.point[mine]], some.pixels[mine], some.n_images, len(chosen))
+    X = state.X[chosen]
+    of_part = replace(sizes, points=len(chosen))
+    equations = normal_equations(state._replace(X=X), part, of_part, columns, is_free, "linear", 1.0)
+    alone = equations.covariance_of_points()
+    extent = float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
+    known = np.isfinite(alone).all(axis=(1, 2))
+    if not (extent > 0 and known.any() and noise > 0):
+        return float("nan")
+    J = equations.response_of_points()[known].reshape(-1, sizes.eliminated)
+    joint = J @ (covariance / noise**2) @ J.T + block_diag(*alone[known])
+    Y = (X[known] - np.median(X[known], axis=0)) / extent
+    along = np.zeros((len(Y), 3, 7))
+    along[:, :, :3] = np.eye(3)
+    for k, axis in enumerate(np.eye(3)):
+        along[:, :, 3 + k] = np.cross(axis, Y)
+    along[:, :, 6] = Y
+    basis = np.linalg.qr(along.reshape(-1, 7))[0]
+    rest = np.eye(len(basis)) - basis @ basis.T
+    variance = np.einsum("ij,jk,ik->i", rest, joint, rest, optimize=True).reshape(-1, 3).sum(axis=1)
+    return float(np.sqrt(np.median(np.maximum(variance, 0))) / extent)
 
 
 # ------------------------------------------------------------------------------------------- the sum of squares

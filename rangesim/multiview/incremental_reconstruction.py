@@ -12,6 +12,7 @@ Snavely, Seitz, Szeliski: "Photo tourism", SIGGRAPH 2006; Schoenberger, Frahm: "
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from rangesim.geometry.correspondences import Array, check_noise
 from rangesim.geometry.two_view import RelativePose, find_relative_pose
 from rangesim.multiview.bundle_adjustment import (
     BundleAdjustment,
+    adjusted_views,
     bundle_adjust,
     check_connected,
 )
@@ -39,6 +41,10 @@ CANDIDATES = 12
 WIDE_RAD = np.radians(10)
 """Angle between the rays of a point beyond which a wider one is no better."""
 GROWTH = 1.2
+MAX_EXCESS = 1.5
+"""Times the stated noise that observations that agree may be off."""
+MIN_AGREEING = 0.5
+"""Fraction of the observations of points in several images below which the answer comes with a warning."""
 FINAL_ROUNDS = 4
 
 
@@ -80,7 +86,14 @@ def structure_from_motion(
     ------
     ValueError
         Fewer than two images; images that share no points, or too few to be placed; no pair with parallax: the same
-        view again, a camera that only rotates, points on one plane; pixels that no ray of the lens reaches.
+        view again, a camera that only rotates, points on one plane; a shape that stays open (`bundle_adjust`); pixels
+        that no ray of the lens reaches.
+
+    Warns
+    -----
+    UserWarning
+        Most observations are left out as wrong, or the others are off by half more than the stated noise: the lens or
+        the noise is another, or most tracks are wrong.
     """
     check_noise(noise_px)
     if tracks.n_images < 2:
@@ -108,7 +121,21 @@ def structure_from_motion(
             adjusted = placed
         else:
             X = triangulate_many(tracks, camera, T, noise_px=noise_px, max_error_px=rough).points
-    return _finished(tracks, camera, T, noise_px, (first, second))
+    found = _finished(tracks, camera, T, noise_px, (first, second))
+    _warn_of_misfit(tracks, found, noise_px)
+    return found
+
+
+def _warn_of_misfit(tracks: Tracks, found: StructureFromMotion, noise_px: float) -> None:
+    linked = tracks.images_per_point[tracks.point] > 1  # a point in one image agrees with anything
+    agreeing = float(found.inliers[linked].mean())
+    if found.noise_px > MAX_EXCESS * noise_px or agreeing < MIN_AGREEING:
+        warnings.warn(
+            f"expected most observations to agree to the stated noise of {noise_px:.3g} px, got {agreeing:.0%} that "
+            f"agree, off by {found.noise_px:.3g} px: noise_px or the lens is another, or most tracks are wrong; state "
+            "the noise, calibrate the lens, or free it in bundle_adjust.",
+            stacklevel=3,
+        )
 
 
 def _first_pair(tracks: Tracks, camera: Intrinsics, noise_px: float, seed: int) -> tuple[tuple[int, int], RelativePose]:
@@ -194,7 +221,7 @@ def _adjusted(
     found = triangulate_many(tracks, camera, T, noise_px=noise_px, max_error_px=limit)
     some = tracks.keep(found.agrees).of_images(placed)
     held_now = [int(np.flatnonzero(placed == i)[0]) for i in held]
-    adjusted = bundle_adjust(
+    adjusted = adjusted_views(
         some,
         camera,
         T[placed],

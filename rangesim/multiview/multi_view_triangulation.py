@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangesim.geometry.correspondences import Array, checked_array
+from rangesim.geometry.correspondences import Array
 from rangesim.multiview.bundle_adjustment import (
     MAX_RELATIVE_DEVIATION,
     Views,
+    check_rigid,
     normal_equations,
     reprojection_errors,
 )
@@ -62,7 +63,7 @@ def triangulate_many(
     Raises
     ------
     ValueError
-        Poses of another shape; fewer than two images with a pose.
+        Poses of another shape, or not rigid; fewer than two images with a pose.
     """
     T = np.asarray(T_camera_world, dtype=np.float64)
     if T.shape != (tracks.n_images, 4, 4):
@@ -70,8 +71,11 @@ def triangulate_many(
     known = np.asarray(np.isfinite(T).all(axis=(1, 2)))
     if known.sum() < 2:
         raise ValueError(f"expected at least two images with a pose, got {int(known.sum())}.")
-    checked_array("T_camera_world", T[known], 4, 4)
+    check_rigid(T[known])
     T = np.where(known[:, None, None], T, np.eye(4))
+    # the linear equations mix directions and places: they need an origin near the cameras, as map coordinates have not
+    origin = -np.einsum("nji,nj->ni", T[known, :3, :3], T[known, :3, 3]).mean(axis=0)
+    T[known, :3, 3] += T[known, :3, :3] @ origin
     rays = np.full((len(tracks), 2), np.nan)
     rays[known[tracks.image]] = camera.normalise(tracks.pixels[known[tracks.image]])
     agrees = np.isfinite(rays).all(axis=1)
@@ -101,7 +105,7 @@ def triangulate_many(
         last = order[np.flatnonzero(np.diff(tracks.point[order], append=-1))]  # the worst of each point
         agrees[last[todo[tracks.point[last]]]] = False
     agrees &= np.isfinite(points[tracks.point]).all(axis=1)
-    return ManyViewPoints(points, deviation, agrees)
+    return ManyViewPoints(points + origin, deviation, agrees)
 
 
 def _solved(tracks: Tracks, rays: Array, camera: Intrinsics, T: Array, noise_px: float) -> tuple[Array, Array]:

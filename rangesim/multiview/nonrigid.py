@@ -191,8 +191,9 @@ def adjust_nonrigid(
     Parameters
     ----------
     tracks, n_basis, noise_px, seed : as `factorise_nonrigid`.
-    prior : "estimated" takes the bend of the shape from the tracks: the root mean square, in the factorisation, of the
-        half of the points that the tracks determine best.
+    prior : "estimated" takes the bend of the shape from the tracks: the mean square, in the factorisation, of the half
+        of the points that the tracks determine best, times (n_images - 2) / (K - 1), for so many bends of a point are
+        made of each basis shape.
 
     Raises
     ------
@@ -290,11 +291,18 @@ def _lifted(virtual: Shapes, cameras: AffineCameras) -> Shapes:
 
 
 def _estimated(found: Descended[Shapes, NormalEquations]) -> TemporalPrior:
-    """The prior that the best determined half of the points suggests."""
+    """The prior that the best determined half of the points suggests.
+
+    A point's n - 2 bends are made of K - 1 basis shapes: as many numbers in each direction are unknown, and the others
+    follow. The sum of squares of the prior is to be that of K - 1 numbers of unit variance, and not of n - 2, else it
+    is too sure by the root of (n - 2) / (K - 1), and pulls the shape off what the tracks say.
+    """
     deviation = _deviations(found, count_unknowns(1, 1, found.state.basis.shape[1]).gauge).max(axis=0)
     best = np.argsort(deviation)[: -(-len(deviation) // 2)]
     bends = np.diff(found.state.shapes[:, best], n=2, axis=0)
-    size = float(np.sqrt(((bends - bends.mean(axis=1, keepdims=True)) ** 2).mean()))
+    n, K = found.state.coefficients.shape
+    repeated = max((n - 2) / max(K - 1, 1), 1.0)
+    size = float(np.sqrt(((bends - bends.mean(axis=1, keepdims=True)) ** 2).mean() * repeated))
     return TemporalPrior(shape_bend_px=size if size > 0 else None)
 
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, check_noise
-from rangesim.multiview.bundle_adjustment import bundle_adjust
+from rangesim.multiview.bundle_adjustment import adjusted_views, bundle_adjust
 from rangesim.multiview.multi_view_triangulation import triangulate_many
 from rangesim.multiview.tracks import Tracks
 from rangesim.rig import Intrinsics
@@ -118,7 +118,7 @@ def _adjusted(
     used = images[some.points_per_image > 0]
     some = live.keep(sound[live.point]).of_images(used)
     held = [i for i, image in enumerate(used) if image < newest]
-    found = bundle_adjust(some, camera, T[used], known, held=held, noise_px=noise_px)
+    found = adjusted_views(some, camera, T[used], known, held=held, noise_px=noise_px)
     T, X = T.copy(), X.copy()
     T[used] = found.T_camera_world
     X[current] = found.points[current]

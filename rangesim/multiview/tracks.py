@@ -80,7 +80,7 @@ class Tracks:
 
     @classmethod
     def from_dense(cls, pixels: ArrayLike) -> Tracks:
-        """Tracks of pixels (n_images, n_points, 2), NaN in both coordinates where a point is not seen.
+        """Tracks of pixels (n_images, n_points, 2), NaN, or masked, in both coordinates where a point is not seen.
 
         Raises
         ------
@@ -88,6 +88,8 @@ class Tracks:
             Another shape; infinite pixels; pixels of which one coordinate alone is NaN.
         """
         try:
+            if isinstance(pixels, np.ma.MaskedArray):  # what is masked is not seen
+                pixels = pixels.astype(np.float64).filled(np.nan)
             dense = np.asarray(pixels, dtype=np.float64)
         except (TypeError, ValueError):
             raise ValueError(f"expected pixels (n_images, n_points, 2) of numbers, got {shown(pixels)}.") from None
@@ -146,15 +148,33 @@ class Tracks:
         )
 
     def of_images(self, images: ArrayLike) -> Tracks:
-        """The tracks in some images, (k,) different numbers, which become 0 to k - 1; points keep their numbers."""
-        chosen = np.asarray(images, dtype=np.int64)
+        """The tracks in some images, (k,) different numbers, which become 0 to k - 1; points keep their numbers.
+
+        Raises
+        ------
+        ValueError
+            Numbers that are no integers, out of range, or not different: copy the pixels to see an image twice.
+        """
+        given = np.asarray(images)
+        if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
+            raise ValueError(f"expected images as (k,) integers, got shape {given.shape} of {given.dtype}.")
+        chosen = given.astype(np.int64)
+        self._check_images(chosen)
+        if len(np.unique(chosen)) < len(chosen):
+            raise ValueError(f"expected different images, got {shown(chosen.tolist())}.")
         place = np.full(self.n_images, -1)
         place[chosen] = np.arange(len(chosen))
         some = place[self.image] >= 0
         return Tracks(place[self.image[some]], self.point[some], self.pixels[some], len(chosen), self.n_points)
 
     def common(self, first: int, second: int) -> CommonPoints:
-        """The points that two images share, with their pixels in either."""
+        """The points that two images share, with their pixels in either; ValueError for images that are none."""
+        self._check_images(np.array([first, second]))
         one, two = (np.flatnonzero(self.image == k) for k in (first, second))
         point, a, b = np.intersect1d(self.point[one], self.point[two], assume_unique=True, return_indices=True)
         return CommonPoints(point, self.pixels[one[a]], self.pixels[two[b]])
+
+    def _check_images(self, images: np.ndarray) -> None:
+        outside = images[(images < 0) | (images >= self.n_images)]
+        if len(outside):
+            raise ValueError(f"expected images from 0 to {self.n_images - 1}, got {outside[0]}.")
