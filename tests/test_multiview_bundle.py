@@ -11,10 +11,11 @@ from many_views import Scene, aligned, around, perturbed
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from rangesim.errors import RangesimWarning
 from rangesim.geometry import calibration_matrix, projection_matrix, triangulate_optimal
 from rangesim.geometry.reprojection import moved_pose
 from rangesim.multiview import Tracks, bundle_adjust, triangulate_many
-from rangesim.rig import Intrinsics
+from rangesim.rig import Intrinsics, look_at
 
 
 def test_dense_and_sparse_tracks_are_the_same() -> None:
@@ -276,3 +277,139 @@ def test_points_whose_rays_are_parallel_are_nowhere() -> None:
     pixels = np.repeat(scene.camera.project(scene.X @ T[0, :3, :3].T + T[0, :3, 3])[None], 2, axis=0)
     pixels += np.random.default_rng(0).normal(0, 0.5, pixels.shape)
     assert np.isnan(triangulate_many(Tracks.from_dense(pixels), scene.camera, T).points).all()
+
+
+# ------------------------------------------------------------------------------------------- as users come with them
+
+
+def shifted(T: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Poses with the world's origin moved, so that X + origin is seen as X was."""
+    moved = T.copy()
+    moved[:, :3, 3] -= T[:, :3, :3] @ origin
+    return moved
+
+
+def test_nothing_depends_on_the_origin_or_the_unit() -> None:
+    """Map coordinates (UTM), and millimetres: points, deviations and covariances are those of metres at home."""
+    scene, origin = around(6, 60), np.array([500_000.0, 5_400_000.0, 300.0])
+    T, X = perturbed(scene, 0.005, 0.02, 0.02)
+    home, homes = bundle_adjust(scene.tracks, scene.camera, T, X), triangulate_many(scene.tracks, scene.camera, T)
+    map_T = shifted(T, origin)
+    there = bundle_adjust(scene.tracks, scene.camera, map_T, X + origin)
+    np.testing.assert_allclose(there.points - origin, home.points, atol=1e-6)
+    np.testing.assert_allclose(there.covariance[:, :3, :3], home.covariance[:, :3, :3], rtol=1e-5, atol=1e-15)
+    found = triangulate_many(scene.tracks, scene.camera, map_T)
+    np.testing.assert_allclose(found.points - origin, homes.points, atol=1e-6)
+    np.testing.assert_allclose(found.deviation, homes.deviation, rtol=1e-6)
+    big = T.copy()
+    big[:, :3, 3] *= 1000
+    large = bundle_adjust(scene.tracks, scene.camera, big, 1000 * X)
+    np.testing.assert_allclose(large.points, 1000 * home.points, rtol=1e-6)
+    assert large.shape_deviation == pytest.approx(home.shape_deviation, rel=1e-4)
+
+
+def test_the_shape_is_off_by_the_deviation_stated() -> None:
+    """Over many draws of noise, after the best similarity; the median of Rayleigh-like errors lies below the rms."""
+    ratios = []
+    for seed in range(12):
+        scene = around(4, 60, seed=seed)
+        found = bundle_adjust(scene.tracks, scene.camera, scene.T, scene.X)
+        extent = np.median(np.linalg.norm(scene.X - np.median(scene.X, axis=0), axis=1))
+        off = aligned(found.points, scene.X) - scene.X
+        ratios.append(np.sqrt(np.median((off**2).sum(axis=1))) / extent / found.shape_deviation)
+    assert 0.75 < np.mean(ratios) < 1.1
+
+
+@pytest.mark.parametrize("baseline", [0.01, 0.5, 2.0])
+def test_a_rotating_camera_is_refused_whatever_baseline_it_starts_with(baseline: float) -> None:
+    """Noise can be explained by depths, at which the covariance looks well: the F test tells."""
+    scene, random = around(6, 60), np.random.default_rng(0)
+    T = np.repeat(scene.T[:1], 6, axis=0)
+    T[:, :3] = Rotation.from_rotvec(random.normal(0, 0.1, (6, 3))).as_matrix() @ T[:, :3]
+    pixels = np.stack([scene.camera.project(scene.X @ P[:3, :3].T + P[:3, 3]) for P in T])
+    tracks = Tracks.from_dense(pixels + random.normal(0, 0.5, pixels.shape))
+    for seed in range(3):
+        moves = np.random.default_rng(seed).normal(0, baseline, (6, 3))
+        start = moved_pose(T, np.concatenate([np.zeros((6, 3)), moves], axis=1))
+        with pytest.raises(ValueError, match=r"parallax|only rotates|determine the shape"):
+            bundle_adjust(tracks, scene.camera, start, scene.X)
+
+
+@pytest.mark.parametrize("loss", ["linear", "cauchy"])
+def test_a_rotation_explains_what_one_saw_and_nothing_else(loss: str) -> None:
+    """The sum of squares of the rotations alone is the noise of a camera that rotates, and the F test keeps cameras
+    that move by a tenth of a per cent of the distance, beside wrong observations under a robust loss."""
+    from rangesim.multiview.bundle_adjustment import _cost_of_rotations
+
+    scene, random = around(6, 200), np.random.default_rng(1)
+    T = np.repeat(scene.T[:1], 6, axis=0)
+    T[:, :3] = Rotation.from_rotvec(random.normal(0, 0.05, (6, 3))).as_matrix() @ T[:, :3]
+
+    def seen(T: np.ndarray) -> np.ndarray:
+        pixels = np.stack([scene.camera.project(scene.X @ P[:3, :3].T + P[:3, 3]) for P in T])
+        return pixels + random.normal(0, 0.5, pixels.shape)
+
+    cost = _cost_of_rotations(scene.camera, T, Tracks.from_dense(seen(T)))
+    assert cost / 0.25 == pytest.approx(2 * 6 * 200 - 3 * 6 - 2 * 200 + 3, rel=0.1)
+    T[:, :3, 3] += random.normal(0, 0.15, (6, 3))
+    pixels = seen(T)
+    if loss == "cauchy":
+        pixels[random.random((6, 200)) < 0.05] += 60
+    found = bundle_adjust(Tracks.from_dense(pixels), scene.camera, T, scene.X, loss=loss)  # type: ignore[arg-type]
+    assert np.isfinite(found.points).all()
+
+
+def test_a_narrow_lens_that_sees_no_shape_is_refused() -> None:
+    """One degree of view over one degree of an arc: relief and turning are told apart by perspective alone."""
+    random = np.random.default_rng(0)
+    X = random.uniform(-1, 1, (100, 3))
+    lens = Intrinsics(1280, 960, 73_000, 73_000, 640, 480)
+
+    def adjusted(half: float) -> float:
+        angles = np.linspace(-half, half, 6)
+        T = np.stack([np.linalg.inv(look_at((200 * np.cos(a), 200 * np.sin(a), 20), (0, 0, 0))) for a in angles])
+        pixels = np.stack([lens.project(X @ P[:3, :3].T + P[:3, 3]) for P in T])
+        tracks = Tracks.from_dense(pixels + np.random.default_rng(1).normal(0, 0.5, pixels.shape))
+        return bundle_adjust(tracks, lens, T, X).shape_deviation
+
+    assert adjusted(0.5) < 0.01
+    with pytest.raises(ValueError, match="determine the shape"):
+        adjusted(0.004)
+
+
+def test_a_descent_that_was_cut_short_says_so() -> None:
+    scene = around(6, 60)
+    with pytest.warns(RangesimWarning, match="still goes down"):
+        found = bundle_adjust(scene.tracks, scene.camera, *perturbed(scene, 0.02, 0.05, 0.1), max_steps=1)
+    assert not found.has_converged
+
+
+def test_poses_and_images_that_are_none_are_refused() -> None:
+    scene = small()
+    for wrong in (scene.T * 1.3, scene.T @ np.diag([1, 1, -1, 1.0])):
+        with pytest.raises(ValueError, match="rigid poses"):
+            bundle_adjust(scene.tracks, scene.camera, wrong, scene.X)
+        with pytest.raises(ValueError, match="rigid poses"):
+            triangulate_many(scene.tracks, scene.camera, wrong)
+    for images, message in (
+        ([0, 0, 1], "different images"),
+        ([-1], "0 to 4"),
+        ([9], "0 to 4"),
+        ([0.5, 1.2], "integers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scene.tracks.of_images(images)
+    with pytest.raises(ValueError, match="0 to 4"):
+        scene.tracks.common(0, 9)
+    with pytest.raises(ValueError, match="held"):
+        bundle_adjust(scene.tracks, scene.camera, scene.T, scene.X, held=[0.5])  # type: ignore[list-item]
+
+
+def test_what_is_masked_is_not_seen() -> None:
+    pixels = np.random.default_rng(0).integers(0, 100, (3, 5, 2))
+    hidden = np.zeros(pixels.shape, dtype=bool)
+    hidden[1, 2] = True
+    tracks = Tracks.from_dense(np.ma.masked_array(pixels, hidden))
+    assert len(tracks) == 14
+    assert not tracks.seen()[1, 2]
+    np.testing.assert_array_equal(tracks.dense()[0], pixels[0])

@@ -187,3 +187,38 @@ def test_degenerate_deformations_are_refused() -> None:
         factorise_nonrigid(Tracks.from_dense(still), 4)
     with pytest.raises(ValueError, match="positive"):
         TemporalPrior(shape_bend_px=0.0)
+
+
+def test_an_estimated_prior_leaves_what_the_tracks_say() -> None:
+    """Complete tracks determine the shape; a prior that bends are chance is to change little of it, and to state it."""
+    ratios, worse = [], []
+    for seed in range(4):
+        random, time = np.random.default_rng(seed), np.linspace(0, 1, 10)
+        shapes = np.stack([random.uniform(-100, 100, (50, 3)), random.normal(0, 15, (50, 3))], axis=1)
+        weights = np.stack([np.ones(10), np.sin(2 * np.pi * 0.4 * time + seed)], axis=1)
+        turns = random.normal(0, 0.15, (10, 3))
+        turns[:, 1] += 1.5 * time
+        seen = np.einsum("nk,pkd,ned->npe", weights, shapes, Rotation.from_rotvec(turns).as_matrix())
+        tracks = Tracks.from_dense(seen[..., :2] + random.normal(0, 0.5, (10, 50, 2)))
+        true = seen - seen.mean(axis=1, keepdims=True)
+        free, held = factorise_nonrigid(tracks, 2), adjust_nonrigid(tracks, 2)
+        error = shape_error(held, true)
+        worse.append(error / shape_error(free, true))
+        ratios.append(error / np.sqrt((held.shape_deviation_px**2).mean() / (true**2).mean()))
+    assert np.mean(worse) < 1.15
+    assert np.mean(ratios) < 1.3
+
+
+def test_slow_waves_in_few_images_are_refused() -> None:
+    """Coefficients that are nearly proportional leave the shape open; an estimated prior would hide it."""
+    for seed in range(3):
+        random, time = np.random.default_rng(seed), np.linspace(0, 1, 10)
+        shapes = random.normal(0, 15, (50, 4, 3))
+        shapes[:, 0] = random.uniform(-100, 100, (50, 3))
+        weights = np.ones((10, 4))
+        weights[:, 1:] = np.sqrt(2) * np.sin(2 * np.pi * np.array([0.4, 0.7, 1.0]) * time[:, None] + np.arange(1, 4))
+        turns = np.stack([0.2 * np.sin(4 * time), np.pi / 2 * time, 0 * time], axis=1)
+        seen = np.einsum("nk,pkd,ned->npe", weights, shapes, Rotation.from_rotvec(turns).as_matrix())
+        tracks = Tracks.from_dense(seen[..., :2] + random.normal(0, 0.5, (10, 50, 2)))
+        with pytest.raises(ValueError, match="rank 12|determine the shape|no two of"):
+            adjust_nonrigid(tracks, 4)

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from many_views import aligned, around, perturbed, position_error, walk
 from scipy.spatial.transform import Rotation
 
+from rangesim.errors import RangesimWarning
 from rangesim.multiview import Tracks, adjust_online, bundle_adjust, structure_from_motion
 
 
@@ -127,3 +130,31 @@ def test_what_cannot_be_placed_online_is_refused() -> None:
         adjust_online(scene.tracks, scene.camera, scene.T[:4], window=1)
     with pytest.raises(ValueError, match="T_start"):
         adjust_online(scene.tracks, scene.camera, scene.T[:1])
+
+
+@pytest.mark.parametrize("wrong", ["noise", "lens", "tracks"])
+def test_a_misfit_is_told(wrong: str) -> None:
+    """A noise stated ten times too small, a focal length twice too long, most observations wrong."""
+    scene = around(6, 100)
+    pixels, camera = scene.tracks.pixels.copy(), scene.camera
+    if wrong == "lens":
+        camera = replace(camera, fx=2 * camera.fx, fy=2 * camera.fy)
+    if wrong == "tracks":
+        random = np.random.default_rng(0)
+        bad = random.random(len(pixels)) < 0.6
+        pixels[bad] = random.uniform(0, 960, (bad.sum(), 2))
+    tracks = Tracks(scene.tracks.image, scene.tracks.point, pixels, 6, 100)
+    with pytest.warns(RangesimWarning, match="noise_px or the lens is another, or most tracks are wrong"):
+        structure_from_motion(tracks, camera, noise_px=0.05 if wrong == "noise" else 0.5)
+
+
+def test_a_lens_off_by_two_per_cent_bends_the_shape_little_and_shows_in_the_noise() -> None:
+    scene = around(6, 100)
+    camera = replace(scene.camera, fx=1.02 * scene.camera.fx, fy=1.02 * scene.camera.fy)
+    found = structure_from_motion(scene.tracks, camera, noise_px=0.5)
+    assert np.sqrt(((aligned(found.points, scene.X) - scene.X) ** 2).sum(axis=1).mean()) < 0.01
+    assert found.noise_px > 0.52
+    points, T = found.points, found.T_camera_world
+    freed = bundle_adjust(scene.tracks, camera, T, points, free=["fx", "fy"])
+    assert abs(freed.camera.fx - scene.camera.fx) < 4 * freed.lens_deviations[0]
+    assert freed.noise_px == pytest.approx(0.5, rel=0.08)

@@ -44,6 +44,7 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
     "part_pose": ["part.png", "--width", "400"],
+    "rendered_motion": ["rendered_motion.png", "--views", "3", "--width", "320"],
     "rectification": ["rectification.png", "--width", "160"],
     "scan": ["--views", "4", "--width", "96", "--out", "out/scan.ply"],
     "segmentation": ["--width", "320"],

@@ -29,6 +29,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rangesim.errors import warn
 from rangesim.geometry.consensus import rounding_of, simpler_model_suffices
 from rangesim.geometry.correspondences import Array, check_noise, checked_array
 from rangesim.geometry.least_squares import descend
@@ -40,7 +41,9 @@ from rangesim.settings.config import shown
 
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 Loss = Literal["linear", "huber", "soft_l1", "cauchy"]
-MAX_STEPS = 200
+MAX_STEPS, ROUGH_STEPS = 1000, 200
+"""At the end, and of views to which others are still to come. Some steps are enough unless the views leave a direction
+nearly open, a long curved valley."""
 CONVERGED = 1e-8
 """Relative decrease of the cost at which it ends: of a million residuals, 1e-8 of the cost is 1 % of the variance of
 one."""
@@ -136,10 +139,21 @@ def bundle_adjust(
         Fewer than two images; poses or points of other shapes; an image without points; images in groups that share no
         points; poses that are not rigid; points behind the cameras; fewer equations than unknowns; cameras or a shape
         that the tracks do not determine; or cameras that explain the tracks no better than one that only rotates.
+
+    Warns
+    -----
+    RangesimWarning
+        The descent did not end in `max_steps`: covariance and deviations do not hold.
     """
     found = adjusted_views(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px, max_steps)
     _refuse_open_shape(found)
     _refuse_rotation_alone(tracks, found, free, held, loss)
+    if not found.has_converged:
+        warn(
+            f"expected a descent that ends, got one that still goes down after {found.steps} steps: the answer is not "
+            "the best, and its deviations do not hold; raise max_steps, or add views from other sides, since some "
+            "direction is nearly open."
+        )
     return found
 
 
@@ -153,7 +167,7 @@ def adjusted_views(
     loss: Loss = "linear",
     loss_scale_px: float = 1.0,
     noise_px: float | None = None,
-    max_steps: int = MAX_STEPS,
+    max_steps: int = ROUGH_STEPS,
 ) -> BundleAdjustment:
     """As `bundle_adjust`, of views to which others are still to come: a shape that is open yet is no error."""
     sizes, some, state = _checked(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px)

@@ -12,11 +12,11 @@ Snavely, Seitz, Szeliski: "Photo tourism", SIGGRAPH 2006; Schoenberger, Frahm: "
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rangesim.errors import warn
 from rangesim.geometry import consensus
 from rangesim.geometry.camera_matrix import calibration_matrix, ideal_pixels
 from rangesim.geometry.camera_pose import find_camera_pose
@@ -91,9 +91,9 @@ def structure_from_motion(
 
     Warns
     -----
-    UserWarning
+    RangesimWarning
         Most observations are left out as wrong, or the others are off by half more than the stated noise: the lens or
-        the noise is another, or most tracks are wrong.
+        the noise is another, or most tracks are wrong. Or the last descent did not end (`bundle_adjust`).
     """
     check_noise(noise_px)
     if tracks.n_images < 2:
@@ -130,11 +130,10 @@ def _warn_of_misfit(tracks: Tracks, found: StructureFromMotion, noise_px: float)
     linked = tracks.images_per_point[tracks.point] > 1  # a point in one image agrees with anything
     agreeing = float(found.inliers[linked].mean())
     if found.noise_px > MAX_EXCESS * noise_px or agreeing < MIN_AGREEING:
-        warnings.warn(
+        warn(
             f"expected most observations to agree to the stated noise of {noise_px:.3g} px, got {agreeing:.0%} that "
             f"agree, off by {found.noise_px:.3g} px: noise_px or the lens is another, or most tracks are wrong; state "
-            "the noise, calibrate the lens, or free it in bundle_adjust.",
-            stacklevel=3,
+            "the noise, calibrate the lens, or free it in bundle_adjust."
         )
 
 

@@ -198,10 +198,14 @@ def adjust_nonrigid(
     Raises
     ------
     ValueError
-        As `factorise_nonrigid`.
+        As `factorise_nonrigid`; of a stated prior, tracks of a lower rank are none.
     """
-    some, points, found, noise = _factorised(tracks, n_basis, noise_px, seed, is_strict=False)
+    is_estimated = not isinstance(prior, TemporalPrior)
+    some, points, found, noise = _factorised(tracks, n_basis, noise_px, seed, is_strict=is_estimated)
     noise = max(noise, LEAST_NOISE * float(np.std(some.pixels)))
+    if is_estimated:  # of a shape that is open, there is nothing to estimate
+        gauge = count_unknowns(1, 1, n_basis).gauge
+        _refuse_open_shape(_deviations(found, gauge) * noise, _principal(found.state), noise)
     used = prior if isinstance(prior, TemporalPrior) else _estimated(found)
     start = found.state
     if used.shape_bend_px is not None:
@@ -346,14 +350,7 @@ def _judged(
     refuse_open_rotations(found.here, gauge, noise, unit)
     deviations = _deviations(found, gauge) * noise / unit
     shapes = _principal(found.state)
-    extent = float(np.sqrt((shapes.basis[:, 0] ** 2).mean()))
-    open_px = float(np.median(deviations))
-    if not open_px <= MAX_SHAPE_DEVIATION * extent:
-        raise ValueError(
-            f"expected tracks that determine the shape, got some that leave its coordinates open by {open_px:.3g} px "
-            f"of an extent of {extent:.3g} at a noise of {noise:.3g} px: give a prior (adjust_nonrigid), fewer basis "
-            "shapes, or more images that turn."
-        )
+    _refuse_open_shape(deviations, shapes, noise)
     residuals = shapes.project()[some.image, some.point] - some.pixels
     basis = np.full((tracks.n_points, K, 3), np.nan)
     basis[points] = shapes.basis
@@ -361,6 +358,17 @@ def _judged(
     everyone[:, points] = deviations
     left = everywhere(tracks, points, residuals)
     return NonRigidShape(shapes.R, shapes.t, shapes.coefficients, basis, everyone, left, noise, prior)
+
+
+def _refuse_open_shape(deviations: Array, shapes: Shapes, noise: float) -> None:
+    extent = float(np.sqrt((shapes.basis[:, 0] ** 2).mean()))
+    open_px = float(np.median(deviations))
+    if not open_px <= MAX_SHAPE_DEVIATION * extent:
+        raise ValueError(
+            f"expected tracks that determine the shape, got some that leave its coordinates open by {open_px:.3g} px "
+            f"of an extent of {extent:.3g} at a noise of {noise:.3g} px: use fewer basis shapes, more images that turn, "
+            "or state how the shape moves (TemporalPrior)."
+        )
 
 
 def _principal(shapes: Shapes) -> Shapes:
