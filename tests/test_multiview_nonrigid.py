@@ -220,5 +220,5 @@ def test_slow_waves_in_few_images_are_refused() -> None:
         turns = np.stack([0.2 * np.sin(4 * time), np.pi / 2 * time, 0 * time], axis=1)
         seen = np.einsum("nk,pkd,ned->npe", weights, shapes, Rotation.from_rotvec(turns).as_matrix())
         tracks = Tracks.from_dense(seen[..., :2] + random.normal(0, 0.5, (10, 50, 2)))
-        with pytest.raises(ValueError, match="rank 12|determine the shape|no two of"):
+        with pytest.raises(ValueError, match=r"rank 12|determine the shape|no two of"):
             adjust_nonrigid(tracks, 4)

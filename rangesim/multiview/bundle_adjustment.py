@@ -25,12 +25,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import stats
 from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from rangesim.errors import warn
-from rangesim.geometry.consensus import rounding_of, simpler_model_suffices
+from rangesim.geometry.consensus import SIGNIFICANCE, rounding_of, simpler_model_suffices
 from rangesim.geometry.correspondences import Array, check_noise, checked_array
 from rangesim.geometry.least_squares import descend
 from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose, reproject, with_all_coefficients
@@ -60,6 +62,12 @@ SHAPE_SAMPLE = 200
 """Points by which the deviation of the shape is judged."""
 TESTED_OBSERVATIONS = 30_000
 """By which cameras that move are told from cameras that only rotate."""
+NO_PERSPECTIVE, SMALL_TURN = 0.1, np.radians(20)
+"""Depth over distance, and radians about the mean direction, below which a shape may look like one of other depth."""
+OTHER_DEPTHS, RELIEF_STEPS = (0.25, 0.5, 2.0, 4.0, 8.0, 16.0), 100
+"""Times the depth found, and steps of a descent from there."""
+ANOTHER_SHAPE, MAX_CURVED = 0.05, 2.0
+"""Of the extent, and times the deviation that the covariance tells, from which on a shape is another one."""
 ROTATION_ROUNDS, ROTATION_STEPS = 10, 30
 RIGHT = 4.0
 """Standard deviations that a right observation is off at most, beside a robust loss."""
@@ -148,6 +156,7 @@ def bundle_adjust(
     found = adjusted_views(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px, max_steps)
     _refuse_open_shape(found)
     _refuse_rotation_alone(tracks, found, free, held, loss)
+    _refuse_other_relief(tracks, found, free, held, loss, loss_scale_px)
     if not found.has_converged:
         warn(
             f"expected a descent that ends, got one that still goes down after {found.steps} steps: the answer is not "
@@ -401,6 +410,71 @@ def _refuse_rotation_alone(
         )
 
 
+def _refuse_other_relief(
+    tracks: Tracks, found: BundleAdjustment, free: Sequence[str], held: Sequence[int], loss: Loss, scale_px: float
+) -> None:
+    """Raise ValueError where a flatter or deeper shape, seen by cameras that turn more or less, explains the tracks.
+
+    Without perspective and under small turns w, images see w times depth alone (the bas-relief ambiguity: Belhumeur,
+    Kriegman, Yuille, IJCV 1999). Such a valley is curved, and at a bottom that the noise made the covariance looks
+    well. So a descent from shapes of other depth ends where the valley leads, and a rise of the sum of squares by r
+    noise^2 must not go that way farther than some times sqrt(r) deviations. Asked of flat scenes from near directions.
+    """
+    known = np.isfinite(found.points).all(axis=1)
+    if len(set(held)) > 1 or known.sum() < 2 or not found.noise_px > 0:
+        return
+    X, T = found.points[known], found.T_camera_world
+    middle = np.median(X, axis=0)
+    towards = middle - -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+    distance = np.linalg.norm(towards, axis=1)
+    towards /= np.maximum(distance, 1e-300)[:, None]
+    d = towards.mean(axis=0) / np.linalg.norm(towards.mean(axis=0))
+    relief = (X - middle) @ d
+    if np.median(np.abs(relief)) > NO_PERSPECTIVE * np.median(distance) or (towards @ d).min() < np.cos(SMALL_TURN):
+        return
+    turns = np.cross(d, towards)
+    cost = _loss_of(found.residuals_px[found.used], loss, scale_px)
+    extent = float(np.median(np.linalg.norm(X - middle, axis=1)))
+    for deeper in OTHER_DEPTHS:
+        other = found.points.copy()
+        other[known] += (deeper - 1) * relief[:, None] * d
+        Q = Rotation.from_rotvec((1 - 1 / deeper) * turns).as_matrix()
+        start = T.copy()
+        start[:, :3, :3] = T[:, :3, :3] @ Q
+        start[:, :3, 3] += np.einsum("nij,nj->ni", T[:, :3, :3], middle - Q @ middle)
+        try:
+            again = adjusted_views(
+                tracks, found.camera, start, other, free, held, loss, scale_px, found.noise_px, RELIEF_STEPS
+            )
+        except ValueError:  # behind a camera, or open altogether: no other answer
+            continue
+        if (again.used != found.used).any():
+            continue
+        rise = (_loss_of(again.residuals_px[again.used], loss, scale_px) - cost) / found.noise_px**2
+        turned = registered(again.points[known], X)
+        apart = float(np.median(np.linalg.norm(turned - X, axis=1))) / extent
+        stated = MAX_CURVED * found.shape_deviation * np.sqrt(max(rise, 1.0))
+        if rise < stats.chi2.isf(SIGNIFICANCE, 1) and apart > max(ANOTHER_SHAPE, stated):
+            raise ValueError(
+                f"expected views that determine the shape, got some that another one explains as well, its points "
+                f"off by {apart:.0%} of their extent: a flatter shape that turns more looks the same through a "
+                "narrow lens; add views from other sides, or from nearer."
+            )
+
+
+def _loss_of(residuals: Array, loss: Loss, scale: float) -> float:
+    return float(scale**2 * LOSSES[loss]((residuals**2).sum(axis=1) / scale**2)[0].sum())
+
+
+def registered(points: Array, onto: Array) -> Array:
+    """Points (n, 3) under the similarity that brings them nearest to others (Umeyama 1991)."""
+    a, b = points - points.mean(axis=0), onto - onto.mean(axis=0)
+    u, values, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    scale = (values * signs).sum() / max((a**2).sum(), 1e-300)
+    return np.asarray(scale * a @ ((u * signs) @ vt).T + onto.mean(axis=0))
+
+
 def _cost_of_rotations(camera: Intrinsics, T: Array, tracks: Tracks) -> float:
     """Sum of squares in px^2 of the best rotations, about one centre, and directions of points."""
     rays = np.concatenate([camera.normalise(tracks.pixels), np.ones((len(tracks), 1))], axis=1)
@@ -426,6 +500,8 @@ def _cost_of_rotations(camera: Intrinsics, T: Array, tracks: Tracks) -> float:
 
     X = np.where(size > 0, X / np.where(size > 0, size, 1.0), [0.0, 0.0, 1.0])
     first = Views(with_all_coefficients(camera), start, X)
+    if not np.isfinite(look(first).cost):
+        return float("inf")  # a point behind a camera, or beyond the fold of its lens
     return descend(look, move, first, max_steps=ROTATION_STEPS, converged=1e-4, least_damping=LEAST_DAMPING).here.cost
 
 

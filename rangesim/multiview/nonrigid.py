@@ -366,8 +366,8 @@ def _refuse_open_shape(deviations: Array, shapes: Shapes, noise: float) -> None:
     if not open_px <= MAX_SHAPE_DEVIATION * extent:
         raise ValueError(
             f"expected tracks that determine the shape, got some that leave its coordinates open by {open_px:.3g} px "
-            f"of an extent of {extent:.3g} at a noise of {noise:.3g} px: use fewer basis shapes, more images that turn, "
-            "or state how the shape moves (TemporalPrior)."
+            f"of an extent of {extent:.3g} at a noise of {noise:.3g} px: use fewer basis shapes, more images that "
+            "turn, or state how the shape moves (TemporalPrior)."
         )
 
 

@@ -89,7 +89,7 @@ class Tracks:
         """
         try:
             if isinstance(pixels, np.ma.MaskedArray):  # what is masked is not seen
-                pixels = pixels.astype(np.float64).filled(np.nan)
+                pixels = np.where(np.ma.getmaskarray(pixels), np.nan, pixels.data.astype(np.float64))
             dense = np.asarray(pixels, dtype=np.float64)
         except (TypeError, ValueError):
             raise ValueError(f"expected pixels (n_images, n_points, 2) of numbers, got {shown(pixels)}.") from None
