@@ -188,6 +188,16 @@ def test_unknown_points_and_points_in_one_image_are_left_out() -> None:
     assert np.isfinite(found.residuals_px[found.used]).all()
 
 
+def test_thousands_of_points_that_nothing_observes_change_nothing() -> None:
+    scene = around(6, 60)
+    tracks = Tracks(scene.tracks.image, scene.tracks.point + 30_000, scene.tracks.pixels, 6, 60_000)
+    X = np.zeros((60_000, 3))
+    X[30_000:30_060] = scene.X
+    found, plain = bundle_adjust(tracks, scene.camera, scene.T, X), bundle_adjust(scene.tracks, *scene[:3])
+    np.testing.assert_allclose(found.points[30_000:30_060], plain.points, atol=1e-9)
+    assert np.isnan(found.points[:30_000]).all()
+
+
 def test_degenerate_bundles_are_refused() -> None:
     scene = around(6, 40)
     T, X, camera, tracks = scene.T, scene.X, scene.camera, scene.tracks

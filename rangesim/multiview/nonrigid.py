@@ -203,7 +203,9 @@ def adjust_nonrigid(
     is_estimated = not isinstance(prior, TemporalPrior)
     some, points, found, noise = _factorised(tracks, n_basis, noise_px, seed, is_strict=is_estimated)
     noise = max(noise, LEAST_NOISE * float(np.std(some.pixels)))
-    if is_estimated:  # of a shape that is open, there is nothing to estimate
+    if is_estimated:
+        found, noise = _left_wrong_minimum(some, found, noise, noise_px is None)
+        # of a shape that is open, there is nothing to estimate
         gauge = count_unknowns(1, 1, n_basis).gauge
         _refuse_open_shape(_deviations(found, gauge) * noise, _principal(found.state), noise)
     used = prior if isinstance(prior, TemporalPrior) else _estimated(found)
@@ -294,7 +296,24 @@ def _lifted(virtual: Shapes, cameras: AffineCameras) -> Shapes:
     return replace(virtual, t=cameras.t, basis=np.einsum("vkd,pv->pkd", virtual.basis, cameras.X))
 
 
-def _estimated(found: Descended[Shapes, NormalEquations]) -> TemporalPrior:
+def _left_wrong_minimum(
+    some: Tracks, found: Descended[Shapes, NormalEquations], noise: float, is_free: bool
+) -> tuple[Descended[Shapes, NormalEquations], float]:
+    """The factorisation, or the better one that lies behind a prior that is too sure, and the noise there.
+
+    With missing points the sum of squares has wrong minima. A strong prior leads out of some; then it is let go.
+    """
+    bend = _estimated(found, has_repeats=False).shape_bend_px
+    if bend is None or not noise > 0:
+        return found, noise
+    led = orthographic.adjust(some, found.state, prior=TemporalPrior(shape_bend_px=bend), noise_px=noise)
+    other = orthographic.adjust(some, led.state)
+    if other.here.cost >= (1 - SAME_COST) * found.here.cost:
+        return found, noise
+    return other, noise * float(np.sqrt(other.here.cost / found.here.cost)) if is_free else noise
+
+
+def _estimated(found: Descended[Shapes, NormalEquations], *, has_repeats: bool = True) -> TemporalPrior:
     """The prior that the best determined half of the points suggests.
 
     A point's n - 2 bends are made of K - 1 basis shapes: as many numbers in each direction are unknown, and the others
@@ -305,7 +324,7 @@ def _estimated(found: Descended[Shapes, NormalEquations]) -> TemporalPrior:
     best = np.argsort(deviation)[: -(-len(deviation) // 2)]
     bends = np.diff(found.state.shapes[:, best], n=2, axis=0)
     n, K = found.state.coefficients.shape
-    repeated = max((n - 2) / max(K - 1, 1), 1.0)
+    repeated = max((n - 2) / max(K - 1, 1), 1.0) if has_repeats else 1.0
     size = float(np.sqrt(((bends - bends.mean(axis=1, keepdims=True)) ** 2).mean() * repeated))
     return TemporalPrior(shape_bend_px=size if size > 0 else None)
 

@@ -157,6 +157,8 @@ class NormalEquations:
             involved = np.zeros(sizes.images, dtype=bool)
             for term, starts in zip(self.terms, self._starts, strict=True):
                 involved[term.images[starts[first] : starts[last]]] = True
+            if not involved.any():
+                continue  # points that nothing observes
             images = np.flatnonzero(involved)
             place = np.full(sizes.images, -1)
             place[images] = np.arange(len(images))
