@@ -171,6 +171,7 @@ def factorise_nonrigid(tracks: Tracks, n_basis: int, *, noise_px: float | None =
         ends at the noise; residuals over three times the stated noise; or rotations that stay open.
     """
     some, points, found, noise = _factorised(tracks, n_basis, noise_px, seed, is_strict=True)
+    found, noise = _left_wrong_minimum(some, found, noise, noise_px is None)
     return _judged(tracks, some, points, found, TemporalPrior(), noise, 1.0)
 
 
