@@ -126,12 +126,12 @@ def test_bad_input_leaves_nothing_behind(tmp_path: Path, arguments: list[str], m
 
 
 def test_poses_that_see_nothing_are_said(tmp_path: Path) -> None:
-    """Of a file without the key, and of poses that look at the table beside all things."""
+    """Of a file without the key, and of poses that look at the wall over all things."""
     poses = tmp_path / "poses.json"
     poses.write_text(json.dumps({"poses": [np.eye(4).tolist()]}))
     with pytest.raises(ValueError, match="the key 'T_world_camera'"):
         run("matte", "--path", str(poses), "--out", str(tmp_path / "out"))
-    poses.write_text(json.dumps([look_at((-0.6, -0.4, 0.12), (-0.6, -0.401, 0)).tolist()]))
+    poses.write_text(json.dumps([look_at((0, 0.1, 0.6), (0, 0.75, 0.7)).tolist()]))
     said = run("matte", "--path", str(poses), "--width", "48", "--spp", "4", "--out", str(tmp_path / "out"))
     assert "no view measured any of these" in said
     assert "No view measured any of" in (tmp_path / "out" / "report.html").read_text()
