@@ -23,6 +23,7 @@ from rangesim.fusion.scan_settings import (
     scan_settings_from_dict,
     scan_settings_to_dict,
 )
+from rangesim.rig import look_at
 
 Run = Callable[..., str]
 
@@ -113,6 +114,7 @@ def test_bad_settings_are_named(tmp_path: Path, text: str, message: str) -> None
         (["matte", "--path", "spiral"], "turntable, dome, hand-held"),
         (["matte", "--path", "poses.json"], r"poses\.json"),
         (["matte", "--sensor", "lidar"], "lidar"),
+        (["matte", "--sensor", "gray", "--sensor", "amcw"], "one --sensor"),
         (["matte", "--voxel", "0.00001", "--views", "1", "--width", "32", "--spp", "2"], "tenth of the distance"),
         (["plane", "--views", "2", "--width", "48", "--spp", "2", "--unknown-poses"], "cannot be aligned|slide"),
     ],
@@ -121,6 +123,18 @@ def test_bad_input_leaves_nothing_behind(tmp_path: Path, arguments: list[str], m
     with pytest.raises((ValueError, FileFormatError), match=message):
         CliRunner().invoke(app, ["scan", *arguments, "--out", str(tmp_path / "out")], catch_exceptions=False)
     assert not list(tmp_path.iterdir())
+
+
+def test_poses_that_see_nothing_are_said(tmp_path: Path) -> None:
+    """Of a file without the key, and of poses that look at the wall over all things."""
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps({"poses": [np.eye(4).tolist()]}))
+    with pytest.raises(ValueError, match="the key 'T_world_camera'"):
+        run("matte", "--path", str(poses), "--out", str(tmp_path / "out"))
+    poses.write_text(json.dumps([look_at((0, 0.1, 0.6), (0, 0.75, 0.7)).tolist()]))
+    said = run("matte", "--path", str(poses), "--width", "48", "--spp", "4", "--out", str(tmp_path / "out"))
+    assert "no view measured any of these" in said
+    assert "No view measured any of" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_a_result_of_another_kind_is_not_replaced(tmp_path: Path) -> None:

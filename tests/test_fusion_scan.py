@@ -12,6 +12,7 @@ from fusion_scenes import ball, block, mesh_depth, part, range_image
 
 import rangesim
 from rangesim import IdealToF, StructuredLight, load_scene
+from rangesim.errors import AlignmentWarning
 from rangesim.fusion import (
     Dome,
     HandHeld,
@@ -239,6 +240,21 @@ def test_views_that_hang_on_one_pair_are_found() -> None:
     pairs = tuple(PairFit(a, b, np.eye(4), 1.0, 0.0, False) for a, b in edges)
     assert _unchecked(pairs, 5) == (3, 4)
     assert _unchecked(pairs[:3], 3) == ()
+
+
+def test_two_views_are_warned_of_as_nothing_confirms_their_pair() -> None:
+    views = made(part(), 2, 20.0)
+    with pytest.warns(AlignmentWarning, match="no loop confirms the pose of view 1"):
+        found = align(views)
+    assert found.unchecked == (1,)
+    assert pose_errors(found.poses, views.true_poses).angle_deg.max() < 0.1  # type: ignore[arg-type]
+
+
+def test_views_out_of_order_are_aligned_or_told_what_order_is_expected() -> None:
+    views = made(part(), 4, 180.0)
+    shuffled = Scan(tuple(views.images[k] for k in (0, 3, 1, 2)))
+    with pytest.raises(ValueError, match="in the order of a walk"):
+        align(shuffled)
 
 
 def test_refuses_what_cannot_be_aligned() -> None:

@@ -11,7 +11,9 @@ import pytest
 from fusion_scenes import CAMERA, ball, block, mesh_depth, part, range_image, sphere_depth
 
 from rangesim.decoding.range_image import RangeImage
+from rangesim.errors import AlignmentWarning
 from rangesim.fusion import (
+    Scan,
     VoxelGrid,
     average_signed_distances,
     fuse,
@@ -230,22 +232,50 @@ def test_the_grid_of_open3d_counts_the_other_way_round() -> None:
     assert np.nanpercentile(off, 99) < 1e-6
 
 
+def test_a_view_far_from_all_others_is_warned_of() -> None:
+    """Such as one whose pose is in millimetres."""
+    images = views(4)
+    T = np.array(images[2].T_world_camera)
+    T[:3, 3] *= 1000
+    with pytest.warns(AlignmentWarning, match=r"the readings of view 2 lie .* from those of any other"):
+        fuse([*images[:2], replace(images[2], T_world_camera=T), images[3]], 4e-3)
+    fuse([images[0], range_image(np.full((72, 96), np.nan))], 4e-3)  # a blind view is none of these; no warning
+
+
+def test_a_wide_truncation_holds_every_voxel_within_it() -> None:
+    """Blocks laid around few points reach as far as those around all of them; and they are laid in no time."""
+    image = views(1)[0]
+    fused = fuse([image], 4e-3, truncation_m=0.1)
+    assert fused.voxels * fused.voxel_m**3 > 4 / 3 * np.pi * 0.1**3
+    narrow = fuse([image], 4e-3, truncation_m=8 * 4e-3)
+    assert surface_error(fused.mesh, narrow.mesh, 4e-3, samples=2000).completeness_m < 5e-4
+
+
 def test_refuses_what_cannot_be_fused() -> None:
     image = views(1)[0]
     nothing = range_image(np.full((72, 96), np.nan))
     for images, options, message in (
         ([], {}, "one view or more"),
         ([nothing], {}, "no pixel measured anything"),
-        ([image], {"voxel_m": 0.0}, "positive voxel_m"),
-        ([image], {"voxel_m": np.nan}, "positive voxel_m"),
+        ([image], {"voxel_m": 0.0}, "voxel_m to be positive"),
+        ([image], {"voxel_m": np.nan}, "voxel_m to be positive"),
+        ([image], {"voxel_m": "2mm"}, "voxel_m to be positive"),
+        ([image], {"voxel_m": 1.0}, "half of what the readings extend over"),
         ([image], {"voxel_m": 1e-6}, "a tenth of the distance"),
         ([image], {"truncation_m": 1e-3}, "at least a voxel"),
+        ([image], {"truncation_m": np.inf}, "truncation_m to be positive and finite"),
+        ([image], {"truncation_m": 5.0}, "voxels of 0.002 m within 5 m of a reading"),
         ([image], {"weights": "confidnce"}, "did you mean 'confidence'"),
         ([image], {"lookup": "cubic"}, "bilinear, nearest"),
         ([image], {"min_weight": -1.0}, "min_weight"),
         ([image], {"min_weight": 1e6}, "found none in 1 views"),
         ([replace(image, camera=None)], {}, "calibrated"),
+        ([image, replace(image, T_world_camera=np.full((4, 4), np.nan))], {}, "pose of view 1 to hold finite"),
+        ([image, replace(image, T_world_camera=np.diag([1, 1, -1, 1.0]))], {}, "pose of view 1 to be rigid"),
+        ([image, replace(image, T_world_camera=np.diag([1e3, 1e3, 1e3, 1.0]))], {}, "pose of view 1 to be rigid"),
+        ([replace(image, camera=image.camera.resized(48, 36))], {}, "its camera's .36, 48. pixels"),  # type: ignore[union-attr]
         ([np.ones((3, 3))], {}, "range images"),
+        (Scan((image,)), {}, "`images` of a Scan"),
     ):
         with pytest.raises(ValueError, match=message):
             fuse(images, **{"voxel_m": 2e-3, **options})  # type: ignore[arg-type]

@@ -38,8 +38,8 @@ def scan_command(
     ] = None,
     views: Annotated[int | None, typer.Option(help="Number of views. (default: 12; dome, hand-held: 24)")] = None,
     sensor: Annotated[
-        str | None,
-        typer.Option("--sensor", "-s", help="As for `rangesim run`, one of them. (default: gray-phase)"),
+        list[str] | None,
+        typer.Option("--sensor", "-s", help="As for `rangesim run`, but one alone. (default: gray-phase)"),
     ] = None,
     voxel: Annotated[
         float | None, typer.Option(help="Metres, edge of a voxel. (default: 1.5 times the distance between readings)")
@@ -72,7 +72,11 @@ def scan_command(
 
     given: dict[str, Any] = {"spp": spp, "width": width, "height": height, "seed": seed, "voxel_m": voxel}
     given |= {"material": material, "unit_m": unit_m}
-    settings = _settings(scene, config, {k: v for k, v in given.items() if v is not None}, sensor)
+    if sensor and len(sensor) > 1:
+        raise ValueError(f"expected one --sensor, got {', '.join(sensor)}; scan once for each.")
+    settings = _settings(
+        scene, config, {k: v for k, v in given.items() if v is not None}, sensor[0] if sensor else None
+    )
     if path is not None or views is not None:
         settings = replace(settings, path=_path(settings.path, path, views))
     if unknown_poses:
@@ -107,13 +111,15 @@ def _path(before: ScanPath, name: str | None, views: int | None) -> ScanPath:
     from rangesim.files.text_files import read_json
     from rangesim.fusion.paths import Path as ScanPath
     from rangesim.fusion.paths import PoseList
-    from rangesim.settings.config import nearest
+    from rangesim.settings.config import nearest, shown
 
     if name is not None and name.endswith(".json"):
         if views is not None:
             raise ValueError("expected --views without a list of poses, which has its own number.")
         data = read_json(Path(name))
-        return PoseList(data["T_world_camera"] if isinstance(data, dict) and "T_world_camera" in data else data)
+        if isinstance(data, dict) and "T_world_camera" not in data:
+            raise ValueError(f"{name}: expected a list of poses, or the key 'T_world_camera', got {shown(list(data))}.")
+        return PoseList(data["T_world_camera"] if isinstance(data, dict) else data)
     if name is not None and name not in PATHS:
         raise ValueError(
             f"expected --path out of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
@@ -135,6 +141,10 @@ def _table(result: ScanResult) -> str:
         recall = "-" if error is None else f"{error.recall:.1%}"
         seen = "-" if result.seen is None else f"{result.seen.shapes[name].surface:.1%}"
         lines.append(f"{name[:19]:20s}{result.materials[name]:14s}{accuracy:>10s}{recall:>10s}{seen:>8s}")
+    if all(result.errors[name] is None for name in result.things):
+        from rangesim.report.scan_page import NOTHING_SEEN
+
+        lines.append(f"no view measured any of these: {NOTHING_SEEN}")
     if result.poses is not None:
         angle, centre = result.poses.angle_deg.max(), 1e3 * result.poses.centre_m.max()
         lines.append(f"poses found: off by at most {angle:.3f} degrees, camera centres {centre:.3f} mm")

@@ -63,6 +63,9 @@ THROUGH = 4.0
 MAX_CONTRADICTION = 0.15
 """Fraction of the points of a view that another may see through: edges and ghosts, not a wrong pose."""
 
+ORDER = "Views are expected in the order of a walk, each overlapping the one before by a third or more."
+REMEDY = f"add views between, or scan something that looks different from all sides. {ORDER}"
+
 
 class PairFit(NamedTuple):
     """Two views that were registered.
@@ -121,7 +124,7 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
     Warns
     -----
     AlignmentWarning
-        Views that no loop holds.
+        Views that no loop holds; of two views always one.
     """
     if len(scan) < 2:
         raise ValueError(f"expected two views or more to align, got {len(scan)}.")
@@ -146,7 +149,7 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
     )
     _refuse_contradiction(aligned, clouds, spacing)
     unchecked = _unchecked(pairs, len(clouds))
-    if unchecked and len(clouds) > 2:
+    if unchecked:  # of two views always: their one pair may fit wrongly, and nobody would know
         views = ", ".join(map(str, unchecked))
         warnings.warn(AlignmentWarning(f"no loop confirms the pose of view {views}; add views between."), stacklevel=2)
     return Alignment(aligned, pairs, spacing, unchecked)
@@ -261,7 +264,7 @@ def _chain(clouds: list[Array], seed: int) -> list[PairFit]:
             found.append(PairFit(source, target, np.asarray(fit.T_target_source), fit.fitness, np.nan, False))
             break
         else:
-            raise ValueError(f"view {source} cannot be aligned; " + " ".join(reasons))
+            raise ValueError(f"view {source} cannot be aligned; {' '.join(reasons)} {ORDER}")
     return found
 
 
@@ -330,7 +333,7 @@ def _refuse_disagreement(pairs: tuple[PairFit, ...], spacing: float) -> None:
         raise ValueError(
             f"expected pairs of views that agree, but views {worst.target} and {worst.source} are "
             f"{1e3 * worst.disagreement_m:.2g} mm off what the others say (spacing {1e3 * spacing:.2g} mm): some pair "
-            "fits wrongly; add views between, or scan something that looks different from all sides."
+            f"fits wrongly; {REMEDY}"
         )
 
 
@@ -349,8 +352,7 @@ def _refuse_contradiction(scan: Scan, clouds: list[Array], spacing: float) -> No
     if worst > MAX_CONTRADICTION:
         raise ValueError(
             f"expected poses in which no view sees through what another measured, but view {views[1]} looks through "
-            f"{worst:.0%} of view {views[0]}: they fit wrongly; add views between, or scan something that looks "
-            "different from all sides."
+            f"{worst:.0%} of view {views[0]}: they fit wrongly; {REMEDY}"
         )
 
 

@@ -224,8 +224,9 @@ def _voxel_m(views: Scan) -> float:
 def _check_readings(views: Scan) -> None:
     if not any(image.valid.any() for image in views.images):
         raise ValueError(
-            f"expected readings in some of {len(views)} views, got none: the path may look past the scene, or the "
-            "scene not be in metres (a mesh in millimetres needs unit_m = 0.001)."
+            f"expected readings in some of {len(views)} views, got none: the path may look past the scene, its poses "
+            "not be T_world_camera in metres, or the scene not be in metres (a mesh in millimetres needs unit_m = "
+            "0.001)."
         )
 
 

@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike
 from rangesim.decoding.range_image import RangeImage
 from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.point_cloud import lattice_normals
-from rangesim.rig import Intrinsics
+from rangesim.rig import Intrinsics, pose
 from rangesim.settings.config import nearest, shown
 
 Weighting = Literal["confidence", "uniform"]
@@ -66,7 +66,7 @@ def signed_distance(
     Raises
     ------
     ValueError
-        The image has no camera (uncalibrated), or points are not (..., 3).
+        The image has no camera (uncalibrated), a pose that is not rigid, or points are not (..., 3).
     """
     camera, T = placed(image, T_world_camera)
     X = np.asarray(points, dtype=np.float64)
@@ -186,12 +186,21 @@ def average_signed_distances(
         return total / weight, weight
 
 
-def placed(image: RangeImage, T_world_camera: ArrayLike | None = None) -> tuple[Intrinsics, np.ndarray]:
-    """Camera and pose (4, 4) of a view; ValueError if it has none."""
-    T = image.T_world_camera if T_world_camera is None else np.asarray(T_world_camera, dtype=np.float64)
+def placed(
+    image: RangeImage, T_world_camera: ArrayLike | None = None, name: str = "T_world_camera"
+) -> tuple[Intrinsics, np.ndarray]:
+    """Camera and pose (4, 4) of a view; ValueError if it has none, a pose that is not rigid and finite, or
+    another size than its camera.
+
+    name : of the pose, for the message.
+    """
+    T = image.T_world_camera if T_world_camera is None else T_world_camera
     if image.camera is None or T is None:
         raise ValueError("expected a calibrated range image: without a rig it has no place among other views.")
-    return image.camera, T
+    size = (image.camera.height, image.camera.width)
+    if image.z.shape != size:
+        raise ValueError(f"expected a range image of its camera's {size} pixels (h, w), got {image.z.shape}.")
+    return image.camera, pose(T, name)
 
 
 def check_lookup(lookup: str) -> None:

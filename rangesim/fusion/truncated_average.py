@@ -9,6 +9,7 @@ ghost; here a loop of our own fills the grid: weights, distortion, and every vie
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from pcgraph.parallel import in_blocks, kernel, routine
 from rangesim import limits
 from rangesim.decoding.range_image import RangeImage
+from rangesim.errors import AlignmentWarning
 from rangesim.fusion.sdf import (
     SAME_SURFACE,
     Lookup,
@@ -26,10 +28,11 @@ from rangesim.fusion.sdf import (
     placed,
     relative_weights,
 )
-from rangesim.settings.bounds import MAX_COORDINATE_M
+from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, check_number
 from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh
 
+LENGTH = Bounds("positive and finite", 1e-9, MAX_COORDINATE_M)
 BLOCK = 8
 """Voxels along the edge of a block."""
 TILE = 8
@@ -40,6 +43,10 @@ TRUNCATION_VOXELS = 3.0
 """Truncation distance, in voxels, if none is given."""
 ENOUGH = 7
 """One reading of so many tells the distance between readings."""
+WIDE = 8.0
+"""Voxels of truncation beyond which the points that blocks are laid around may be farther apart."""
+COARSEST = 0.5
+"""Of the largest extent of the readings, at most, that a voxel is."""
 FINEST = 0.1
 """Of the distance between neighbouring readings, at least, that a voxel is: in smaller ones surfaces are specks."""
 MIN_VIEWS = 0.05
@@ -94,8 +101,13 @@ def fuse(
     Raises
     ------
     ValueError
-        No views or readings, one without a camera, voxels so small that a limit is passed, or no surface that reaches
-        `min_weight`.
+        No views or readings, one without a camera or with a pose that is not rigid, voxels so small that a limit is
+        passed or larger than half of what the readings extend over, or no surface that reaches `min_weight`.
+
+    Warns
+    -----
+    AlignmentWarning
+        Views whose readings lie farther from those of all others than they extend: a pose in millimetres, or inverted.
     """
     truncation = _checked(images, voxel_m, truncation_m, lookup)
     least = min(MIN_VIEWS * len(images), MAX_MIN_WEIGHT) if min_weight is None else min_weight
@@ -104,34 +116,70 @@ def fuse(
     relative = relative_weights(images, weights)
     _check_fineness(images, voxel_m)
     grid = _Blocks.near(images, relative, voxel_m, truncation)
+    _check_coarseness(grid.boxes, voxel_m)
+    _warn_of_views_apart(grid.boxes)
     for image, weight in zip(images, relative, strict=True):
         grid.add(image, weight, truncation, lookup)
     mesh, of_vertices = grid.surface(least, truncation)
     if not len(mesh.faces):
         raise ValueError(
             f"expected a surface that readings of weight {least:g} agree on, found none in {len(images)} views; check "
-            "their poses, or take larger voxels or a smaller min_weight."
+            "their poses (T_world_camera), or take another voxel_m or a smaller min_weight."
         )
     return FusedSurface(mesh, float(voxel_m), truncation, of_vertices, float(least), grid.voxels)
 
 
 def _checked(images: Sequence[RangeImage], voxel_m: float, truncation_m: float | None, lookup: str) -> float:
     """The truncation distance; ValueError on what cannot be fused."""
-    if not len(images):
+    if not isinstance(images, Sequence):
+        raise ValueError(f"expected a list of range images to fuse, such as `images` of a Scan, got {shown(images)}.")
+    if not images:
         raise ValueError("expected one view or more to fuse, got none.")
     for number, image in enumerate(images):
         if not isinstance(image, RangeImage):
             raise ValueError(f"expected range images to fuse, got {shown(image)} as number {number}.")
-        placed(image)
-    if not 0 < voxel_m <= MAX_COORDINATE_M:
-        raise ValueError(f"expected a positive voxel_m in metres, got {shown(voxel_m)}.")
+        placed(image, name=f"the pose of view {number}")
+    check_number("voxel_m", voxel_m, LENGTH)
     check_lookup(lookup)
+    if truncation_m is not None:
+        check_number("truncation_m", truncation_m, LENGTH)
     truncation = TRUNCATION_VOXELS * voxel_m if truncation_m is None else truncation_m
-    if not voxel_m <= truncation <= MAX_COORDINATE_M:
-        raise ValueError(
-            f"expected truncation_m of at least a voxel of {voxel_m:g} m, and finite, got {shown(truncation_m)}."
-        )
+    if truncation < voxel_m:
+        raise ValueError(f"expected truncation_m of at least a voxel of {voxel_m:g} m, got {truncation_m:g} m.")
+    # Around a single reading already
+    blocks = float(np.floor(2 * truncation / (BLOCK * voxel_m))) ** 3
+    limits.check("voxels", int(blocks) * BLOCK**3, f"voxels of {voxel_m:g} m within {truncation:g} m of a reading")
     return float(truncation)
+
+
+def _check_coarseness(boxes: np.ndarray, voxel_m: float) -> None:
+    """ValueError if all readings lie within two voxels: nothing would be left of them."""
+    extent = float((np.nanmax(boxes[:, 1], axis=0) - np.nanmin(boxes[:, 0], axis=0)).max())
+    if voxel_m > COARSEST * extent:
+        raise ValueError(
+            f"expected voxel_m of at most {COARSEST * extent:.2g}, half of what the readings extend over, got "
+            f"{voxel_m:g} m."
+        )
+
+
+def _warn_of_views_apart(boxes: np.ndarray) -> None:
+    """AlignmentWarning of views that read nothing near what any other reads: their poses are likely of another unit."""
+    gap = np.maximum(boxes[:, None, 0] - boxes[None, :, 1], boxes[None, :, 0] - boxes[:, None, 1]).max(axis=-1)
+    extent = (boxes[:, 1] - boxes[:, 0]).max(axis=-1)
+    apart = gap > np.maximum(extent[:, None], extent[None])  # False with NaN
+    np.fill_diagonal(apart, True)
+    has_readings = np.isfinite(extent)
+    alone = np.flatnonzero((apart | ~has_readings[None]).all(axis=1) & has_readings)
+    if len(alone) and has_readings.sum() > 1:
+        views = ", ".join(map(str, alone))
+        nearest_m = float(np.nanmin(np.where(np.eye(len(gap), dtype=bool), np.nan, gap)[alone]))
+        warnings.warn(
+            AlignmentWarning(
+                f"the readings of view {views} lie {nearest_m:.2g} m or more from those of any other; poses are "
+                "T_world_camera in metres."
+            ),
+            stacklevel=3,
+        )
 
 
 def _check_fineness(images: Sequence[RangeImage], voxel_m: float) -> None:
@@ -147,7 +195,8 @@ def _check_fineness(images: Sequence[RangeImage], voxel_m: float) -> None:
 class _Blocks:
     """Open3D's grid with all blocks that will be needed, whose arrays are filled in place.
 
-    origin : (3,) metres, world: where the grid has its zero, near the readings, for single precision.
+    origin : (3,) metres, world: where the grid has its zero, near the readings, for single precision. boxes : (n, 2, 3)
+    metres, world, lowest and highest corner of what each view reads; NaN of a view without readings.
     keys : (k, 3) int32, places of the blocks. rows : (k,) where their voxels stand in `total` and `weight`,
     (capacity, 8, 8, 8) float32, indexed [block, z, y, x]; first the sums, at the end the average in Open3D's sign.
     """
@@ -155,6 +204,7 @@ class _Blocks:
     grid: Any
     origin: np.ndarray
     voxel_m: float
+    boxes: np.ndarray
     keys: np.ndarray
     rows: np.ndarray
     total: np.ndarray
@@ -169,7 +219,8 @@ class _Blocks:
 
         core, edge = o3d.core, BLOCK * voxel_m
         places, origin = [np.zeros(0, np.int64)], None
-        for image, weight in zip(images, weights, strict=True):
+        boxes = np.full((len(images), 2, 3), np.nan)  # corners of what each view reads
+        for k, (image, weight) in enumerate(zip(images, weights, strict=True)):
             camera, T = placed(image)
             rays = camera.directions(camera.pixel_centres())
             counts = (weight > 0) & np.isfinite(image.z)
@@ -178,7 +229,8 @@ class _Blocks:
                 continue
             if origin is None:
                 origin = np.round(np.median(points, axis=0) / edge) * edge
-            local = _thinned(points - origin, voxel_m)
+            boxes[k] = points.min(axis=0), points.max(axis=0)
+            local, spread = _thinned(points - origin, voxel_m, truncation_m)
             extent = np.abs(local).max() + truncation_m
             if extent / edge >= KEY // 2 - 2:
                 raise ValueError(
@@ -188,7 +240,9 @@ class _Blocks:
                 ("tsdf",), (core.float32,), ((1,),), voxel_size=voxel_m, block_resolution=BLOCK, block_count=1
             )
             cloud = o3d.t.geometry.PointCloud(core.Tensor(local.astype(np.float32)))
-            near = grid.compute_unique_block_coordinates(cloud, truncation_m / voxel_m).numpy().astype(np.int64)
+            near = (
+                grid.compute_unique_block_coordinates(cloud, (truncation_m + spread) / voxel_m).numpy().astype(np.int64)
+            )
             x, y, z = near.T + KEY // 2
             places = [np.unique(np.concatenate([*places, (x * KEY + y) * KEY + z]))]
             limits.check("voxels", len(places[0]) * BLOCK**3, f"voxels of {voxel_m:g} m")
@@ -206,7 +260,7 @@ class _Blocks:
         rows, _ = grid.hashmap().activate(core.Tensor(keys))
         total, weight = (grid.attribute(name).numpy()[..., 0] for name in ("tsdf", "weight"))
         total[...], weight[...] = 0, 0
-        return cls(grid, origin, float(voxel_m), keys, rows.numpy(), total, weight)
+        return cls(grid, origin, float(voxel_m), boxes, keys, rows.numpy(), total, weight)
 
     @property
     def voxels(self) -> int:
@@ -269,15 +323,18 @@ class _Blocks:
         return np.where(has, self.weight[np.where(has, row, 0), z, y, x], 0).astype(np.float32)
 
 
-def _thinned(points: np.ndarray, voxel_m: float) -> np.ndarray:
-    """One of the points in each voxel of half the size, roughly: more tell nothing new of the blocks."""
-    if len(points) < 10_000:
-        return points
-    place = np.floor(points / (2 * voxel_m)).astype(np.int64)
+def _thinned(points: np.ndarray, voxel_m: float, truncation_m: float) -> tuple[np.ndarray, float]:
+    """One of the points in each cube of two voxels, roughly: more tell nothing new of the blocks; and metres by which
+    blocks have to reach farther, as the cubes are larger where the truncation distance is."""
+    is_wide = truncation_m > WIDE * voxel_m
+    if len(points) < 10_000 and not is_wide:
+        return points, 0.0
+    cube = truncation_m / 4 if is_wide else 2 * voxel_m
+    place = np.floor(points / cube).astype(np.int64)
     place -= place.min(axis=0)
     size = place.max(axis=0) + 1
     number = (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
-    return np.asarray(points[np.unique(number, return_index=True)[1]])
+    return np.asarray(points[np.unique(number, return_index=True)[1]]), cube * float(np.sqrt(3)) if is_wide else 0.0
 
 
 def _farthest(z: np.ndarray, weight: np.ndarray) -> np.ndarray:

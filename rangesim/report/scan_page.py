@@ -27,6 +27,7 @@ PICTURES = 3
 WIDTH_PX = 480
 SAMPLES = 20_000
 """Points on the mesh that the first sentence is about."""
+NOTHING_SEEN = "does the path look at them, and are its poses T_world_camera in metres?"
 SEEN, UNSEEN = (94, 147, 190), (222, 122, 60)
 STATE_COLORS = {VoxelState.NEVER_SEEN: (90, 90, 96), VoxelState.FREE: (240, 240, 236), VoxelState.SURFACE: SEEN}
 STATE_NAMES = {
@@ -70,6 +71,8 @@ def context(result: ScanResult) -> dict[str, Any]:
         "shapes": [_shape_cells(result, name) for name in result.errors],
         "views": [_view_cells(result, k) for k in range(number)],
         "poses_found": result.poses is not None,
+        "truncation_mm": f"{1e3 * fused.truncation_m:.3g}",
+        "min_weight": f"{fused.min_weight:.2g}",
         "voxel_mm": f"{1e3 * fused.voxel_m:.3g}",
         "grid_mm": "-" if result.seen is None else f"{1e3 * result.seen.grid.voxel_m:.3g}",
         "fractions": []
@@ -102,13 +105,15 @@ def _line(result: ScanResult) -> str:
 
 def _verdict(result: ScanResult) -> list[str]:
     """Sentences: how right, how complete, what was never seen."""
-    truth = TriangleMesh.joined(list(result.surfaces.values()))
-    off = distances_to(result.fused.mesh.sample(SAMPLES)[0], truth)
-    within = float((off <= result.fused.voxel_m).mean())
-    said = [
-        f"Half of the fused surface lies within {1e3 * float(np.median(off)):.2g} mm of the true one, "
-        f"{_percent(within)} within a voxel."
-    ]
+    off = _distances_of_things(result)
+    of = "" if len(result.things) == len(result.surfaces) else ", background left out,"
+    said = [f"No view measured any of {_count(len(result.things), 'thing')}: {NOTHING_SEEN}"]
+    if len(off):
+        within = float((off <= result.fused.voxel_m).mean())
+        said = [
+            f"Half of the fused surface{of} lies within {1e3 * float(np.median(off)):.2g} mm of the true one, "
+            f"{_percent(within)} within a voxel."
+        ]
     if result.seen is not None:
         areas = {n: s.area_m2 for n, s in result.seen.shapes.items()}
         seen = sum(areas[n] * s.surface for n, s in result.seen.shapes.items()) / sum(areas.values())
@@ -125,6 +130,14 @@ def _verdict(result: ScanResult) -> list[str]:
             f"{1e3 * result.poses.centre_m.max():.2g} mm at worst."
         )
     return said
+
+
+def _distances_of_things(result: ScanResult) -> np.ndarray:
+    """(n,) metres, from the truth, of samples of the mesh that are nearest to a thing, not to background."""
+    points = result.fused.mesh.sample(SAMPLES)[0]
+    off = np.stack([distances_to(points, surface) for surface in result.surfaces.values()])
+    is_thing = np.array([name in result.things for name in result.surfaces])
+    return np.asarray(off.min(axis=0)[is_thing[off.argmin(axis=0)]])
 
 
 def _row(
@@ -175,7 +188,9 @@ def _slices(result: ScanResult) -> list[dict[str, str]]:
     states, truth = result.seen.states, result.seen.truth
     solid = truth >= 0
     if solid.any():
-        middle = [int(np.argmax(solid.sum(axis=tuple(j for j in range(3) if j != axis)))) for axis in (2, 1)]
+        # Half of the solid lies on either side: the fullest slice is often the one that touches the table
+        filled_to = [np.cumsum(solid.sum(axis=tuple(j for j in range(3) if j != axis))) for axis in (2, 1)]
+        middle = [int(np.searchsorted(c, c[-1] / 2)) for c in filled_to]
     else:
         middle = [states.shape[2] // 2, states.shape[1] // 2]
     made = []
