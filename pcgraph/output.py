@@ -47,6 +47,7 @@ MANIFEST_FORMAT = "rangesim-manifest"
 MANIFEST_VERSION = 1
 MAX_MANIFEST_BYTES = 64 << 20
 _JOURNAL, _LOCK, _WORK, _NEW, _OLD, _DOOMED = "journal.json", "lock", "work", "new", "old", "doomed"
+_ATTEMPTS = 1000  # at a directory whose owner removes it just then
 
 
 @dataclass(frozen=True)
@@ -298,8 +299,12 @@ class _Staging:
         with _claims_lock:
             claim = cls(target)
             try:
-                while not claim.take(kind):
+                for _ in range(_ATTEMPTS):
+                    if claim.take(kind):
+                        break
                     time.sleep(0.001)
+                else:
+                    raise kind.error(f"{named} cannot be made, or is gone as soon as it is made; name another place.")
                 if claim.handle is None:
                     raise kind.error(f"another process is writing to {named}; wait for it, or name another place.")
                 _carry_out(target)

@@ -230,6 +230,19 @@ def test_links_to_directories_are_written_through(tmp_path: Path, monkeypatch: p
     assert contents(tmp_path / "here") == OLD
 
 
+def test_a_place_that_never_comes_into_being_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in /proc, where making a directory says that there is none; it was once tried for ever."""
+    monkeypatch.setattr(output, "_ATTEMPTS", 20)
+
+    def vanishes(path: Path, *_: object, **__: object) -> None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", vanishes)
+    with pytest.raises(Refused, match="cannot be made"):
+        publish(tmp_path / "n", NEW)
+    assert not (tmp_path / "n").exists()
+
+
 def test_two_at_a_time_are_told_apart(tmp_path: Path) -> None:
     publish(tmp_path / "n", OLD)
     with new_directory(tmp_path / "n", KIND) as folder:
