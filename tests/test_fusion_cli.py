@@ -57,6 +57,7 @@ def test_a_scan_writes_mesh_poses_views_and_statistics(scanned: Path) -> None:
     again = scan_settings_from_dict(record["settings"])
     assert again.path == Turntable(4)
     assert scan_settings_to_dict(again) == record["settings"]
+    assert "encloses no voxel: can, can_lid." in (scanned / "report.html").read_text()  # a tube and a disc
     result = CliRunner().invoke(app, ["verify", str(scanned)])
     assert result.exit_code == 0, result.output
 

@@ -75,6 +75,7 @@ def context(result: ScanResult) -> dict[str, Any]:
         "min_weight": f"{fused.min_weight:.2g}",
         "voxel_mm": f"{1e3 * fused.voxel_m:.3g}",
         "grid_mm": "-" if result.seen is None else f"{1e3 * result.seen.grid.voxel_m:.3g}",
+        "open_shapes": _open_shapes(result),
         "fractions": []
         if result.seen is None
         else [(STATE_NAMES[s], _percent(result.seen.fraction(s))) for s in STATE_NAMES],
@@ -204,6 +205,13 @@ def _slices(result: ScanResult) -> list[dict[str, str]]:
             picture = picture.repeat(larger, axis=0).repeat(larger, axis=1)
             made.append({"uri": figures.png(picture), "alt": title, "note": title})
     return made
+
+
+def _open_shapes(result: ScanResult) -> list[str]:
+    """Names of the things whose surface encloses no voxel: it is not closed, or they are thin."""
+    if result.seen is None:
+        return []
+    return [name for name, seen in result.seen.shapes.items() if np.isnan(seen.volume_surface)]
 
 
 def _shape_cells(result: ScanResult, name: str) -> list[str]:
