@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim import limits
 from rangesim.electronics.ambient import Ambient
-from rangesim.errors import FileFormatError
 from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
-from rangesim.files.bundled_scenes import scene_names
-from rangesim.files.text_files import read_toml
+from rangesim.files.settings_files import load_settings
 from rangesim.motion import Motion
 from rangesim.motion.track import motion_from_dict
 from rangesim.settings.bounds import Metres, check_fields, whole
@@ -107,16 +105,7 @@ def load_experiment(path: str | Path) -> Experiment:
     FileFormatError
         The file is missing or no valid TOML, or holds an unknown key or a bad value; the message names the place.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileFormatError(f"{path} does not exist; expected an experiment (.toml).")
-    try:
-        experiment = experiment_from_dict(read_toml(path), path.parent)
-    except ValueError as error:
-        raise FileFormatError(f"{path}: {error}") from error
-    beside = path.parent / experiment.scene
-    comes_along = experiment.scene in scene_names() and not beside.is_file()
-    return experiment if comes_along else replace(experiment, scene=str(beside))
+    return load_settings(path, "an experiment", experiment_from_dict)
 
 
 def experiment_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> Experiment:

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim import limits
 from rangesim.electronics.ambient import Ambient
-from rangesim.errors import FileFormatError
 from rangesim.experiment.instrument import Instrument, instrument, instrument_from_dict
-from rangesim.files.bundled_scenes import scene_names
-from rangesim.files.text_files import read_toml
+from rangesim.files.settings_files import load_settings
 from rangesim.fusion.paths import Path, Turntable
 from rangesim.settings.bounds import Bounds, Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
@@ -86,16 +84,7 @@ def load_scan_settings(file: str | FilePath) -> ScanSettings:
     FileFormatError
         The file is missing or no valid TOML, or holds an unknown key or a bad value; the message names the place.
     """
-    file = FilePath(file)
-    if not file.is_file():
-        raise FileFormatError(f"{file} does not exist; expected the settings of a scan (.toml).")
-    try:
-        settings = scan_settings_from_dict(read_toml(file), file.parent)
-    except ValueError as error:
-        raise FileFormatError(f"{file}: {error}") from error
-    beside = file.parent / settings.scene
-    comes_along = settings.scene in scene_names() and not beside.is_file()
-    return settings if comes_along else replace(settings, scene=str(beside))
+    return load_settings(file, "the settings of a scan", scan_settings_from_dict)
 
 
 def scan_settings_from_dict(data: Mapping[str, Any], files_in: FilePath | None = None) -> ScanSettings:
