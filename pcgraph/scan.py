@@ -37,7 +37,7 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
-from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means
+from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import bounding_box, median_spacing, spacing_law
 from pcgraph.voxels.surface import Surface
@@ -52,7 +52,8 @@ _MANY_SUPERVOXELS = 800
 _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 RANGE_GROWTH = 0.5
 _FEW_OUTLIERS = 0.95  # of the points are left
-_MIN_JOINED = 0.75  # of the voxels
+_MIN_JOINED = 0.75  # of the voxels have
+_AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
 _MIN_VOXELS = 500
 
@@ -408,22 +409,20 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGr
 
     On a surface most voxels have at least five others around them. What is no surface at any size, as a line, stays.
     """
-    if _joined(grid) >= _MIN_JOINED:
-        return grid
-    larger = grid
-    for _ in range(_ENLARGEMENTS):
-        if math.sqrt(2.0) * larger.size > largest:
+    cells, degrees, size = [grid.cells, grid.cells], np.diff(grid.indptr), grid.size
+    for step in range(_ENLARGEMENTS + 1):
+        if np.mean(degrees >= _AROUND_ON_SURFACE) >= _MIN_JOINED:
+            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features) if step else grid
+        size *= math.sqrt(2.0)
+        if size > largest:
             break
-        larger = voxel_grid(cloud.points, cloud.colors, math.sqrt(2.0) * larger.size, grid.warp, cloud.features)
-        if larger.n_voxels < _MIN_VOXELS:
+        # After two steps eight cells are one, so that only the first step needs the points.
+        scaled = cells[0] / 2.0 if step else grid.warp.forward(cloud.points) / size
+        larger, degrees = occupied_cells(scaled, size)
+        if len(larger) < _MIN_VOXELS:
             break
-        if _joined(larger) >= _MIN_JOINED:
-            return larger
+        cells = [cells[1], larger]
     return grid
-
-
-def _joined(grid: VoxelGrid) -> float:
-    return float((np.diff(grid.indptr) >= 5).mean())
 
 
 def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float | None) -> bool:

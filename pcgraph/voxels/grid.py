@@ -23,6 +23,7 @@ MAX_NEIGHBOURS = 26
 """Voxels around a voxel."""
 MAX_GAP = 3.0
 """Voxel edges between the means of two voxels, at most, that a gap lies between."""
+_DIGIT = 8  # bits
 _AMID = 8  # voxels around one amid a surface
 
 
@@ -281,15 +282,36 @@ def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int6
 def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys, none negative, in ascending order, and where each was; equal ones stay in their order.
 
-    Key and place go into one number where they fit, as numbers sort three times faster than their places do.
+    By their digits, the last first: keys span few bits, so this is four to seven times as fast as comparing them.
     """
-    bits = int(len(keys) - 1).bit_length()
-    if int(keys.max()) >= 1 << (62 - bits):
-        order = np.argsort(keys, kind="stable")
-        return keys[order], order
-    both = (keys << bits) | np.arange(len(keys))
-    both.sort()
-    return both >> bits, both & ((1 << bits) - 1)
+    n_digits = max(-(-int(keys.max()).bit_length() // _DIGIT), 1)
+    return _sort_by_digits(keys, n_digits)
+
+
+@kernel
+def _sort_by_digits(keys: NDArray[np.int64], n_digits: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5)."""
+    n, mask = len(keys), (1 << _DIGIT) - 1
+    starts = np.zeros((n_digits, 1 << _DIGIT), np.int64)
+    for i in range(n):
+        for digit in range(n_digits):
+            starts[digit, (keys[i] >> (digit * _DIGIT)) & mask] += 1
+    ordered, order = keys.copy(), np.arange(n)
+    room, places = np.empty_like(ordered), np.empty_like(order)
+    for digit in range(n_digits):
+        start, shift = starts[digit], digit * _DIGIT
+        if start.max() == n:
+            continue  # all have the same
+        total = 0
+        for value in range(len(start)):
+            start[value], total = total, total + start[value]
+        for i in range(n):
+            value = (ordered[i] >> shift) & mask
+            at = start[value]
+            start[value] = at + 1
+            room[at], places[at] = ordered[i], order[i]
+        ordered, room, order, places = room, ordered, places, order
+    return ordered, order
 
 
 @kernel
@@ -321,6 +343,29 @@ def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:
 # --- which occupied voxels touch ---
 
 
+def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Cells that hold places, (v, 3) float64, ascending, and how many of the 26 around each do, (v,) int64.
+
+    Parameters
+    ----------
+    scaled : (n, 3) float64
+        Places in units of a cell.
+    size : float, metres
+        Edge length of a cell, for the message.
+
+    Raises
+    ------
+    ValueError
+        The places span so many cells that a grid coordinate cannot be written as a whole number.
+    """
+    keys, pitch = cell_keys(scaled, size)
+    ordered, order = sorted_keys(keys)
+    first = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1))
+    degrees = np.empty(len(first), np.int64)
+    in_blocks(_walk, len(first), ordered[first], *pitch, degrees, np.empty((len(first), 0), np.int32))
+    return np.floor(scaled[order[first]]), degrees
+
+
 def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Neighbourhood:
     """The 26-neighbourhood of occupied voxels.
 
@@ -350,8 +395,9 @@ def _walk(
     counts: NDArray[np.int64],
     room: NDArray[np.int32],
 ) -> None:
-    """The lists, one row each: nine pointers walk the sorted keys, each along one row of three voxels around."""
-    n = len(keys)
+    """The lists, one row each, or but their lengths where there is no room: nine pointers walk the sorted keys, each
+    along one row of three voxels around."""
+    n, lists = len(keys), room.shape[1] > 0
     pointers = np.empty(9, np.int64)
     shifts = np.empty(9, np.int64)
     for row in range(9):
@@ -374,7 +420,8 @@ def _walk(
             pointers[row] = at
             while at < n and keys[at] <= target + 2:
                 if at != i:
-                    room[i, count] = at
+                    if lists:
+                        room[i, count] = at
                     count += 1
                 at += 1
         counts[i] = count
