@@ -141,14 +141,15 @@ class CleanCloud(ShortRepr):
 
     def without(self, outliers: NDArray[np.bool_]) -> CleanCloud:
         """The points but for some, (n,) bool."""
+        left = np.flatnonzero(~outliers)
         return replace(
             self,
-            points=self.points[~outliers],
-            colors=None if self.colors is None else self.colors[~outliers],
-            normals=None if self.normals is None else self.normals[~outliers],
-            kept=self.kept[~outliers],
+            points=self.points.take(left, axis=0),
+            colors=None if self.colors is None else self.colors.take(left, axis=0),
+            normals=None if self.normals is None else self.normals.take(left, axis=0),
+            kept=self.kept[left],
             outliers=np.sort(np.concatenate((self.outliers, self.kept[outliers]))),
-            features=None if self.features is None else self.features[~outliers],
+            features=None if self.features is None else self.features.take(left, axis=0),
         )
 
 

@@ -30,8 +30,8 @@ MIN_ROWS = 16
 """The same for elements that are rows of an image."""
 
 
-def in_blocks(loop: Callable[..., None], n: int, *arguments: object, smallest: int = MIN_BLOCK) -> None:
-    """Run `loop(start, stop, *arguments)` for blocks that cover 0..n, at the same time.
+def in_blocks(loop: Callable[..., _A], n: int, *arguments: object, smallest: int = MIN_BLOCK) -> list[_A]:
+    """What `loop(start, stop, *arguments)` returns for blocks that cover 0..n, run at the same time, block by block.
 
     Threads are started anew and joined: no pool outlives the call, so a process may fork at any time and
     several threads may call at once. As many run as ``NUMBA_NUM_THREADS`` says, by default one per core.
@@ -49,13 +49,11 @@ def in_blocks(loop: Callable[..., None], n: int, *arguments: object, smallest: i
     blocks = max(1, min(int(config.NUMBA_NUM_THREADS), n // smallest))
     bounds = [n * block // blocks for block in range(blocks + 1)]
     if blocks == 1:
-        loop(0, n, *arguments)
-        return
+        return [loop(0, n, *arguments)]
     with ThreadPoolExecutor(blocks - 1) as pool:
         others = [pool.submit(loop, bounds[b], bounds[b + 1], *arguments) for b in range(1, blocks)]
-        loop(bounds[0], bounds[1], *arguments)
-    for other in others:
-        other.result()  # raises what the loop raised
+        first = loop(bounds[0], bounds[1], *arguments)
+    return [first, *(other.result() for other in others)]  # raises what a loop raised
 
 
 def side_by_side(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
+from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.grid import MAX_GAP, VoxelGrid, boundary_voxels, voxels_within
 
 
@@ -30,7 +31,7 @@ def gaps(
         Supervoxel of each voxel.
     nodes : NodeFeatures of k supervoxels
     touching : (m, 2) int32
-        Pairs of supervoxels that touch, the smaller first.
+        Pairs of supervoxels that touch, the smaller first, ascending.
 
     Notes
     -----
@@ -40,10 +41,11 @@ def gaps(
     boundary = np.flatnonzero(boundary_voxels(grid))
     near = voxels_within(grid, boundary, MAX_GAP, boundary, later=True)
     source, target = np.repeat(boundary, np.diff(near.indptr)), near.neighbours
+    starts = np.searchsorted(touching[:, 0], np.arange(k + 1))
+    apart = np.empty(len(source), np.bool_)
+    in_blocks(_find_apart, len(source), source, target, supervoxels, starts, touching[:, 1].copy(), apart)
+    source, target = source[apart], target[apart]
     key = _keys(supervoxels[source], supervoxels[target], k)
-    apart = supervoxels[source] != supervoxels[target]
-    apart[apart] = ~np.isin(key[apart], _keys(touching[:, 0], touching[:, 1], k))
-    source, target, key = source[apart], target[apart], key[apart]
     width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / grid.size, axis=1)
     key, width = np.tile(key, 2), np.tile(width, 2)  # each side of each pair
     voxel, other = np.concatenate((source, target)), np.concatenate((supervoxels[target], supervoxels[source]))
@@ -62,6 +64,31 @@ def gaps(
     np.minimum.at(shortest, edge, width)
     weights = np.bincount(edge, np.exp(1.0 - width), len(edges)).astype(np.float64)
     return Gaps(edges, edge_features(nodes, facing), shortest, weights)
+
+
+@kernel
+def _find_apart(
+    start: int,
+    stop: int,
+    source: NDArray[np.int64],
+    target: NDArray[np.int32],
+    supervoxels: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    touching: NDArray[np.int32],
+    apart: NDArray[np.bool_],
+) -> None:
+    """Set which pairs of voxels belong to two supervoxels that do not touch.
+
+    ``touching[starts[a]:starts[a + 1]]`` are the larger supervoxels that supervoxel a touches.
+    """
+    for i in range(start, stop):
+        a, b = supervoxels[source[i]], supervoxels[target[i]]
+        smaller, larger = min(a, b), max(a, b)
+        apart[i] = a != b
+        for at in range(starts[smaller], starts[smaller + 1]):
+            if touching[at] == larger:
+                apart[i] = False
+                break
 
 
 def _keys(a: NDArray[np.int32], b: NDArray[np.int32], k: np.int64) -> NDArray[np.int64]:

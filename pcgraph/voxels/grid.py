@@ -24,6 +24,7 @@ MAX_NEIGHBOURS = 26
 MAX_GAP = 3.0
 """Voxel edges between the means of two voxels, at most, that a gap lies between."""
 _DIGIT = 8  # bits
+_END = np.iinfo(np.int64).max
 _AMID = 8  # voxels around one amid a surface
 
 
@@ -105,27 +106,51 @@ class VoxelGrid(ShortRepr):
 def grid_without(grid: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
     """The grid without some of its voxels, (v,) bool, and without their points."""
     stays, point_stays = ~voxels, ~voxels[grid.voxel_of_point]
+    kept = np.flatnonzero(stays)
     number = np.cumsum(stays, dtype=np.int32) - 1
     point_number = np.cumsum(point_stays) - 1
-    source = np.repeat(np.arange(grid.n_voxels), np.diff(grid.indptr))
-    pairs = stays[source] & stays[grid.neighbours]
-    degrees = np.bincount(source[pairs], minlength=grid.n_voxels)[stays]
-    counts = grid.counts[stays]
+    degrees = np.empty(len(kept), np.int64)
+    neighbours = np.concatenate(in_blocks(_kept_neighbours, len(kept), kept, grid.neighbourhood, stays, number, degrees))
+    counts = grid.counts[kept]
     return replace(
         grid,
-        cells=grid.cells[stays],
+        cells=grid.cells.take(kept, axis=0),
         voxel_of_point=number[grid.voxel_of_point[point_stays]],
-        order=point_number[grid.order[point_stays[grid.order]]],
+        order=point_number[grid.order[np.repeat(stays, np.diff(grid.starts))]],
         starts=np.concatenate(([0], np.cumsum(counts))),
         counts=counts,
-        warped=grid.warped[stays],
-        centroids=grid.centroids[stays],
-        edge_lengths=grid.edge_lengths[stays],
-        colors=None if grid.colors is None else grid.colors[stays],
+        warped=grid.warped.take(kept, axis=0),
+        centroids=grid.centroids.take(kept, axis=0),
+        edge_lengths=grid.edge_lengths[kept],
+        colors=None if grid.colors is None else grid.colors.take(kept, axis=0),
         indptr=np.concatenate(([0], np.cumsum(degrees))),
-        neighbours=number[grid.neighbours[pairs]],
-        features=None if grid.features is None else grid.features[stays],
+        neighbours=neighbours,
+        features=None if grid.features is None else grid.features.take(kept, axis=0),
     )
+
+
+@kernel
+def _kept_neighbours(
+    start: int,
+    stop: int,
+    kept: NDArray[np.int64],
+    grid: Neighbourhood,
+    stays: NDArray[np.bool_],
+    number: NDArray[np.int32],
+    degrees: NDArray[np.int64],
+) -> NDArray[np.int32]:
+    """New numbers of the neighbours that stay, one kept voxel after the other, and how many each has, in `degrees`."""
+    first, last = (grid.indptr[kept[start]], grid.indptr[kept[stop - 1] + 1]) if start < stop else (0, 0)
+    found, n = np.empty(last - first, np.int32), 0
+    for i in range(start, stop):
+        before = n
+        for at in range(grid.indptr[kept[i]], grid.indptr[kept[i] + 1]):
+            j = grid.neighbours[at]
+            if stays[j]:
+                found[n] = number[j]
+                n += 1
+        degrees[i] = n - before
+    return found[:n]
 
 
 def voxel_grid(
@@ -471,12 +496,8 @@ def voxels_within(
     places, counts = grid.warped / grid.size, np.zeros(len(voxels), np.int64)
     around = _Places(keys[voxels], places[voxels])
     sought = _Places(keys, places) if among is None else _Places(keys[among], places[among])
-    nothing: NDArray[np.int32] = np.empty(0, np.int32)
-    in_blocks(_within, len(voxels), around, sought, pitch, reach, later, counts, counts, nothing)
+    found = np.concatenate(in_blocks(_within, len(voxels), around, sought, pitch, reach, later, counts))
     indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
-    found = np.empty(indptr[-1], np.int32)
-    if len(found):
-        in_blocks(_within, len(voxels), around, sought, pitch, reach, later, counts, indptr, found)
     return Neighbourhood(indptr, found if among is None else among.astype(np.int32)[found])
 
 
@@ -497,21 +518,22 @@ def _within(
     reach: float,
     later: bool,
     counts: NDArray[np.int64],
-    indptr: NDArray[np.int64],
-    found: NDArray[np.int32],
-) -> None:
-    """Count the voxels around, or list them where there is room: pointers gallop along the sorted keys, one per row."""
+) -> NDArray[np.int32]:
+    """The lists one after the other, and their lengths in `counts`: pointers gallop along the sorted keys, one per
+    row."""
     keys, places = sought.keys, sought.means
     n, cells = len(keys), int(np.ceil(reach))
     rows = 2 * cells + 1
     first_row = rows * rows // 2 if later else 0
-    pointers = np.empty(rows * rows, np.int64)
-    for row in range(rows * rows):
-        pointers[row] = 0
+    pointers = np.zeros(rows * rows, np.int64)
+    ahead = np.full(rows * rows, keys[0] if n else 0)  # keys at the pointers
+    n_found, found = 0, np.empty(1024, np.int32)
     for v in range(start, stop):
-        own, mean, count = around.keys[v], around.means[v], 0
+        own, mean, before = around.keys[v], around.means[v], n_found
         for row in range(first_row, rows * rows):
             middle = own + (row // rows - cells) * pitch[0] + (row % rows - cells) * pitch[1]
+            if ahead[row] > middle + cells:
+                continue
             first = own + 1 if later and row == first_row else middle - cells
             at, step = pointers[row], 1
             while at + step < n and keys[at + step] < first:
@@ -524,15 +546,18 @@ def _within(
             if at < n and keys[at] < first:
                 at += 1
             pointers[row] = at
+            ahead[row] = keys[at] if at < n else _END
             while at < n and keys[at] <= middle + cells:
                 if keys[at] != own:
                     x, y, z = places[at, 0] - mean[0], places[at, 1] - mean[1], places[at, 2] - mean[2]
                     if x * x + y * y + z * z <= reach * reach:
-                        if len(found):
-                            found[indptr[v] + count] = at
-                        count += 1
+                        if n_found == len(found):
+                            found = np.concatenate((found, np.empty_like(found)))
+                        found[n_found] = at
+                        n_found += 1
                 at += 1
-        counts[v] = count
+        counts[v] = n_found - before
+    return found[:n_found]
 
 
 # --- two scans of one scene in one grid ---

@@ -54,9 +54,8 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     in_blocks(_count_around, grid.n_voxels, grid.indptr, grid.neighbours, grid.counts, around)
     if n_points < _MIN_POINTS:  # only now: the cloud that kernels are warmed up on is small
         return nothing
-    order = np.argsort(around, kind="stable")
-    points = np.cumsum(grid.counts[order])
-    typical = float(around[order[np.searchsorted(points, (n_points + 1) // 2)]])  # median over the points
+    points = np.cumsum(np.bincount(around, grid.counts))
+    typical = float(np.searchsorted(points, (n_points + 1) // 2))  # median over the points
     sparse = around <= _SPARSE * typical
     low, high = bounding_box(grid.cells)
     volume = float(np.prod(np.maximum(high - low + 1.0, _MIN_EXTENT)))
