@@ -48,6 +48,8 @@ _MAX_BINS = 512  # along each side: a map that stays in the cache
 _SLANTED = 8.0  # widths between squares of one surface of which one may seem to hide the other
 _STEEPEST = 4.0  # of a square that is seen at a slant: tangent of its angle
 _TINY = 1e-12
+_NOTHING = np.iinfo(np.int64).max
+_NUMBER = (1 << 32) - 1
 _FAR = 1e3  # voxel edges from a voxel to its orientation point
 
 
@@ -455,39 +457,45 @@ def _look(
     normals: NDArray[np.float64],
     seen: NDArray[np.bool_],
 ) -> None:
-    """Set what is seen from each place, by the least range in each bin of directions that a square may cover."""
+    """Set what is seen from each place, by the least range in each bin of directions that a square may cover.
+
+    A bin holds the range, whose bits as a float32 sort as it does, above the number of the square that has it.
+    """
     n = len(centres)
-    at, ranges, per_radian = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
+    at, before = np.empty(n, np.int32), np.empty(n, np.float32)  # what is nearer than this hides the square
     for k in range(start, stop):
         bins = bins_of[k]
-        nearest, first = np.empty(bins * bins, np.float32), np.empty(bins * bins, np.int32)
-        for b in range(bins * bins):
-            nearest[b] = np.inf
+        nearest = np.full(bins * bins, _NOTHING)
         for i in range(n):
             x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
-            ranges[i] = math.sqrt(x * x + y * y + z * z)
-            if ranges[i] <= 0.0:
-                at[i], per_radian[i] = -1, 1.0
+            distance = math.sqrt(x * x + y * y + z * z)
+            if distance <= 0.0:
+                at[i] = -1
                 continue
             u, v = _bin_of(x, y, z, bins)
             at[i] = min(int(u), bins - 1) * bins + min(int(v), bins - 1)
-            per_radian[i] = 0.5 * bins * ranges[i] / (abs(x) + abs(y) + abs(z))  # at most, of the octahedral map
-            cosine = abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / ranges[i]
-            slope = min(math.sqrt(max(1.0 - cosine * cosine, 0.0)) / max(cosine, _TINY), _STEEPEST) / per_radian[i]
-            half = min(0.6 * widths[i] / ranges[i] * per_radian[i], 24.0)
-            for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
-                for q in range(max(int(v - half), 0), min(int(v + half), bins - 1) + 1):
-                    off = max(abs(p + 0.5 - u), abs(q + 0.5 - v), 0.5) - 0.5  # beside its centre it may be farther
-                    reaches = ranges[i] * np.float32(1.0 + slope * off)
-                    if reaches < nearest[p * bins + q]:
-                        nearest[p * bins + q] = reaches
-                        first[p * bins + q] = i
-        for i in range(n):
+            per_radian = 0.5 * bins * distance / (abs(x) + abs(y) + abs(z))  # at most, of the octahedral map
             # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-            depth = widths[i] + 0.5 * ranges[i] / per_radian[i]
-            seen[k, i] = at[i] >= 0 and (
-                ranges[i] <= nearest[at[i]] + depth or _on_one_surface(i, first[at[i]], centres, widths, normals)
-            )
+            before[i] = distance - widths[i] - 0.5 * distance / per_radian
+            cosine = abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / distance
+            slope = min(math.sqrt(max(1.0 - cosine * cosine, 0.0)) / max(cosine, _TINY), _STEEPEST) / per_radian
+            half = min(0.6 * widths[i] / distance * per_radian, 24.0)
+            first, last = max(int(v - half), 0), min(int(v + half), bins - 1)
+            for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
+                off = max(abs(p + 0.5 - u) - 0.5, 0.0)
+                for q in range(first, last + 1):
+                    beside = max(off, abs(q + 0.5 - v) - 0.5)  # beside its centre it may be farther
+                    bits = np.float32(distance * (1.0 + slope * beside)).view(np.int32)
+                    nearest[p * bins + q] = min(nearest[p * bins + q], np.int64(bits) << 32 | i)
+        for i in range(n):
+            seen[k, i] = at[i] >= 0
+            if seen[k, i]:
+                front = nearest[at[i]]
+                too_far = before[i] - np.int32(front >> 32).view(np.float32)
+                seen[k, i] = too_far <= 0.0 or (
+                    too_far < _SLANTED * widths[i]
+                    and _on_one_surface(i, front & _NUMBER, centres, widths, normals)
+                )
 
 
 @kernel
