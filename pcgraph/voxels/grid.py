@@ -184,8 +184,8 @@ def voxel_grid(
     ordered, order = sorted_keys(keys)
     starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
     n_voxels = len(starts) - 1
-    voxel_of_point, warped = np.empty(len(points), np.int32), np.empty((n_voxels, 3))
-    in_blocks(_gather, n_voxels, starts, order, scaled, voxel_of_point, warped)
+    voxel_of_point, cells, warped = np.empty(len(points), np.int32), np.empty((n_voxels, 3)), np.empty((n_voxels, 3))
+    in_blocks(_gather, n_voxels, starts, order, scaled, voxel_of_point, cells, warped)
     warped *= size
     centroids = warp.backward(warped)
     if colors is not None:
@@ -194,7 +194,7 @@ def voxel_grid(
     return VoxelGrid(
         size=size,
         warp=warp,
-        cells=np.floor(scaled[order[starts[:-1]]]),
+        cells=cells,
         voxel_of_point=voxel_of_point,
         order=order,
         starts=starts,
@@ -230,13 +230,15 @@ def _gather(
     order: NDArray[np.int64],
     scaled: NDArray[np.float64],
     voxel_of_point: NDArray[np.int32],
+    cells: NDArray[np.float64],
     warped: NDArray[np.float64],
 ) -> None:
-    """Set the voxel of each point, and the mean of each voxel's points in units of a voxel."""
+    """Set the voxel of each point, each voxel's cell, and the mean of its points in units of a voxel."""
     for v in range(start, stop):
         x = y = z = np.int64(0)
         first = order[starts[v]]
         cell_x, cell_y, cell_z = np.floor(scaled[first, 0]), np.floor(scaled[first, 1]), np.floor(scaled[first, 2])
+        cells[v, 0], cells[v, 1], cells[v, 2] = cell_x, cell_y, cell_z
         for at in range(starts[v], starts[v + 1]):
             p = order[at]
             voxel_of_point[p] = v
@@ -388,7 +390,7 @@ def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np
     first = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1))
     degrees = np.empty(len(first), np.int64)
     in_blocks(_walk, len(first), ordered[first], *pitch, degrees, np.empty((len(first), 0), np.int32))
-    return np.floor(scaled[order[first]]), degrees
+    return np.floor(scaled.take(order[first], axis=0)), degrees
 
 
 def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Neighbourhood:
@@ -435,14 +437,18 @@ def _walk(
             else:
                 high = middle
         pointers[row] = low
+    ahead = np.zeros(9, np.int64)  # keys at the pointers, once these are where they belong
     for i in range(start, stop):
         count = 0
         for row in range(9):
             target = keys[i] + shifts[row]
+            if ahead[row] > target + 2:
+                continue
             at = pointers[row]
             while at < n and keys[at] < target:
                 at += 1
             pointers[row] = at
+            ahead[row] = keys[at] if at < n else _END
             while at < n and keys[at] <= target + 2:
                 if at != i:
                     if lists:
