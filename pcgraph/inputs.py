@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.cloud import Cloud
 from pcgraph.columns import RobustScaling
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.spacing import bounding_box
+from pcgraph.voxels.cells import bounding_box
 
 _SMALLEST = 1e-250
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow

@@ -8,8 +8,9 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid
-from pcgraph.voxels.spacing import bounding_box, median_spacing
+from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.visibility import visible_fraction
 
 _STEPS_PER_SPACING = 4.0  # of floating-point numbers: fewer, and points lie on a lattice of rounding

@@ -37,9 +37,10 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
+from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
-from pcgraph.voxels.spacing import bounding_box, median_spacing, spacing_law
+from pcgraph.voxels.spacing import median_spacing, spacing_law
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp

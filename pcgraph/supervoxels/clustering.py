@@ -14,7 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
-from pcgraph.voxels.grid import VoxelGrid, cell_keys, sorted_keys
+from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
+from pcgraph.voxels.grid import VoxelGrid
 
 EARLY_SWEEPS = 1.8
 """Times seed size over voxel size: sweeps in which PCL's supervoxels take voxels from each other."""
@@ -195,7 +196,7 @@ def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float,
     """
     keys, _ = cell_keys(grid.warped / seed_size, seed_size)
     ordered, order = sorted_keys(keys)
-    starts = np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(keys)]))
+    starts = starts_of_runs(ordered)
     ratio = seed_size / grid.size  # a cell counts if it holds a tenth of a plane, or half of a line
     enough = min(0.1 * ratio * ratio, 0.5 * ratio)
     return np.sort(_seeds_of_cells(grid.warped, normals, order, starts, enough, two_sided))

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
 from pcgraph.parallel import in_blocks, kernel
+from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, VoxelGrid, boundary_voxels, voxels_within
-from pcgraph.voxels.spacing import bounding_box
 
 OUTLIER = -2
 """Label of a point that belongs to nothing."""

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
+from pcgraph.voxels.cells import bounding_box
 
 _SAMPLE = 4096  # points whose nearest neighbour is sought
 _CROWD = 1 << 16  # points among which it is sought, about
@@ -30,16 +31,6 @@ _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
 _MIN_EXPONENT_OF_HALF = 0.3
 _OWN_ORIGIN = 0.1  # explained variance by which another place must beat the frame's origin
-
-
-def bounding_box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest coordinates, (3,) each, of points (n, 3), n >= 1.
-
-    Column by column: NumPy reduces rows of three some ten times more slowly.
-    """
-    low = np.array([points[:, axis].min() for axis in range(3)])
-    high = np.array([points[:, axis].max() for axis in range(3)])
-    return low, high
 
 
 def median_spacing(points: NDArray[np.float64]) -> float:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
+from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
-from pcgraph.voxels.spacing import bounding_box, sphere_directions
+from pcgraph.voxels.spacing import sphere_directions
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 
@@ -493,8 +494,7 @@ def _look(
                 front = nearest[at[i]]
                 too_far = before[i] - np.int32(front >> 32).view(np.float32)
                 seen[k, i] = too_far <= 0.0 or (
-                    too_far < _SLANTED * widths[i]
-                    and _on_one_surface(i, front & _NUMBER, centres, widths, normals)
+                    too_far < _SLANTED * widths[i] and _on_one_surface(i, front & _NUMBER, centres, widths, normals)
                 )
 
 

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells of a cubic grid as whole numbers that sort: how points are brought to those beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.parallel import in_blocks, kernel
+
+_MAX_KEY = float(1 << 62)
+_DIGIT = 8  # bits
+
+
+def bounding_box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest coordinates, (3,) each, of points (n, 3), n >= 1.
+
+    Column by column: NumPy reduces rows of three some ten times more slowly.
+    """
+    low = np.array([points[:, axis].min() for axis in range(3)])
+    high = np.array([points[:, axis].max() for axis in range(3)])
+    return low, high
+
+
+def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
+    """One whole number per place that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
+
+    Parameters
+    ----------
+    scaled : (n, 3) float64
+        Places in units of a cell; cells are the unit cubes.
+    size : float, metres
+        Edge length of a cell, for the message.
+
+    Raises
+    ------
+    ValueError
+        The places span so many cells that the numbers do not fit.
+    """
+    cells = scaled
+    low, high = np.floor(bounding_box(scaled))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
+    if not _fits(high - low):
+        cells = np.stack([_without_gaps(np.floor(scaled[:, axis])) for axis in range(3)], axis=1)
+        low, high = bounding_box(cells)
+        if not _fits(high - low):
+            raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
+    # Two spare cells per axis keep a row's end from touching the next row's start.
+    extent = (high - low).astype(np.int64) + 3
+    pitch = (int(extent[1] * extent[2]), int(extent[2]))
+    keys = np.empty(len(cells), np.int64)
+    in_blocks(_number_cells, len(cells), cells, low, *pitch, keys)
+    return keys, pitch
+
+
+def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys, none negative, in ascending order, and where each was; equal ones stay in their order.
+
+    By their digits, the last first: keys span few bits, so this is four to seven times as fast as comparing them.
+    """
+    n_digits = max(-(-int(keys.max()).bit_length() // _DIGIT), 1)
+    return _sort_by_digits(keys, n_digits)
+
+
+def starts_of_runs(ordered: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each of m runs of equal keys starts, and where the last one ends, (m + 1,), of keys (n,), n >= 1."""
+    return np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(ordered)]))
+
+
+@kernel
+def _sort_by_digits(keys: NDArray[np.int64], n_digits: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5)."""
+    n, mask = len(keys), (1 << _DIGIT) - 1
+    starts = np.zeros((n_digits, 1 << _DIGIT), np.int64)
+    for i in range(n):
+        for digit in range(n_digits):
+            starts[digit, (keys[i] >> (digit * _DIGIT)) & mask] += 1
+    ordered, order = keys.copy(), np.arange(n)
+    room, places = np.empty_like(ordered), np.empty_like(order)
+    for digit in range(n_digits):
+        start, shift = starts[digit], digit * _DIGIT
+        if start.max() == n:
+            continue  # all have the same
+        total = 0
+        for value in range(len(start)):
+            start[value], total = total, total + start[value]
+        for i in range(n):
+            value = (ordered[i] >> shift) & mask
+            at = start[value]
+            start[value] = at + 1
+            room[at], places[at] = ordered[i], order[i]
+        ordered, room, order, places = room, ordered, places, order
+    return ordered, order
+
+
+@kernel
+def _number_cells(
+    start: int,
+    stop: int,
+    cells: NDArray[np.float64],
+    low: NDArray[np.float64],
+    pitch_x: int,
+    pitch_y: int,
+    keys: NDArray[np.int64],
+) -> None:
+    """Keys of cells, given by their coordinates or by places in them."""
+    for p in range(start, stop):
+        x, y = np.int64(np.floor(cells[p, 0]) - low[0]), np.int64(np.floor(cells[p, 1]) - low[1])
+        keys[p] = x * pitch_x + y * pitch_y + np.int64(np.floor(cells[p, 2]) - low[2])
+
+
+def _fits(span: NDArray[np.float64]) -> bool:
+    return bool(span.max() < _MAX_KEY) and bool(np.prod(span + 3.0) < _MAX_KEY)
+
+
+def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Same order and same touching pairs, but no gap wider than one empty cell."""
+    values, inverse = np.unique(cells, return_inverse=True)
+    return np.concatenate(([0.0], np.cumsum(np.minimum(np.diff(values), 2.0))))[inverse]
