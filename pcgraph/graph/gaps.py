@@ -40,7 +40,8 @@ def gaps(
     k = np.int64(len(nodes.size))
     boundary = np.flatnonzero(boundary_voxels(grid))
     near = voxels_within(grid, boundary, MAX_GAP, boundary, later=True)
-    source, target = np.repeat(boundary, np.diff(near.indptr)), near.neighbours
+    source: NDArray[np.int64] = np.repeat(boundary, np.diff(near.indptr))
+    target = near.neighbours
     starts = np.searchsorted(touching[:, 0], np.arange(k + 1))
     apart = np.empty(len(source), np.bool_)
     in_blocks(_find_apart, len(source), source, target, supervoxels, starts, touching[:, 1].copy(), apart)

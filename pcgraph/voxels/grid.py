@@ -108,9 +108,7 @@ def grid_without(grid: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
     number = np.cumsum(stays, dtype=np.int32) - 1
     point_number = np.cumsum(point_stays) - 1
     degrees = np.empty(len(kept), np.int64)
-    neighbours = np.concatenate(
-        in_blocks(_kept_neighbours, len(kept), kept, grid.neighbourhood, stays, number, degrees)
-    )
+    lists = in_blocks(_kept_neighbours, len(kept), kept, grid.neighbourhood, stays, number, degrees)
     counts = grid.counts[kept]
     return replace(
         grid,
@@ -124,7 +122,7 @@ def grid_without(grid: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
         edge_lengths=grid.edge_lengths[kept],
         colors=None if grid.colors is None else grid.colors.take(kept, axis=0),
         indptr=np.concatenate(([0], np.cumsum(degrees))),
-        neighbours=neighbours,
+        neighbours=np.concatenate(lists),
         features=None if grid.features is None else grid.features.take(kept, axis=0),
     )
 
