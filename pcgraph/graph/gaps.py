@@ -49,7 +49,8 @@ def gaps(
     key = _keys(supervoxels[source], supervoxels[target], k)
     width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / grid.size, axis=1)
     key, width = np.tile(key, 2), np.tile(width, 2)  # each side of each pair
-    voxel, other = np.concatenate((source, target)), np.concatenate((supervoxels[target], supervoxels[source]))
+    voxel: NDArray[np.int64] = np.concatenate((source, target))
+    other = np.concatenate((supervoxels[target], supervoxels[source]))
     ways = voxel * k + other
     order = np.argsort(ways, kind="stable")
     starts = np.flatnonzero(np.diff(ways[order], prepend=-1))

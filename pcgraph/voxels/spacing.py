@@ -12,11 +12,15 @@ from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.cells import bounding_box, cell_keys, sorted_keys, starts_of_runs
 
 _SAMPLE = 4096  # points whose nearest neighbour is sought
 _CROWD = 1 << 16  # points among which it is sought, about
 _BLOCKS = 32  # of space, along each axis
+_TRIES = 64
+_MANY_BESIDE = 512  # points in 27 cells, at most, that are looked at
+_FEW_CUT_OFF = 0.1  # of the points have more beside them
+_NEARLY_ALL = 0.95  # of the points in one place: the others are outliers
 _NO_SPACING_M = 0.01
 _THIN = 0.01  # of its extent: a cloud whose points, at their spacing, cover so little
 _THINNED = 1 << 14  # points among which the law of spacing is looked for,
@@ -54,44 +58,120 @@ def median_spacing(points: NDArray[np.float64]) -> float:
     are looked at, all points of each.
     """
     drawn = _some_places(points)
-    crowd, hashes = _each_place_once(drawn)
+    crowd = _each_place_once(drawn)
     if 2 * len(crowd) < len(drawn) < len(points):  # duplicates took the room of others
-        crowd, hashes = _each_place_once(_some_places(_each_place_once(points)[0]))
-    spacing = _median_spacing(crowd, hashes)
+        crowd = _each_place_once(_some_places(_each_place_once(points)))
+    spacing = _median_spacing(crowd)
     low, high = bounding_box(crowd)
     if spacing * math.sqrt(len(crowd)) < _THIN * float((high - low).max()):  # perhaps the points are copies of others
-        cells = np.unique(np.floor((crowd - low) / (100.0 * spacing)), axis=0, return_index=True)[1]
-        of_cells = _median_spacing(crowd[cells], hashes[cells])
-        if of_cells > 1000.0 * spacing and len(cells) > 1:
+        _, cells, held = np.unique(
+            np.floor((crowd - low) / (100.0 * spacing)), axis=0, return_index=True, return_counts=True
+        )
+        of_cells = _median_spacing(crowd[np.sort(cells)])
+        if of_cells > 1000.0 * spacing and held.max() < _NEARLY_ALL * len(crowd):
             return of_cells
     return spacing
 
 
-def _median_spacing(crowd: NDArray[np.float64], hashes: NDArray[np.uint64]) -> float:
-    """Median distance to the nearest of distinct points, (n, 3), read at some of them."""
-    if len(crowd) == 1:
-        return _NO_SPACING_M
-    sample = np.arange(len(crowd))
-    if len(crowd) > _SAMPLE:  # the smallest hashes: as good as random, yet a property of the points
-        sample = np.argpartition(hashes, _SAMPLE)[:_SAMPLE]
-    tree = cKDTree(crowd, balanced_tree=False, compact_nodes=False)
-    distances = tree.query(crowd[sample], k=_NEIGHBOUR + 1)[0][:, 1:]
-    nearest = distances[:, 0][(distances[:, 0] > 0.0) & np.isfinite(distances[:, 0])]
-    if not len(nearest):
-        return _NO_SPACING_M
-    eighth = distances[:, -1][np.isfinite(distances[:, -1])]
-    return max(float(np.median(nearest)), float(np.median(eighth)) / _NEIGHBOUR if len(eighth) else 0.0)
+def _median_spacing(crowd: NDArray[np.float64]) -> float:
+    """Median distance to the nearest of distinct points, (n, 3), or an eighth of that to the eighth if that is more.
+
+    Read at the first points. Neighbours are sought in the 27 cells of a grid around each. Only the medians need to be
+    known: where the median point has its neighbours farther off than an edge, the cells are too small, and where they
+    hold too many to look at all, too large.
+    """
+    low, high = bounding_box(crowd)
+    extent, spacing = float((high - low).max()), 0.0
+    edge = _edge_for_neighbours(crowd, low, extent)
+    for _ in range(_TRIES):
+        if not _TINY < edge < math.inf:
+            break
+        near, is_cut_off = _near(crowd, low, edge)
+        medians = np.median(near[: 2 if len(crowd) > _NEIGHBOUR else 1], axis=1)
+        if np.isfinite(medians).all():
+            spacing = max(float(medians[0]), float(medians[-1]) / _NEIGHBOUR)
+            if is_cut_off.mean() <= _FEW_CUT_OFF:
+                break
+            edge *= 0.25
+        elif spacing > 0.0:  # cells are too large for some points and too small for others
+            break
+        else:
+            edge *= 2.0
+    return spacing if spacing > 0.0 else _NO_SPACING_M
 
 
-def _each_place_once(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint64]]:
-    """One point per place, in the order of their hashes, and these."""
-    hashes, bits = _hashes(points), max(int(len(points) - 1).bit_length(), 1)
-    low = np.uint64((1 << bits) - 1)
-    order = np.sort((hashes & ~low) | np.arange(len(points), dtype=np.uint64)) & low  # faster than to sort indices
-    order = order.astype(np.int64)
-    hashes = hashes[order]
-    first = np.concatenate(([True], hashes[1:] != hashes[:-1]))
-    return points[order[first]], hashes[first]
+def _edge_for_neighbours(points: NDArray[np.float64], low: NDArray[np.float64], extent: float) -> float:
+    """Edge of cells that hold four points each, about, where these lie on surfaces."""
+    block = np.empty(len(points), np.int32)
+    in_blocks(_find_block, len(points), points, low, max(extent, _TINY) / _BLOCKS, block)
+    return 2.0 * extent / _BLOCKS * math.sqrt(np.count_nonzero(np.bincount(block)) / len(points))
+
+
+def _near(
+    crowd: NDArray[np.float64], low: NDArray[np.float64], edge: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Distance to the nearest and to the eighth point, (2, s), from the first of a crowd, infinite where more than the
+    edge of a cell; and whether there were too many to look at all, (s,)."""
+    keys, pitch = cell_keys((crowd - low) / edge, edge)
+    ordered, order = sorted_keys(keys)
+    unit = math.ldexp(0.5, math.frexp(edge)[1])  # in which distances neither overflow nor are rounded
+    places, reach = crowd.take(order, axis=0) / unit, edge / unit
+    sample = np.flatnonzero(order < _SAMPLE)
+    near, is_cut_off = np.empty((2, len(sample))), np.empty(len(sample), np.bool_)
+    in_blocks(_find_near, len(sample), ordered, pitch, places, reach, sample, near, is_cut_off)
+    return unit * near, is_cut_off
+
+
+@kernel
+def _find_near(
+    start: int,
+    stop: int,
+    keys: NDArray[np.int64],
+    pitch: tuple[int, int],
+    places: NDArray[np.float64],
+    reach: float,
+    sample: NDArray[np.int64],
+    near: NDArray[np.float64],
+    is_cut_off: NDArray[np.bool_],
+) -> None:
+    """Set what `_near` says, within a reach: nine pointers gallop along the sorted keys, the own row's first."""
+    n, pointers, squares = len(keys), np.zeros(9, np.int64), np.empty(_NEIGHBOUR)
+    for s in range(start, stop):
+        own, beside = sample[s], 0
+        squares[:] = np.inf
+        for row in range(9):
+            first = keys[own] + ((row + 4) % 9 // 3 - 1) * pitch[0] + ((row + 4) % 3 - 1) * pitch[1] - 1
+            at, step = pointers[row], 1
+            while at + step < n and keys[at + step] < first:
+                at += step
+                step *= 2
+            while step > 0:
+                if at + step < n and keys[at + step] < first:
+                    at += step
+                step //= 2
+            if at < n and keys[at] < first:
+                at += 1
+            pointers[row] = at
+            while at < n and keys[at] <= first + 2 and beside < _MANY_BESIDE:
+                x, y, z = places[at, 0] - places[own, 0], places[at, 1] - places[own, 1], places[at, 2] - places[own, 2]
+                square = x * x + y * y + z * z
+                if square < squares[_NEIGHBOUR - 1] and at != own:
+                    rank = _NEIGHBOUR - 1
+                    while rank > 0 and squares[rank - 1] > square:
+                        squares[rank] = squares[rank - 1]
+                        rank -= 1
+                    squares[rank] = square
+                beside += 1
+                at += 1
+        is_cut_off[s] = beside >= _MANY_BESIDE
+        near[0, s] = math.sqrt(squares[0]) if squares[0] <= reach * reach else np.inf
+        near[1, s] = math.sqrt(squares[_NEIGHBOUR - 1]) if squares[_NEIGHBOUR - 1] <= reach * reach else np.inf
+
+
+def _each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """One point per place, in the order of their hashes: the first are as good as random, yet the points' own."""
+    ordered, order = sorted_keys((_hashes(points) >> np.uint64(1)).astype(np.int64))
+    return points.take(order[starts_of_runs(ordered)[:-1]], axis=0)
 
 
 def _hashes(points: NDArray[np.float64]) -> NDArray[np.uint64]:
@@ -121,13 +201,14 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return points
     block = np.empty(len(points), np.int32)
     in_blocks(_find_block, len(points), points, low, edge, block)
-    counts = np.bincount(block, minlength=_BLOCKS**3)
-    numbers: NDArray[np.uint64] = np.arange(_BLOCKS**3, dtype=np.uint64)
-    chances = (_mixed(numbers) >> np.uint64(11)).astype(np.float64) * 2.0**-53 + 2.0**-54  # 0..1, without both
-    order = np.argsort(-np.log(chances) / np.maximum(counts, 1e-9), kind="stable")
+    counts = np.bincount(block)
+    occupied = np.flatnonzero(counts)
+    counts = counts[occupied]
+    chances = (_mixed(occupied.astype(np.uint64)) >> np.uint64(11)) * 2.0**-53 + 2.0**-54  # 0..1, without both
+    order = np.argsort(-np.log(chances) / counts, kind="stable")
     taken = np.zeros(_BLOCKS**3, bool)
-    taken[order] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
-    return points[np.flatnonzero(taken[block])]
+    taken[occupied[order]] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
+    return points.take(np.flatnonzero(taken[block]), axis=0)
 
 
 @kernel
@@ -230,7 +311,7 @@ def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
         in_blocks(_thin, len(points), points, np.uint64(_THINNED / len(points) * 2.0**64), taken)
         chosen = points[taken]
     if len(chosen):
-        chosen = _each_place_once(chosen)[0]
+        chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
         return chosen[:0], np.empty(0)
     sample = chosen[:_READINGS]
