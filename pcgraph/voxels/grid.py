@@ -22,6 +22,8 @@ MAX_NEIGHBOURS = 26
 """Voxels around a voxel."""
 MAX_GAP = 3.0
 """Voxel edges between the means of two voxels, at most, that a gap lies between."""
+_STRETCH = 1024  # cells in a row of which the cells around are counted,
+_COUNTED = 1 << 16  # and of how many they are, about
 _END = np.iinfo(np.int64).max
 _AMID = 8  # voxels around one amid a surface
 
@@ -273,7 +275,9 @@ def _average(
 
 
 def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Cells that hold places, (v, 3) float64, ascending, and how many of the 26 around each do, (v,) int64.
+    """Cells that hold places, (v, 3) float64, ascending, and how many of the 26 around some of them do, int64.
+
+    Of many cells these are those of some stretches, evenly spread.
 
     Parameters
     ----------
@@ -290,9 +294,13 @@ def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np
     keys, pitch = cell_keys(scaled, size)
     ordered, order = sorted_keys(keys)
     first = starts_of_runs(ordered)[:-1]
-    degrees = np.empty(len(first), np.int64)
-    in_blocks(_walk, len(first), ordered[first], *pitch, degrees, np.empty((len(first), 0), np.int32))
-    return np.floor(scaled.take(order[first], axis=0)), degrees
+    occupied, degrees = ordered[first], np.empty(len(first), np.int64)
+    step = _STRETCH * max(1, len(first) // _COUNTED)
+    stretches = [slice(at, min(at + _STRETCH, len(first))) for at in range(0, len(first), step)]
+    for stretch in stretches:
+        _walk(stretch.start, stretch.stop, occupied, *pitch, degrees, np.empty((len(first), 0), np.int32))
+    counted = np.concatenate([degrees[stretch] for stretch in stretches])
+    return np.floor(scaled.take(order[first], axis=0)), counted
 
 
 def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Neighbourhood:

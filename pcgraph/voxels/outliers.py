@@ -12,6 +12,7 @@ from scipy.special import pdtrc
 
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.eigen import least_eigenvalue
 from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, VoxelGrid, boundary_voxels, voxels_within
 
 OUTLIER = -2
@@ -86,11 +87,28 @@ def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bo
         return found
     places = grid.warped[alone] / grid.size
     near = cKDTree(places, balanced_tree=False).query(places, _NEAREST)[1]
-    spread = places[near] - places[near].mean(axis=1, keepdims=True)
-    variances = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", spread, spread))
-    flat = variances[:, 0] < _FLAT * variances.sum(axis=1)
+    flat = np.empty(len(alone), np.bool_)
+    in_blocks(_find_flat, len(alone), places, near, flat)
     found[alone] = flat[near].mean(axis=1) >= 0.5
     return found
+
+
+@kernel
+def _find_flat(
+    start: int, stop: int, places: NDArray[np.float64], near: NDArray[np.int64], flat: NDArray[np.bool_]
+) -> None:
+    """Set whether the places near each lie about a plane or a line."""
+    n = near.shape[1]
+    for i in range(start, stop):
+        mean_x = mean_y = mean_z = 0.0
+        for j in near[i]:
+            mean_x, mean_y, mean_z = mean_x + places[j, 0] / n, mean_y + places[j, 1] / n, mean_z + places[j, 2] / n
+        xx = yy = zz = xy = xz = yz = 0.0
+        for j in near[i]:
+            x, y, z = places[j, 0] - mean_x, places[j, 1] - mean_y, places[j, 2] - mean_z
+            xx, yy, zz = xx + x * x, yy + y * y, zz + z * z
+            xy, xz, yz = xy + x * y, xz + x * z, yz + y * z
+        flat[i] = least_eigenvalue(xx, yy, zz, xy, xz, yz) < _FLAT * (xx + yy + zz)
 
 
 def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:

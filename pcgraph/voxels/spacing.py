@@ -28,6 +28,7 @@ _READINGS = 1 << 10  # and at how many of them spacing is read
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
 _NEIGHBOUR = 8
 _TRIMMINGS = 2
+_LEAST_RANGE = 1e-3  # in half extents
 _TINY = float(np.finfo(np.float64).tiny)
 _MIN_EXPLAINED = 0.5
 _MIN_EXPONENT = 0.5
@@ -309,7 +310,7 @@ def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     if len(points) > _THINNED:
         taken = np.empty(len(points), np.bool_)
         in_blocks(_thin, len(points), points, np.uint64(_THINNED / len(points) * 2.0**64), taken)
-        chosen = points[taken]
+        chosen = points.take(np.flatnonzero(taken), axis=0)
     if len(chosen):
         chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
@@ -323,20 +324,44 @@ def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
 def _ranges(places: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distances from a viewpoint, (m,), none so near that its logarithm outweighs all others."""
     rays = places - viewpoint
-    return np.sqrt(np.einsum("...i,...i->...", rays, rays)) + 1e-3
+    return np.sqrt(np.einsum("...i,...i->...", rays, rays)) + _LEAST_RANGE
 
 
 def _regressions(
     places: NDArray[np.float64], logs: NDArray[np.float64], viewpoints: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Explained fraction of the variance, and exponent, (k,) each, of the law about each of k viewpoints."""
-    x = np.log(_ranges(places[None], viewpoints[:, None]))
-    x -= x.mean(axis=1, keepdims=True)
-    y = logs - logs.mean()
-    variance, squares = float(y @ y), np.einsum("ij,ij->i", x, x)
-    slope = np.clip(np.einsum("ij,j->i", x, y) / np.maximum(squares, _TINY), 0.0, _MAX_EXPONENT)
-    left = ((y - slope[:, None] * x) ** 2).sum(axis=1)
-    return 1.0 - left / max(variance, _TINY), slope
+    explained, slopes = np.empty(len(viewpoints)), np.empty(len(viewpoints))
+    _regress(places, logs - logs.mean(), viewpoints, explained, slopes)
+    return explained, slopes
+
+
+@kernel
+def _regress(
+    places: NDArray[np.float64],
+    y: NDArray[np.float64],
+    viewpoints: NDArray[np.float64],
+    explained: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+) -> None:
+    """Set what `_regressions` returns, of logarithms whose mean is zero."""
+    x = np.empty(len(y))
+    for v in range(len(viewpoints)):
+        mean = 0.0
+        for i in range(len(y)):
+            square = 0.0
+            for axis in range(3):
+                square += (places[i, axis] - viewpoints[v, axis]) ** 2
+            x[i] = math.log(math.sqrt(square) + _LEAST_RANGE)
+            mean += x[i] / len(y)
+        variance = squares = products = 0.0
+        for i in range(len(y)):
+            variance += y[i] * y[i]
+            squares += (x[i] - mean) * (x[i] - mean)
+            products += (x[i] - mean) * y[i]
+        slope = min(max(products / max(squares, _TINY), 0.0), _MAX_EXPONENT)
+        left = variance - slope * (2.0 * products - slope * squares)
+        explained[v], slopes[v] = 1.0 - left / max(variance, _TINY), slope
 
 
 def _least_exponent(
