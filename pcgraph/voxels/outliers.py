@@ -123,7 +123,13 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     grid : VoxelGrid of v voxels
     """
     detached, degrees = np.zeros(grid.n_voxels, np.bool_), np.diff(grid.indptr)
-    few = np.flatnonzero((degrees < _PIECE) & (grid.counts < _PIECE))
+    is_few = (degrees < _PIECE) & (grid.counts < _PIECE)
+    few = np.flatnonzero(is_few)
+    alone = np.ones(len(few), np.bool_)  # touching nothing larger; the others need no search
+    for slot in range(_PIECE - 1):
+        has = degrees[few] > slot
+        alone[has] &= is_few[grid.neighbours[grid.indptr[few[has]] + slot]]
+    few = few[alone]
     if not len(few) or int(grid.counts.sum()) < _MIN_POINTS:
         return detached
     near = voxels_within(grid, few, MAX_GAP, np.flatnonzero(boundary_voxels(grid)))
