@@ -10,8 +10,11 @@ import pytest
 from clouds import patch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks
+from pcgraph.voxels.cells import sorted_keys
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.spacing import median_spacing
@@ -80,6 +83,50 @@ def test_spacing_of_a_large_lattice_is_its_step():
     assert median_spacing(points) == pytest.approx(0.01, rel=1e-9)
     order = np.random.default_rng(0).permutation(len(points))
     assert median_spacing(points[order]) == median_spacing(points)
+
+
+def _spacing_by_tree(points: NDArray[np.float64]) -> float:
+    """Median distance to the nearest point, or an eighth of that to the eighth, over all points."""
+    distances = cKDTree(points).query(points, min(9, len(points)))[0]
+    eighth = np.median(distances[:, 8]) / 8.0 if len(points) > 8 else 0.0
+    return float(max(np.median(distances[:, 1]), eighth))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["plane", "volume", "line", "lattice", "seven", "two", "heavy tails", "tiny", "huge", "far away", "clusters"],
+)
+def test_spacing_is_that_of_a_tree_over_all_points(kind: str) -> None:
+    rng = np.random.default_rng(5)
+    points = {
+        "plane": np.c_[rng.random((4000, 2)), np.zeros(4000)],
+        "volume": rng.random((4000, 3)),
+        "line": np.c_[np.linspace(0.0, 1.0, 3000), np.zeros((3000, 2))],
+        "lattice": np.stack(np.meshgrid(*[np.arange(15.0)] * 3), axis=-1).reshape(-1, 3),
+        "seven": rng.random((7, 3)),
+        "two": np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]),
+        "heavy tails": rng.standard_cauchy((4000, 3)),
+        "tiny": 1e-120 * rng.random((4000, 3)),
+        "huge": 1e140 * rng.random((4000, 3)),
+        "far away": 1e6 + rng.random((4000, 3)),
+        "clusters": np.repeat(rng.random((40, 3)), 100, axis=0) + rng.normal(0.0, 1e-3, (4000, 3)),
+    }[kind]
+    tolerance = 0.05 if kind == "heavy tails" else 1e-9  # where points are too many in some cells, too few in others
+    assert median_spacing(points) == pytest.approx(_spacing_by_tree(points), rel=tolerance)
+    assert median_spacing(points[rng.permutation(len(points))]) == median_spacing(points)
+
+
+def test_a_far_point_leaves_the_spacing_as_it_was() -> None:
+    points = np.random.default_rng(2).random((4000, 3))
+    assert median_spacing(np.vstack((points, [[1e9, -1e9, 1e9]]))) == pytest.approx(median_spacing(points), rel=0.02)
+
+
+@given(st.lists(st.integers(0, 1 << 62), min_size=1, max_size=200))
+def test_keys_are_sorted_by_their_digits_as_by_numpy(keys: list[int]) -> None:
+    array = np.array(keys, np.int64)
+    ordered, order = sorted_keys(array)
+    np.testing.assert_array_equal(order, np.argsort(array, kind="stable"))
+    np.testing.assert_array_equal(ordered, array[order])
 
 
 def test_spacing_of_many_random_points_is_that_of_a_tree_over_all():
