@@ -20,7 +20,7 @@ _BLOCKS = 32  # of space, along each axis
 _TRIES = 64
 _MANY_BESIDE = 512  # points in 27 cells, at most, that are looked at
 _FEW_CUT_OFF = 0.05  # of the points have more beside them
-_NEARLY_ALL = 0.95  # of the points in one place: the others are outliers
+_NEARLY_ALL = 0.95  # of the points (in one place: the others are outliers)
 _NO_SPACING_M = 0.01
 _THIN = 0.01  # of its extent: a cloud whose points, at their spacing, cover so little
 _THINNED = 1 << 14  # points among which the law of spacing is looked for,
@@ -93,7 +93,7 @@ def _median_spacing(crowd: NDArray[np.float64]) -> float:
             spacing = max(float(medians[0]), float(medians[-1]) / _NEIGHBOUR)
             if is_cut_off.mean() <= _FEW_CUT_OFF:
                 break
-            edge *= 0.5 if is_cut_off.mean() < 0.5 else 0.125
+            edge *= 0.5 if is_cut_off.mean() < _NEARLY_ALL else 0.125
         elif spacing > 0.0:  # cells are too large for some points and too small for others
             break
         else:
