@@ -37,7 +37,7 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels import visibility
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
-from pcgraph.voxels.spacing import some_blocks, spacing_law
+from pcgraph.voxels.spacing import median_spacing, some_blocks, spacing_law
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
 
@@ -106,6 +106,7 @@ def compile_voxels() -> None:
     """Compile what it takes from points to supervoxels, and half of the orientation."""
     points, grid = _step_in_voxels()
     some_blocks(points)
+    median_spacing(points)
     spacing_law(points)
     outlier_voxels(grid)
     visible_fraction(grid, np.zeros(3))
