@@ -73,7 +73,7 @@ def warn_of_dust(n_objects: int, n_supervoxels: int, voxel_size: float) -> None:
 
 def warn_of_volume(grid: VoxelGrid) -> None:
     """Warn where most voxels have others on nearly all sides, as noise that fills a volume has."""
-    if grid.n_voxels >= _MIN_VOXELS and float(np.median(np.diff(grid.indptr))) > _SOLID:
+    if grid.n_voxels >= _MIN_VOXELS and float(np.mean(np.diff(grid.indptr) > _SOLID)) > 0.5:
         _warn(
             "expected points on surfaces, but they fill a volume as noise does: at most voxels there are others on "
             f"nearly all sides ({grid.edge_lengths.mean():.3g} m); objects found in it mean little"

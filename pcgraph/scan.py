@@ -41,7 +41,7 @@ from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import median_spacing, spacing_law
-from pcgraph.voxels.surface import Surface
+from pcgraph.voxels.surface import LocalPlanes, Surface
 from pcgraph.voxels.visibility import visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
@@ -158,9 +158,9 @@ def segment(
     warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
-    position, orientation = _orientation(grid, found, place)
+    position, planes = _outward_planes(grid, settings.method, found, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
-    result = segment_scan(Scan(cloud, position, grid, orientation, initial_labels, seed), None, settings)
+    result = segment_scan(Scan(cloud, position, grid, planes, initial_labels, seed), None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
 
@@ -228,10 +228,12 @@ def update(
     union = grid_union(before.grid, seen)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
-    orientation = np.empty((union.grid.n_voxels, 3))
-    position, orientation[union.second] = _orientation(seen, None, place)
-    orientation[union.first] = before.grid.centroids + before.normals * (1e3 * before.grid.edge_lengths)[:, None]
-    scan = Scan(cloud, position, union.grid, orientation, labels, earlier.seed_size)
+    outside = np.empty((union.grid.n_voxels, 3))
+    position, planes = _outward_planes(seen, settings.method, None, place)
+    outside[union.second] = _far_along(seen, planes.normals)
+    outside[union.first] = _far_along(before.grid, before.normals)
+    planes = settings.method.planes(union.grid, outside)
+    scan = Scan(cloud, position, union.grid, planes, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
 
 
@@ -245,8 +247,8 @@ class Scan:
     viewpoint : (3,) or (n, 3) float64, metres
     grid : VoxelGrid of v voxels
         All that has been seen; its `voxel_of_point` speaks of these points.
-    orientation_points : (3,) or (v, 3) float64, metres
-        A place on the outer side of each voxel's surface.
+    planes : LocalPlanes of v voxels
+        On which they lie; normals point outwards.
     initial_labels : (v,) int32
         Supervoxels of earlier scans, -1 elsewhere.
     seed_size : float, metres
@@ -255,7 +257,7 @@ class Scan:
     cloud: CleanCloud
     viewpoint: NDArray[np.float64]
     grid: VoxelGrid
-    orientation_points: NDArray[np.float64]
+    planes: LocalPlanes
     initial_labels: NDArray[np.int32]
     seed_size: float
 
@@ -288,7 +290,7 @@ def _refusal(argument: str, family: str, given: object) -> str:
 def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
     """Segmentation of a scan: the algorithm from voxels on."""
     cloud, grid, method, linkage = scan.cloud, scan.grid, settings.method, settings.linkage
-    planes = method.planes(grid, scan.orientation_points)
+    planes = scan.planes
     normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
@@ -370,22 +372,29 @@ def _without(
     return cloud.without(points), grid_without(grid, voxels), place
 
 
-def _orientation(
-    grid: VoxelGrid, found: NDArray[np.float64] | None, given: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """From where the cloud was seen, and a place on the outer side of each voxel, (3,) or (v, 3).
+def _outward_planes(
+    grid: VoxelGrid, method: SupervoxelMethod, found: NDArray[np.float64] | None, given: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], LocalPlanes]:
+    """From where the cloud was seen, (3,) or (n, 3), and the plane of each voxel, its normal on the outer side.
 
     A viewpoint that was given counts before one that the spacing tells. Voxels of points that were seen from several
     places take the mean of those.
     """
     if given is None:
-        sides = visible_sides(grid, found)
-        return sides.viewpoint, sides.outside
+        upwards = np.array([0.0, 0.0, 1.0])
+        planes = method.planes(grid, _far_along(grid, upwards) if found is None else found)
+        sides = visible_sides(grid, planes.normals, found)
+        return sides.viewpoint, replace(planes, normals=sides.normals)
     if given.ndim == 1:
-        return given, given
+        return given, method.planes(grid, given)
     low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
-    return given, middle + reach * voxel_means((given - middle) / reach, grid)
+    return given, method.planes(grid, middle + reach * voxel_means((given - middle) / reach, grid))
+
+
+def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places a thousand voxel edges off the voxels in some directions, (3,) or (v, 3): from there they are seen."""
+    return grid.centroids + directions * (1e3 * grid.edge_lengths)[:, None]
 
 
 def _voxel_size(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> float:

@@ -123,7 +123,8 @@ def compile_the_rest() -> None:
     By then the other process has left in numba's cache what this needs of voxels.
     """
     _compile_graph_and_tree()
-    visible_sides(_step_in_voxels()[1])
+    grid = _step_in_voxels()[1]
+    visible_sides(grid, np.zeros((grid.n_voxels, 3)))
 
 
 def _compile_graph_and_tree() -> None:

@@ -51,7 +51,6 @@ _STEEPEST = 4.0  # of a square that is seen at a slant: tangent of its angle
 _TINY = 1e-12
 _NOTHING = np.iinfo(np.int64).max
 _NUMBER = (1 << 32) - 1
-_FAR = 1e3  # voxel edges from a voxel to its orientation point
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,20 +61,24 @@ class VisibleSides(ShortRepr):
     ----------
     viewpoint : (3,) float64, metres
         The place that tells most.
-    outside : (v, 3) float64, metres
-        A place on the outer side of each voxel's surface.
+    normals : (v, 3) float64
+        Unit normals, outwards.
     """
 
     viewpoint: NDArray[np.float64]
-    outside: NDArray[np.float64]
+    normals: NDArray[np.float64]
 
 
-def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> VisibleSides:
+def visible_sides(
+    grid: VoxelGrid, normals: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None
+) -> VisibleSides:
     """The outer side of the surface at each voxel, found from what is visible.
 
     Parameters
     ----------
     grid : VoxelGrid of v voxels
+    normals : (v, 3) float64
+        Unit normals of the surface, towards either side.
     viewpoint : (3,) float64, metres, optional
         About where all was seen from. What lies edge-on from there, as ground does from a place on it, is decided by
         what is visible; if little does, nothing else is asked.
@@ -96,14 +99,13 @@ def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None)
     """
     middle, reach = _unit_frame(grid, grid.centroids)
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
-    normals = _either_normals(grid)
     told, likely = np.zeros(grid.n_voxels), None
     if viewpoint is not None:
         likely = (viewpoint - middle) / reach
         rays = likely - centres
         told = np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
-            return VisibleSides(viewpoint, np.tile(viewpoint, (grid.n_voxels, 1)))
+            return VisibleSides(viewpoint, np.where(told[:, None] < 0.0, -normals, normals))
     places, weights = _telling_places(centres, widths, -middle / reach, likely)
     towards = np.empty((grid.n_voxels, 3))
     seen = seen_from(places, centres, widths, normals)
@@ -113,9 +115,8 @@ def visible_sides(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None)
     for _ in range(_SMOOTHING):
         in_blocks(_vote_along, grid.n_voxels, grid.indptr, grid.neighbours, normals, votes, smoothed)
         votes, smoothed = smoothed, votes
-    towards = np.where(votes < 0.0, -1.0, 1.0)[:, None] * normals
     seen_most = middle + reach * places[0] if viewpoint is None else viewpoint
-    return VisibleSides(seen_most, grid.centroids + towards * (_FAR * grid.edge_lengths)[:, None])
+    return VisibleSides(seen_most, np.where(votes[:, None] < 0.0, -normals, normals))
 
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
