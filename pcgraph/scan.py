@@ -47,7 +47,7 @@ from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
 VOXELS_PER_SPACING = 3.5
-VOXELS_PER_SEED = 6.0  # voxel edges between seeds, at most,
+VOXELS_PER_SEED = 5.0  # voxel edges between seeds, at most,
 _MIN_VOXELS_PER_SEED = 3.0  # and at least
 _MANY_SUPERVOXELS = 800
 _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
@@ -98,7 +98,7 @@ def segment(
     voxel_size : float, metres, optional
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
     seed_size : float, metres, optional
-        Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 6 times `voxel_size`, or less, 3 times at
+        Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
         least, where that would leave fewer than some 800 supervoxels.
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
@@ -409,7 +409,7 @@ def _voxel_size(cloud: CleanCloud, voxel_size: float | None, seed_size: float | 
 
 
 def _seed_size(grid: VoxelGrid) -> float:
-    """Six voxel edges; less, but three at least, where that leaves few supervoxels."""
+    """Five voxel edges; less, but three at least, where that leaves few supervoxels."""
     edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * _MANY_SUPERVOXELS))
     return grid.size * min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 

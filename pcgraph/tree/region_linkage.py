@@ -30,6 +30,8 @@ class RegionLinkage(Linkage):
         Cost of an edge, radians.
     gap : float, radians per voxel edge, >= 0
         What a gap costs beyond one voxel edge.
+    color : float, voxel edges, >= 0
+        Distance that a difference of 1 counts for, in a colour of 0..1.
 
     Notes
     -----
@@ -38,18 +40,20 @@ class RegionLinkage(Linkage):
         (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^1/2  (w / (b + w))^3/4
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
-    increase of the squared distances to the regions' best planes by the merge, and l = E / b that per length b of the
-    contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean supervoxel; w is the
-    width of the smaller region. So what lies on one plane merges first, whatever its normals; a small piece merges
-    early, as its contact says little; and a valley counts most between two large surfaces that meet along a line short
-    for their size. Contacts are touching voxels and, at a price, gaps of up to three voxel edges.
+    increase of the squared distances to the regions' best planes and mean colours by the merge, and l = E / b that per
+    length b of the contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean
+    supervoxel; w is the width of the smaller region. So what lies on one plane and has one colour merges first,
+    whatever its normals; a small piece merges early, as its contact says little; and a valley counts most between two
+    large surfaces that meet along a line short for their size. Contacts are touching voxels and, at a price, gaps of up
+    to three voxel edges.
 
-    The constants were chosen once, for the mean over depth images of tables, a fused office, a simulated room and
-    simulated streets (docs/domains.md); none is far from others that do as well.
+    The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
+    bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
     """
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
-    gap: float = 0.25
+    gap: float = 0.15
+    color: float = 1.0
 
     default_object_altitude = 0.4
     default_part_altitude = 0.06
@@ -57,6 +61,7 @@ class RegionLinkage(Linkage):
     def __post_init__(self) -> None:
         check_cost(self.cost)
         non_negative("gap", self.gap)
+        non_negative("color", self.color)
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least altitude first."""
@@ -67,7 +72,7 @@ class RegionLinkage(Linkage):
             across = self.cost(gaps.edge_features) + self.gap * (gaps.widths - 1.0)
             edges, costs = np.concatenate((edges, gaps.edges)), np.concatenate((costs, across))
             weights = np.concatenate((weights, gaps.weights))
-        return region_linkage(graph, leaves, edges, costs, weights)
+        return region_linkage(graph, leaves, edges, costs, weights, self.color)
 
 
 _STEPS = float(1 << 20)
@@ -84,7 +89,7 @@ class _Shape(NamedTuple):
     width: float
 
 
-_SHAPE = _Shape(c0=0.08, c1=0.031, e0=1.0, l0=0.1, width=7.7)
+_SHAPE = _Shape(c0=0.08, c1=0.04, e0=1.0, l0=0.1, width=7.7)
 
 
 def region_linkage(
@@ -93,6 +98,7 @@ def region_linkage(
     edges: NDArray[np.int32],
     costs: NDArray[np.float64],
     weights: NDArray[np.float64],
+    color: float = 0.0,
 ) -> Merges:
     """Merges of regions along edges, the least altitude of `RegionLinkage` first.
 
@@ -106,6 +112,8 @@ def region_linkage(
     costs : (m,) float64, radians, >= 0
     weights : (m,) float64, > 0
         Contacts in voxels, of both sides.
+    color : float, voxel edges, >= 0
+        What colours count, if there are any.
 
     Returns
     -------
@@ -113,7 +121,7 @@ def region_linkage(
         Altitudes are made not to decrease: a merge below the altitude of an earlier one takes that. Of equal ones the
         first edge merges first.
     """
-    state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, 0.0, 1.0))
+    state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, color, 1.0))
     sums = np.stack((costs * weights, weights))
     contracted = ContractedGraph.of(graph.n_nodes, edges, _first_altitudes(state, edges, sums, _SHAPE), sums)
     _merge(state, contracted, _SHAPE)

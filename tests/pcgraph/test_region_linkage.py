@@ -30,7 +30,7 @@ def test_the_altitude_of_two_regions_is_the_formula():
     union = a + b + n[0] * n[1] / n.sum() * np.outer(apart, apart)
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
-    evidence = cost + 0.08 + 0.031 * math.log(1 + scale / 0.1)
+    evidence = cost + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
@@ -70,3 +70,25 @@ def test_settings_are_checked():
         RegionLinkage(gap=-1.0)
     with pytest.raises(ValueError, match="BoundaryCost"):
         RegionLinkage(cost=3)
+
+
+def _two_halves_of_a_plane(colors):
+    x, y = (c.ravel() for c in np.meshgrid(np.arange(0.0, 1.0, 0.01), np.arange(0.0, 0.5, 0.01)))
+    return pcgraph.segment(np.stack((x, y, 0.0 * x), axis=1), colors(x), viewpoint=(0.5, 0.25, 2.0))
+
+
+def test_colours_part_a_plane_last_but_never_into_objects():
+    truth = (np.meshgrid(np.arange(0.0, 1.0, 0.01), np.arange(0.0, 0.5, 0.01))[0].ravel() > 0.495).astype(int)
+    painted = _two_halves_of_a_plane(lambda x: np.where(x[:, None] > 0.495, (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)))
+    assert pcgraph.metrics.segmentation_covering(painted.cut(n=2), truth) > 0.98
+    assert painted.labels.max() == 0
+    plain = _two_halves_of_a_plane(lambda x: np.full((len(x), 3), 0.4))
+    bare = _two_halves_of_a_plane(lambda x: None)
+    assert plain.tree.altitudes.tobytes() == bare.tree.altitudes.tobytes()
+
+
+def test_colour_that_is_noise_changes_no_object():
+    points, truth, viewpoint = two_boxes_on_a_plane()
+    noise = np.random.default_rng(0).random((len(points), 3))
+    result = pcgraph.segment(points, noise, viewpoint=viewpoint)
+    assert pcgraph.metrics.segmentation_covering(result.labels, truth) > 0.99
