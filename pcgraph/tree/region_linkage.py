@@ -148,26 +148,27 @@ def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
     hardly changes, an edge gets it when it comes up.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
-    is_old = np.zeros(len(heap.edges), np.bool_)
+    # After how many merges each region changed, and each altitude was computed.
+    changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
     while heap.size[0] > 0:
         edge = heap.order[0]
-        if is_old[edge]:
-            is_old[edge] = False
-            a, b = halves[2 * edge].end, halves[2 * edge + 1].end
+        a, b = halves[2 * edge].end, halves[2 * edge + 1].end
+        if computed[edge] < max(changed[a], changed[b]):
+            computed[edge] = graph.done[0]
             heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
             continue
         kept, gone, n_parallel = contract_cheapest(graph)
         unite(state, kept, gone)
-        few, half = clusters[kept].degree <= _MANY, clusters[kept].first
+        changed[kept] = graph.done[0]
+        half = clusters[kept].first if clusters[kept].degree <= _MANY else NONE
         while half != NONE:
             edge = half >> 1
-            is_old[edge] = not few
-            if few:
-                heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, shape))
+            computed[edge] = graph.done[0]
+            heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, shape))
             half = halves[half].after
         for edge in graph.parallel[:n_parallel]:
-            if is_old[edge]:  # two became one: both old altitudes say little
-                is_old[edge] = False
+            if computed[edge] < graph.done[0]:  # two became one: both old altitudes say little
+                computed[edge] = graph.done[0]
                 a, b = halves[2 * edge].end, halves[2 * edge + 1].end
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
 
