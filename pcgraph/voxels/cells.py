@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks, kernel
+from pcgraph.parallel import in_blocks, kernel, routine
 
 _MAX_KEY = float(1 << 62)
 _DIGIT = 8  # bits
@@ -66,6 +66,20 @@ def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
 def starts_of_runs(ordered: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where each of m runs of equal keys starts, and where the last one ends, (m + 1,), of keys (n,), n >= 1."""
     return np.concatenate(([0], np.flatnonzero(ordered[1:] != ordered[:-1]) + 1, [len(ordered)]))
+
+
+@routine
+def gallop(keys: NDArray[np.int64], at: int, key: int) -> int:
+    """The first place from `at` on of a key not below one, in ascending keys: by steps that double, then halve."""
+    n, step = len(keys), 1
+    while at + step < n and keys[at + step] < key:
+        at += step
+        step *= 2
+    while step > 0:
+        if at + step < n and keys[at + step] < key:
+            at += step
+        step //= 2
+    return at + 1 if at < n and keys[at] < key else at
 
 
 @kernel

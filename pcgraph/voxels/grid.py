@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
+from pcgraph.voxels.cells import cell_keys, gallop, sorted_keys, starts_of_runs
 from pcgraph.voxels.warp import Warp
 
 # Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
@@ -451,17 +451,7 @@ def _within(
             if ahead[row] > middle + cells:
                 continue
             first = own + 1 if later and row == first_row else middle - cells
-            at, step = pointers[row], 1
-            while at + step < n and keys[at + step] < first:
-                at += step
-                step *= 2
-            while step > 0:
-                if at + step < n and keys[at + step] < first:
-                    at += step
-                step //= 2
-            if at < n and keys[at] < first:
-                at += 1
-            pointers[row] = at
+            at = pointers[row] = gallop(keys, pointers[row], first)
             ahead[row] = keys[at] if at < n else _END
             while at < n and keys[at] <= middle + cells:
                 if keys[at] != own:

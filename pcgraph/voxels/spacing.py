@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.cells import bounding_box, cell_keys, sorted_keys, starts_of_runs
+from pcgraph.voxels.cells import bounding_box, cell_keys, gallop, sorted_keys, starts_of_runs
 
 _SAMPLE = 4096  # points whose nearest neighbour is sought
 _CROWD = 1 << 16  # points among which it is sought, about
@@ -142,17 +142,7 @@ def _find_near(
         squares[:] = np.inf
         for row in range(9):
             first = keys[own] + ((row + 4) % 9 // 3 - 1) * pitch[0] + ((row + 4) % 3 - 1) * pitch[1] - 1
-            at, step = pointers[row], 1
-            while at + step < n and keys[at + step] < first:
-                at += step
-                step *= 2
-            while step > 0:
-                if at + step < n and keys[at + step] < first:
-                    at += step
-                step //= 2
-            if at < n and keys[at] < first:
-                at += 1
-            pointers[row] = at
+            at = pointers[row] = gallop(keys, pointers[row], first)
             while at < n and keys[at] <= first + 2 and beside < _MANY_BESIDE:
                 x, y, z = places[at, 0] - places[own, 0], places[at, 1] - places[own, 1], places[at, 2] - places[own, 2]
                 square = x * x + y * y + z * z
