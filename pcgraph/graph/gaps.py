@@ -10,7 +10,7 @@ from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.parallel import in_blocks, kernel
-from pcgraph.voxels.grid import MAX_GAP, VoxelGrid, boundary_voxels, voxels_within
+from pcgraph.voxels.grid import VoxelGrid, boundary_voxels, voxels_within
 
 
 def gaps(
@@ -20,7 +20,10 @@ def gaps(
     nodes: NodeFeatures,
     touching: NDArray[np.int32],
 ) -> Gaps:
-    """Pairs of supervoxels that do not touch, but whose boundary voxels come within three voxel edges of each other.
+    """Pairs of supervoxels that do not touch, but whose boundary voxels come near each other.
+
+    Near is three voxel edges, or eight where voxels grow with range from a scanner, whose rows lie far apart
+    (`pcgraph.voxels.warp.Warp.max_gap`).
 
     Parameters
     ----------
@@ -39,7 +42,7 @@ def gaps(
     """
     k = np.int64(len(nodes.size))
     boundary = np.flatnonzero(boundary_voxels(grid))
-    near = voxels_within(grid, boundary, MAX_GAP, boundary, later=True)
+    near = voxels_within(grid, boundary, grid.warp.max_gap, boundary, later=True)
     source: NDArray[np.int64] = np.repeat(boundary, np.diff(near.indptr))
     target = near.neighbours
     starts = np.searchsorted(touching[:, 0], np.arange(k + 1))

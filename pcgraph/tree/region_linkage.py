@@ -44,8 +44,8 @@ class RegionLinkage(Linkage):
     length b of the contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean
     supervoxel; w is the width of the smaller region. So what lies on one plane and has one colour merges first,
     whatever its normals; a small piece merges early, as its contact says little; and a valley counts most between two
-    large surfaces that meet along a line short for their size. Contacts are touching voxels and, at a price, gaps of up
-    to three voxel edges.
+    large surfaces that meet along a line short for their size. Contacts are touching voxels and, at a price, gaps
+    (`pcgraph.graph.gaps.gaps`).
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.

@@ -20,8 +20,8 @@ _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
 MAX_NEIGHBOURS = 26
 """Voxels around a voxel."""
-MAX_GAP = 3.0
-"""Voxel edges between the means of two voxels, at most, that a gap lies between."""
+MAX_GAP = Warp.max_gap
+"""Voxel edges between the means of two voxels, at most, that a gap lies between, but in scans whose voxels grow."""
 _STRETCH = 1024  # cells in a row of which the cells around are counted,
 _COUNTED = 1 << 16  # and of how many they are, about
 _END = np.iinfo(np.int64).max

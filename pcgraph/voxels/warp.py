@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,15 @@ _MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are 
 
 @dataclass(frozen=True)
 class Warp:
-    """The identity: voxels of one size everywhere."""
+    """The identity: voxels of one size everywhere.
+
+    Attributes
+    ----------
+    max_gap : float, voxel edges
+        Distance between the means of two voxels, at most, that a gap lies between.
+    """
+
+    max_gap: ClassVar[float] = 3.0
 
     def check(self, points: NDArray[np.float64]) -> None:
         """ValueError if a point has no place in the warped space."""
@@ -94,6 +103,9 @@ class RangeWarp(Warp):
         Range at which the warp keeps lengths across the ray.
     growth : float, 0..1, without 1
     """
+
+    # A scanner's rows lie farther apart than the points along them.
+    max_gap: ClassVar[float] = 8.0
 
     viewpoint: NDArray[np.float64]
     reference_range: float

@@ -32,6 +32,15 @@ def test_what_lies_in_one_plane_merges_across_gaps_of_up_to_three_voxel_edges(em
     assert bool(len(result.graph.gaps.edges)) == (0 < empty < 3)
 
 
+def test_rows_of_a_scan_from_one_place_merge_across_wider_gaps():
+    rings = [np.arange(0, 2 * np.pi, 0.04 / r)[:, None] * (1.0, 0.0) + (0.0, r) for r in np.arange(4.0, 6.0, 0.35)]
+    angle, radius = np.concatenate(rings).T
+    ground = np.stack((radius * np.cos(angle), radius * np.sin(angle), np.full(len(angle), -1.8)), axis=1)
+    settings = {"voxel_size": 0.08, "viewpoint": (0.0, 0.0, 0.0)}
+    assert pcgraph.segment(ground, range_growth=0.5, **settings).labels.max() == 0
+    assert pcgraph.segment(ground, range_growth=0.0, **settings).labels.max() + 1 == len(rings)
+
+
 def test_a_linkage_of_contacts_alone_merges_across_no_gap():
     assert two_sheets(1, linkage=pcgraph.ConvexityLinkage()).labels.max() + 1 == 2
 
