@@ -347,18 +347,14 @@ def _walk(
             else:
                 high = middle
         pointers[row] = low
-    ahead = np.zeros(9, np.int64)  # keys at the pointers, once these are where they belong
     for i in range(start, stop):
         count = 0
         for row in range(9):
             target = keys[i] + shifts[row]
-            if ahead[row] > target + 2:
-                continue
             at = pointers[row]
             while at < n and keys[at] < target:
                 at += 1
             pointers[row] = at
-            ahead[row] = keys[at] if at < n else _END
             while at < n and keys[at] <= target + 2:
                 if at != i:
                     if lists:

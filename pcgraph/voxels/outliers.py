@@ -114,9 +114,10 @@ def _find_flat(
 def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     """Voxels of pieces of at most four points that have nothing else within three voxel edges, (v,) bool.
 
-    No contact and no gap (`pcgraph.graph.gaps.gaps`) joins such a piece to anything. Where they hold more than a
-    fiftieth of the points, what lies on surfaces of its own, as a coarse scan beside a fine one, stays. Clouds of fewer
-    than 1000 points, and those that are such pieces to more than two thirds, have none.
+    No contact joins such a piece to anything, and no gap (`pcgraph.graph.gaps.gaps`) but a wider one, as between the
+    rows of a scan. Where they hold more than a fiftieth of the points, what lies on surfaces of its own, as a coarse
+    scan beside a fine one, stays. Clouds of fewer than 1000 points, and those that are such pieces to more than two
+    thirds, have none.
 
     Parameters
     ----------

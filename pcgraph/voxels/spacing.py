@@ -103,9 +103,8 @@ def _median_spacing(crowd: NDArray[np.float64]) -> float:
 
 def _edge_for_neighbours(points: NDArray[np.float64], low: NDArray[np.float64], extent: float) -> float:
     """Edge of cells that hold four points each, about, where these lie on surfaces."""
-    block = np.empty(len(points), np.int32)
-    in_blocks(_find_block, len(points), points, low, max(extent, _TINY) / _BLOCKS, block)
-    return 2.0 * extent / _BLOCKS * math.sqrt(np.count_nonzero(np.bincount(block)) / len(points))
+    blocks = np.bincount(_blocks_of(points, low, max(extent, _TINY) / _BLOCKS))
+    return 2.0 * extent / _BLOCKS * math.sqrt(np.count_nonzero(blocks) / len(points))
 
 
 def _near(
@@ -190,8 +189,7 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     edge = float((high - low).max()) / _BLOCKS
     if not edge > 0.0:
         return points
-    block = np.empty(len(points), np.int32)
-    in_blocks(_find_block, len(points), points, low, edge, block)
+    block = _blocks_of(points, low, edge)
     counts = np.bincount(block)
     occupied = np.flatnonzero(counts)
     counts = counts[occupied]
@@ -200,6 +198,13 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     taken = np.zeros(_BLOCKS**3, bool)
     taken[occupied[order]] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
     return points.take(np.flatnonzero(taken[block]), axis=0)
+
+
+def _blocks_of(points: NDArray[np.float64], low: NDArray[np.float64], edge: float) -> NDArray[np.int32]:
+    """Number of the block of space in which each point lies, (n,)."""
+    block = np.empty(len(points), np.int32)
+    in_blocks(_find_block, len(points), points, low, edge, block)
+    return block
 
 
 @kernel
