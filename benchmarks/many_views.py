@@ -28,6 +28,7 @@ from fused_scans import fusion, registration, weights
 from scipy.spatial.transform import Rotation
 from tomography import tomography
 
+from rangesim.geometry.registration import nearest_similarity
 from rangesim.geometry.reprojection import moved_pose
 from rangesim.multiview import (
     NonRigidShape,
@@ -118,11 +119,8 @@ def perturbed(scene: Scene, turn: float, move: float, shift: float, seed: int = 
 
 def aligned(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Points (k, 3) moved by the similarity that brings them nearest to the true ones (Umeyama 1991)."""
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1, 1, np.linalg.det(u @ vt)])
-    scale = (values * signs).sum() / (a**2).sum()
-    return np.asarray(scale * a @ ((u * signs) @ vt).T + true.mean(axis=0))
+    T = nearest_similarity(found, true)
+    return np.asarray(found @ T[:3, :3].T + T[:3, 3])
 
 
 def centres(T: np.ndarray) -> np.ndarray:

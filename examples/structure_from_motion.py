@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim import Intrinsics, look_at
+from rangesim.geometry.registration import nearest_similarity
 from rangesim.multiview import Tracks, adjust_nonrigid, structure_from_motion
 
 NOISE_PX, WRONG = 0.5, 0.03
@@ -55,15 +56,6 @@ def photographed(views: int, count: int) -> tuple[Intrinsics, np.ndarray, np.nda
     return camera, T, X, Tracks.from_dense(pixels)
 
 
-def aligned(found: np.ndarray, true: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points, and more of them, under the similarity that brings the first nearest to the true ones."""
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1, 1, np.linalg.det(u @ vt)])
-    to_true = (values * signs).sum() / (a**2).sum() * ((u * signs) @ vt).T
-    return a @ to_true + true.mean(axis=0), (more - found.mean(axis=0)) @ to_true + true.mean(axis=0)
-
-
 def deforming() -> tuple[np.ndarray, Tracks]:
     """(10, 50, 3) a waving sheet of points in the frames of ten cameras, pixels, and noisy tracks with gaps."""
     random = np.random.default_rng(2)
@@ -91,7 +83,8 @@ def main() -> None:
     found = structure_from_motion(tracks, camera, noise_px=NOISE_PX)
     known = np.isfinite(found.points).all(axis=1)
     places = -np.einsum("nji,nj->ni", found.T_camera_world[:, :3, :3], found.T_camera_world[:, :3, 3])
-    points, places = aligned(found.points[known], X[known], places)
+    T_true = nearest_similarity(found.points[known], X[known])
+    points, places = (some @ T_true[:3, :3].T + T_true[:3, 3] for some in (found.points[known], places))
     true_places = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     error = 1e3 * np.linalg.norm(points - X[known], axis=1)
     off = 1e3 * np.linalg.norm(places - true_places, axis=1)

@@ -141,6 +141,20 @@ def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, 
     return found
 
 
+def nearest_similarity(source: Array, target: Array) -> Array:
+    """(4, 4) T_target_source: the scale, rotation and translation that bring points (n, 3) nearest to their partners.
+
+    Source: Umeyama, PAMI 1991.
+    """
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, values, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    T = np.eye(4)
+    T[:3, :3] = (values * signs).sum() / max((a**2).sum(), 1e-300) * (u * signs) @ vt
+    T[:3, 3] = target.mean(axis=0) - T[:3, :3] @ source.mean(axis=0)
+    return T
+
+
 class _Surface(NamedTuple):
     """A target: its points (m, 3), with normals as Open3D's cloud, their search tree and median spacing in metres."""
 

@@ -35,6 +35,7 @@ from rangesim.errors import warn
 from rangesim.geometry.consensus import SIGNIFICANCE, rounding_of, simpler_model_suffices
 from rangesim.geometry.correspondences import Array, check_noise, checked_array
 from rangesim.geometry.least_squares import descend
+from rangesim.geometry.registration import nearest_similarity
 from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose, reproject, with_all_coefficients
 from rangesim.multiview.schur_complement import LEAST_DAMPING, NormalEquations, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
@@ -153,7 +154,9 @@ def bundle_adjust(
     RangesimWarning
         The descent did not end in `max_steps`: covariance and deviations do not hold.
     """
-    found = adjusted_views(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px, max_steps)
+    found = adjusted_views(
+        tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px, max_steps, is_last=True
+    )
     _refuse_open_shape(found)
     _refuse_rotation_alone(tracks, found, free, held, loss)
     _refuse_other_relief(tracks, found, free, held, loss, loss_scale_px)
@@ -177,8 +180,12 @@ def adjusted_views(
     loss_scale_px: float = 1.0,
     noise_px: float | None = None,
     max_steps: int = ROUGH_STEPS,
+    is_last: bool = False,
 ) -> BundleAdjustment:
-    """As `bundle_adjust`, of views to which others are still to come: a shape that is open yet is no error."""
+    """As `bundle_adjust`, of views to which others are still to come: a shape that is open yet is no error.
+
+    How far it is open is told where they are the last.
+    """
     sizes, some, state = _checked(tracks, camera, T_camera_world, points, free, held, loss, loss_scale_px, noise_px)
     columns = [LENS_NAMES.index(name) for name in free]
     is_free = np.ones(tracks.n_images, dtype=bool)
@@ -211,6 +218,9 @@ def adjusted_views(
     known[np.unique(some.point)] = X[np.unique(some.point)]
     everywhere = np.full((len(tracks), 2), np.nan)
     everywhere[used] = residuals
+    shape = float("nan")
+    if is_last:
+        shape = _shape_deviation(Views(found.state.camera, T, X), some, sizes, columns, is_free, covariance, noise)
     return BundleAdjustment(
         found.state.camera,
         T,
@@ -220,7 +230,7 @@ def adjusted_views(
         float(noise),
         of_images,
         lens,
-        noise * _shape_deviation(Views(found.state.camera, T, X), some, sizes, columns, is_free, covariance, noise),
+        noise * shape,
         found.steps,
         found.has_converged,
     )
@@ -451,7 +461,8 @@ def _refuse_other_relief(
         if (again.used != found.used).any():
             continue
         rise = (_loss_of(again.residuals_px[again.used], loss, scale_px) - cost) / found.noise_px**2
-        turned = registered(again.points[known], X)
+        similarity = nearest_similarity(again.points[known], X)
+        turned = again.points[known] @ similarity[:3, :3].T + similarity[:3, 3]
         apart = float(np.median(np.linalg.norm(turned - X, axis=1))) / extent
         stated = MAX_CURVED * found.shape_deviation * np.sqrt(max(rise, 1.0))
         if rise < stats.chi2.isf(SIGNIFICANCE, 1) and apart > max(ANOTHER_SHAPE, stated):
@@ -464,15 +475,6 @@ def _refuse_other_relief(
 
 def _loss_of(residuals: Array, loss: Loss, scale: float) -> float:
     return float(scale**2 * LOSSES[loss]((residuals**2).sum(axis=1) / scale**2)[0].sum())
-
-
-def registered(points: Array, onto: Array) -> Array:
-    """Points (n, 3) under the similarity that brings them nearest to others (Umeyama 1991)."""
-    a, b = points - points.mean(axis=0), onto - onto.mean(axis=0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-    scale = (values * signs).sum() / max((a**2).sum(), 1e-300)
-    return np.asarray(scale * a @ ((u * signs) @ vt).T + onto.mean(axis=0))
 
 
 def _cost_of_rotations(camera: Intrinsics, T: Array, tracks: Tracks) -> float:
