@@ -298,7 +298,7 @@ def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np
     step = _STRETCH * max(1, len(first) // _COUNTED)
     stretches = [slice(at, min(at + _STRETCH, len(first))) for at in range(0, len(first), step)]
     for stretch in stretches:
-        _walk(stretch.start, stretch.stop, occupied, *pitch, degrees, np.empty((len(first), 0), np.int32))
+        _walk(stretch.start, stretch.stop, occupied, *pitch, degrees, False)
     counted = np.concatenate([degrees[stretch] for stretch in stretches])
     return np.floor(scaled.take(order[first], axis=0)), counted
 
@@ -314,12 +314,8 @@ def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Neig
         What a step in x and in y adds to a key.
     """
     counts = np.empty(len(keys), np.int64)
-    room = np.empty((len(keys), MAX_NEIGHBOURS), np.int32)
-    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, room)
-    indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
-    neighbours = np.empty(indptr[-1], np.int32)
-    in_blocks(_pack, len(keys), indptr, room, neighbours)
-    return Neighbourhood(indptr, neighbours)
+    lists = in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, True)
+    return Neighbourhood(np.concatenate((np.zeros(1, np.int64), np.cumsum(counts))), np.concatenate(lists))
 
 
 @kernel
@@ -330,11 +326,11 @@ def _walk(
     pitch_x: int,
     pitch_y: int,
     counts: NDArray[np.int64],
-    room: NDArray[np.int32],
-) -> None:
-    """The lists, one row each, or but their lengths where there is no room: nine pointers walk the sorted keys, each
-    along one row of three voxels around."""
-    n, lists = len(keys), room.shape[1] > 0
+    with_lists: bool,
+) -> NDArray[np.int32]:
+    """The lists, one after the other, if wanted, and how long each is, in `counts`: nine pointers walk the sorted keys,
+    each along one row of three voxels around."""
+    n, found, n_found = len(keys), np.empty((stop - start) * MAX_NEIGHBOURS if with_lists else 0, np.int32), 0
     pointers = np.empty(9, np.int64)
     shifts = np.empty(9, np.int64)
     for row in range(9):
@@ -357,22 +353,13 @@ def _walk(
             pointers[row] = at
             while at < n and keys[at] <= target + 2:
                 if at != i:
-                    if lists:
-                        room[i, count] = at
+                    if with_lists:
+                        found[n_found + count] = at
                     count += 1
                 at += 1
         counts[i] = count
-
-
-@kernel
-def _pack(
-    start: int, stop: int, indptr: NDArray[np.int64], room: NDArray[np.int32], neighbours: NDArray[np.int32]
-) -> None:
-    """The lists one after the other."""
-    for i in range(start, stop):
-        first = indptr[i]
-        for q in range(indptr[i + 1] - first):
-            neighbours[first + q] = room[i, q]
+        n_found += count
+    return found[: n_found if with_lists else 0]
 
 
 # --- which voxels lie near each other ---

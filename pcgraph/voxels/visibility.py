@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
-from pcgraph.voxels.grid import VoxelGrid, voxel_grid
+from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
 from pcgraph.voxels.spacing import sphere_directions
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
@@ -42,7 +42,8 @@ _DECIDED, _OUTSIDE_IN, _UPPER, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # wha
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _VIEWS = 12  # places that the voxels themselves are looked at from
-_MANY = 100_000  # voxels: of more a third is looked at
+_MANY = 100_000  # voxels: of more a seventh is looked at, where whole steps along x, y and z
+_SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # add up to a multiple of seven
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
@@ -94,8 +95,8 @@ def visible_sides(
     two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
     sides, then how much of what is seen from outside has its outside there, and how much of what is seen from the
     upper half of these places, or from the origin if all lies before it as before a camera that looks along z. The
-    voxels then take the mean direction to the places that see them, those that none sees, and of many voxels two
-    thirds, from the voxels around.
+    voxels then take the mean direction to the places that see them, those that none sees, and of many voxels six
+    sevenths, from the voxels around.
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
@@ -110,15 +111,16 @@ def visible_sides(
             return VisibleSides(viewpoint, np.where(told[:, None] < 0.0, -normals, normals))
     places, weights = _telling_places(centres, widths, -middle / reach, likely)
     votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
-    if grid.n_voxels > _MANY:  # on any plane a third of the voxels, which hide as much if so much larger
-        looked_at, widths = np.flatnonzero(grid.cells.sum(axis=1) % 3.0 == 0.0), math.sqrt(3.0) * widths
+    if grid.n_voxels > _MANY:  # a seventh, evenly spread on any plane, which hides as much if so much larger
+        looked_at, widths = np.flatnonzero(grid.cells @ _SPREAD_OUT % 7.0 == 0.0), math.sqrt(7.0) * widths
     centres, widths, sides = centres[looked_at], widths[looked_at], normals[looked_at]
     seen, towards = seen_from(places, centres, widths, sides), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
-    smoothed = np.empty_like(votes)
+    smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
+    in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
     for _ in range(_SMOOTHING):
-        in_blocks(_vote_along, grid.n_voxels, grid.indptr, grid.neighbours, normals, votes, smoothed)
+        in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
         votes, smoothed = smoothed, votes
     seen_most = middle + reach * places[0] if viewpoint is None else viewpoint
     return VisibleSides(seen_most, np.where(votes[:, None] < 0.0, -normals, normals))
@@ -394,8 +396,8 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
 @routine
 def _bin_of(x: float, y: float, z: float, bins: int) -> tuple[float, float]:
     """Place of a direction on the octahedral map of bins x bins."""
-    total = abs(x) + abs(y) + abs(z)
-    u, v = x / total, y / total
+    per_total = 1.0 / (abs(x) + abs(y) + abs(z))
+    u, v = x * per_total, y * per_total
     if z < 0.0:
         u, v = (1.0 - abs(v)) * (1.0 if u >= 0.0 else -1.0), (1.0 - abs(u)) * (1.0 if v >= 0.0 else -1.0)
     return 0.5 * (u + 1.0) * bins, 0.5 * (v + 1.0) * bins
@@ -481,18 +483,19 @@ def _look(
                 continue
             u, v = _bin_of(x, y, z, bins)
             at[i] = min(int(u), bins - 1) * bins + min(int(v), bins - 1)
-            per_radian = 0.5 * bins * distance / (abs(x) + abs(y) + abs(z))  # at most, of the octahedral map
+            bin_width = 2.0 * (abs(x) + abs(y) + abs(z)) / bins  # across the direction, at least, as of the square
             # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-            before[i] = distance - widths[i] - 0.5 * distance / per_radian
-            cosine = abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / distance
-            slope = min(math.sqrt(max(1.0 - cosine * cosine, 0.0)) / max(cosine, _TINY), _STEEPEST) / per_radian
-            half = min(0.6 * widths[i] / distance * per_radian, 24.0)
+            before[i] = distance - widths[i] - 0.5 * bin_width
+            depth = abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2])
+            across = math.sqrt(max(distance * distance - depth * depth, 0.0))
+            slope = bin_width * (across / depth if across < _STEEPEST * depth else _STEEPEST)
+            half = min(0.6 * widths[i] / bin_width, 24.0)
             first, last = max(int(v - half), 0), min(int(v + half), bins - 1)
             for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
                 off = max(abs(p + 0.5 - u) - 0.5, 0.0)
                 for q in range(first, last + 1):
                     beside = max(off, abs(q + 0.5 - v) - 0.5)  # beside its centre it may be farther
-                    bits = np.float32(distance * (1.0 + slope * beside)).view(np.int32)
+                    bits = np.float32(distance + slope * beside).view(np.int32)
                     nearest[p * bins + q] = min(nearest[p * bins + q], np.int64(bits) << 32 | i)
         for i in range(n):
             seen[k, i] = at[i] >= 0
@@ -527,21 +530,30 @@ def _look_around(
 
 
 @kernel
+def _compare_normals(
+    start: int, stop: int, around: Neighbourhood, normals: NDArray[np.float64], alike: NDArray[np.int8]
+) -> None:
+    """Set whether each voxel and each of those around it are on one surface: 1, -1 with opposite normals, or 0."""
+    for i in range(start, stop):
+        for a in range(around.indptr[i], around.indptr[i + 1]):
+            j = around.neighbours[a]
+            cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            alike[a] = (cosine > _SAME) - (cosine < -_SAME)
+
+
+@kernel
 def _vote_along(
     start: int,
     stop: int,
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
-    normals: NDArray[np.float64],
+    around: Neighbourhood,
+    alike: NDArray[np.int8],
     votes: NDArray[np.float64],
     smoothed: NDArray[np.float64],
 ) -> None:
     """Set the votes for the side of each voxel's normal, with those of the voxels around on the same surface."""
+    indptr, neighbours = around
     for i in range(start, stop):
         total = votes[i]
         for a in range(indptr[i], indptr[i + 1]):
-            j = neighbours[a]
-            cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
-            if abs(cosine) > _SAME:
-                total += math.copysign(votes[j], votes[j] * cosine)
+            total += alike[a] * votes[neighbours[a]]
         smoothed[i] = total / (indptr[i + 1] - indptr[i] + 1)
