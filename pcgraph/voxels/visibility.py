@@ -343,14 +343,16 @@ def _most_telling(
 
 def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:
     """Some of the places, by weight and by how much each sees, (k, n) bool, that those before see seldom or never."""
-    interest, left = np.ones(seen.shape[1]), weights.copy()
+    places = np.flatnonzero(weights > 0.0)
+    left, sees = weights[places], seen[places].astype(np.float32)
+    interest = np.ones(seen.shape[1], np.float32)
     chosen: list[int] = []
     while len(chosen) < _VIEWS and left.any():
-        best = int(np.argmax(left * (seen @ interest)))
+        best = int(np.argmax(left * np.einsum("kn,n->k", sees, interest)))
         chosen.append(best)
-        interest[seen[best]] *= 0.25
+        interest[sees[best] > 0.0] *= np.float32(0.25)
         left[best] = 0.0
-    return np.array(chosen)
+    return places[chosen]
 
 
 def _coarse(centres: NDArray[np.float64], width: float) -> VoxelGrid:
