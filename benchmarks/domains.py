@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Is pcgraph's default good on every kind of cloud? One table of clouds against settings and what people use.
 
-    python benchmarks/domains.py [--domains "room1,street sweep A"] [--quick] [--superpoints FOLDER]
+    python benchmarks/domains.py [--domains "room1,street sweep A"] [--quick] [--turns N] [--superpoints FOLDER]
 
 Rows of each domain (`domain_clouds.py`):
 
@@ -29,7 +29,9 @@ Columns, means over a domain's clouds; those that count in the domain are named 
     change, noise  wov less that of the same cloud without noise; IoU of the points that have no label with the noise
     objects, single, s    objects, those of one point, seconds per cloud
 
-A point without a label belongs to one more segment, that of all such points. The last line is JSON: for each domain
+A point without a label belongs to one more segment, that of all such points. A cloud turned about z and shifted is
+another draw of voxels, and scores of one cloud change by some hundredths; with --turns all rows of domains that have
+only one cloud are means over so many copies of it. The last line is JSON: for each domain
 default, best, baselines; and worst_loss, the least of default - max(best, baselines) over the scores that count.
 """
 
@@ -41,6 +43,7 @@ import itertools
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +53,7 @@ from domain_clouds import NOISE, Domain, MissingDataError, Sample, domains
 from numpy.typing import NDArray
 from peers import PclSetting, pcl_driver, run_pcl
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 import pcgraph
 from pcgraph.metrics import tree_oracle, weighted_overlap
@@ -72,6 +76,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domains", help="names, comma-separated, or the beginnings of names; default: all")
     parser.add_argument("--quick", action="store_true", help="leave out large clouds and the best knobs")
+    parser.add_argument(
+        "--turns", type=int, default=1, metavar="N", help="copies of a cloud that is its domain's only one"
+    )
     parser.add_argument("--superpoints", type=Path, help="folder of .npz with points, labels, superpoints (and colors)")
     args = parser.parse_args()
     chosen = _chosen(domains(args.superpoints), args.domains, args.quick)
@@ -83,6 +90,8 @@ def main() -> None:
         except MissingDataError as missing:
             print(f"\n{domain.name}: left out, {missing}")
             continue
+        if len(samples) == 1:
+            samples = _turned(samples[0], args.turns)
         report[domain.name] = _measure(domain, samples, with_best=not args.quick)
     losses = {name: rows["loss"] for name, rows in report.items() if rows["loss"] is not None}
     worst = min(losses, key=losses.__getitem__, default=None)
@@ -97,6 +106,18 @@ def _chosen(every: list[Domain], names: str | None, quick: bool) -> list[Domain]
         if not any(domain.name.startswith(beginning) for domain in every):
             raise SystemExit(f"no domain {beginning!r}; there are: {', '.join(domain.name for domain in every)}")
     return [domain for domain in every if domain.name.startswith(tuple(beginnings))]
+
+
+def _turned(sample: Sample, turns: int) -> list[Sample]:
+    """A cloud that is a list of points, and copies of it turned about z and shifted."""
+    turned = [sample]
+    for seed in range(1, 1 if sample.organised else turns):
+        random = np.random.default_rng(seed)
+        turn = Rotation.from_euler("z", random.uniform(0.0, 360.0), degrees=True).as_matrix()
+        shift = random.uniform(0.0, 0.1, 3)
+        viewpoint = None if sample.viewpoint is None else sample.viewpoint @ turn.T + shift
+        turned.append(replace(sample, points=sample.points @ turn.T + shift, viewpoint=viewpoint))
+    return turned
 
 
 def _warm_up() -> None:
