@@ -42,8 +42,8 @@ _DECIDED, _OUTSIDE_IN, _UPPER, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # wha
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _VIEWS = 12  # places that the voxels themselves are looked at from
-_MANY = 100_000  # voxels: of more a seventh is looked at, where whole steps along x, y and z
-_SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # add up to a multiple of seven
+_MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
+_SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # along x, y and z, times these, add up to a multiple of seven or three
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
@@ -95,8 +95,8 @@ def visible_sides(
     two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
     sides, then how much of what is seen from outside has its outside there, and how much of what is seen from the
     upper half of these places, or from the origin if all lies before it as before a camera that looks along z. The
-    voxels then take the mean direction to the places that see them, those that none sees, and of many voxels six
-    sevenths, from the voxels around.
+    voxels then take the mean direction to the places that see them, those that none sees, and of many voxels most,
+    from the voxels around.
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
@@ -111,8 +111,9 @@ def visible_sides(
             return VisibleSides(viewpoint, np.where(told[:, None] < 0.0, -normals, normals))
     places, weights = _telling_places(centres, widths, -middle / reach, likely)
     votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
-    if grid.n_voxels > _MANY:  # a seventh, evenly spread on any plane, which hides as much if so much larger
-        looked_at, widths = np.flatnonzero(grid.cells @ _SPREAD_OUT % 7.0 == 0.0), math.sqrt(7.0) * widths
+    step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
+    if step > 1.0:  # some, evenly spread on any plane, which hide as much if so much larger
+        looked_at, widths = np.flatnonzero(grid.cells @ _SPREAD_OUT % step == 0.0), math.sqrt(step) * widths
     centres, widths, sides = centres[looked_at], widths[looked_at], normals[looked_at]
     seen, towards = seen_from(places, centres, widths, sides), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
