@@ -14,13 +14,14 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+import scanned_elsewhere
 import scanned_rooms
 import scanned_scenes
 import scanned_streets
 from mosd import load_clouds
 from numpy.typing import NDArray
 from scanned_rooms import flat, office, stations
-from scanned_scenes import Scene
+from scanned_scenes import Scan, Scene
 from scanned_streets import CAR, PERSON, POLE, drive, street, sweep
 from scipy.spatial.transform import Rotation
 
@@ -142,6 +143,7 @@ def domains(superpoints: Path | None = None) -> list[Domain]:
         *(Domain(f"isprs samp{k}", aerial, partial(isprs, k), 100, air, 0.5) for k in (11, 12, 21, 23, 31, 41)),
         Domain("bins A", levels, partial(bins, "A"), 100, (0.02, 0.04, 0.08), 0.03),
         Domain("bins C", levels, partial(bins, "C"), 100, (0.02, 0.04, 0.08), 0.03),
+        *(Domain(name, things, partial(elsewhere, name), 100, *units) for name, units in ELSEWHERE.items()),
         Domain("plane 2 mm", ("one",), planes, 1, (0.01, 0.03), 0.01),
         Domain("plane in mm", ("one",), planes_in_millimetres, 1, (10.0, 30.0), 10.0),
     ]
@@ -297,6 +299,31 @@ def _from_npz(name: str, above: float, ground: int) -> Sample:
     return Sample(points, labels.astype(np.int32), colors if len(colors) else None, viewpoint, ground=ground)
 
 
+# --- Kinds held back ----------------------------------------------------------------------------------------------
+
+
+ELSEWHERE = {  # radii of DBSCAN, and distance from RANSAC's plane, metres
+    "plant": ((0.05, 0.1, 0.2), 0.02),
+    "warehouse": ((0.05, 0.1, 0.2), 0.02),
+    "stereo table": ((0.02, 0.04, 0.08), 0.02),
+    "hay bales": ((0.4, 0.8, 1.6), 0.15),
+    "turntable": ((0.004, 0.008, 0.016), 0.003),
+    "house front": ((0.1, 0.2, 0.4), 0.04),
+    "drifting walk": ((0.04, 0.08, 0.15), 0.03),
+    "power lines": ((1.0, 2.0, 4.0), 0.3),
+}
+
+
+def elsewhere(name: str) -> list[Sample]:
+    """A scene of a kind that no constant was chosen on; all of its things are judged."""
+    return [_kept(name, lambda: _scene_elsewhere(getattr(scanned_elsewhere, name.replace(" ", "_"))()))]
+
+
+def _scene_elsewhere(found: Scan) -> Sample:
+    counts = np.bincount(found.things)
+    return Sample(found.points, found.things, None, found.origins, things=np.flatnonzero(counts >= MIN_THING))
+
+
 # --- Planes -------------------------------------------------------------------------------------------------------
 
 
@@ -340,7 +367,8 @@ def _found(path: Path) -> Path:
 
 def _kept(name: str, make: Callable[[], Sample]) -> Sample:
     """A sample from build/, made if it is not there or the code of clouds and scenes has changed since."""
-    sources = (__file__, scanned_rooms.__file__, scanned_scenes.__file__, scanned_streets.__file__)
+    scenes = (scanned_scenes, scanned_rooms, scanned_streets, scanned_elsewhere)
+    sources = (__file__, *(str(module.__file__) for module in scenes))
     code = b"".join(Path(file).read_bytes() for file in sources)
     path = CACHE / f"{name.replace(' ', '_')}-{hashlib.sha256(code).hexdigest()[:12]}.npz"
     if path.exists():

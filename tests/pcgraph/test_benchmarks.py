@@ -9,12 +9,16 @@ import subprocess
 import numpy as np
 import pytest
 import room
+import scanned_elsewhere
 from baselines import felzenszwalb, normal_graph, plane_and_clusters
 from clouds import two_boxes_on_a_plane
 from peers import PclSetting, run_lin, run_pcl
 from scanned_scenes import Scene, ball, box, rod, scan, sphere_of_rays
 from scanned_streets import GROUND, SENSOR_M, street, sweep
 from scipy.spatial import cKDTree
+
+import pcgraph
+from pcgraph.metrics import weighted_overlap
 
 PLAIN = PclSetting(0.01, 0.06, color=0.0, spatial=0.4, normal=1.0, camera=False)
 
@@ -88,6 +92,32 @@ def _corner(concave: bool) -> np.ndarray:
     points = np.stack([x, y, 1.0 - np.abs(x) if concave else 1.0 + np.abs(x)], axis=-1).astype(np.float32)
     points[0, 0] = np.nan
     return points
+
+
+@pytest.mark.parametrize(("kind", "least"), [("turntable", 0.98), ("stereo_table", 0.98), ("plant", 0.89)])
+def test_kinds_that_were_held_back_are_segmented_with_nothing_given(kind, least):
+    found = getattr(scanned_elsewhere, kind)()
+    assert weighted_overlap(pcgraph.segment(found.points).labels, found.things) > least
+
+
+def test_a_stereo_camera_measures_disparities_in_eighths_of_a_pixel():
+    z = scanned_elsewhere.stereo_table().points[:, 2]
+    eighths = 8.0 * 525.0 * 0.12 / z
+    np.testing.assert_allclose(eighths, np.rint(eighths), atol=1e-2)
+    assert len(np.unique(np.rint(eighths))) > 100
+
+
+def test_a_walk_that_drifts_doubles_its_walls():
+    found = scanned_elsewhere.drifting_walk()
+    _, first, visits = np.unique(found.origins, axis=0, return_index=True, return_inverse=True)
+    later = np.isin(visits, visits[np.sort(first)[4:]])
+    x, y, z = found.points.T
+    wall = (x > 8.9) & (np.abs(y - 2.0) < 1.7) & (np.abs(z - 1.7) < 0.7)
+    before, after = found.points[wall & ~later], found.points[wall & later]
+    assert before[:, 0].mean() == pytest.approx(9.0, abs=0.001)
+    turn = np.radians(0.3)  # about the origin: what lies on x = 9 comes to x cos - y sin + 1.5 cm
+    true = (9.0 + 0.015 * np.cos(turn) + 0.01 * np.sin(turn) - np.sin(turn) * after[:, 1]) / np.cos(turn)
+    assert (after[:, 0] - true).mean() == pytest.approx(0.0, abs=0.001)
 
 
 def _pcl_is_here() -> bool:
