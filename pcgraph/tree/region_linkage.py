@@ -37,15 +37,16 @@ class RegionLinkage(Linkage):
     -----
     Two regions A and B merge at
 
-        (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^1/2  (w / (b + w))^3/4
+        (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^1/2  (w / (b + w))^3/4  (1 + M / (r m))^1/4
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
     increase of the squared distances to the regions' best planes and mean colours by the merge, and l = E / b that per
     length b of the contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean
-    supervoxel; w is the width of the smaller region. So what lies on one plane and has one colour merges first,
-    whatever its normals; a small piece merges early, as its contact says little; and a valley counts most between two
-    large surfaces that meet along a line short for their size. Contacts are touching voxels and, at a price, gaps
-    (`pcgraph.graph.gaps.gaps`).
+    supervoxel; w is the width of the smaller region; m and M are the masses of the smaller and the larger one. So what
+    lies on one plane and has one colour merges first, whatever its normals; a small piece merges early, as its contact
+    says little, but later with a surface a hundred times as large, so that a thing is whole before it joins what it
+    stands on; and a valley counts most between two large surfaces that meet along a line short for their size. Contacts
+    are touching voxels and, at a price, gaps (`pcgraph.graph.gaps.gaps`).
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -87,9 +88,10 @@ class _Shape(NamedTuple):
     e0: float
     l0: float
     width: float
+    r: float
 
 
-_SHAPE = _Shape(c0=0.08, c1=0.04, e0=1.0, l0=0.1, width=7.7)
+_SHAPE = _Shape(c0=0.08, c1=0.04, e0=1.0, l0=0.1, width=7.7, r=100.0)
 
 
 def region_linkage(
@@ -179,9 +181,10 @@ def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, 
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
     increase = max(energy_increase(state, a, b), 0.0)
     scale = increase / length
-    width = shape.width * math.sqrt(min(state.masses[a], state.masses[b]))
+    smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
+    width = shape.width * math.sqrt(smaller)
     shortness = width / (length + width)
     evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
-    evidence *= math.sqrt(shortness * math.sqrt(shortness))
+    evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
     return round(evidence * _STEPS) / _STEPS

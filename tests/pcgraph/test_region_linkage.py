@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,11 @@ import pcgraph
 from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
 
 
-def test_the_altitude_of_two_regions_is_the_formula():
+@pytest.mark.parametrize("times_as_large", [1, 300])
+def test_the_altitude_of_two_regions_is_the_formula(times_as_large):
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
+    grown = leaves.counts * np.array([1, times_as_large])
+    leaves = replace(leaves, counts=grown, scatters=leaves.scatters * (grown / leaves.counts)[:, None, None])
     cost, weight = 0.4, 7.0
     found = region_linkage(graph, leaves, graph.edges, np.array([cost]), np.array([weight])).altitudes[0]
     unit = float(np.median(graph.edge_features.voxel_edge))
@@ -32,6 +36,7 @@ def test_the_altitude_of_two_regions_is_the_formula():
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
     evidence = cost + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
+    weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
 
