@@ -32,6 +32,8 @@ NEAR_EPIPOLE = 0.25
 CONVERGED, MAX_STEPS = 1e-5, 20
 """Steps end where one changes the correction by less than this fraction of it, so that the next would change it by
 about the square; where none does, it is checked likewise."""
+PARALLEL = 1e-12
+"""Radians between rays, or less: rounding, a thousandth of a millionth of a pixel."""
 
 
 class CorrectedPixels(NamedTuple):
@@ -226,12 +228,15 @@ def _checked(
 
 
 def _judged(p: Array, q: Array, x: Array, y: Array, X: Array) -> TriangulatedPoints:
-    """With reprojection errors; NaN where not finite or not in front of both cameras."""
+    """With reprojection errors; NaN where not finite, as far off as parallel rays, or not in front of both cameras."""
     points, error = np.full(X.shape, np.nan), np.full(len(X), np.nan)
     finite = np.asarray(np.isfinite(X).all(axis=-1))
     sound = finite.copy()
+    C, D = (centre(P)[:3] / centre(P)[3] for P in (p, q))
+    farthest = np.linalg.norm(D - C) / PARALLEL
     for P in (p, q):
         sound[finite] = sound[finite] & (depth(P, X[finite]) > 0)
+    sound[finite] &= np.linalg.norm(X[finite] - C, axis=-1) < farthest
     points[sound] = X[sound]
     parts = [project(P, X[sound]) - measured[sound] for P, measured in ((p, x), (q, y))]
     error[sound] = np.linalg.norm(np.hstack(parts), axis=-1)
@@ -312,7 +317,8 @@ def _intersect(start, stop, cameras, first, second, measured_first, measured_sec
         size = nx * nx + ny * ny + nz * nz
         along = (by * qz - bz * qy) * nx + (bz * qx - bx * qz) * ny + (bx * qy - by * qx) * nz
         other = (by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz
-        if along > 0 and other > 0:  # so size > 0 as well
+        least = PARALLEL * PARALLEL * (px * px + py * py + pz * pz) * (qx * qx + qy * qy + qz * qz)
+        if along > 0 and other > 0 and size > least:
             z = along / size
             points[i, 0] = cameras.first_centre[0] + z * px
             points[i, 1] = cameras.first_centre[1] + z * py
