@@ -76,6 +76,7 @@ def test_each_camera_has_its_own_signals_and_photons_are_traced_once(
             np.testing.assert_array_equal(getattr(one.truth, part), getattr(other.truth, part))
     # The second camera has random numbers of its own: other noise, the same light
     assert all_bytes(both[1]) != all_bytes(alone[1])
+    # (the means of caustics deviate by 4 to 6 % each, over six seeds)
     for part, deviation in {"direct": 0.025, "multipath": 0.025, "caustic": 0.07, "ambient": 0.025}.items():
         one, other = (getattr(signals[1].energy, part) for signals in (both, alone))
         assert one.mean() == pytest.approx(other.mean(), rel=4 * deviation), (
