@@ -42,7 +42,7 @@ from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_ce
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import median_spacing, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface
-from pcgraph.voxels.visibility import visible_sides
+from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
@@ -140,7 +140,7 @@ def segment(
     compile_in_two_processes()
     n_points = len(cloud.points)
     for _ in range(2):
-        voxel, (found, warp) = side_by_side(
+        voxel, (found, mirrored, warp) = side_by_side(
             partial(_voxel_size, cloud, voxel_size, seed_size),
             partial(_place_and_warp, cloud, place, camera, range_growth),
         )
@@ -158,6 +158,8 @@ def segment(
     warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
+    if place is None and mirrored is not None:  # all of a scan was seen
+        found = max((found, mirrored), key=partial(visible_fraction, grid))
     position, planes = _outward_planes(grid, settings.method, found, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
     result = segment_scan(Scan(cloud, position, grid, planes, initial_labels, seed), None, settings)
@@ -346,19 +348,20 @@ def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArr
 
 def _place_and_warp(
     cloud: CleanCloud, position: NDArray[np.float64] | None, camera: bool | None, range_growth: float | None
-) -> tuple[NDArray[np.float64] | None, Warp]:
-    """From where the cloud was seen, if that is known or its spacing tells; and how its voxels grow."""
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None, Warp]:
+    """From where the cloud was seen, if that is known or its spacing tells; from where instead; how its voxels grow."""
     if camera is None:
         camera = position is not None and _is_camera(cloud, position, range_growth)
-    growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
+    growth, mirrored = 0.0 if range_growth is None else fraction("range_growth", range_growth), None
     if position is None or (range_growth is None and position.ndim == 1 and not camera):
         law = spacing_law(cloud.points, position)
         if law.holds:
-            position = law.viewpoint
+            position, mirrored = law.viewpoint, law.mirrored
             growth = RANGE_GROWTH if range_growth is None and not camera else growth
     if position is None and not (camera or growth):
-        return None, Warp()
-    return position, choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
+        return None, None, Warp()
+    warp = choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
+    return position, mirrored, warp
 
 
 def _without(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +30,17 @@ _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
 _NEIGHBOUR = 8
 _TRIMMINGS = 2
 _LEAST_RANGE = 1e-3  # in half extents
+_SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
 _TINY = float(np.finfo(np.float64).tiny)
-_MIN_EXPLAINED = 0.5
+_MIN_EXPLAINED = 0.63  # mean of what law and range explain
 _MIN_EXPONENT = 0.5
 _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
 _MIN_EXPONENT_OF_HALF = 0.3
-_OWN_ORIGIN = 0.1  # explained variance by which another place must beat the frame's origin
+_ALIKE = 0.02  # explained variance: what explains less than this more is no better
+_OWN_ORIGIN = 0.05  # explained variance by which another place must beat the frame's origin
+_MIN_COSINE = 0.1  # between a surface and the rays that meet it: at less a beam's spacing is that along its rows
+_PRIOR = 0.1  # of the variance for a deviation of 1 from the exponent of a beam of constant angle, in search of a place
 
 
 def median_spacing(points: NDArray[np.float64]) -> float:
@@ -231,29 +236,37 @@ def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 @dataclass(frozen=True, eq=False)
 class SpacingLaw(ShortRepr):
-    """Spacing in proportion to a power of the range from one place: the cloud is one scan, and was taken from there.
+    """Spacing in proportion to a power of the range from one place, and to the inverse root of the cosine at which rays
+    from there meet the surface: the cloud is one scan, and was taken from there.
 
     Attributes
     ----------
     viewpoint : (3,) float64, metres
     exponent : float, 0..1.5
         About 1 for a beam of constant angle, more where noise grows with range as well.
-    explained : float, 0..1
-        Fraction of the variance of the spacing's logarithm that the law explains.
+    explained : float, at most 1
+        Fraction of the variance of the spacing's logarithm that the law explains; negative if it is worse than none.
+    by_range : float, 0..1
+        Fraction that range explains of what cosines leave. About 0 where all is far, and only the slant of the surfaces
+        makes a difference, as seen from the air.
     in_halves : float
         The lesser of the exponents in the near and in the far half of the readings, where ranges differ enough to tell;
         else `exponent`. About 0 where a fine scan of a thing lies within a coarse one of its surroundings.
+    mirrored : (3,) float64, metres, or None
+        A place on the other side of what is nearly one plane, if spacing does not tell which of the two it was.
     """
 
     viewpoint: NDArray[np.float64]
     exponent: float
     explained: float
+    by_range: float
     in_halves: float
+    mirrored: NDArray[np.float64] | None = None
 
     @property
     def holds(self) -> bool:
         """Whether the law says more than chance would, near and far."""
-        told = self.explained >= _MIN_EXPLAINED and self.exponent >= _MIN_EXPONENT
+        told = (self.explained + self.by_range) / 2.0 >= _MIN_EXPLAINED and self.exponent >= _MIN_EXPONENT
         return told and self.in_halves >= _MIN_EXPONENT_OF_HALF
 
 
@@ -269,38 +282,58 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
 
     Notes
     -----
-    Log spacing, by the distance to the eighth neighbour in a thinned cloud, is regressed on log range. Places all
-    around and within the cloud are tried, then moved by ever smaller steps; readings far off the line, such as noise,
-    are left out.
+    Rays of constant solid angle meet a surface at distances of r / sqrt(cos), r the range and cos that of the angle
+    between ray and normal. Log spacing, by the distance to the eighth neighbour in a thinned cloud, and with the cosine
+    taken out, is regressed on log range. Places all around and within the cloud are tried, then moved by ever smaller
+    steps; readings far off the line, such as noise, are left out.
     """
-    nowhere = SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0)
-    places, spacing = _readings(points)
-    if len(places) < _MIN_READINGS:
-        return nowhere
-    low, high = bounding_box(places)
+    found = _readings(points)
+    if len(found.logs) < _MIN_READINGS:
+        return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0)
+    low, high = bounding_box(found.places)
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
-    origin, logs = -middle / reach, np.log(spacing / reach)
-    places = (places - middle) / reach
-    place = None if viewpoint is None else (viewpoint - middle) / reach
-    kept = np.ones(len(logs), bool)
-    for _ in range(_TRIMMINGS):
-        found = _most_telling_place(places[kept], logs[kept]) if place is None else place
-        explained, exponent = _regressions(places[kept], logs[kept], found[None])
-        residuals = logs - exponent[0] * np.log(_ranges(places, found))
+    every = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
+    given = None if viewpoint is None else (viewpoint - middle) / reach
+    place, mirrored = _most_telling_places(every) if given is None else (given, None)
+    kept, own = np.ones(len(every.logs), bool), viewpoint
+    for trimmed in range(_TRIMMINGS):
+        some = every.some(kept)
+        if trimmed and given is None:
+            place = _searched(some.some(slice(None, None, 2)), place, _SHORT_STEP, 8)[0]
+        line = _regressions(some, place[None])
+        residuals = _corrected(every, place) - line.exponents[0] * np.log(_ranges(every.places, place))
         residuals -= np.median(residuals[kept])
         spread = 1.4826 * float(np.median(np.abs(residuals[kept])))
         kept = np.abs(residuals) <= 2.5 * max(spread, 0.1)
-    if viewpoint is None:
-        of_origin, exponent_of_origin = _regressions(places[kept], logs[kept], origin[None])
-        if of_origin[0] >= explained[0] - _OWN_ORIGIN:
-            in_halves = _least_exponent(places, logs, origin, float(exponent_of_origin[0]))
-            return SpacingLaw(np.zeros(3), float(exponent_of_origin[0]), float(of_origin[0]), in_halves)
-    in_halves = _least_exponent(places, logs, found, float(exponent[0]))
-    return SpacingLaw(middle + reach * found, float(exponent[0]), float(explained[0]), in_halves)
+    if given is None:
+        origin = -middle / reach
+        line_of_origin = _regressions(every.some(kept), origin[None])
+        if line_of_origin.explained[0] >= line.explained[0] - _OWN_ORIGIN:
+            place, line, own, mirrored = origin, line_of_origin, np.zeros(3), None
+    return SpacingLaw(
+        viewpoint=middle + reach * place if own is None else own,
+        exponent=float(line.exponents[0]),
+        explained=float(line.explained[0]),
+        by_range=float(line.by_range[0]),
+        in_halves=_least_exponent(every, place, float(line.exponents[0])),
+        mirrored=None if mirrored is None else middle + reach * mirrored,
+    )
 
 
-def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Some places, (m, 3), and the spacing there, (m,), in a cloud thinned by the points' hashes."""
+class _Readings(NamedTuple):
+    """Places, (m, 3), unit normals of the surface there, (m, 3), and logarithms of the spacing, (m,)."""
+
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    logs: NDArray[np.float64]
+
+    def some(self, which: NDArray[np.bool_] | slice) -> _Readings:
+        """Those of some places."""
+        return _Readings(self.places[which], self.normals[which], self.logs[which])
+
+
+def _readings(points: NDArray[np.float64]) -> _Readings:
+    """Readings at some places in a cloud thinned by the points' hashes."""
     chosen = points
     if len(points) > _THINNED:
         taken = np.empty(len(points), np.bool_)
@@ -309,11 +342,15 @@ def _readings(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     if len(chosen):
         chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
-        return chosen[:0], np.empty(0)
+        return _Readings(chosen[:0], chosen[:0], np.empty(0))
     sample = chosen[:_READINGS]
-    spacing = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)[0][:, -1]
+    near, around = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)
+    spacing = near[:, -1]
     usable = np.isfinite(spacing) & (spacing > 0.0)
-    return sample[usable], spacing[usable]
+    sample, spacing, patches = sample[usable], spacing[usable], chosen[around[usable]]
+    patches = (patches - patches.mean(axis=1, keepdims=True)) / spacing[:, None, None]
+    normals = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))[1][:, :, 0]
+    return _Readings(sample, np.ascontiguousarray(normals), np.log(spacing))
 
 
 def _ranges(places: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -322,48 +359,71 @@ def _ranges(places: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDAr
     return np.sqrt(np.einsum("...i,...i->...", rays, rays)) + _LEAST_RANGE
 
 
-def _regressions(
-    places: NDArray[np.float64], logs: NDArray[np.float64], viewpoints: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Explained fraction of the variance, and exponent, (k,) each, of the law about each of k viewpoints."""
-    explained, slopes = np.empty(len(viewpoints)), np.empty(len(viewpoints))
-    _regress(places, logs - logs.mean(), viewpoints, explained, slopes)
-    return explained, slopes
+def _corrected(readings: _Readings, viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Log spacing, (m,), as it were if rays from a viewpoint met the surface at right angles."""
+    rays = readings.places - viewpoint
+    cosines = np.abs(np.einsum("mi,mi->m", rays, readings.normals)) / _ranges(readings.places, viewpoint)
+    return readings.logs + 0.5 * np.log(np.maximum(cosines, _MIN_COSINE))
+
+
+class _Lines(NamedTuple):
+    """Regressions about k viewpoints: what each explains of the variance, exponent, what range explains, (k,) each."""
+
+    explained: NDArray[np.float64]
+    exponents: NDArray[np.float64]
+    by_range: NDArray[np.float64]
+
+
+def _regressions(readings: _Readings, viewpoints: NDArray[np.float64], prior: float = 0.0) -> _Lines:
+    """The law about each of k viewpoints, (k, 3).
+
+    A prior, in variances, draws exponents to 1 and counts against what is explained.
+    """
+    found = _Lines(*np.empty((3, len(viewpoints))))
+    _regress(readings, viewpoints, prior, found)
+    return found
 
 
 @kernel
-def _regress(
-    places: NDArray[np.float64],
-    y: NDArray[np.float64],
-    viewpoints: NDArray[np.float64],
-    explained: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-) -> None:
-    """Set what `_regressions` returns, of logarithms whose mean is zero."""
-    x = np.empty(len(y))
+def _regress(readings: _Readings, viewpoints: NDArray[np.float64], prior: float, found: _Lines) -> None:
+    """Set what `_regressions` returns."""
+    places, normals, logs = readings
+    n, mean = len(logs), 0.0
+    for i in range(n):
+        mean += logs[i] / n
+    variance = 0.0
+    for i in range(n):
+        variance += (logs[i] - mean) ** 2
+    x, y = np.empty(n), np.empty(n)
     for v in range(len(viewpoints)):
-        mean = 0.0
-        for i in range(len(y)):
-            square = 0.0
+        mean_x = mean_y = 0.0
+        for i in range(n):
+            square = along = 0.0
             for axis in range(3):
-                square += (places[i, axis] - viewpoints[v, axis]) ** 2
-            x[i] = math.log(math.sqrt(square) + _LEAST_RANGE)
-            mean += x[i] / len(y)
-        variance = squares = products = 0.0
-        for i in range(len(y)):
-            variance += y[i] * y[i]
-            squares += (x[i] - mean) * (x[i] - mean)
-            products += (x[i] - mean) * y[i]
-        slope = min(max(products / max(squares, _TINY), 0.0), _MAX_EXPONENT)
-        left = variance - slope * (2.0 * products - slope * squares)
-        explained[v], slopes[v] = 1.0 - left / max(variance, _TINY), slope
+                ray = places[i, axis] - viewpoints[v, axis]
+                square += ray * ray
+                along += ray * normals[i, axis]
+            reach = math.sqrt(square) + _LEAST_RANGE
+            x[i] = math.log(reach)
+            y[i] = logs[i] + 0.5 * math.log(max(abs(along) / reach, _MIN_COSINE))
+            mean_x += x[i] / n
+            mean_y += y[i] / n
+        of_x = of_y = products = 0.0
+        for i in range(n):
+            of_x += (x[i] - mean_x) ** 2
+            of_y += (y[i] - mean_y) ** 2
+            products += (x[i] - mean_x) * (y[i] - mean_y)
+        slope = (products + prior * variance) / max(of_x + prior * variance, _TINY)
+        slope = min(max(slope, 0.0), _MAX_EXPONENT)
+        left = of_y - slope * (2.0 * products - slope * of_x)
+        found.by_range[v] = 1.0 - left / max(of_y, _TINY)
+        found.explained[v] = 1.0 - left / max(variance, _TINY) - prior * (slope - 1.0) ** 2
+        found.exponents[v] = slope
 
 
-def _least_exponent(
-    places: NDArray[np.float64], logs: NDArray[np.float64], viewpoint: NDArray[np.float64], exponent: float
-) -> float:
+def _least_exponent(readings: _Readings, viewpoint: NDArray[np.float64], exponent: float) -> float:
     """The lesser of the exponents in the near and the far half, by medians; `exponent` where the span is small."""
-    x = np.log(_ranges(places, viewpoint))
+    x, y = np.log(_ranges(readings.places, viewpoint)), _corrected(readings, viewpoint)
     order = np.argsort(x, kind="stable")
     if x[order[len(x) * 9 // 10]] - x[order[len(x) // 10]] < math.log(_WIDE_SPAN):
         return exponent
@@ -371,31 +431,58 @@ def _least_exponent(
     for half in np.array_split(order, 2):
         third = len(half) // 3
         near, far = half[:third], half[-third:]
-        rise = float(np.median(logs[far]) - np.median(logs[near]))
+        rise = float(np.median(y[far]) - np.median(y[near]))
         slopes.append(rise / max(float(np.median(x[far]) - np.median(x[near])), _TINY))
     return min(slopes)
 
 
-def _most_telling_place(places: NDArray[np.float64], logs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The place, (3,), about which spacing follows the law best, found by a pattern search around the cloud."""
-    low, high = bounding_box(places)
+def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """The place, (3,), about which spacing follows the law best, found by a pattern search around the cloud.
+
+    A plane looks the same from its other side. Only what stands on it tells them apart, so both are compared; where
+    that does not tell either, the second place is the other.
+    """
+    low, high = bounding_box(readings.places)
+    reach = float(np.linalg.norm(high - low)) / 2.0
+    some, half = readings.some(slice(None, None, 4)), readings.some(slice(None, None, 2))
     steps = (np.arange(5) + 0.5) / 5
     inside = low + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
-    reach = float(np.linalg.norm(high - low)) / 2.0
     outside = [(low + high) / 2.0 + far * reach * sphere_directions(40) for far in (1.2, 2.0)]
-    candidates, some = np.concatenate((inside, *outside)), slice(None, None, 4)
-    place = candidates[int(np.argmax(_regressions(places[some], logs[some], candidates)[0]))]
-    places, logs = places[::2], logs[::2]
-    best = _regressions(places, logs, place[None])[0][0]
-    moves, step = np.concatenate((np.eye(3), -np.eye(3), sphere_directions(8))), 0.3 * reach
-    for _ in range(14):
+    candidates = np.concatenate((inside, *outside))
+    place = candidates[int(np.argmax(_regressions(some, candidates, _PRIOR).explained))]
+    place, step = _searched(some, place, 0.3 * reach, 8)
+    place, _ = _searched(half, place, step, 8)
+    other = _mirrored(place, half)
+    other, _ = _searched(half, other, float(np.linalg.norm(other - place)) / 8.0, 5)
+    first, second = _regressions(half, np.stack((place, other)), _PRIOR).explained
+    if second > first:
+        place, other = other, place
+    return place, other if abs(first - second) < _ALIKE else None
+
+
+def _mirrored(place: NDArray[np.float64], readings: _Readings) -> NDArray[np.float64]:
+    """A place, (3,), on the other side of the plane on which most lies: at the narrowest quarter of all offsets."""
+    normal = np.linalg.eigh(readings.normals.T @ readings.normals)[1][:, -1]
+    offsets = np.sort(readings.places @ normal)
+    quarter = len(offsets) // 4
+    first = int(np.argmin(offsets[quarter:] - offsets[:-quarter]))
+    return place - 2.0 * (place @ normal - offsets[first + quarter // 2]) * normal
+
+
+def _searched(
+    readings: _Readings, place: NDArray[np.float64], step: float, rounds: int
+) -> tuple[NDArray[np.float64], float]:
+    """A place, (3,), after steps to where the law explains more, and how long the next step would be."""
+    best = _regressions(readings, place[None], _PRIOR).explained[0]
+    moves = np.concatenate((np.eye(3), -np.eye(3), sphere_directions(8)))
+    for _ in range(rounds):
         tried = place + step * moves
-        explained = _regressions(places, logs, tried)[0]
+        explained = _regressions(readings, tried, _PRIOR).explained
         if explained.max() > best + 1e-4:
             place, best = tried[int(np.argmax(explained))], float(explained.max())
         else:
             step *= 0.5
-    return place
+    return place, step
 
 
 def sphere_directions(n: int) -> NDArray[np.float64]:
