@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,16 +12,27 @@ from pcgraph.parallel import in_blocks, kernel, routine
 
 _MAX_KEY = float(1 << 62)
 _DIGIT = 8  # bits
+_POINTS_OF_BLOCK = 1 << 16  # that are looked through in less time than it takes to start a thread
 
 
 def bounding_box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest coordinates, (3,) each, of points (n, 3), n >= 1.
+    """Lowest and highest coordinates, (3,) each, of points (n, 3), n >= 1; NaN if one is."""
+    of_blocks = in_blocks(_bounds, len(points), np.ascontiguousarray(points, np.float64), smallest=_POINTS_OF_BLOCK)
+    bounds = np.array(of_blocks)
+    return bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
 
-    Column by column: NumPy reduces rows of three some ten times more slowly.
-    """
-    low = np.array([points[:, axis].min() for axis in range(3)])
-    high = np.array([points[:, axis].max() for axis in range(3)])
-    return low, high
+
+@kernel
+def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lowest and highest coordinates, (2, 3), of some of the points."""
+    low_x, low_y, low_z = high_x, high_y, high_z = points[start]
+    for p in range(start, stop):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        low_x, low_y, low_z = x if x < low_x else low_x, y if y < low_y else low_y, z if z < low_z else low_z
+        high_x, high_y, high_z = x if x > high_x else high_x, y if y > high_y else high_y, z if z > high_z else high_z
+        if math.isnan(x + y + z) and (math.isnan(x) or math.isnan(y) or math.isnan(z)):
+            return np.full((2, 3), np.nan)
+    return np.array(((low_x, low_y, low_z), (high_x, high_y, high_z)))
 
 
 def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
