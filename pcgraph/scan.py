@@ -40,7 +40,7 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
-from pcgraph.voxels.spacing import median_spacing, spacing_law
+from pcgraph.voxels.spacing import SpacingLaw, median_spacing, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
@@ -56,6 +56,7 @@ _FEW_OUTLIERS = 0.95  # of the points are left
 _MIN_JOINED = 0.75  # of the voxels have
 _AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
+_OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
 
 
@@ -140,9 +141,9 @@ def segment(
     compile_in_two_processes()
     n_points = len(cloud.points)
     for _ in range(2):
-        voxel, (found, mirrored, warp) = side_by_side(
+        voxel, (law, warp) = side_by_side(
             partial(_voxel_size, cloud, voxel_size, seed_size),
-            partial(_place_and_warp, cloud, place, camera, range_growth),
+            partial(_law_and_warp, cloud, place, camera, range_growth),
         )
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
@@ -158,9 +159,8 @@ def segment(
     warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
-    if place is None and mirrored is not None:  # all of a scan was seen
-        found = max((found, mirrored), key=partial(visible_fraction, grid))
-    position, planes = _outward_planes(grid, settings.method, found, place)
+    told = None if law is None or place is not None else _told_place(law, grid)
+    position, planes = _outward_planes(grid, settings.method, told, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
     result = segment_scan(Scan(cloud, position, grid, planes, initial_labels, seed), None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
@@ -346,22 +346,30 @@ def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArr
     return np.where(usable, means / np.where(usable, length, 1.0), estimated)
 
 
-def _place_and_warp(
+def _law_and_warp(
     cloud: CleanCloud, position: NDArray[np.float64] | None, camera: bool | None, range_growth: float | None
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None, Warp]:
-    """From where the cloud was seen, if that is known or its spacing tells; from where instead; how its voxels grow."""
+) -> tuple[SpacingLaw | None, Warp]:
+    """How spacing depends on range, where that counts for place or scale; and how voxels grow."""
     if camera is None:
         camera = position is not None and _is_camera(cloud, position, range_growth)
-    growth, mirrored = 0.0 if range_growth is None else fraction("range_growth", range_growth), None
+    growth, law = 0.0 if range_growth is None else fraction("range_growth", range_growth), None
     if position is None or (range_growth is None and position.ndim == 1 and not camera):
         law = spacing_law(cloud.points, position)
         if law.holds:
-            position, mirrored = law.viewpoint, law.mirrored
+            position = law.viewpoint
             growth = RANGE_GROWTH if range_growth is None and not camera else growth
     if position is None and not (camera or growth):
-        return None, None, Warp()
-    warp = choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
-    return position, mirrored, warp
+        return law, Warp()
+    return law, choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
+
+
+def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
+    """The place that spacing tells, (3,), unless more is visible from its mirror image, or less than of one scan."""
+    if not law.tells_place or (law.holds and law.mirrored is None):
+        return law.viewpoint if law.holds else None
+    places = [law.viewpoint, *(() if law.mirrored is None else (law.mirrored,))]
+    visible = [visible_fraction(grid, place) for place in places]
+    return places[int(np.argmax(visible))] if law.holds or max(visible) >= _OF_ONE_SCAN else None
 
 
 def _without(
@@ -376,7 +384,7 @@ def _without(
 
 
 def _outward_planes(
-    grid: VoxelGrid, method: SupervoxelMethod, found: NDArray[np.float64] | None, given: NDArray[np.float64] | None
+    grid: VoxelGrid, method: SupervoxelMethod, told: NDArray[np.float64] | None, given: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], LocalPlanes]:
     """From where the cloud was seen, (3,) or (n, 3), and the plane of each voxel, its normal on the outer side.
 
@@ -385,8 +393,8 @@ def _outward_planes(
     """
     if given is None:
         upwards = np.array([0.0, 0.0, 1.0])
-        planes = method.planes(grid, _far_along(grid, upwards) if found is None else found)
-        sides = visible_sides(grid, planes.normals, found)
+        planes = method.planes(grid, _far_along(grid, upwards) if told is None else told)
+        sides = visible_sides(grid, planes.normals, told)
         return sides.viewpoint, replace(planes, normals=sides.normals)
     if given.ndim == 1:
         return given, method.planes(grid, given)

@@ -32,7 +32,8 @@ _TRIMMINGS = 2
 _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
 _TINY = float(np.finfo(np.float64).tiny)
-_MIN_EXPLAINED = 0.63  # mean of what law and range explain
+_MIN_EXPLAINED = 0.55  # mean of what law and range explain
+_MIN_HINT = 0.2
 _MIN_EXPONENT = 0.5
 _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
@@ -268,6 +269,12 @@ class SpacingLaw(ShortRepr):
         """Whether the law says more than chance would, near and far."""
         told = (self.explained + self.by_range) / 2.0 >= _MIN_EXPLAINED and self.exponent >= _MIN_EXPONENT
         return told and self.in_halves >= _MIN_EXPONENT_OF_HALF
+
+    @property
+    def tells_place(self) -> bool:
+        """Whether the place is told, be it by a piece of a scan, over whose ranges spacing hardly changes."""
+        told = (self.explained + self.by_range) / 2.0 >= _MIN_HINT and self.by_range >= 0.1
+        return self.holds or (told and self.exponent >= _MIN_EXPONENT and self.mirrored is None)
 
 
 def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None) -> SpacingLaw:
