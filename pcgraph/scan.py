@@ -54,6 +54,7 @@ _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 RANGE_GROWTH = 0.5
 _FEW_OUTLIERS = 0.95  # of the points are left
 _MIN_JOINED = 0.75  # of the voxels have
+_HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have
 _AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
@@ -428,12 +429,16 @@ def _seed_size(grid: VoxelGrid) -> float:
 def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
     """The grid, or one of larger voxels, by steps of half a power of two, where that joins what falls apart.
 
-    On a surface most voxels have at least five others around them. What is no surface at any size, as a line, stays.
+    On a surface most voxels have at least five others around them. What is no surface at any size, as a line, stays. So
+    does the grid where half of it is joined and larger voxels hardly join more, as they do not far rings of a sweep.
     """
     cells, degrees, size = [grid.cells, grid.cells], np.diff(grid.indptr), grid.size
+    joined = [float(np.mean(degrees >= _AROUND_ON_SURFACE))]
     for step in range(_ENLARGEMENTS + 1):
-        if np.mean(degrees >= _AROUND_ON_SURFACE) >= _MIN_JOINED:
-            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features) if step else grid
+        if joined[-1] >= _MIN_JOINED:
+            if step == 0 or (joined[0] >= _HALF_JOINED and joined[-1] - joined[0] < _MIN_GAIN * step):
+                break
+            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
         size *= math.sqrt(2.0)
         if size > largest:
             break
@@ -443,6 +448,7 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGr
         if len(larger) < _MIN_VOXELS:
             break
         cells = [cells[1], larger]
+        joined.append(float(np.mean(degrees >= _AROUND_ON_SURFACE)))
     return grid
 
 

@@ -148,3 +148,14 @@ def test_lin_gives_as_many_supervoxels_as_cubes_are_occupied():
     assert seconds > 0.0
     assert labels.min() == 0
     assert len(np.unique(labels)) == pytest.approx(len(cubes), rel=0.1)  # they count cubes of voxels' means
+
+
+@pytest.mark.parametrize("seed", [6, 7])
+def test_a_sweep_keeps_its_things_when_it_is_thinned_to_one_point_per_cell(seed):
+    """Its far rings do not touch at any size: voxels as large as cars would not join them, but all else."""
+    made = street(seed, half_length=60.0)
+    found = sweep(made, 0)
+    kept = np.unique(np.floor(found.points / 0.2), axis=0, return_index=True)[1]
+    result = pcgraph.segment(found.points[kept])
+    assert result.voxel_size < 1.0
+    assert weighted_overlap(result.labels, found.things[kept]) > 0.6
