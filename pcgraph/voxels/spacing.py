@@ -33,7 +33,7 @@ _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
 _TINY = float(np.finfo(np.float64).tiny)
 _MIN_EXPLAINED = 0.55  # mean of what law and range explain
-_MIN_HINT = 0.2
+_MIN_HINT, _MIN_BY_RANGE = 0.2, 0.1  # the same, and what range explains alone, of a piece of a scan
 _MIN_EXPONENT = 0.5
 _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
@@ -273,7 +273,7 @@ class SpacingLaw(ShortRepr):
     @property
     def tells_place(self) -> bool:
         """Whether the place is told, be it by a piece of a scan, over whose ranges spacing hardly changes."""
-        told = (self.explained + self.by_range) / 2.0 >= _MIN_HINT and self.by_range >= 0.1
+        told = (self.explained + self.by_range) / 2.0 >= _MIN_HINT and self.by_range >= _MIN_BY_RANGE
         return self.holds or (told and self.exponent >= _MIN_EXPONENT and self.mirrored is None)
 
 
