@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the place from which a scan was taken found from its points alone? Single scans and fused ones, turned at random.
+"""Is the place from which a scan was taken found from its points alone? Single scans, parts of them and fused ones.
 
     python benchmarks/scan_places.py [--turns N]
 
@@ -17,9 +17,10 @@ The last line is JSON: the same by kind.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -34,7 +35,10 @@ import pcgraph
 from pcgraph.metrics import weighted_overlap
 from pcgraph.voxels.spacing import spacing_law
 
-Cloud = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64] | None]  # points, truth, place
+Points = NDArray[np.float64]
+Kept = NDArray[np.int64] | NDArray[np.bool_]
+Truth = NDArray[np.int32]
+Cloud = tuple[NDArray[np.float64], Truth, NDArray[np.float64] | None]  # points, truth, place
 
 
 def main() -> None:
@@ -115,13 +119,48 @@ def _fused() -> Iterator[Cloud]:
         yield found.points, found.things, None
 
 
-KINDS = {
+# --- What people do to scans before they segment them: which points are left ------------------------------------------
+
+
+def _left(load: Callable[[], Iterator[Cloud]], chosen: Callable[[Points, Truth], Kept]) -> Iterator[Cloud]:
+    """Some points of every second cloud."""
+    for points, truth, place in itertools.islice(load(), 0, None, 2):
+        kept = chosen(points, truth)
+        yield points[kept], truth[kept], place
+
+
+def _one_per_cell(size: float, points: Points, _: Truth) -> Kept:
+    return np.unique(np.floor(points / size), axis=0, return_index=True)[1]
+
+
+def _around_things(points: Points, truth: Truth) -> Kept:
+    return np.linalg.norm(points - points[truth >= 2].mean(axis=0), axis=1) < 0.25
+
+
+def _noisy_tables() -> Iterator[Cloud]:
+    rng = np.random.default_rng(0)
+    for points, truth, place in itertools.islice(_tables(), 0, None, 2):
+        yield points + rng.normal(0.0, 0.002, points.shape), truth, place
+
+
+KINDS: dict[str, Callable[[], Iterator[Cloud]]] = {
     "tables (mOSD), camera": _tables,
     "streets, 64 beams": _sweeps,
     "rooms, one tripod": _stations,
     "plant, warehouse: one tripod": partial(_elsewhere, "plant", "warehouse"),
     "table, stereo camera": partial(_elsewhere, "stereo_table"),
     "fused, from many places": _fused,
+    "tables, a tenth": partial(_left, _tables, lambda points, _: np.arange(0, len(points), 10)),
+    "tables, left half": partial(_left, _tables, lambda points, _: points[:, 0] < np.median(points[:, 0])),
+    "tables, 2 mm of noise": _noisy_tables,
+    "tables, 25 cm around things": partial(_left, _tables, _around_things),
+    "tables, one point per 3 mm": partial(_left, _tables, partial(_one_per_cell, 0.003)),
+    "tables, one point per 5 mm": partial(_left, _tables, partial(_one_per_cell, 0.005)),
+    "streets, 90 degrees": partial(_left, _sweeps, lambda points, _: points[:, 0] > np.abs(points[:, 1])),
+    "streets, within 15 m": partial(_left, _sweeps, lambda points, _: np.linalg.norm(points, axis=1) < 15.0),
+    "streets, beyond 10 m": partial(_left, _sweeps, lambda points, _: np.linalg.norm(points, axis=1) > 10.0),
+    "streets, without ground": partial(_left, _sweeps, lambda points, _: points[:, 2] > -1.5),
+    "streets, one per 20 cm": partial(_left, _sweeps, partial(_one_per_cell, 0.2)),
 }
 
 if __name__ == "__main__":
