@@ -233,7 +233,7 @@ def test_every_value_of_a_field_works_or_is_refused_in_one_sentence(
         assert not message or message.startswith("expected")
         assert len(message) < 500
         assert "\n" not in message
-        assert time.process_time() - start < (5 if message else 30)  # hangs, whatever else the machine does
+        assert time.process_time() - start < (2 if message else 10)  # hangs, whatever else the machine does
 
 
 def ends(hint: Any) -> list[Any]:
