@@ -160,8 +160,7 @@ def segment(
     warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
-    told = None if law is None or place is not None else _told_place(law, grid)
-    position, planes = _outward_planes(grid, settings.method, told, place)
+    position, planes = _outward_planes(grid, settings.method, law, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
     result = segment_scan(Scan(cloud, position, grid, planes, initial_labels, seed), None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
@@ -366,9 +365,11 @@ def _law_and_warp(
 
 def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
     """The place that spacing tells, (3,), unless more is visible from its mirror image, or less than of one scan."""
-    if not law.tells_place or (law.holds and law.mirrored is None):
-        return law.viewpoint if law.holds else None
-    places = [law.viewpoint, *(() if law.mirrored is None else (law.mirrored,))]
+    if not law.tells_place:
+        return None
+    if law.holds and law.mirrored is None:
+        return law.viewpoint
+    places = [law.viewpoint] if law.mirrored is None else [law.viewpoint, law.mirrored]
     visible = [visible_fraction(grid, place) for place in places]
     return places[int(np.argmax(visible))] if law.holds or max(visible) >= _OF_ONE_SCAN else None
 
@@ -385,7 +386,7 @@ def _without(
 
 
 def _outward_planes(
-    grid: VoxelGrid, method: SupervoxelMethod, told: NDArray[np.float64] | None, given: NDArray[np.float64] | None
+    grid: VoxelGrid, method: SupervoxelMethod, law: SpacingLaw | None, given: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], LocalPlanes]:
     """From where the cloud was seen, (3,) or (n, 3), and the plane of each voxel, its normal on the outer side.
 
@@ -393,7 +394,7 @@ def _outward_planes(
     places take the mean of those.
     """
     if given is None:
-        upwards = np.array([0.0, 0.0, 1.0])
+        told, upwards = None if law is None else _told_place(law, grid), np.array([0.0, 0.0, 1.0])
         planes = method.planes(grid, _far_along(grid, upwards) if told is None else told)
         sides = visible_sides(grid, planes.normals, told)
         return sides.viewpoint, replace(planes, normals=sides.normals)
@@ -433,12 +434,13 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGr
     does the grid where half of it is joined and larger voxels hardly join more, as they do not far rings of a sweep.
     """
     cells, degrees, size = [grid.cells, grid.cells], np.diff(grid.indptr), grid.size
-    joined = [float(np.mean(degrees >= _AROUND_ON_SURFACE))]
+    joined = joined_at_first = float(np.mean(degrees >= _AROUND_ON_SURFACE))
     for step in range(_ENLARGEMENTS + 1):
-        if joined[-1] >= _MIN_JOINED:
-            if step == 0 or (joined[0] >= _HALF_JOINED and joined[-1] - joined[0] < _MIN_GAIN * step):
-                break
-            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
+        if joined >= _MIN_JOINED:
+            is_worth = joined_at_first < _HALF_JOINED or joined - joined_at_first >= _MIN_GAIN * step
+            return (
+                voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features) if step and is_worth else grid
+            )
         size *= math.sqrt(2.0)
         if size > largest:
             break
@@ -448,7 +450,7 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGr
         if len(larger) < _MIN_VOXELS:
             break
         cells = [cells[1], larger]
-        joined.append(float(np.mean(degrees >= _AROUND_ON_SURFACE)))
+        joined = float(np.mean(degrees >= _AROUND_ON_SURFACE))
     return grid
 
 

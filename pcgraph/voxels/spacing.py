@@ -267,14 +267,16 @@ class SpacingLaw(ShortRepr):
     @property
     def holds(self) -> bool:
         """Whether the law says more than chance would, near and far."""
-        told = (self.explained + self.by_range) / 2.0 >= _MIN_EXPLAINED and self.exponent >= _MIN_EXPONENT
-        return told and self.in_halves >= _MIN_EXPONENT_OF_HALF
+        return self._tells(_MIN_EXPLAINED) and self.in_halves >= _MIN_EXPONENT_OF_HALF
 
     @property
     def tells_place(self) -> bool:
         """Whether the place is told, be it by a piece of a scan, over whose ranges spacing hardly changes."""
-        told = (self.explained + self.by_range) / 2.0 >= _MIN_HINT and self.by_range >= _MIN_BY_RANGE
-        return self.holds or (told and self.exponent >= _MIN_EXPONENT and self.mirrored is None)
+        return self.holds or (self._tells(_MIN_HINT) and self.by_range >= _MIN_BY_RANGE and self.mirrored is None)
+
+    def _tells(self, least: float) -> bool:
+        """Whether law and range explain so much, and spacing grows with range."""
+        return (self.explained + self.by_range) / 2.0 >= least and self.exponent >= _MIN_EXPONENT
 
 
 def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None) -> SpacingLaw:
@@ -308,7 +310,8 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         if trimmed and given is None:
             place = _searched(some.some(slice(None, None, 2)), place, _SHORT_STEP, 8)[0]
         line = _regressions(some, place[None])
-        residuals = _corrected(every, place) - line.exponents[0] * np.log(_ranges(every.places, place))
+        log_range, log_spacing = _on_law(every, place)
+        residuals = log_spacing - line.exponents[0] * log_range
         residuals -= np.median(residuals[kept])
         spread = 1.4826 * float(np.median(np.abs(residuals[kept])))
         kept = np.abs(residuals) <= 2.5 * max(spread, 0.1)
@@ -360,17 +363,28 @@ def _readings(points: NDArray[np.float64]) -> _Readings:
     return _Readings(sample, np.ascontiguousarray(normals), np.log(spacing))
 
 
-def _ranges(places: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances from a viewpoint, (m,), none so near that its logarithm outweighs all others."""
-    rays = places - viewpoint
-    return np.sqrt(np.einsum("...i,...i->...", rays, rays)) + _LEAST_RANGE
+def _on_law(readings: _Readings, viewpoint: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Log range, (m,), and log spacing as it were if rays from a viewpoint met the surface at right angles, (m,)."""
+    x, y = np.empty((2, len(readings.logs)))
+    _place_on_law(readings, viewpoint, x, y)
+    return x, y
 
 
-def _corrected(readings: _Readings, viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Log spacing, (m,), as it were if rays from a viewpoint met the surface at right angles."""
-    rays = readings.places - viewpoint
-    cosines = np.abs(np.einsum("mi,mi->m", rays, readings.normals)) / _ranges(readings.places, viewpoint)
-    return readings.logs + 0.5 * np.log(np.maximum(cosines, _MIN_COSINE))
+@kernel
+def _place_on_law(
+    readings: _Readings, viewpoint: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> None:
+    """Set what `_on_law` returns; no range is so short that its logarithm outweighs all others."""
+    places, normals, logs = readings
+    for i in range(len(logs)):
+        square = along = 0.0
+        for axis in range(3):
+            ray = places[i, axis] - viewpoint[axis]
+            square += ray * ray
+            along += ray * normals[i, axis]
+        reach = math.sqrt(square) + _LEAST_RANGE
+        x[i] = math.log(reach)
+        y[i] = logs[i] + 0.5 * math.log(max(abs(along) / reach, _MIN_COSINE))
 
 
 class _Lines(NamedTuple):
@@ -394,7 +408,7 @@ def _regressions(readings: _Readings, viewpoints: NDArray[np.float64], prior: fl
 @kernel
 def _regress(readings: _Readings, viewpoints: NDArray[np.float64], prior: float, found: _Lines) -> None:
     """Set what `_regressions` returns."""
-    places, normals, logs = readings
+    logs = readings.logs
     n, mean = len(logs), 0.0
     for i in range(n):
         mean += logs[i] / n
@@ -403,16 +417,9 @@ def _regress(readings: _Readings, viewpoints: NDArray[np.float64], prior: float,
         variance += (logs[i] - mean) ** 2
     x, y = np.empty(n), np.empty(n)
     for v in range(len(viewpoints)):
+        _place_on_law(readings, viewpoints[v], x, y)
         mean_x = mean_y = 0.0
         for i in range(n):
-            square = along = 0.0
-            for axis in range(3):
-                ray = places[i, axis] - viewpoints[v, axis]
-                square += ray * ray
-                along += ray * normals[i, axis]
-            reach = math.sqrt(square) + _LEAST_RANGE
-            x[i] = math.log(reach)
-            y[i] = logs[i] + 0.5 * math.log(max(abs(along) / reach, _MIN_COSINE))
             mean_x += x[i] / n
             mean_y += y[i] / n
         of_x = of_y = products = 0.0
@@ -430,7 +437,7 @@ def _regress(readings: _Readings, viewpoints: NDArray[np.float64], prior: float,
 
 def _least_exponent(readings: _Readings, viewpoint: NDArray[np.float64], exponent: float) -> float:
     """The lesser of the exponents in the near and the far half, by medians; `exponent` where the span is small."""
-    x, y = np.log(_ranges(readings.places, viewpoint)), _corrected(readings, viewpoint)
+    x, y = _on_law(readings, viewpoint)
     order = np.argsort(x, kind="stable")
     if x[order[len(x) * 9 // 10]] - x[order[len(x) // 10]] < math.log(_WIDE_SPAN):
         return exponent

@@ -86,7 +86,7 @@ def triangulate_midpoint(
     """Points half way between the two rays where they are nearest to each other; parameters as `triangulate_linear`."""
     p, q, x, y = _checked(P_first, P_second, first, second)
     fundamental_from_cameras(p, q)
-    C, D = (centre(P)[:3] / centre(P)[3] for P in (p, q))
+    C, D = _centres(p, q)
     d, e = rays(p, x), rays(q, y)
     normal = np.cross(d, e)
     size = (normal * normal).sum(axis=-1)
@@ -142,7 +142,7 @@ def triangulate_optimal(
     """
     p, q, x, y = _checked(P_first, P_second, first, second)
     corrected = correct_pixels(fundamental_from_cameras(p, q), x, y)
-    rays_of = _Rays(*(_world_from_pixel(P) for P in (p, q)), *(centre(P)[:3] / centre(P)[3] for P in (p, q)))
+    rays_of = _Rays(_world_from_pixel(p), _world_from_pixel(q), *_centres(p, q))
     points, error = np.empty((len(x), 3)), np.empty(len(x))
     in_blocks(
         _intersect,
@@ -215,6 +215,12 @@ def _world_from_pixel(P: Array) -> Array:
     return np.ascontiguousarray(np.linalg.inv(block))
 
 
+def _centres(p: Array, q: Array) -> tuple[Array, Array]:
+    """(3,) of each camera, metres; not finite of an affine one."""
+    first, second = (centre(P) for P in (p, q))
+    return first[:3] / first[3], second[:3] / second[3]
+
+
 def _checked(
     P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> tuple[Array, Array, Array, Array]:
@@ -232,7 +238,7 @@ def _judged(p: Array, q: Array, x: Array, y: Array, X: Array) -> TriangulatedPoi
     points, error = np.full(X.shape, np.nan), np.full(len(X), np.nan)
     finite = np.asarray(np.isfinite(X).all(axis=-1))
     sound = finite.copy()
-    C, D = (centre(P)[:3] / centre(P)[3] for P in (p, q))
+    C, D = _centres(p, q)
     farthest = np.linalg.norm(D - C) / PARALLEL
     for P in (p, q):
         sound[finite] = sound[finite] & (depth(P, X[finite]) > 0)
