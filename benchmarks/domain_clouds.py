@@ -170,7 +170,7 @@ def mosd_points() -> list[Sample]:
 
 def mosd_turned() -> list[Sample]:
     """The lists turned any way and moved by 100 m."""
-    return [_turned(sample, seed) for seed, sample in enumerate(mosd_points())]
+    return [turned(sample, seed) for seed, sample in enumerate(mosd_points())]
 
 
 def mosd_millimetres() -> list[Sample]:
@@ -205,12 +205,14 @@ def _listed(sample: Sample, seed: int) -> Sample:
     return Sample(sample.points.reshape(-1, 3)[order], sample.truth.ravel()[order], colors, np.zeros(3), camera=True)
 
 
-def _turned(sample: Sample, seed: int) -> Sample:
+def turned(sample: Sample, seed: int) -> Sample:
+    """The cloud turned at random and moved by 100 m; a camera's frame is none any more."""
     rng = np.random.default_rng(seed)
     turn = Rotation.random(rng=rng).as_matrix()
     way = rng.standard_normal(3)
     shift = 100.0 * way / np.linalg.norm(way)
-    return replace(sample, points=sample.points @ turn.T + shift, viewpoint=shift, camera=False)
+    viewpoint = None if sample.viewpoint is None else sample.viewpoint @ turn.T + shift
+    return replace(sample, points=sample.points @ turn.T + shift, viewpoint=viewpoint, camera=False)
 
 
 def _in_millimetres(sample: Sample) -> Sample:

@@ -437,10 +437,9 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGr
     joined = joined_at_first = float(np.mean(degrees >= _AROUND_ON_SURFACE))
     for step in range(_ENLARGEMENTS + 1):
         if joined >= _MIN_JOINED:
-            is_worth = joined_at_first < _HALF_JOINED or joined - joined_at_first >= _MIN_GAIN * step
-            return (
-                voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features) if step and is_worth else grid
-            )
+            if step == 0 or (joined_at_first >= _HALF_JOINED and joined - joined_at_first < _MIN_GAIN * step):
+                return grid
+            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
         size *= math.sqrt(2.0)
         if size > largest:
             break
