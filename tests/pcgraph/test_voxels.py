@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.parallel import in_blocks
-from pcgraph.voxels.cells import sorted_keys
+from pcgraph.voxels.cells import bounding_box, sorted_keys
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.spacing import median_spacing
@@ -119,6 +119,24 @@ def test_spacing_is_that_of_a_tree_over_all_points(kind: str) -> None:
 def test_a_far_point_leaves_the_spacing_as_it_was() -> None:
     points = np.random.default_rng(2).random((4000, 3))
     assert median_spacing(np.vstack((points, [[1e9, -1e9, 1e9]]))) == pytest.approx(median_spacing(points), rel=0.02)
+
+
+@given(st.lists(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3), min_size=1, max_size=30))
+def test_a_bounding_box_is_numpys_or_nan(points: list[tuple[float, float, float]]) -> None:
+    array = np.array(points)
+    expected = array.min(axis=0), array.max(axis=0)
+    if np.isnan(array).any():
+        expected = np.full((2, 3), np.nan)
+    np.testing.assert_array_equal(bounding_box(array), expected)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_bounding_box_of_many_points_is_that_of_all_blocks(value: float) -> None:
+    points = np.random.default_rng(0).normal(size=(300_001, 3))
+    np.testing.assert_array_equal(bounding_box(points), (points.min(axis=0), points.max(axis=0)))
+    points[-1, 1] = value
+    expected = np.full((2, 3), np.nan) if np.isnan(value) else (points.min(axis=0), points.max(axis=0))
+    np.testing.assert_array_equal(bounding_box(points), expected)
 
 
 @given(st.lists(st.integers(0, 1 << 62), min_size=1, max_size=200))
