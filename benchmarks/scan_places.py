@@ -156,7 +156,9 @@ KINDS: dict[str, Callable[[], Iterable[Sample]]] = {
     "streets, within 15 m": partial(_left, _sweeps, partial(_within, 15.0)),
     "streets, beyond 10 m": partial(_left, _sweeps, lambda sample: ~_within(10.0, sample)),
     "streets, without ground": partial(_left, _sweeps, lambda sample: sample.points[:, 2] > -1.5),
+    "streets, one per 15 cm": partial(_left, _sweeps, partial(_one_per_cell, 0.15)),
     "streets, one per 20 cm": partial(_left, _sweeps, partial(_one_per_cell, 0.2)),
+    "streets, one per 30 cm": partial(_left, _sweeps, partial(_one_per_cell, 0.3)),
 }
 
 if __name__ == "__main__":

@@ -98,7 +98,8 @@ def segment(
         What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
     voxel_size : float, metres, optional
-        Their r. Default: 3.5 times the median distance between nearest points, whatever the unit.
+        Their r. Default: 3.5 times the median distance between nearest points, whatever the unit; of a camera's, as if
+        all lay at the median depth.
     seed_size : float, metres, optional
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
         least, where that would leave fewer than some 800 supervoxels.
@@ -142,10 +143,7 @@ def segment(
     compile_in_two_processes()
     n_points = len(cloud.points)
     for _ in range(2):
-        voxel, (law, warp) = side_by_side(
-            partial(_voxel_size, cloud, voxel_size, seed_size),
-            partial(_law_and_warp, cloud, place, camera, range_growth),
-        )
+        voxel, law, warp = _scale(cloud, place, camera, range_growth, voxel_size, seed_size)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
@@ -346,18 +344,38 @@ def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArr
     return np.where(usable, means / np.where(usable, length, 1.0), estimated)
 
 
-def _law_and_warp(
-    cloud: CleanCloud, position: NDArray[np.float64] | None, camera: bool | None, range_growth: float | None
-) -> tuple[SpacingLaw | None, Warp]:
-    """How spacing depends on range, where that counts for place or scale; and how voxels grow."""
+def _scale(
+    cloud: CleanCloud,
+    position: NDArray[np.float64] | None,
+    camera: bool | None,
+    range_growth: float | None,
+    voxel_size: float | None,
+    seed_size: float | None,
+) -> tuple[float, SpacingLaw | None, Warp]:
+    """The voxel size; how spacing depends on range, where that counts for place or scale; and how voxels grow."""
     if camera is None:
         camera = position is not None and _is_camera(cloud, position, range_growth)
-    growth, law = 0.0 if range_growth is None else fraction("range_growth", range_growth), None
-    if position is None or (range_growth is None and position.ndim == 1 and not camera):
+    growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
+    if camera and position is not None:
+        warp = choose_warp(cloud.points, position, camera, growth)
+        return _voxel_size(cloud, warp, voxel_size, seed_size), None, warp
+    voxel, (law, warp) = side_by_side(
+        partial(_voxel_size, cloud, Warp(), voxel_size, seed_size),
+        partial(_law_and_warp, cloud, position, camera, growth, range_growth is None),
+    )
+    return voxel, law, warp
+
+
+def _law_and_warp(
+    cloud: CleanCloud, position: NDArray[np.float64] | None, camera: bool, growth: float, may_grow: bool
+) -> tuple[SpacingLaw | None, Warp]:
+    """How spacing depends on range, where that counts; and how voxels grow, with range too if they may."""
+    law = None
+    if position is None or (may_grow and position.ndim == 1):
         law = spacing_law(cloud.points, position)
         if law.holds:
             position = law.viewpoint
-            growth = RANGE_GROWTH if range_growth is None and not camera else growth
+            growth = RANGE_GROWTH if may_grow and not camera else growth
     if position is None and not (camera or growth):
         return law, Warp()
     return law, choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
@@ -410,11 +428,11 @@ def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.f
     return grid.centroids + directions * (1e3 * grid.edge_lengths)[:, None]
 
 
-def _voxel_size(cloud: CleanCloud, voxel_size: float | None, seed_size: float | None) -> float:
-    """The voxel size, given or found, no larger than the seed size; both checked."""
+def _voxel_size(cloud: CleanCloud, warp: Warp, voxel_size: float | None, seed_size: float | None) -> float:
+    """The voxel size, given or found in the warped space, no larger than the seed size; both checked."""
     seed = math.inf if seed_size is None else positive("seed_size", seed_size)
     if voxel_size is None:
-        return positive("voxel_size", min(VOXELS_PER_SPACING * median_spacing(cloud.points), seed))
+        return positive("voxel_size", min(VOXELS_PER_SPACING * median_spacing(cloud.points, warp), seed))
     voxel = positive("voxel_size", voxel_size)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box, cell_keys, gallop, sorted_keys, starts_of_runs
+from pcgraph.voxels.warp import Warp
 
 _SAMPLE = 4096  # points whose nearest neighbour is sought
 _CROWD = 1 << 16  # points among which it is sought, about
@@ -45,13 +46,16 @@ _MIN_COSINE = 0.1  # between a surface and the rays that meet it: at less a beam
 _PRIOR = 0.1  # of the variance for a deviation of 1 from the exponent of a beam of constant angle, in search of a place
 
 
-def median_spacing(points: NDArray[np.float64]) -> float:
+def median_spacing(points: NDArray[np.float64], warp: Warp | None = None) -> float:
     """Median distance to the nearest point elsewhere, metres, over a sample free of the points' order.
 
     Parameters
     ----------
     points : (n, 3) float64, metres
         Finite, n >= 1. Duplicates count as one point.
+    warp : Warp, optional
+        To the space in which distances are read, such as that of a camera, whose pixels are as far apart everywhere.
+        Default: the points' own.
 
     Returns
     -------
@@ -69,6 +73,7 @@ def median_spacing(points: NDArray[np.float64]) -> float:
     crowd = _each_place_once(drawn)
     if 2 * len(crowd) < len(drawn) < len(points):  # duplicates took the room of others
         crowd = _each_place_once(_some_places(_each_place_once(points)))
+    crowd = crowd if warp is None else warp.forward(crowd)
     spacing = _median_spacing(crowd)
     low, high = bounding_box(crowd)
     if spacing * math.sqrt(len(crowd)) < _THIN * float((high - low).max()):  # perhaps the points are copies of others
