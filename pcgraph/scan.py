@@ -42,7 +42,7 @@ from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_ce
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import SpacingLaw, median_spacing, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface
-from pcgraph.voxels.visibility import visible_fraction, visible_sides
+from pcgraph.voxels.visibility import telling_places, visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
@@ -413,8 +413,13 @@ def _outward_planes(
     """
     if given is None:
         told, upwards = None if law is None else _told_place(law, grid), np.array([0.0, 0.0, 1.0])
-        planes = method.planes(grid, _far_along(grid, upwards) if told is None else told)
-        sides = visible_sides(grid, planes.normals, told)
+        if told is None:
+            planes, telling = side_by_side(
+                lambda: method.planes(grid, _far_along(grid, upwards)), lambda: telling_places(grid)
+            )
+        else:
+            planes, telling = method.planes(grid, told), None
+        sides = visible_sides(grid, planes.normals, told, telling)
         return sides.viewpoint, replace(planes, normals=sides.normals)
     if given.ndim == 1:
         return given, method.planes(grid, given)

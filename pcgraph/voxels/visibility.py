@@ -71,8 +71,25 @@ class VisibleSides(ShortRepr):
     normals: NDArray[np.float64]
 
 
+class TellingPlaces(NamedTuple):
+    """Places from which the outside is seen, the most telling first.
+
+    Attributes
+    ----------
+    places : (k, 3) float64, in half extents of the voxels' centroids from the middle of their bounding box
+    weights : (k,) float64, 0..1
+        How much each counts.
+    """
+
+    places: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
 def visible_sides(
-    grid: VoxelGrid, normals: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    viewpoint: NDArray[np.float64] | None = None,
+    telling: TellingPlaces | None = None,
 ) -> VisibleSides:
     """The outer side of the surface at each voxel, found from what is visible.
 
@@ -84,6 +101,8 @@ def visible_sides(
     viewpoint : (3,) float64, metres, optional
         About where all was seen from. What lies edge-on from there, as ground does from a place on it, is decided by
         what is visible; if little does, nothing else is asked.
+    telling : TellingPlaces, optional
+        `telling_places(grid, viewpoint)`, where that is known.
 
     Notes
     -----
@@ -102,14 +121,13 @@ def visible_sides(
     """
     middle, reach = _unit_frame(grid, grid.centroids)
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
-    told, likely = np.zeros(grid.n_voxels), None
+    told = np.zeros(grid.n_voxels)
     if viewpoint is not None:
-        likely = (viewpoint - middle) / reach
-        rays = likely - centres
+        rays = (viewpoint - middle) / reach - centres
         told = np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
             return VisibleSides(viewpoint, np.where(told[:, None] < 0.0, -normals, normals))
-    places, weights = _telling_places(centres, widths, -middle / reach, likely)
+    places, weights = telling_places(grid, viewpoint) if telling is None else telling
     votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
     step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
     if step > 1.0:  # some, evenly spread on any plane, which hide as much if so much larger
@@ -177,14 +195,12 @@ def _lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
 
 
-def _telling_places(
-    centres: NDArray[np.float64],
-    widths: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    viewpoint: NDArray[np.float64] | None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (k, 3) from which the outside is seen, and how much each counts, (k,), the first most."""
-    coarse = _coarse(centres, float(np.median(widths)))
+def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> TellingPlaces:
+    """The places that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`."""
+    middle, reach = _unit_frame(grid, grid.centroids)
+    origin = -middle / reach
+    viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
+    coarse = _coarse((grid.centroids - middle) / reach, float(np.median(grid.edge_lengths)) / reach)
     low, high = bounding_box(coarse.centroids)
     inside = _free_places(coarse, low, high)
     outside = (low + high) / 2.0 + _DISTANCE * _lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
@@ -208,7 +224,7 @@ def _telling_places(
     found = _agreements(sides, _starts(sides, outside, likely))
     weights = _most_telling(found, sides, coarse, closed, likely, viewpoint is not None)
     chosen = _spread_choice(seen, weights)
-    return places[chosen], weights[chosen]
+    return TellingPlaces(places[chosen], weights[chosen])
 
 
 def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -218,15 +234,32 @@ def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: ND
     starts[_HALVES, :_OUTSIDE] = 1.0
     starts[_HALVES + 1, _OUTSIDE:] = 1.0
     starts[_HALVES + 2] = likely
-    unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
+    unseen, news = np.ones((2, sides.shape[1]), np.float32), np.empty(len(sides), np.float32)  # of each side
     for start in starts[_HALVES + 3 :]:
-        news = np.einsum("kn,n->k", np.maximum(sides, 0.0), unseen[0])
-        news += np.einsum("kn,n->k", np.maximum(-sides, 0.0), unseen[1])
+        in_blocks(_tell_news, len(sides), sides, unseen, news, smallest=1)
         leader = int(np.argmax(news))
         start[leader] = 1.0
         unseen[0, sides[leader] > 0.0] = 0.0
         unseen[1, sides[leader] < 0.0] = 0.0
     return starts[starts.any(axis=1)]
+
+
+@summing_routine
+def _news(sides: NDArray[np.float32], unseen: NDArray[np.float32]) -> np.float32:
+    """Sum of the cosines that a place sees of sides that no leader has seen."""
+    total = np.float32(0.0)
+    for i in range(len(sides)):
+        total += sides[i] * unseen[0, i] if sides[i] > 0.0 else -sides[i] * unseen[1, i]
+    return total
+
+
+@kernel
+def _tell_news(
+    start: int, stop: int, sides: NDArray[np.float32], unseen: NDArray[np.float32], news: NDArray[np.float32]
+) -> None:
+    """Set what each place sees that no leader has seen."""
+    for k in range(start, stop):
+        news[k] = _news(sides[k], unseen)
 
 
 class _Agreements(NamedTuple):
@@ -318,21 +351,16 @@ def _most_telling(
     A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
     one of places closed in, as in a room: of that all but narrow gaps is seen from within.
     """
-    cells = np.repeat(np.arange(coarse.n_voxels), np.diff(coarse.indptr))
     visible = np.abs(sides).sum(axis=1)
-    different = list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values())
+    different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
     is_closed = any(float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0 for s in different)
     likely_counts = _FROM_VIEWPOINT if likely_is_told else _UPPER
+    shown = np.empty(len(different))
+    in_blocks(_show, len(different), different, sides, found, coarse.neighbourhood, is_closed, shown, smallest=1)
     most, best = -np.inf, found.weights[0]
-    for s in different:
+    for s, fraction in zip(different, shown, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
-        shown = np.einsum("k,kn->n", weights, np.maximum(sides * found.outward[s], 0.0))
-        shown = np.minimum(shown / _WELL_SEEN, 1.0)
-        if not is_closed:
-            around = shown.copy()
-            np.maximum.at(around, cells, shown[coarse.neighbours])
-            shown = around
-        score = float(shown.mean())
+        score = float(fraction)
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
         score += _DECIDED * float(decided[visible > 0.0].mean())
         for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, likely_counts)):
@@ -340,6 +368,38 @@ def _most_telling(
         if score > most:
             most, best = score, weights
     return best.astype(np.float64)
+
+
+@kernel
+def _show(
+    start: int,
+    stop: int,
+    different: NDArray[np.int64],
+    sides: NDArray[np.float32],
+    found: _Agreements,
+    around: Neighbourhood,
+    is_closed: bool,
+    shown: NDArray[np.float64],
+) -> None:
+    """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in."""
+    n_places, n = sides.shape
+    of_cells, nothing = np.empty(n, np.float32), np.float32(0.0)
+    for d in range(start, stop):
+        weights, outward = found.weights[different[d]], found.outward[different[d]]
+        for i in range(n):
+            of_cells[i] = nothing
+        for k in range(n_places):
+            if weights[k] > 0.0:
+                for i in range(n):
+                    of_cells[i] += weights[k] * max(sides[k, i] * outward[i], nothing)
+        total = 0.0
+        for i in range(n):
+            most = of_cells[i]
+            if not is_closed:
+                for a in range(around.indptr[i], around.indptr[i + 1]):
+                    most = max(most, of_cells[around.neighbours[a]])
+            total += min(most / _WELL_SEEN, 1.0)
+        shown[d] = total / n
 
 
 def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:

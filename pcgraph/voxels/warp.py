@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -113,23 +114,53 @@ class RangeWarp(Warp):
 
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64, about the viewpoint."""
-        local = points - self.viewpoint
-        local *= (_lengths(local) / self.reference_range)[:, None] ** -self.growth
-        return local
+        warped = np.empty((len(points), 3))
+        in_blocks(_draw_near, len(points), points, self.viewpoint, self.reference_range, self.growth, warped)
+        return warped
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of warped positions."""
-        stretch = (_lengths(warped) / self.reference_range) ** (self.growth / (1.0 - self.growth))
+        stretch = (_ranges(warped, np.zeros(3)) / self.reference_range) ** (self.growth / (1.0 - self.growth))
         return warped * stretch[:, None] + self.viewpoint
 
     def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(r / r0)^growth, (n,) float64."""
-        return (_lengths(points - self.viewpoint) / self.reference_range) ** self.growth
+        return (_ranges(points, self.viewpoint) / self.reference_range) ** self.growth
 
 
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths of rows, (n,) float64; at least `_MIN_LENGTH`."""
-    return np.maximum(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)), _MIN_LENGTH)
+def _ranges(points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ranges of points from a viewpoint, (n,) float64, metres; at least `_MIN_LENGTH`."""
+    ranges = np.empty(len(points))
+    in_blocks(_measure, len(points), points, viewpoint, ranges)
+    return ranges
+
+
+@kernel
+def _measure(
+    start: int, stop: int, points: NDArray[np.float64], viewpoint: NDArray[np.float64], ranges: NDArray[np.float64]
+) -> None:
+    """Set ranges of points."""
+    for p in range(start, stop):
+        x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
+        ranges[p] = max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
+
+
+@kernel
+def _draw_near(
+    start: int,
+    stop: int,
+    points: NDArray[np.float64],
+    viewpoint: NDArray[np.float64],
+    reference_range: float,
+    growth: float,
+    warped: NDArray[np.float64],
+) -> None:
+    """Set places of points, about the viewpoint, as far away as `RangeWarp` says."""
+    for p in range(start, stop):
+        x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
+        distance = max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
+        scale = (distance / reference_range) ** -growth
+        warped[p, 0], warped[p, 1], warped[p, 2] = scale * x, scale * y, scale * z
 
 
 @kernel
@@ -177,7 +208,7 @@ def choose_warp(
     if camera and range_growth:
         raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
     if range_growth:
-        distance = float(np.median(_lengths(points - viewpoint)))
+        distance = float(np.median(_ranges(points, viewpoint)))
         return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
     if not camera:
         return Warp()
