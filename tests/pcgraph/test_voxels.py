@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+import pcgraph
 from pcgraph.parallel import in_blocks
 from pcgraph.voxels.cells import bounding_box, sorted_keys
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.surface import local_planes
-from pcgraph.voxels.warp import Warp
+from pcgraph.voxels.warp import Warp, choose_warp
 
 
 def six(matrix):
@@ -145,6 +146,19 @@ def test_keys_are_sorted_by_their_digits_as_by_numpy(keys: list[int]) -> None:
     ordered, order = sorted_keys(array)
     np.testing.assert_array_equal(order, np.argsort(array, kind="stable"))
     np.testing.assert_array_equal(ordered, array[order])
+
+
+@pytest.mark.parametrize("shape", [(120, 160), (480, 640)])
+def test_the_spacing_of_an_image_is_that_of_its_pixels_at_the_median_depth(shape: tuple[int, int]) -> None:
+    """Ground from 1 m to 20 m: near pixels, close together, are no denser on the image than far ones."""
+    height, width = shape
+    pitch = 1.0 / width
+    u, v = np.meshgrid(pitch * (np.arange(width) - width / 2), np.linspace(0.05, 1.0, height))
+    points = np.stack((u, v, np.ones_like(u)), axis=-1) / v[..., None]  # 1 m below the camera
+    warp = choose_warp(points.reshape(-1, 3), np.zeros(3), camera=True)
+    expected = pitch * float(np.median(points[..., 2]))
+    assert median_spacing(points.reshape(-1, 3), warp) == pytest.approx(expected, rel=1e-6)
+    assert pcgraph.segment(points).surface.grid.size == pytest.approx(3.5 * expected, rel=1e-6)
 
 
 def test_spacing_of_many_random_points_is_that_of_a_tree_over_all():
