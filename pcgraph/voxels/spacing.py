@@ -43,6 +43,7 @@ _MIN_EXPONENT_OF_HALF = 0.3
 _ALIKE = 0.02  # explained variance: what explains less than this more is no better
 _OWN_ORIGIN = 0.05  # explained variance by which another place must beat the frame's origin
 _MIN_COSINE = 0.1  # between a surface and the rays that meet it: at less a beam's spacing is that along its rows
+_ROW = 0.1  # of the variance along a row of points is at most across it
 _PRIOR = 0.1  # of the variance for a deviation of 1 from the exponent of a beam of constant angle, in search of a place
 
 
@@ -337,7 +338,17 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
 
 
 class _Readings(NamedTuple):
-    """Places, (m, 3), unit normals of the surface there, (m, 3), and logarithms of the spacing, (m,)."""
+    """How densely a surface is sampled at m places.
+
+    Attributes
+    ----------
+    places : (m, 3) float64
+    normals : (m, 3) float64
+        Unit normals of the surface; zero where the points around lie in a row and tell none, as on one ring of a sweep:
+        they lie on the cone of its beam.
+    logs : (m,) float64
+        Logarithms of the spacing.
+    """
 
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
@@ -365,8 +376,9 @@ def _readings(points: NDArray[np.float64]) -> _Readings:
     usable = np.isfinite(spacing) & (spacing > 0.0)
     sample, spacing, patches = sample[usable], spacing[usable], chosen[around[usable]]
     patches = (patches - patches.mean(axis=1, keepdims=True)) / spacing[:, None, None]
-    normals = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))[1][:, :, 0]
-    return _Readings(sample, np.ascontiguousarray(normals), np.log(spacing))
+    spreads, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))
+    in_a_row = spreads[:, 1] < _ROW * spreads[:, 2]
+    return _Readings(sample, np.where(in_a_row[:, None], 0.0, axes[:, :, 0]), np.log(spacing))
 
 
 def _on_law(readings: _Readings, viewpoint: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -384,13 +396,17 @@ def _place_on_law(
     places, normals, logs = readings
     for i in range(len(logs)):
         square = along = 0.0
+        has_normal = False
         for axis in range(3):
             ray = places[i, axis] - viewpoint[axis]
             square += ray * ray
             along += ray * normals[i, axis]
+            has_normal |= normals[i, axis] != 0.0
         reach = math.sqrt(square) + _LEAST_RANGE
         x[i] = math.log(reach)
-        y[i] = logs[i] + 0.5 * math.log(max(abs(along) / reach, _MIN_COSINE))
+        y[i] = logs[i]
+        if has_normal:
+            y[i] += 0.5 * math.log(max(abs(along) / reach, _MIN_COSINE))
 
 
 class _Lines(NamedTuple):
