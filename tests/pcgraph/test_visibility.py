@@ -265,7 +265,7 @@ def rings_ahead(seed):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_points_on_one_ring_tell_no_slant(seed):
-    """They lie on the cone of its beam, edge-on to the rays: taken for the surface, the scanner was below the ground."""
+    """They lie on the cone of its beam, edge-on to the rays: taken for the surface, the scanner was underground."""
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     points = rings_ahead(seed)
     moved = points @ turn.T + 100.0
