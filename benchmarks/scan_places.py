@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the place from which a scan was taken found from its points alone? Single scans, parts of them and fused ones.
+"""Is the place from which a scan was taken found from its points alone? Scans by several sensors, and fused ones.
 
     python benchmarks/scan_places.py [--turns N]
 
@@ -38,6 +38,8 @@ from domain_clouds import (
 )
 from numpy.typing import NDArray
 from scanned_rooms import flat, office, stations
+from scanned_scenes import Floats, scan, sphere_of_rays
+from scanned_streets import SENSOR_M, street
 
 import pcgraph
 from pcgraph.metrics import weighted_overlap
@@ -109,6 +111,38 @@ def _fused() -> Iterator[Sample]:
         yield Sample(found.points, found.things)
 
 
+# --- Other sensors, on which no constant was chosen -------------------------------------------------------------------
+
+
+def _in_streets(rays: Floats) -> Iterator[Sample]:
+    """Three streets from the roof of a car, 2 cm of noise."""
+    for seed in (31, 32, 33):
+        made = street(seed)
+        place = made.on_ground(0.0, -1.75) + np.array([0.0, 0.0, SENSOR_M])
+        found = scan(made.scene, place[None], [rays], 0.02, np.random.default_rng(seed))
+        yield Sample(found.points, found.things, viewpoint=place)
+
+
+def _in_a_flat(rays: Floats) -> Iterator[Sample]:
+    """Rooms from four places, 1 cm of noise."""
+    scene, places = flat()
+    for seed, place in enumerate(places[:4]):
+        found = scan(scene, place[None], [rays], 0.01, np.random.default_rng(seed), reach=30.0)
+        yield Sample(found.points, found.things, viewpoint=place)
+
+
+def _beams(number: int, lowest: float, highest: float, azimuths: tuple[float, float] = (0.0, 360.0)) -> Floats:
+    """Rays of a turning LiDAR, 0.2 degrees apart along its rings; angles in degrees."""
+    return sphere_of_rays(np.arange(*azimuths, 0.2), np.linspace(lowest, highest, number))
+
+
+def _rosette() -> Floats:
+    """Rays at random within 70 by 37 degrees ahead, as of a rosette scanner."""
+    azimuth, elevation = np.radians(np.random.default_rng(0).uniform((-35.0, -25.0), (35.0, 12.0), (60_000, 2))).T
+    across = np.cos(elevation)
+    return np.stack((across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)), axis=1)
+
+
 # --- What people do to scans before they segment them: which points are left ------------------------------------------
 
 
@@ -144,6 +178,13 @@ KINDS: dict[str, Callable[[], Iterable[Sample]]] = {
     "plant, warehouse: one tripod": lambda: [_single("plant"), _single("warehouse")],
     "table, stereo camera": lambda: [_single("stereo_table")],
     "fused, from many places": _fused,
+    "streets, 16 beams": lambda: _in_streets(_beams(16, -15.0, 15.0)),
+    "streets, 32 beams": lambda: _in_streets(_beams(32, -30.0, 10.0)),
+    "streets, 128 beams ahead": lambda: _in_streets(_beams(128, -12.0, 12.0, (-60.0, 60.0))),
+    "streets, rosette ahead": lambda: _in_streets(_rosette()),
+    "rooms, 16 beams": lambda: _in_a_flat(_beams(16, -15.0, 15.0)),
+    "rooms, 32 beams": lambda: _in_a_flat(_beams(32, -30.0, 10.0)),
+    "rooms, 128 beams, 90 degrees": lambda: _in_a_flat(_beams(128, -45.0, 45.0, (0.0, 90.0))),
     "tables, a tenth": partial(_left, mosd_points, lambda sample: np.arange(0, len(sample.points), 10)),
     "tables, left half": partial(
         _left, mosd_points, lambda sample: sample.points[:, 0] < np.median(sample.points[:, 0])
