@@ -76,7 +76,7 @@ def warn_of_volume(grid: VoxelGrid) -> None:
     if grid.n_voxels >= _MIN_VOXELS and float(np.mean(np.diff(grid.indptr) > _SOLID)) > 0.5:
         _warn(
             "expected points on surfaces, but they fill a volume as noise does: at most voxels there are others on "
-            f"nearly all sides ({grid.edge_lengths.mean():.3g} m); objects found in it mean little"
+            f"nearly all sides ({grid.edge_lengths.mean():.3g} m); objects found in it may mean little"
         )
 
 

@@ -59,6 +59,7 @@ _AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
+_SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
 
 
 def segment(
@@ -105,8 +106,9 @@ def segment(
         least, where that would leave fewer than some 800 supervoxels.
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
-        depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, unless
-        voxels grow with range. (A missing point stored as (0, 0, 0) lies at the viewpoint: make it NaN.)
+        depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, with x/z
+        and y/z in the order of columns and rows, unless voxels grow with range. (A missing point stored as (0, 0, 0)
+        lies at the viewpoint: make it NaN.)
     range_growth : float, 0..1, without 1
         Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
         scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece. Default:
@@ -356,9 +358,9 @@ def _scale(
     if camera is None:
         camera = position is not None and _is_camera(cloud, position, range_growth)
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
-    if camera and position is not None:
-        warp = choose_warp(cloud.points, position, camera, growth)
-        return _voxel_size(cloud, warp, voxel_size, seed_size), None, warp
+    if camera:
+        law, warp = _law_and_warp(cloud, position, camera, growth, range_growth is None)
+        return _voxel_size(cloud, warp, voxel_size, seed_size), law, warp
     voxel, (law, warp) = side_by_side(
         partial(_voxel_size, cloud, Warp(), voxel_size, seed_size),
         partial(_law_and_warp, cloud, position, camera, growth, range_growth is None),
@@ -371,7 +373,7 @@ def _law_and_warp(
 ) -> tuple[SpacingLaw | None, Warp]:
     """How spacing depends on range, where that counts; and how voxels grow, with range too if they may."""
     law = None
-    if position is None or (may_grow and position.ndim == 1):
+    if position is None or (may_grow and position.ndim == 1 and not camera):
         law = spacing_law(cloud.points, position)
         if law.holds:
             position = law.viewpoint
@@ -477,7 +479,28 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGr
 
 
 def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float | None) -> bool:
-    """Whether a camera at the viewpoint may have taken this as one image."""
+    """Whether a camera at the viewpoint may have taken this as one image: what lies to the right is in a column there.
+
+    Other organised clouds, as height maps and the rows of a turning scanner, may also lie in front of a place.
+    """
     if len(cloud.shape) != 2 or viewpoint.ndim != 1 or range_growth:
         return False
-    return bool(cloud.points[:, 2].min() > viewpoint[2])
+    if not cloud.points[:, 2].min() > viewpoint[2]:
+        return False
+    some = np.random.default_rng(0).integers(len(cloud.points), size=_SOME_PIXELS)
+    rays = cloud.points[some] - viewpoint
+    x, y = (rays[:, :2] / rays[:, 2:]).T
+    row, column = np.divmod(cloud.kept[some], cloud.shape[1])
+    orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second of an image on its side
+    return any(all(_rank_correlation(a, b) >= _IN_ORDER for a, b in order) for order in orders)
+
+
+def _rank_correlation(a: NDArray[np.number], b: NDArray[np.number]) -> float:
+    """How far one column rises or falls with another, 0..1 (Spearman); 1 where one is constant."""
+    ranks = []
+    for values in (a, b):
+        _, place, number = np.unique(values, return_inverse=True, return_counts=True)
+        if len(number) == 1:
+            return 1.0
+        ranks.append((np.cumsum(number) - 0.5 * number)[place])
+    return abs(float(np.corrcoef(*ranks)[0, 1]))

@@ -60,6 +60,51 @@ def test_an_image_may_grow_with_range():
     assert np.ptp(result.surface.grid.edge_lengths) > 0.1 * result.voxel_size
 
 
+def image_of_steps(height=60, width=80):
+    """A floor before a camera, with steps in depth, (height, width, 3)."""
+    u, v = np.meshgrid((np.arange(width) - width / 2) / width, (np.arange(height) + 1) / height)
+    return np.stack((u, v, np.ones_like(u)), axis=-1) * (1.0 / (v + 0.2) + (u > 0.1))[..., None]
+
+
+@pytest.mark.parametrize(
+    "moved", ["as it is", "mirrored", "on its side", "upside down", "half missing", "a row", "a column"]
+)
+def test_what_is_in_the_order_of_its_rays_is_an_image(moved):
+    image = image_of_steps()
+    half = np.where(np.random.default_rng(0).random((*image.shape[:2], 1)) < 0.5, np.nan, image)
+    clouds = {
+        "as it is": image,
+        "mirrored": image[:, ::-1],
+        "on its side": image.swapaxes(0, 1),
+        "upside down": image[::-1, ::-1],
+        "half missing": half,
+        "a row": image[20:21],
+        "a column": image[:, 20:21],
+    }
+    assert pcgraph.segment(clouds[moved]).camera
+
+
+def test_height_maps_and_turning_scanners_are_no_images():
+    """They may lie at z > 0 all the same, where x/z means nothing."""
+    x, y = np.meshgrid(np.arange(80) * 0.5, np.arange(60) * 0.5)
+    heights = np.stack((x, y, 1.0 + 4.0 * (2.0 + np.sin(x / 5) + np.cos(y / 4))), axis=-1)
+    up, around = np.meshgrid(np.linspace(0.3, -0.4, 32), np.linspace(0, 6.28, 400), indexing="ij")
+    rays = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1)
+    ranges = np.minimum(np.where(rays[..., 2] < 0, -1.7 / np.minimum(rays[..., 2], -1e-9), np.inf), 30.0)
+    sweep = rays * ranges[..., None] + (0.0, 0.0, 2.0)
+    assert sweep[..., 2].min() > 0.0
+    assert not pcgraph.segment(heights).camera
+    assert not pcgraph.segment(sweep).camera
+    assert pcgraph.segment(heights, camera=True).camera  # if told so
+
+
+def test_a_list_told_to_be_a_cameras_has_the_voxels_of_its_image():
+    image = image_of_steps(120, 160)
+    as_list = pcgraph.segment(image.reshape(-1, 3), camera=True)
+    assert as_list.voxel_size == pcgraph.segment(image).voxel_size
+    assert as_list.voxel_size != pcgraph.segment(image, camera=False).voxel_size
+
+
 def test_viewpoints_of_another_shape_are_refused():
     points, seen_from = plate()
     with pytest.raises(ValueError, match="viewpoint of three finite coordinates in metres, or one per point"):
@@ -159,7 +204,7 @@ def test_updates_that_do_not_fit_are_refused(halves):
     with pytest.raises(ValueError, match="colours with both scans or with neither"):
         pcgraph.update(first, left, np.full(left.shape, 0.5), viewpoint=viewpoint)
     image = (left[:3000] + 1.0).reshape(50, 60, 3)
-    seen_by_camera = pcgraph.segment(image)
+    seen_by_camera = pcgraph.segment(image, camera=True)
     with pytest.raises(ValueError, match="camera=False"):
         pcgraph.update(seen_by_camera, left - 9.0, viewpoint=viewpoint)
 
