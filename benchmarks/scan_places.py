@@ -136,6 +136,11 @@ def _beams(number: int, lowest: float, highest: float, azimuths: tuple[float, fl
     return sphere_of_rays(np.arange(*azimuths, 0.2), np.linspace(lowest, highest, number))
 
 
+def _rows(lowest: float, highest: float) -> Floats:
+    """Rays of a terrestrial scanner, every half degree in azimuth and elevation."""
+    return sphere_of_rays(np.arange(0.0, 360.0, 0.5), np.arange(lowest, highest, 0.5))
+
+
 def _rosette() -> Floats:
     """Rays at random within 70 by 37 degrees ahead, as of a rosette scanner."""
     azimuth, elevation = np.radians(np.random.default_rng(0).uniform((-35.0, -25.0), (35.0, 12.0), (60_000, 2))).T
@@ -185,6 +190,7 @@ KINDS: dict[str, Callable[[], Iterable[Sample]]] = {
     "rooms, 16 beams": lambda: _in_a_flat(_beams(16, -15.0, 15.0)),
     "rooms, 32 beams": lambda: _in_a_flat(_beams(32, -30.0, 10.0)),
     "rooms, 128 beams, 90 degrees": lambda: _in_a_flat(_beams(128, -45.0, 45.0, (0.0, 90.0))),
+    "rooms, up to the zenith": lambda: _in_a_flat(_rows(-60.0, 90.1)),
     "tables, a tenth": partial(_left, mosd_points, lambda sample: np.arange(0, len(sample.points), 10)),
     "tables, left half": partial(
         _left, mosd_points, lambda sample: sample.points[:, 0] < np.median(sample.points[:, 0])

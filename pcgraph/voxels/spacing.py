@@ -195,8 +195,7 @@ def _some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points of as many blocks of space as it takes for a crowd, the blocks by their hashes.
 
-    A block is as likely as it holds points (Efraimidis and Spirakis 2006): the crowd is as dense as the cloud, however
-    that lies to the axes.
+    A block is as likely as it holds points: the crowd is as dense as the cloud, however that lies to the axes.
     """
     low, high = bounding_box(points)
     edge = float((high - low).max()) / _BLOCKS
@@ -206,8 +205,7 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     counts = np.bincount(block)
     occupied = np.flatnonzero(counts)
     counts = counts[occupied]
-    chances = (_mixed(occupied.astype(np.uint64)) >> np.uint64(11)) * 2.0**-53 + 2.0**-54  # 0..1, without both
-    order = np.argsort(-np.log(chances) / counts, kind="stable")
+    order = _order_of_draw(occupied.astype(np.uint64), counts)
     taken = np.zeros(_BLOCKS**3, bool)
     taken[occupied[order]] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
     return points.take(np.flatnonzero(taken[block]), axis=0)
@@ -237,6 +235,17 @@ def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Whole numbers without a pattern, by one step of a multiplicative hash."""
     spread = values * np.uint64(0xD6E8FEB86659FD93)
     return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+
+
+def _order_of_draw(numbers: NDArray[np.uint64], weights: NDArray[np.number]) -> NDArray[np.int64]:
+    """Order in which things are drawn, each as likely the next as its weight says, by what their numbers hash to.
+
+    Notes
+    -----
+    Source: Efraimidis and Spirakis 2006.
+    """
+    chances = (_mixed(numbers) >> np.uint64(11)) * 2.0**-53 + 2.0**-54  # 0..1, without both
+    return np.argsort(-np.log(chances) / weights, kind="stable")
 
 
 # --- spacing that grows with range: one scan from one place -----------------------------------------------------------
@@ -360,7 +369,11 @@ class _Readings(NamedTuple):
 
 
 def _readings(points: NDArray[np.float64]) -> _Readings:
-    """Readings at some places in a cloud thinned by the points' hashes."""
+    """Readings at some places in a cloud thinned by the points' hashes.
+
+    Places are drawn by the root of the spacing, between as points and as surface lie: at the pole of a scanner that
+    turns by equal angles points are many, and not as far apart as the law says.
+    """
     chosen = points
     if len(points) > _THINNED:
         taken = np.empty(len(points), np.bool_)
@@ -370,11 +383,13 @@ def _readings(points: NDArray[np.float64]) -> _Readings:
         chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
-    sample = chosen[:_READINGS]
+    sample = chosen[: 2 * _READINGS]
     near, around = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)
-    spacing = near[:, -1]
-    usable = np.isfinite(spacing) & (spacing > 0.0)
-    sample, spacing, patches = sample[usable], spacing[usable], chosen[around[usable]]
+    usable = np.flatnonzero(np.isfinite(near[:, -1]) & (near[:, -1] > 0.0))
+    if len(usable):
+        weights = np.sqrt(np.minimum(near[usable, -1], np.percentile(near[usable, -1], 90)))  # not for points far off
+        usable = np.sort(usable[_order_of_draw(_hashes(sample[usable]), weights)[:_READINGS]])
+    sample, spacing, patches = sample[usable], near[usable, -1], chosen[around[usable]]
     patches = (patches - patches.mean(axis=1, keepdims=True)) / spacing[:, None, None]
     spreads, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))
     in_a_row = spreads[:, 1] < _ROW * spreads[:, 2]

@@ -217,13 +217,14 @@ def test_a_turned_image_is_seen_from_its_camera(seed):
     assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.99
 
 
-def scanned_furniture(seed, place=(7.0, 1.0, 1.2), size=(8.0, 5.0, 2.6), n=180):
-    """Eight boxes in a room, from a tripod near its corner, 3 mm of noise."""
+def scanned_furniture(seed, place=(7.0, 1.0, 1.2), size=(8.0, 5.0, 2.6), n=180, highest=60, n_boxes=8):
+    """Boxes in a room, from a tripod near its corner, 3 mm of noise."""
     rng, place = np.random.default_rng(seed), np.array(place)
-    up, around = np.meshgrid(np.radians(np.linspace(-60, 60, n)), np.linspace(-np.pi, np.pi, 3 * n), indexing="ij")
+    up = np.radians(np.linspace(-60, highest, n))
+    up, around = np.meshgrid(up, np.linspace(-np.pi, np.pi, 3 * n), indexing="ij")
     rays = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1).reshape(-1, 3)
     ranges = np.maximum(-place / rays, (size - place) / rays).min(axis=1)
-    for _ in range(8):
+    for _ in range(n_boxes):
         low = np.append(rng.uniform(0, np.array(size[:2]) - 1), 0.0)
         high = low + rng.uniform(0.4, 1.2, 3)
         entry = np.minimum((low - place) / rays, (high - place) / rays).max(axis=1)
@@ -240,6 +241,18 @@ def test_the_place_in_a_room_is_found_whichever_way_it_is_turned(seed):
     law = spacing_law(points @ turn.T + 100.0)
     assert law.holds
     assert np.linalg.norm(law.viewpoint - 100.0 - turn @ place) < 0.15  # m
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("size", [(4.0, 4.0, 4.0), (8.0, 5.0, 2.6)])
+def test_a_scanners_pole_does_not_mislead(size, seed):
+    """Rows of equal angles meet above the scanner: a sixth of the points of an empty room lie there."""
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    points, place = scanned_furniture(seed, (1.5, 2.0, 1.5), size, highest=90, n_boxes=0)
+    moved = points @ turn.T + 100.0
+    off = np.linalg.norm(spacing_law(moved).viewpoint - 100.0 - turn @ place)
+    assert off < 0.45 * np.median(np.linalg.norm(points - place, axis=1))
+    assert fraction_facing(moved, pcgraph.segment(moved), 100.0 + turn @ place) > 0.99
 
 
 def rings_ahead(seed):
