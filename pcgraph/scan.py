@@ -489,7 +489,8 @@ def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: 
         return False
     some = np.random.default_rng(0).integers(len(cloud.points), size=_SOME_PIXELS)
     rays = cloud.points[some] - viewpoint
-    x, y = (rays[:, :2] / rays[:, 2:]).T
+    with np.errstate(over="ignore"):  # of points in the camera
+        x, y = (rays[:, :2] / rays[:, 2:]).T
     row, column = np.divmod(cloud.kept[some], cloud.shape[1])
     orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second of an image on its side
     return any(all(_rank_correlation(a, b) >= _IN_ORDER for a, b in order) for order in orders)
