@@ -29,7 +29,7 @@ _THINNED = 1 << 14  # points among which the law of spacing is looked for,
 _READINGS = 1 << 10  # and at how many of them spacing is read
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
 _NEIGHBOUR = 8
-_STARTS = 6  # of the search for a place
+_STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths in half diagonals
 _TRIMMINGS = 2
 _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
@@ -490,9 +490,9 @@ def _least_exponent(readings: _Readings, viewpoint: NDArray[np.float64], exponen
 def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """The place, (3,), about which spacing follows the law best, found by pattern searches around the cloud.
 
-    In a room only places near the true one lead to it, so the search starts from several. A plane looks the same from
-    its other side. Only what stands on it tells them apart, so both are compared; where that does not tell either, the
-    second place is the other.
+    In a room only places near the true one lead to it, so the search starts from several, far apart. A plane looks the
+    same from its other side. Only what stands on it tells them apart, so both are compared; where that does not tell
+    either, the second place is the other.
     """
     low, high = bounding_box(readings.places)
     reach = float(np.linalg.norm(high - low)) / 2.0
@@ -501,8 +501,13 @@ def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDAr
     inside = low + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
     outside = [(low + high) / 2.0 + far * reach * sphere_directions(40) for far in (1.2, 2.0)]
     candidates = np.concatenate((inside, *outside))
-    starts = np.argsort(-_regressions(some, candidates, _PRIOR).explained, kind="stable")[:_STARTS]
-    found = [_searched(some, candidates[start], 0.3 * reach, 5) for start in starts]
+    starts: list[NDArray[np.float64]] = []
+    for place in candidates[np.argsort(-_regressions(some, candidates, _PRIOR).explained, kind="stable")]:
+        if all(np.linalg.norm(place - start) > _APART * reach for start in starts):
+            starts.append(place)
+            if len(starts) == _STARTS:
+                break
+    found = [_searched(some, start, _FIRST_STEP * reach, 5) for start in starts]
     best = int(np.argmax(_regressions(half, np.stack([place for place, _ in found]), _PRIOR).explained))
     place, _ = _searched(half, *found[best], 8)
     other = _mirrored(place, half)
