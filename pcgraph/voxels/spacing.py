@@ -26,11 +26,10 @@ _NEARLY_ALL = 0.95  # of the points (in one place: the others are outliers)
 _NO_SPACING_M = 0.01
 _THIN = 0.01  # of its extent: a cloud whose points, at their spacing, cover so little
 _THINNED = 1 << 14  # points among which the law of spacing is looked for,
-_READINGS = 1 << 10  # and at how many of them spacing is read
+_READINGS = 1 << 10  # and how many readings of the spacing count
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
 _NEIGHBOUR = 8
 _STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths in half diagonals
-_TRIMMINGS = 2
 _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
 _TINY = float(np.finfo(np.float64).tiny)
@@ -317,21 +316,18 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0)
     low, high = bounding_box(found.places)
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
-    every = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
-    given = None if viewpoint is None else (viewpoint - middle) / reach
-    place, mirrored = _most_telling_places(every) if given is None else (given, None)
-    kept, own = np.ones(len(every.logs), bool), viewpoint
-    for trimmed in range(_TRIMMINGS):
-        some = every.some(kept)
-        if trimmed and given is None:
-            place = _searched(some.some(slice(None, None, 2)), place, _SHORT_STEP, 8)[0]
-        line = _regressions(some, place[None])
-        log_range, log_spacing = _on_law(every, place)
-        residuals = log_spacing - line.exponents[0] * log_range
-        residuals -= np.median(residuals[kept])
-        spread = 1.4826 * float(np.median(np.abs(residuals[kept])))
-        kept = np.abs(residuals) <= 2.5 * max(spread, 0.1)
-    if given is None:
+    found = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
+    every, own, mirrored = found.some(slice(None, _READINGS)), viewpoint, None
+    if viewpoint is None:
+        spread_out = found.some(_between_points_and_surface(found))
+        place, mirrored = _most_telling_places(spread_out)
+        near_line = spread_out.some(_on_line(spread_out, place))
+        place = _searched(near_line.some(slice(None, None, 2)), place, _SHORT_STEP, 8)[0]
+    else:
+        place = (viewpoint - middle) / reach
+    kept = _on_line(every, place)
+    line = _regressions(every.some(kept), place[None])
+    if viewpoint is None:
         origin = -middle / reach
         line_of_origin = _regressions(every.some(kept), origin[None])
         if line_of_origin.explained[0] >= line.explained[0] - _OWN_ORIGIN:
@@ -363,17 +359,13 @@ class _Readings(NamedTuple):
     normals: NDArray[np.float64]
     logs: NDArray[np.float64]
 
-    def some(self, which: NDArray[np.bool_] | slice) -> _Readings:
+    def some(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> _Readings:
         """Those of some places."""
         return _Readings(self.places[which], self.normals[which], self.logs[which])
 
 
 def _readings(points: NDArray[np.float64]) -> _Readings:
-    """Readings at some places in a cloud thinned by the points' hashes.
-
-    Places are drawn by the root of the spacing, between as points and as surface lie: at the pole of a scanner that
-    turns by equal angles points are many, and not as far apart as the law says.
-    """
+    """Readings at some places in a cloud thinned by the points' hashes, in an order as good as random."""
     chosen = points
     if len(points) > _THINNED:
         taken = np.empty(len(points), np.bool_)
@@ -385,15 +377,31 @@ def _readings(points: NDArray[np.float64]) -> _Readings:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
     sample = chosen[: 2 * _READINGS]
     near, around = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)
-    usable = np.flatnonzero(np.isfinite(near[:, -1]) & (near[:, -1] > 0.0))
-    if len(usable):
-        weights = np.sqrt(np.minimum(near[usable, -1], np.percentile(near[usable, -1], 90)))  # not for points far off
-        usable = np.sort(usable[_order_of_draw(_hashes(sample[usable]), weights)[:_READINGS]])
+    usable = np.isfinite(near[:, -1]) & (near[:, -1] > 0.0)
     sample, spacing, patches = sample[usable], near[usable, -1], chosen[around[usable]]
     patches = (patches - patches.mean(axis=1, keepdims=True)) / spacing[:, None, None]
     spreads, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))
     in_a_row = spreads[:, 1] < _ROW * spreads[:, 2]
     return _Readings(sample, np.where(in_a_row[:, None], 0.0, axes[:, :, 0]), np.log(spacing))
+
+
+def _between_points_and_surface(readings: _Readings) -> NDArray[np.int64]:
+    """Which readings, ascending, count in the search for a place: drawn by the root of their spacing.
+
+    So they lie between as points and as surface lie: at the pole of a scanner that turns by equal angles points are
+    many, and not as far apart as the law says.
+    """
+    logs = np.minimum(readings.logs, np.percentile(readings.logs, 90))  # not for points far off
+    order = _order_of_draw(np.arange(len(logs), dtype=np.uint64) + np.uint64(1), np.exp(0.5 * (logs - logs.max())))
+    return np.sort(order[:_READINGS])
+
+
+def _on_line(readings: _Readings, place: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which readings lie near the line through all of them about a place; others may be noise."""
+    log_range, log_spacing = _on_law(readings, place)
+    residuals = log_spacing - _regressions(readings, place[None]).exponents[0] * log_range
+    residuals -= np.median(residuals)
+    return np.abs(residuals) <= 2.5 * max(1.4826 * float(np.median(np.abs(residuals))), 0.1)
 
 
 def _on_law(readings: _Readings, viewpoint: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
