@@ -38,8 +38,8 @@ from domain_clouds import (
 )
 from numpy.typing import NDArray
 from scanned_rooms import flat, office, stations
-from scanned_scenes import Floats, scan, sphere_of_rays
-from scanned_streets import SENSOR_M, street
+from scanned_scenes import Floats, rays_at, scan, sphere_of_rays
+from scanned_streets import place_over_lane, street
 
 import pcgraph
 from pcgraph.metrics import weighted_overlap
@@ -111,14 +111,14 @@ def _fused() -> Iterator[Sample]:
         yield Sample(found.points, found.things)
 
 
-# --- Other sensors, on which no constant was chosen -------------------------------------------------------------------
+# --- Other sensors ----------------------------------------------------------------------------------------------------
 
 
 def _in_streets(rays: Floats) -> Iterator[Sample]:
     """Three streets from the roof of a car, 2 cm of noise."""
     for seed in (31, 32, 33):
         made = street(seed)
-        place = made.on_ground(0.0, -1.75) + np.array([0.0, 0.0, SENSOR_M])
+        place = place_over_lane(made)
         found = scan(made.scene, place[None], [rays], 0.02, np.random.default_rng(seed))
         yield Sample(found.points, found.things, viewpoint=place)
 
@@ -143,9 +143,7 @@ def _rows(lowest: float, highest: float) -> Floats:
 
 def _rosette() -> Floats:
     """Rays at random within 70 by 37 degrees ahead, as of a rosette scanner."""
-    azimuth, elevation = np.radians(np.random.default_rng(0).uniform((-35.0, -25.0), (35.0, 12.0), (60_000, 2))).T
-    across = np.cos(elevation)
-    return np.stack((across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)), axis=1)
+    return rays_at(*np.random.default_rng(0).uniform((-35.0, -25.0), (35.0, 12.0), (60_000, 2)).T)
 
 
 # --- What people do to scans before they segment them: which points are left ------------------------------------------

@@ -104,7 +104,13 @@ def scan(
 
 def sphere_of_rays(azimuths: Floats, elevations: Floats) -> Floats:
     """Unit directions (a e, 3) of a scanner that turns about z; degrees."""
-    a, e = (np.radians(angles).ravel() for angles in np.meshgrid(azimuths, elevations, indexing="ij"))
+    a, e = np.meshgrid(azimuths, elevations, indexing="ij")
+    return rays_at(a.ravel(), e.ravel())
+
+
+def rays_at(azimuths: Floats, elevations: Floats) -> Floats:
+    """Unit vectors (n, 3) at azimuths about z and elevations (n,), degrees."""
+    a, e = np.radians(azimuths), np.radians(elevations)
     return np.stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=1)
 
 

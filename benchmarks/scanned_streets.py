@@ -193,10 +193,15 @@ def _house(made: Street, start: float, end: float, side: float, front: float, rn
         scene.add(number, box((low[0], y[0], low[2]), (far[0], y[1], far[2])), loss)
 
 
+def place_over_lane(made: Street) -> Floats:
+    """Where a LiDAR stands on the roof of a car in the right lane, (3,)."""
+    return made.on_ground(0.0, -1.75) + np.array([0.0, 0.0, SENSOR_M])
+
+
 def sweep(made: Street, seed: int) -> Scan:
     """One revolution of a 64-beam LiDAR that stands over the right lane; the sensor is the origin of the points."""
     rng = np.random.default_rng(seed)
-    place = made.on_ground(0.0, -1.75) + np.array([0.0, 0.0, SENSOR_M])
+    place = place_over_lane(made)
     azimuths = np.arange(0.0, 360.0, 0.17) + rng.uniform(0.0, 0.17)
     rays = sphere_of_rays(azimuths, np.linspace(2.0, -24.9, 64))
     found = scan(made.scene, place[None], [rays[rng.random(len(rays)) >= 0.1]], 0.02, rng)

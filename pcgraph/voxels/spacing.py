@@ -311,7 +311,7 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
     taken out, is regressed on log range. Places all around and within the cloud are tried, then moved by ever smaller
     steps; readings far off the line, such as noise, are left out.
     """
-    found = _readings(points)
+    found = _readings(points, _READINGS if viewpoint is not None else 2 * _READINGS)
     if len(found.logs) < _MIN_READINGS:
         return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0)
     low, high = bounding_box(found.places)
@@ -364,8 +364,8 @@ class _Readings(NamedTuple):
         return _Readings(self.places[which], self.normals[which], self.logs[which])
 
 
-def _readings(points: NDArray[np.float64]) -> _Readings:
-    """Readings at some places in a cloud thinned by the points' hashes, in an order as good as random."""
+def _readings(points: NDArray[np.float64], number: int) -> _Readings:
+    """Readings at so many places in a cloud thinned by the points' hashes, in an order as good as random."""
     chosen = points
     if len(points) > _THINNED:
         taken = np.empty(len(points), np.bool_)
@@ -375,7 +375,7 @@ def _readings(points: NDArray[np.float64]) -> _Readings:
         chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
-    sample = chosen[: 2 * _READINGS]
+    sample = chosen[:number]
     near, around = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)
     usable = np.isfinite(near[:, -1]) & (near[:, -1] > 0.0)
     sample, spacing, patches = sample[usable], near[usable, -1], chosen[around[usable]]

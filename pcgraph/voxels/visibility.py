@@ -234,7 +234,8 @@ def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: ND
     starts[_HALVES, :_OUTSIDE] = 1.0
     starts[_HALVES + 1, _OUTSIDE:] = 1.0
     starts[_HALVES + 2] = likely
-    unseen, news = np.ones((2, sides.shape[1]), np.float32), np.empty(len(sides), np.float32)  # of each side
+    unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
+    news = np.empty(len(sides), np.float32)
     for start in starts[_HALVES + 3 :]:
         in_blocks(_tell_news, len(sides), sides, unseen, news, smallest=1)
         leader = int(np.argmax(news))

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks, kernel
+from pcgraph.parallel import in_blocks, kernel, routine
 
 _MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
 
@@ -135,14 +135,20 @@ def _ranges(points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDAr
     return ranges
 
 
+@routine
+def _ray(points: NDArray[np.float64], p: int, viewpoint: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """From a viewpoint to point p: x, y, z, and the range, at least `_MIN_LENGTH`."""
+    x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
+    return x, y, z, max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
+
+
 @kernel
 def _measure(
     start: int, stop: int, points: NDArray[np.float64], viewpoint: NDArray[np.float64], ranges: NDArray[np.float64]
 ) -> None:
     """Set ranges of points."""
     for p in range(start, stop):
-        x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
-        ranges[p] = max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
+        _, _, _, ranges[p] = _ray(points, p, viewpoint)
 
 
 @kernel
@@ -157,8 +163,7 @@ def _draw_near(
 ) -> None:
     """Set places of points, about the viewpoint, as far away as `RangeWarp` says."""
     for p in range(start, stop):
-        x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
-        distance = max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
+        x, y, z, distance = _ray(points, p, viewpoint)
         scale = (distance / reference_range) ** -growth
         warped[p, 0], warped[p, 1], warped[p, 2] = scale * x, scale * y, scale * z
 

@@ -217,19 +217,27 @@ def test_a_turned_image_is_seen_from_its_camera(seed):
     assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.99
 
 
+def rays_at(elevations, azimuths):
+    """Unit vectors at all pairs of angles, radians, (n, 3)."""
+    up, around = np.meshgrid(elevations, azimuths, indexing="ij")
+    return np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1).reshape(-1, 3)
+
+
+def ranges_with_box(ranges, rays, low, high, nearest=0.0):
+    """Ranges along rays from the origin, where a box farther than `nearest` stands in the way."""
+    entry, leave = np.minimum(low / rays, high / rays).max(axis=1), np.maximum(low / rays, high / rays).min(axis=1)
+    return np.where((entry < leave) & (entry > nearest), np.minimum(ranges, entry), ranges)
+
+
 def scanned_furniture(seed, place=(7.0, 1.0, 1.2), size=(8.0, 5.0, 2.6), n=180, highest=60, n_boxes=8):
     """Boxes in a room, from a tripod near its corner, 3 mm of noise."""
     rng, place = np.random.default_rng(seed), np.array(place)
-    up = np.radians(np.linspace(-60, highest, n))
-    up, around = np.meshgrid(up, np.linspace(-np.pi, np.pi, 3 * n), indexing="ij")
-    rays = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1).reshape(-1, 3)
+    rays = rays_at(np.radians(np.linspace(-60, highest, n)), np.linspace(-np.pi, np.pi, 3 * n))
     ranges = np.maximum(-place / rays, (size - place) / rays).min(axis=1)
     for _ in range(n_boxes):
         low = np.append(rng.uniform(0, np.array(size[:2]) - 1), 0.0)
         high = low + rng.uniform(0.4, 1.2, 3)
-        entry = np.minimum((low - place) / rays, (high - place) / rays).max(axis=1)
-        leave = np.maximum((low - place) / rays, (high - place) / rays).min(axis=1)
-        ranges = np.where((entry < leave) & (entry > 0.5), np.minimum(ranges, entry), ranges)
+        ranges = ranges_with_box(ranges, rays, low - place, high - place, nearest=0.5)
     return rays * ranges[:, None] + place + rng.normal(0, 0.003, rays.shape), place
 
 
@@ -257,10 +265,7 @@ def test_a_scanners_pole_does_not_mislead():
 def rings_ahead(seed):
     """Ground, a wall and boxes in the 90 degrees before a 64-beam LiDAR 1.7 m above the ground, 2 cm of range noise."""
     rng = np.random.default_rng(seed)
-    up, around = np.meshgrid(
-        np.radians(np.linspace(-24.8, 2.0, 64)), np.radians(np.arange(-45, 45, 0.2)), indexing="ij"
-    )
-    rays = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1).reshape(-1, 3)
+    rays = rays_at(np.radians(np.linspace(-24.8, 2.0, 64)), np.radians(np.arange(-45, 45, 0.2)))
     with np.errstate(divide="ignore"):
         ranges = np.minimum(
             np.where(rays[:, 2] < 0, -1.7 / rays[:, 2], np.inf), np.where(rays[:, 1] > 0, 8.0 / rays[:, 1], np.inf)
@@ -268,9 +273,7 @@ def rings_ahead(seed):
         for _ in range(6):
             low = np.array([rng.uniform(6, 35), rng.uniform(-9, 4), -1.7])
             high = low + rng.uniform((1.5, 1.5, 1.0), (4.5, 2.0, 2.0))
-            entry = np.minimum(low / rays, high / rays).max(axis=1)
-            leave = np.maximum(low / rays, high / rays).min(axis=1)
-            ranges = np.where((entry < leave) & (entry > 0), np.minimum(ranges, entry), ranges)
+            ranges = ranges_with_box(ranges, rays, low, high)
     ranges += rng.normal(0, 0.02, ranges.shape)
     return (rays * ranges[:, None])[ranges < 60]
 
