@@ -41,7 +41,7 @@ from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import SpacingLaw, median_spacing, spacing_law
-from pcgraph.voxels.surface import LocalPlanes, Surface
+from pcgraph.voxels.surface import LocalPlanes, Surface, roughness
 from pcgraph.voxels.visibility import telling_places, visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
@@ -57,6 +57,9 @@ _MIN_JOINED = 0.75  # of the voxels have
 _HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have
 _AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
+_ALL_JOINED, _SMOOTH = 0.94, 0.15  # of the smaller voxels, and of their edges: so evenly points lie, and so smoothly,
+_FEW_VOXELS = 120_000  # where voxels are made smaller, if they are so few,
+_REFINEMENTS = 2  # at most so often
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
@@ -154,7 +157,7 @@ def segment(
     warn_of_rounding(points, cloud.points, spacing)  # type: ignore[arg-type]
     if spacing is not None:
         warn_of_duplicates(cloud.points, spacing)
-        grid = _without_dust(cloud, grid, math.inf if seed_size is None else float(seed_size))
+        grid = _fitting_grid(cloud, grid, math.inf if seed_size is None else float(seed_size))
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     warn_of_volume(grid)
@@ -452,29 +455,61 @@ def _seed_size(grid: VoxelGrid) -> float:
     return grid.size * min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 
-def _without_dust(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
-    """The grid, or one of larger voxels, by steps of half a power of two, where that joins what falls apart.
+def _fitting_grid(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
+    """The grid, or one of larger voxels where surfaces fall apart, or of smaller ones where they would stay whole.
 
-    On a surface most voxels have at least five others around them. What is no surface at any size, as a line, stays. So
-    does the grid where half of it is joined and larger voxels hardly join more, as they do not far rings of a sweep.
+    Sizes change by half powers of two. On a surface most voxels have at least five others around them.
     """
-    cells, degrees, size = [grid.cells, grid.cells], np.diff(grid.indptr), grid.size
-    joined = joined_at_first = float(np.mean(degrees >= _AROUND_ON_SURFACE))
-    for step in range(_ENLARGEMENTS + 1):
-        if joined >= _MIN_JOINED:
-            if step == 0 or (joined_at_first >= _HALF_JOINED and joined - joined_at_first < _MIN_GAIN * step):
-                return grid
-            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
+    degrees = np.diff(grid.indptr)
+    return _without_dust(cloud, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else _with_detail(cloud, grid)
+
+
+def _joined(degrees: NDArray[np.int64]) -> float:
+    """Fraction of the voxels that have as many others around them as on a surface."""
+    return float(np.mean(degrees >= _AROUND_ON_SURFACE))
+
+
+def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> VoxelGrid:
+    """The grid, or one of voxels large enough to join what falls apart.
+
+    What is no surface at any size, as a line, stays. So does the grid where half of it is joined and larger voxels
+    hardly join more, as they do not far rings of a sweep.
+    """
+    cells, size, joined_at_first = [grid.cells, grid.cells], grid.size, _joined(degrees)
+    for step in range(1, _ENLARGEMENTS + 1):
         size *= math.sqrt(2.0)
         if size > largest:
             break
         # After two steps eight cells are one, so that only the first step needs the points.
-        scaled = cells[0] / 2.0 if step else grid.warp.forward(cloud.points) / size
+        scaled = cells[0] / 2.0 if step > 1 else grid.warp.forward(cloud.points) / size
         larger, degrees = occupied_cells(scaled, size)
         if len(larger) < _MIN_VOXELS:
             break
-        cells = [cells[1], larger]
-        joined = float(np.mean(degrees >= _AROUND_ON_SURFACE))
+        cells, joined = [cells[1], larger], _joined(degrees)
+        if joined >= _MIN_JOINED:
+            if joined_at_first >= _HALF_JOINED and joined - joined_at_first < _MIN_GAIN * step:
+                break
+            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
+    return grid
+
+
+def _with_detail(cloud: CleanCloud, grid: VoxelGrid) -> VoxelGrid:
+    """The grid, or one of smaller voxels where nearly all of them stay joined and noise is far below their size.
+
+    So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
+    than those of points at random. Grids of one scan stay as they are, as its points lie less densely where surfaces
+    slant; so do those of many voxels, for the time's sake.
+    """
+    if grid.warp.of_one_scan or _joined(np.diff(grid.indptr)) < _ALL_JOINED:
+        return grid
+    for _ in range(_REFINEMENTS):
+        size = grid.size / math.sqrt(2.0)
+        if grid.n_voxels > _FEW_VOXELS or _joined(occupied_cells(cloud.points / size, size)[1]) < _ALL_JOINED:
+            break
+        finer = voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
+        if roughness(finer) > _SMOOTH:
+            break
+        grid = finer
     return grid
 
 

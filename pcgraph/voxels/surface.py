@@ -20,6 +20,7 @@ from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 
 _OWN_BONUS = 0.7  # the window around the voxel itself wins unless another is better by this factor
+_LOOKED_AT, _STRETCHES = 4096, 16  # voxels at which roughness is read, and how many stretches they make
 
 
 class Windows(NamedTuple):
@@ -56,6 +57,26 @@ def fitted_windows(grid: VoxelGrid, towards: NDArray[np.float64]) -> Windows:
     in_blocks(_second_ring, n, grid.neighbourhood, ring, windows.moments)
     in_blocks(_fit, n, towards, windows)
     return windows
+
+
+def roughness(grid: VoxelGrid) -> float:
+    """How far voxels lie off the planes of their windows where the surface is smooth, voxel edges.
+
+    It is the lower quartile, over voxels of some evenly spread stretches, of the root mean square distance of the
+    window's voxels to its plane.
+    """
+    n = grid.n_voxels
+    stretches = max(1, min(n // _LOOKED_AT, _STRETCHES))
+    ring, windows = np.empty((n, 10)), Windows(np.empty((n, 10)), np.empty((n, 3)), np.full(n, np.nan))
+    in_blocks(_first_ring, n, grid.neighbourhood, grid.centroids, ring)
+    towards = np.zeros((n, 3))
+    towards[:, 2] = 1.0
+    for stretch in range(stretches):
+        start = n * stretch // stretches
+        stop = min(start + _LOOKED_AT // stretches, n)
+        _second_ring(start, stop, grid.neighbourhood, ring, windows.moments)
+        _fit(start, stop, towards, windows)
+    return float(np.nanquantile(np.sqrt(windows.residuals) / grid.edge_lengths, 0.25))
 
 
 @kernel

@@ -23,9 +23,12 @@ class Warp:
     ----------
     max_gap : float, voxel edges
         Distance between the means of two voxels, at most, that a gap lies between.
+    of_one_scan : bool
+        Whether voxels grow with the distance from the one place that all points were seen from.
     """
 
     max_gap: ClassVar[float] = 3.0
+    of_one_scan: ClassVar[bool] = False
 
     def check(self, points: NDArray[np.float64]) -> None:
         """ValueError if a point has no place in the warped space."""
@@ -60,6 +63,8 @@ class CameraWarp(Warp):
     -----
     Source: the single-camera transform of PCL's VCCS (x/z, y/z, ln z), here with a scale that keeps metres.
     """
+
+    of_one_scan: ClassVar[bool] = True
 
     viewpoint: NDArray[np.float64]
     reference_depth: float
@@ -107,6 +112,7 @@ class RangeWarp(Warp):
 
     # A scanner's rows lie farther apart than the points along them.
     max_gap: ClassVar[float] = 8.0
+    of_one_scan: ClassVar[bool] = True
 
     viewpoint: NDArray[np.float64]
     reference_range: float

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import VIEWPOINT, patch, two_boxes_on_a_plane
+from clouds import SPACING, VIEWPOINT, patch, two_boxes_on_a_plane
 from scipy.spatial.transform import Rotation
 from simulated_rooms import CLASSES
 from solids import sphere
@@ -47,13 +47,14 @@ def test_planes_hold_their_points_and_nothing_is_lost(boxes):
 
 
 def test_rigid_motion_moves_the_answer_along(boxes):
-    points, _, result = boxes
+    points, truth, result = boxes
     turn, shift = Rotation.from_rotvec([0.4, -0.8, 1.3]).as_matrix(), np.array([3.0, -7.0, 2.0])
     moved = pcgraph.segment(points @ turn.T + shift, viewpoint=turn @ VIEWPOINT + shift)
     here, there = find_planes(result), find_planes(moved)
     assert there.normals[0] == pytest.approx(turn @ here.normals[0], abs=1e-4)
     assert there.offsets[0] == pytest.approx(here.offsets[0] + there.normals[0] @ shift, abs=1e-4)
-    assert there.areas[0] == pytest.approx(here.areas[0], rel=0.06)
+    area = SPACING**2 * (truth == 0).sum()
+    assert (here.areas[0], there.areas[0]) == pytest.approx((area, area), rel=0.05)
     ours = objects_on(result, points=points)
     theirs = objects_on(moved, points=points @ turn.T + shift)
     assert len(theirs) == len(ours) == 2

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 import pcgraph
 from pcgraph.parallel import in_blocks
@@ -159,6 +160,23 @@ def test_the_spacing_of_an_image_is_that_of_its_pixels_at_the_median_depth(shape
     expected = pitch * float(np.median(points[..., 2]))
     assert median_spacing(points.reshape(-1, 3), warp) == pytest.approx(expected, rel=1e-6)
     assert pcgraph.segment(points).surface.grid.size == pytest.approx(3.5 * expected, rel=1e-6)
+
+
+def three_faces(noise: float) -> NDArray[np.float64]:
+    """Lattice on three faces of a cube of 1 m, turned, with noise in spacings."""
+    u, v = (np.mgrid[0:80, 0:80].reshape(2, -1) + 0.5) / 80
+    faces = np.concatenate([np.roll(np.stack((u, v, np.zeros_like(u)), axis=1), axis, axis=1) for axis in range(3)])
+    faces += np.random.default_rng(0).normal(0.0, noise / 80, faces.shape)
+    return faces @ Rotation.from_rotvec([0.4, -0.8, 1.3]).as_matrix()
+
+
+@pytest.mark.parametrize(("noise", "is_smaller"), [(0.0, True), (0.1, True), (0.5, False)])
+def test_voxels_are_smaller_where_points_lie_evenly_on_smooth_surfaces(noise: float, is_smaller: bool) -> None:
+    points = three_faces(noise)
+    voxel, usual = pcgraph.segment(points).voxel_size, 3.5 * median_spacing(points)
+    assert voxel < 0.8 * usual if is_smaller else voxel == pytest.approx(usual)
+    assert pcgraph.segment(points, viewpoint=(-2.0, -2.0, -2.0)).voxel_size == voxel
+    assert pcgraph.segment(points, voxel_size=0.05).voxel_size == 0.05
 
 
 def test_spacing_of_many_random_points_is_that_of_a_tree_over_all():
