@@ -59,7 +59,8 @@ _AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
 _ALL_JOINED, _SMOOTH = 0.94, 0.15  # of the smaller voxels, and of their edges: so evenly points lie, and so smoothly,
 _FEW_VOXELS = 120_000  # where voxels are made smaller, if they are so few,
-_REFINEMENTS = 2  # at most so often
+_REFINEMENTS = 2  # at most so often;
+_SLAB = 1 << 14  # voxels of which this is read
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
@@ -497,20 +498,20 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid) -> VoxelGrid:
     """The grid, or one of smaller voxels where nearly all of them stay joined and noise is far below their size.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
-    than those of points at random. Grids of one scan stay as they are, as its points lie less densely where surfaces
-    slant; so do those of many voxels, for the time's sake.
+    than those of points at random. It is read off a slab in the middle. Grids of one scan stay as they are, as its
+    points lie less densely where surfaces slant; so do those of many voxels, for the time's sake.
     """
-    if grid.warp.of_one_scan or _joined(np.diff(grid.indptr)) < _ALL_JOINED:
+    n, size = grid.n_voxels, grid.size
+    if grid.warp.of_one_scan or n > _FEW_VOXELS or _joined(np.diff(grid.indptr)) < _ALL_JOINED:
         return grid
+    slab = grid.starts[[max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2)]]
+    points = cloud.points[grid.order[slab[0] : slab[1]]]
     for _ in range(_REFINEMENTS):
-        size = grid.size / math.sqrt(2.0)
-        if grid.n_voxels > _FEW_VOXELS or _joined(occupied_cells(cloud.points / size, size)[1]) < _ALL_JOINED:
+        finer = voxel_grid(points, None, size / math.sqrt(2.0), grid.warp)
+        if _joined(np.diff(finer.indptr)) < _ALL_JOINED or roughness(finer) > _SMOOTH:
             break
-        finer = voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
-        if roughness(finer) > _SMOOTH:
-            break
-        grid = finer
-    return grid
+        size = finer.size
+    return grid if size == grid.size else voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
 
 
 def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float | None) -> bool:
