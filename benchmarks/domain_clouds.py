@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Labelled clouds of many kinds, for `domains.py`: depth images, fused rooms, streets, airborne lidar, bins, noise.
+"""Labelled clouds of many kinds, for `domains.py`: depth images, fused rooms, meshes, streets, airborne lidar, noise.
 
 Real ones come from ../shared/data and are left out where they are missing. The others are made here: exact truth, the
 same for the same seed, kept under build/ until the code that makes them changes.
@@ -11,13 +11,16 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 
+import meshed_rooms
 import numpy as np
 import scanned_elsewhere
 import scanned_rooms
 import scanned_scenes
 import scanned_streets
+from meshed_rooms import meshed
 from mosd import load_clouds
 from numpy.typing import NDArray
 from scanned_rooms import flat, office, stations
@@ -136,6 +139,11 @@ def domains(superpoints: Path | None = None) -> list[Domain]:
         Domain("room1", rooms, room1, 300, room, 0.03),
         Domain("simulated room A", rooms, lambda: simulated_room("A"), 300, room, 0.02),
         Domain("simulated room B", rooms, lambda: simulated_room("B"), 300, room, 0.02),
+        Domain("room1 thinned", rooms, lambda: thinned_room("room1", 0.03), 300, room, 0.03),
+        Domain("room A thinned", rooms, lambda: thinned_room("A", 0.05), 300, room, 0.02),
+        Domain("room B thinned", rooms, lambda: thinned_room("B", 0.03), 300, room, 0.02),
+        Domain("room A as mesh", rooms, lambda: meshed_room("A"), 300, room, 0.02),
+        Domain("room B as mesh", rooms, lambda: meshed_room("B"), 300, room, 0.02),
         Domain("street sweep A", things, lambda: street_sweep(1), 300, road, 0.2),
         Domain("street sweep B", things, lambda: street_sweep(7), 300, road, 0.2),
         Domain("street mobile", levels, lambda: street_mobile(3), 300, road, 0.2, large=True),
@@ -240,11 +248,31 @@ def simulated_room(name: str) -> list[Sample]:
     return [_kept(f"room {name}", lambda: _room_sample(*(office() if name == "A" else flat()), colored=name == "A"))]
 
 
-def _room_sample(scene: Scene, places: NDArray[np.float64], *, colored: bool) -> Sample:
-    found, rng = stations(scene, places, 0, 0.9), np.random.default_rng(0)
+def meshed_room(name: str) -> list[Sample]:
+    """The same room as the vertices of a mesh fused from depth images: A as fused, B simplified."""
+    if find_spec("skimage") is None:
+        raise MissingDataError("scikit-image (the extra ct) is not installed")
+    if name == "A":
+        return [_kept("mesh A", lambda: _room_sample(*office(), meshed(*office(), 0, 0.04), colored=True))]
+    return [_kept("mesh B", lambda: _room_sample(*flat(), meshed(*flat(), 0, 0.025, 80_000), colored=False))]
+
+
+def thinned_room(name: str, edge: float) -> list[Sample]:
+    """A room as most store it, by the mean of the points in each cube, whose label is that of one of them."""
+    (sample,) = room1() if name == "room1" else simulated_room(name)
+    _, one, cube = np.unique(np.floor(sample.points / edge), axis=0, return_index=True, return_inverse=True)
+    count = np.bincount(cube.ravel())
+    points = np.stack([np.bincount(cube.ravel(), axis) / count for axis in sample.points.T], axis=1)
+    colors = None if sample.colors is None else sample.colors[one]
+    return [Sample(points, sample.truth[one], colors, _middle(points))]
+
+
+def _room_sample(scene: Scene, places: NDArray[np.float64], found: Scan | None = None, *, colored: bool) -> Sample:
+    """A room as terrestrial scanners see it, or as found."""
+    found, rng = found or stations(scene, places, 0, 0.9), np.random.default_rng(0)
     shades = np.array(scene.tints, np.int64)[found.things] + rng.integers(-12, 13, (len(found.things), 3))
     colors = shades.clip(0, 255).astype(np.uint8) if colored else None
-    counts = np.bincount(found.things, minlength=len(scene.kinds))
+    counts = np.bincount(found.things[found.things >= 0], minlength=len(scene.kinds))
     things = np.setdiff1d(np.flatnonzero(counts >= MIN_THING), scene.numbers("floor", "wall", "ceiling"))
     return Sample(found.points, found.things, colors, found.origins, found.parts, things)
 
@@ -369,7 +397,7 @@ def _found(path: Path) -> Path:
 
 def _kept(name: str, make: Callable[[], Sample]) -> Sample:
     """A sample from build/, made if it is not there or the code of clouds and scenes has changed since."""
-    scenes = (scanned_scenes, scanned_rooms, scanned_streets, scanned_elsewhere)
+    scenes = (scanned_scenes, scanned_rooms, meshed_rooms, scanned_streets, scanned_elsewhere)
     sources = (__file__, *(str(module.__file__) for module in scenes))
     code = b"".join(Path(file).read_bytes() for file in sources)
     path = CACHE / f"{name.replace(' ', '_')}-{hashlib.sha256(code).hexdigest()[:12]}.npz"

@@ -8,6 +8,7 @@ Everything is made of convex solids, each the hull of a few points; leaves are l
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,18 +79,12 @@ def scan(
     scene: Scene, places: Floats, directions: list[Floats], noise: float, rng: np.random.Generator, reach: float = 100.0
 ) -> Scan:
     """What is hit by rays from each place, unit directions (r, 3) each, with noise along the ray, metres."""
-    import open3d as o3d
-
-    caster = o3d.t.geometry.RaycastingScene()
-    corners = np.concatenate(scene.corners).reshape(-1, 3).astype(np.float32)
-    triangles = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-    caster.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(triangles))
-    part_of_triangle = np.repeat(np.arange(len(scene.corners)), [len(part) for part in scene.corners])
+    caster, part_of_triangle = caster_of(scene)
     losses, things = np.array(scene.losses), np.array(scene.things)
     columns = []
     for place, along in zip(places, directions, strict=True):
         rays = np.concatenate((np.broadcast_to(place, along.shape), along), axis=1).astype(np.float32)
-        answer = caster.cast_rays(o3d.core.Tensor(rays))
+        answer = caster.cast_rays(rays)
         distance, triangle = answer["t_hit"].numpy().astype(np.float64), answer["primitive_ids"].numpy()
         hit = np.flatnonzero(distance < reach)
         part = part_of_triangle[triangle[hit]]
@@ -100,6 +95,16 @@ def scan(
         columns.append((points, np.broadcast_to(place, points.shape), things[part], part))
     points, origins, thing, part = (np.concatenate(column) for column in zip(*columns, strict=True))
     return Scan(points, origins, thing.astype(np.int32), part.astype(np.int32))
+
+
+def caster_of(scene: Scene) -> tuple[Any, NDArray[np.int64]]:
+    """Open3D's ray caster for a scene, and the part of each triangle, (t,)."""
+    import open3d as o3d
+
+    caster = o3d.t.geometry.RaycastingScene()
+    corners = np.concatenate(scene.corners).reshape(-1, 3).astype(np.float32)
+    caster.add_triangles(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
+    return caster, np.repeat(np.arange(len(scene.corners)), [len(part) for part in scene.corners])
 
 
 def sphere_of_rays(azimuths: Floats, elevations: Floats) -> Floats:
