@@ -57,10 +57,12 @@ _MIN_JOINED = 0.75  # of the voxels have
 _HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have
 _AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
-_ALL_JOINED, _SMOOTH = 0.94, 0.15  # of the smaller voxels, and of their edges: so evenly points lie, and so smoothly,
-_FEW_VOXELS = 120_000  # where voxels are made smaller, if they are so few,
-_REFINEMENTS = 2  # at most so often;
-_SLAB = 1 << 14  # voxels of which this is read
+# Voxels can be smaller by steps of a quarter of a power of two
+_REFINEMENTS = 4  # at most,
+_FEW_VOXELS = 120_000  # if they are so few,
+_ALL_JOINED = 0.92  # and of them, less
+_PRICE_OF_ROUGHNESS = 0.5  # of their roughness, stay joined,
+_SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
@@ -459,7 +461,7 @@ def _seed_size(grid: VoxelGrid) -> float:
 def _fitting_grid(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
     """The grid, or one of larger voxels where surfaces fall apart, or of smaller ones where they would stay whole.
 
-    Sizes change by half powers of two. On a surface most voxels have at least five others around them.
+    On a surface most voxels have at least five others around them.
     """
     degrees = np.diff(grid.indptr)
     return _without_dust(cloud, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else _with_detail(cloud, grid)
@@ -471,7 +473,7 @@ def _joined(degrees: NDArray[np.int64]) -> float:
 
 
 def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> VoxelGrid:
-    """The grid, or one of voxels large enough to join what falls apart.
+    """The grid, or one of voxels larger by half powers of two, enough to join what falls apart.
 
     What is no surface at any size, as a line, stays. So does the grid where half of it is joined and larger voxels
     hardly join more, as they do not far rings of a sweep.
@@ -495,22 +497,25 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]
 
 
 def _with_detail(cloud: CleanCloud, grid: VoxelGrid) -> VoxelGrid:
-    """The grid, or one of smaller voxels where nearly all of them stay joined and noise is far below their size.
+    """The grid, or one of voxels smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
-    than those of points at random. It is read off a slab in the middle. Grids of one scan stay as they are, as its
-    points lie less densely where surfaces slant; so do those of many voxels, for the time's sake.
+    than those of points at random. The rougher the surface, the more have to stay joined: noise needs larger voxels.
+    Both are read off a slab in the middle. Grids of one scan stay as they are, as its points lie less densely where
+    surfaces slant; so do those of many voxels, for the time's sake.
     """
     n, size = grid.n_voxels, grid.size
     if grid.warp.of_one_scan or n > _FEW_VOXELS or _joined(np.diff(grid.indptr)) < _ALL_JOINED:
         return grid
     slab = grid.starts[[max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2)]]
     points = cloud.points[grid.order[slab[0] : slab[1]]]
-    for _ in range(_REFINEMENTS):
-        finer = voxel_grid(points, None, size / math.sqrt(2.0), grid.warp)
-        if _joined(np.diff(finer.indptr)) < _ALL_JOINED or roughness(finer) > _SMOOTH:
+    for step in range(1, _REFINEMENTS + 1):
+        finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
+        joined = _joined(np.diff(finer.indptr))
+        if joined < _ALL_JOINED:
             break
-        size = finer.size
+        if joined - _PRICE_OF_ROUGHNESS * roughness(finer) >= _ALL_JOINED:
+            size = finer.size
     return grid if size == grid.size else voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
 
 
