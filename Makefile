@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick fuzz lint format constraints audit clean system
+.PHONY: help demo test coverage test-quick fuzz lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -19,10 +19,13 @@ demo: $(VENV)/.installed ## set up if needed, run the comparison on the tabletop
 
 # Each worker traces with all cores for a part of its time: more than four workers gain nothing.
 PARALLEL := -n auto --maxprocesses=4 --dist loadfile
-test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run every test with coverage
+test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run every test
+	$(BIN)/python -m pytest $(PARALLEL)
+
+coverage: $(VENV)/.installed-test ## every test, and which lines none reaches; takes a third longer
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term
 
-test-quick: $(VENV)/.installed-test ## the tests without those marked slow, without coverage
+test-quick: $(VENV)/.installed-test ## the tests without those marked slow
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 N := 20000
