@@ -181,7 +181,7 @@ def clean_cloud(
     if not len(kept):
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
     with np.errstate(over="ignore"):  # long doubles
-        places = flat.take(kept, axis=0).astype(np.float64)
+        places = _rows(flat, kept).astype(np.float64)
     largest = float(np.abs(bounding_box(places)).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
@@ -270,10 +270,15 @@ def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray
     return array.reshape(-1, 3)
 
 
+def _rows(values: NDArray[np.generic], kept: NDArray[np.int64]) -> NDArray[np.generic]:
+    """Rows of these numbers, ascending; a view where they are all."""
+    return values if len(kept) == len(values) else values.take(kept, axis=0)
+
+
 def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
     if colors is None:
         return None
-    array = _same_shape("colors", colors, shape).take(kept, axis=0)
+    array = _rows(_same_shape("colors", colors, shape), kept)
     if array.dtype == np.uint8:
         shades = array.astype(np.float64)
         shades *= 1.0 / 255.0

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.disjoint_sets import root_of
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grid import VoxelGrid
@@ -511,31 +512,24 @@ def _largest_pieces(
     """Labels of the voxels in their supervoxel's fixed piece, else in its largest (the first of equals), else -1."""
     indptr, neighbours = voxels.indptr, voxels.neighbours
     n = len(labels)
-    piece = np.full(n, -1, np.int32)
-    stack = np.empty(n, np.int32)
-    sizes = np.zeros(n, np.int64)
-    largest = np.full(n_supervoxels, -1, np.int64)
-    n_pieces = 0
-    for start in range(n):
-        if piece[start] >= 0:
-            continue
-        piece[start] = n_pieces
-        stack[0] = start
-        depth = 1
-        while depth > 0:
-            depth -= 1
-            i = stack[depth]
-            sizes[n_pieces] += n if fixed[i] else 1  # a fixed voxel outweighs all others
-            for a in range(indptr[i], indptr[i + 1]):
-                j = neighbours[a]
-                if piece[j] < 0 and labels[j] == labels[i]:
-                    piece[j] = n_pieces
-                    stack[depth] = j
-                    depth += 1
-        s = labels[start]
-        if largest[s] < 0 or sizes[n_pieces] > sizes[largest[s]]:
-            largest[s] = n_pieces
-        n_pieces += 1
+    links, piece = np.arange(n, dtype=np.int32), np.empty(n, np.int32)  # a piece is known by its first voxel
+    for i in range(n):
+        root = i
+        for a in range(indptr[i], indptr[i + 1]):
+            if neighbours[a] > i:
+                break
+            if labels[neighbours[a]] == labels[i]:
+                other = root_of(links, neighbours[a])
+                links[max(root, other)] = min(root, other)
+                root = min(root, other)
+    sizes, largest = np.zeros(n, np.int64), np.full(n_supervoxels, -1, np.int64)
+    for i in range(n):
+        piece[i] = root_of(links, i)
+        sizes[piece[i]] += n if fixed[i] else 1  # a fixed voxel outweighs all others
+    for i in range(n):
+        s = labels[i]
+        if piece[i] == i and (largest[s] < 0 or sizes[i] > sizes[largest[s]]):
+            largest[s] = i
     for i in range(n):
         piece[i] = labels[i] if piece[i] == largest[labels[i]] else -1
     return piece

@@ -602,7 +602,7 @@ def _compare_normals(
         for a in range(around.indptr[i], around.indptr[i + 1]):
             j = around.neighbours[a]
             cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
-            alike[a] = 1 if cosine > _SAME else (-1 if cosine < -_SAME else 0)
+            alike[a] = np.int8(cosine > _SAME) - np.int8(cosine < -_SAME)  # without a branch
 
 
 @kernel
