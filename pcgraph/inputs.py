@@ -181,7 +181,7 @@ def clean_cloud(
     if not len(kept):
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
     with np.errstate(over="ignore"):  # long doubles
-        places = _rows(flat, kept).astype(np.float64)
+        places = _rows(flat, kept).astype(np.float64, order="C")
     largest = float(np.abs(bounding_box(places)).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
@@ -280,12 +280,12 @@ def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.i
         return None
     array = _rows(_same_shape("colors", colors, shape), kept)
     if array.dtype == np.uint8:
-        shades = array.astype(np.float64)
+        shades = array.astype(np.float64, order="C")
         shades *= 1.0 / 255.0
         return shades
     if array.dtype.kind != "f":
         raise ValueError(f"expected colors as uint8 (0..255) or float (0..1), got {array.dtype}")
-    shades = array.astype(np.float64)
+    shades = array.astype(np.float64, order="C")
     if not ((shades >= 0.0) & (shades <= 1.0)).all():
         raise ValueError("expected float colors within 0..1 at finite points; divide by 255 or pass uint8")
     return shades

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import root_of
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
-from pcgraph.voxels.grid import VoxelGrid
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 
 EARLY_SWEEPS = 1.8
 """Times seed size over voxel size: sweeps in which PCL's supervoxels take voxels from each other."""
@@ -316,7 +316,7 @@ def _expand(
             s = labels[i]
             for a in range(indptr[i], indptr[i + 1]):
                 j = neighbours[a]
-                if labels[j] == s or (labels[j] >= 0 and sweep >= early_sweeps):
+                if labels[j] == s or claim[j] == s or (labels[j] >= 0 and sweep >= early_sweeps):
                     continue
                 d = distance(features, j, means, s, metric)
                 if d < best[j] or (d == best[j] and claim[j] > s):
@@ -413,20 +413,25 @@ def _choose(
 ) -> None:
     """Set the nearest of the supervoxels around each active voxel; of equals its own, else the smaller number."""
     features, indptr, neighbours, metric = voxels
+    around = np.empty(MAX_NEIGHBOURS + 1, np.int32)
     for q in range(start, stop):
         i = active[q]
-        own = nearest = labels[i]
-        least, last = -1.0, own
-        for a in range(indptr[i], indptr[i + 1]):
-            s = labels[neighbours[a]]
-            if s in (own, last, nearest):
-                continue
-            last = s
-            if least < 0.0:
-                least = distance(features, i, means, own, metric)
-            d = distance(features, i, means, s, metric)
-            if d < least or (d == least and nearest != own and s < nearest):
-                nearest, least = s, d
+        own = nearest = last = labels[i]
+        n = 0
+        for a in range(indptr[i], indptr[i + 1]):  # without a branch, which would often be guessed wrongly
+            around[n] = labels[neighbours[a]]
+            n += (around[n] != own) & (around[n] != last)
+            last = labels[neighbours[a]]
+        least = distance(features, i, means, own, metric) if n > 0 else 0.0
+        for b in range(n):
+            s = around[b]
+            for earlier in range(b):
+                if around[earlier] == s:
+                    break
+            else:
+                d = distance(features, i, means, s, metric)
+                if d < least or (d == least and nearest != own and s < nearest):
+                    nearest, least = s, d
         chosen[q] = nearest
 
 
