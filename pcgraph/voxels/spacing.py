@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.parallel import in_blocks, kernel
+from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box, cell_keys, gallop, sorted_keys, starts_of_runs
 from pcgraph.voxels.warp import Warp
@@ -172,16 +172,20 @@ def _find_near(
 
 def _each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """One point per place, in the order of their hashes: the first are as good as random, yet the points' own."""
-    ordered, order = sorted_keys((_hashes(points) >> np.uint64(1)).astype(np.int64))
+    hashes = np.empty(len(points), np.int64)
+    in_blocks(_hash, len(points), points, hashes)
+    ordered, order = sorted_keys(hashes)
     return points.take(order[starts_of_runs(ordered)[:-1]], axis=0)
 
 
-def _hashes(points: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """A whole number per point that depends on its place alone, and differs between places."""
-    bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
-    odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    mixed = _mixed(bits * odd)
-    return _mixed(mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(1)) ^ (mixed[:, 2] >> np.uint64(2)))
+@kernel
+def _hash(start: int, stop: int, points: NDArray[np.float64], hashes: NDArray[np.int64]) -> None:
+    """Set a whole number per point, 0 to 2**63 - 1, that depends on its place alone, and differs between places."""
+    for p in range(start, stop):  # + 0.0 makes one zero of the two
+        x = _mix(np.float64(points[p, 0] + 0.0).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
+        y = _mix(np.float64(points[p, 1] + 0.0).view(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F))
+        z = _mix(np.float64(points[p, 2] + 0.0).view(np.uint64) * np.uint64(0x165667B19E3779F9))
+        hashes[p] = np.int64(_mix(x ^ (y >> np.uint64(1)) ^ (z >> np.uint64(2))) >> np.uint64(1))
 
 
 def _some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -233,6 +237,13 @@ def _find_block(
 def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Whole numbers without a pattern, by one step of a multiplicative hash."""
     spread = values * np.uint64(0xD6E8FEB86659FD93)
+    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+
+
+@routine
+def _mix(value: np.uint64) -> np.uint64:
+    """What `_mixed` returns, of one number."""
+    spread = value * np.uint64(0xD6E8FEB86659FD93)
     return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
 
 

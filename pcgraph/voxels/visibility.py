@@ -131,7 +131,8 @@ def visible_sides(
     votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
     step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
     if step > 1.0:  # some, evenly spread on any plane, which hide as much if so much larger
-        looked_at, widths = np.flatnonzero(grid.cells @ _SPREAD_OUT % step == 0.0), math.sqrt(step) * widths
+        steps = grid.cells @ _SPREAD_OUT
+        looked_at, widths = np.flatnonzero(steps == step * np.rint(steps / step)), math.sqrt(step) * widths
     centres, widths, sides = centres[looked_at], widths[looked_at], normals[looked_at]
     seen, towards = seen_from(places, centres, widths, sides), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
