@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -134,6 +135,8 @@ class CleanCloud(ShortRepr):
 
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""
+        if len(labels) == math.prod(self.shape):
+            return labels.astype(np.int32).reshape(self.shape)
         full = np.full(self.shape, -1, np.int32)
         full.reshape(-1)[self.kept] = labels
         full.reshape(-1)[self.outliers] = of_outliers
