@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ _THINNED = 1 << 14  # points among which the law of spacing is looked for,
 _READINGS = 1 << 10  # and how many readings of the spacing count
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
 _NEIGHBOUR = 8
+_MIN_SAMPLE = 512  # places of a block whose neighbours are sought
 _STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths in half diagonals
 _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
@@ -372,7 +374,7 @@ class _Readings(NamedTuple):
 
     def some(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> _Readings:
         """Those of some places."""
-        return _Readings(self.places[which], self.normals[which], self.logs[which])
+        return _Readings(*(np.ascontiguousarray(column[which]) for column in self))
 
 
 def _readings(points: NDArray[np.float64], number: int) -> _Readings:
@@ -386,14 +388,23 @@ def _readings(points: NDArray[np.float64], number: int) -> _Readings:
         chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
-    sample = chosen[:number]
-    near, around = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)
+    sample, tree = chosen[:number], cKDTree(chosen, balanced_tree=False, compact_nodes=False)
+    of_blocks = in_blocks(partial(_spacing_and_normals, tree, sample), len(sample), smallest=_MIN_SAMPLE)
+    usable, spacing, normals = (np.concatenate(column) for column in zip(*of_blocks, strict=True))
+    return _Readings(sample[usable], normals, np.log(spacing))
+
+
+def _spacing_and_normals(
+    tree: cKDTree, sample: NDArray[np.float64], start: int, stop: int
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Whether the eighth neighbours of a block of places tell a spacing, and where they do, it and the normals."""
+    near, around = tree.query(sample[start:stop], k=_NEIGHBOUR + 1)
     usable = np.isfinite(near[:, -1]) & (near[:, -1] > 0.0)
-    sample, spacing, patches = sample[usable], near[usable, -1], chosen[around[usable]]
+    spacing, patches = near[usable, -1], tree.data[around[usable]]
     patches = (patches - patches.mean(axis=1, keepdims=True)) / spacing[:, None, None]
     spreads, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))
     in_a_row = spreads[:, 1] < _ROW * spreads[:, 2]
-    return _Readings(sample, np.where(in_a_row[:, None], 0.0, axes[:, :, 0]), np.log(spacing))
+    return usable, spacing, np.where(in_a_row[:, None], 0.0, axes[:, :, 0])
 
 
 def _between_points_and_surface(readings: _Readings) -> NDArray[np.int64]:
