@@ -10,7 +10,7 @@ from pcgraph.parallel import kernel
 
 
 @kernel
-def root_of(links: NDArray[np.int64], element: int) -> int:
+def root_of(links: NDArray[np.integer], element: int) -> int:
     """Representative of an element's set; paths are halved on the way (Tarjan and van Leeuwen 1984)."""
     while links[element] != element:
         links[element] = links[links[element]]

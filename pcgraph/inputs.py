@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -134,6 +135,8 @@ class CleanCloud(ShortRepr):
 
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""
+        if len(labels) == math.prod(self.shape):
+            return labels.astype(np.int32).reshape(self.shape)
         full = np.full(self.shape, -1, np.int32)
         full.reshape(-1)[self.kept] = labels
         full.reshape(-1)[self.outliers] = of_outliers
@@ -181,7 +184,7 @@ def clean_cloud(
     if not len(kept):
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
     with np.errstate(over="ignore"):  # long doubles
-        places = flat.take(kept, axis=0).astype(np.float64)
+        places = _rows(flat, kept).astype(np.float64, order="C")
     largest = float(np.abs(bounding_box(places)).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
@@ -270,17 +273,22 @@ def _same_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray
     return array.reshape(-1, 3)
 
 
+def _rows(values: NDArray[np.generic], kept: NDArray[np.int64]) -> NDArray[np.generic]:
+    """Rows of these numbers, ascending; a view where they are all."""
+    return values if len(kept) == len(values) else values.take(kept, axis=0)
+
+
 def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
     if colors is None:
         return None
-    array = _same_shape("colors", colors, shape).take(kept, axis=0)
+    array = _rows(_same_shape("colors", colors, shape), kept)
     if array.dtype == np.uint8:
-        shades = array.astype(np.float64)
+        shades = array.astype(np.float64, order="C")
         shades *= 1.0 / 255.0
         return shades
     if array.dtype.kind != "f":
         raise ValueError(f"expected colors as uint8 (0..255) or float (0..1), got {array.dtype}")
-    shades = array.astype(np.float64)
+    shades = array.astype(np.float64, order="C")
     if not ((shades >= 0.0) & (shades <= 1.0)).all():
         raise ValueError("expected float colors within 0..1 at finite points; divide by 255 or pass uint8")
     return shades

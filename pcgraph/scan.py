@@ -306,11 +306,13 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     supervoxels = checked_supervoxels(
         method.supervoxels(grid, normals, scan.seed_size, scan.initial_labels), grid.n_voxels, method
     )
-    leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
     surface = Surface(grid, normals, supervoxels)
-    leaves, touching = side_by_side(
-        lambda: _leaves(cloud, surface, leaf_of_point, earlier), lambda: contacts(grid, normals, supervoxels)
-    )
+
+    def with_points() -> tuple[NDArray[np.int32], Moments]:
+        leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
+        return leaf_of_point, _leaves(cloud, surface, leaf_of_point, earlier)
+
+    (leaf_of_point, leaves), touching = side_by_side(with_points, lambda: contacts(grid, normals, supervoxels))
     nodes = node_features(leaves)
     near = gaps(grid, normals, supervoxels, nodes, touching.edges)
     graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near)

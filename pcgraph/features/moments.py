@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.columns import group_means
-from pcgraph.parallel import kernel, routine
+from pcgraph.parallel import kernel, routine, side_by_side
 from pcgraph.short_repr import ShortRepr
 
 
@@ -88,11 +89,14 @@ def moments_of_groups(
     n_groups : int
     features : (n, d) float32, scaled, or None
     """
-    counts, centroids, scatters = _mean_and_scatter(points, groups, n_groups, about_first=True)
     of_features = None if features is None else group_means(features, groups, n_groups)
     if colors is None:
+        counts, centroids, scatters = _mean_and_scatter(points, groups, n_groups, about_first=True)
         return Moments(counts, centroids, scatters, None, features=of_features)
-    _, means, color_scatters = _mean_and_scatter(colors, groups, n_groups, about_first=False)
+    (counts, centroids, scatters), (_, means, color_scatters) = side_by_side(
+        partial(_mean_and_scatter, points, groups, n_groups, about_first=True),
+        partial(_mean_and_scatter, colors, groups, n_groups, about_first=False),
+    )
     return Moments(counts, centroids, scatters, means, color_scatters, features=of_features)
 
 

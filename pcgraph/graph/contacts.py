@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,23 +82,56 @@ def facing_sides(
         2 e of edge e where it lies on the side of the smaller supervoxel, else 2 e + 1.
     """
     n_sides = 2 * len(edges)
-    voxels = np.bincount(side, minlength=n_sides)
-
-    def sums(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        rows = vectors[voxel]
-        return np.stack([np.bincount(side, rows[:, axis], n_sides) for axis in range(3)], axis=1)
-
-    directions = sums(normals)
+    voxels, lengths = np.zeros(n_sides, np.int64), np.zeros(len(edges))
+    places, directions = np.zeros((n_sides, 3)), np.zeros((n_sides, 3))
+    sides = _Sides(voxels, places, directions, lengths)
+    _sum_up_sides(voxel.astype(np.int32, copy=False), side, grid.centroids, normals, grid.edge_lengths, sides)
     x, y, z = directions.T
     norms = np.sqrt(x * x + y * y + z * z)
-    lengths = np.bincount(side >> 1, 0.5 * grid.edge_lengths[voxel], len(edges))
     return Contacts(
         edges=edges,
         voxels=voxels.reshape(-1, 2),
-        positions=(sums(grid.centroids) / voxels[:, None]).reshape(-1, 2, 3),
+        positions=(places / voxels[:, None]).reshape(-1, 2, 3),
         normals=(directions / np.maximum(norms, 1e-12)[:, None]).reshape(-1, 2, 3),
-        lengths=lengths.astype(np.float64),  # int64 if there is none
+        lengths=lengths,
     )
+
+
+class _Sides(NamedTuple):
+    """Sums over the voxels on each of s sides of contacts, zero at first; see `Contacts`.
+
+    Attributes
+    ----------
+    voxels : (s,) int64
+    places, directions : (s, 3) float64
+        Of centroids and normals.
+    lengths : (s / 2,) float64
+        Of both sides of a contact.
+    """
+
+    voxels: NDArray[np.int64]
+    places: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    lengths: NDArray[np.float64]
+
+
+@kernel
+def _sum_up_sides(
+    voxel: NDArray[np.int32],
+    side: NDArray[np.int64],
+    centroids: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    edge_lengths: NDArray[np.float64],
+    sums: _Sides,
+) -> None:
+    """Add each voxel to the sums of its side."""
+    for row in range(len(voxel)):
+        v, s = voxel[row], side[row]
+        sums.voxels[s] += 1
+        for axis in range(3):
+            sums.places[s, axis] += centroids[v, axis]
+            sums.directions[s, axis] += normals[v, axis]
+        sums.lengths[s >> 1] += 0.5 * edge_lengths[v]
 
 
 @kernel

@@ -13,9 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.disjoint_sets import root_of
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
-from pcgraph.voxels.grid import VoxelGrid
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 
 EARLY_SWEEPS = 1.8
 """Times seed size over voxel size: sweeps in which PCL's supervoxels take voxels from each other."""
@@ -315,7 +316,7 @@ def _expand(
             s = labels[i]
             for a in range(indptr[i], indptr[i + 1]):
                 j = neighbours[a]
-                if labels[j] == s or (labels[j] >= 0 and sweep >= early_sweeps):
+                if labels[j] == s or claim[j] == s or (labels[j] >= 0 and sweep >= early_sweeps):
                     continue
                 d = distance(features, j, means, s, metric)
                 if d < best[j] or (d == best[j] and claim[j] > s):
@@ -412,20 +413,25 @@ def _choose(
 ) -> None:
     """Set the nearest of the supervoxels around each active voxel; of equals its own, else the smaller number."""
     features, indptr, neighbours, metric = voxels
+    around = np.empty(MAX_NEIGHBOURS + 1, np.int32)
     for q in range(start, stop):
         i = active[q]
-        own = nearest = labels[i]
-        least, last = -1.0, own
-        for a in range(indptr[i], indptr[i + 1]):
-            s = labels[neighbours[a]]
-            if s in (own, last, nearest):
-                continue
-            last = s
-            if least < 0.0:
-                least = distance(features, i, means, own, metric)
-            d = distance(features, i, means, s, metric)
-            if d < least or (d == least and nearest != own and s < nearest):
-                nearest, least = s, d
+        own = nearest = last = labels[i]
+        n = 0
+        for a in range(indptr[i], indptr[i + 1]):  # without a branch, which would often be guessed wrongly
+            around[n] = labels[neighbours[a]]
+            n += (around[n] != own) & (around[n] != last)
+            last = labels[neighbours[a]]
+        least = distance(features, i, means, own, metric) if n > 0 else 0.0
+        for b in range(n):
+            s = around[b]
+            for earlier in range(b):
+                if around[earlier] == s:
+                    break
+            else:
+                d = distance(features, i, means, s, metric)
+                if d < least or (d == least and nearest != own and s < nearest):
+                    nearest, least = s, d
         chosen[q] = nearest
 
 
@@ -511,31 +517,24 @@ def _largest_pieces(
     """Labels of the voxels in their supervoxel's fixed piece, else in its largest (the first of equals), else -1."""
     indptr, neighbours = voxels.indptr, voxels.neighbours
     n = len(labels)
-    piece = np.full(n, -1, np.int32)
-    stack = np.empty(n, np.int32)
-    sizes = np.zeros(n, np.int64)
-    largest = np.full(n_supervoxels, -1, np.int64)
-    n_pieces = 0
-    for start in range(n):
-        if piece[start] >= 0:
-            continue
-        piece[start] = n_pieces
-        stack[0] = start
-        depth = 1
-        while depth > 0:
-            depth -= 1
-            i = stack[depth]
-            sizes[n_pieces] += n if fixed[i] else 1  # a fixed voxel outweighs all others
-            for a in range(indptr[i], indptr[i + 1]):
-                j = neighbours[a]
-                if piece[j] < 0 and labels[j] == labels[i]:
-                    piece[j] = n_pieces
-                    stack[depth] = j
-                    depth += 1
-        s = labels[start]
-        if largest[s] < 0 or sizes[n_pieces] > sizes[largest[s]]:
-            largest[s] = n_pieces
-        n_pieces += 1
+    links, piece = np.arange(n, dtype=np.int32), np.empty(n, np.int32)  # a piece is known by its first voxel
+    for i in range(n):
+        root = i
+        for a in range(indptr[i], indptr[i + 1]):
+            if neighbours[a] > i:
+                break
+            if labels[neighbours[a]] == labels[i]:
+                other = root_of(links, neighbours[a])
+                links[max(root, other)] = min(root, other)
+                root = min(root, other)
+    sizes, largest = np.zeros(n, np.int64), np.full(n_supervoxels, -1, np.int64)
+    for i in range(n):
+        piece[i] = root_of(links, i)
+        sizes[piece[i]] += n if fixed[i] else 1  # a fixed voxel outweighs all others
+    for i in range(n):
+        s = labels[i]
+        if piece[i] == i and (largest[s] < 0 or sizes[i] > sizes[largest[s]]):
+            largest[s] = i
     for i in range(n):
         piece[i] = labels[i] if piece[i] == largest[labels[i]] else -1
     return piece

@@ -107,11 +107,27 @@ def assign_points(
     """
     chosen = np.empty(len(points), np.int32)
     surface = np.empty((grid.n_voxels, 8))  # a voxel's row fills one line of the cache
-    surface[:, :3], surface[:, 3:6] = grid.centroids, planes.normals
-    surface[:, 6] = np.einsum("ij,ij->i", planes.normals, planes.origins - grid.centroids)
+    in_blocks(_set_surface, grid.n_voxels, grid.centroids, planes.normals, planes.origins, surface)
     members = PointsOfVoxels(points, grid.order, grid.starts)
     in_blocks(_assign, grid.n_voxels, members, grid.indptr, grid.neighbours, surface, supervoxels, chosen)
     return chosen
+
+
+@kernel
+def _set_surface(
+    start: int,
+    stop: int,
+    centroids: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    origins: NDArray[np.float64],
+    surface: NDArray[np.float64],
+) -> None:
+    """Set rows of the voxels: centroid, normal, and how far along the normal the plane lies from the centroid."""
+    for v in range(start, stop):
+        surface[v, 6] = 0.0
+        for axis in range(3):
+            surface[v, axis], surface[v, 3 + axis] = centroids[v, axis], normals[v, axis]
+            surface[v, 6] += normals[v, axis] * (origins[v, axis] - centroids[v, axis])
 
 
 @kernel
@@ -128,7 +144,8 @@ def _assign(
     """Set each point's supervoxel: of the voxel on whose plane, and near which, it lies; of equals its own voxel's."""
     points, order, starts = members
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
-    near, label = np.empty((MAX_NEIGHBOURS, 8)), np.empty(MAX_NEIGHBOURS, np.int32)
+    near, labels = np.empty((MAX_NEIGHBOURS, 8)), np.empty(MAX_NEIGHBOURS, np.int32)
+    places, nearest = np.empty((64, 3)), np.empty(64, np.int32)
     for v in range(start, stop):
         own, n = supervoxels[v], 0
         for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around
@@ -136,26 +153,31 @@ def _assign(
             if supervoxels[i] != own:
                 for column in range(7):
                     near[n, column] = surface[i, column]
-                label[n] = supervoxels[i]
+                labels[n] = supervoxels[i]
                 n += 1
-        for at in range(starts[v], starts[v + 1]):
-            chosen[order[at]] = own
         if n == 0:
+            for at in range(starts[v], starts[v + 1]):
+                chosen[order[at]] = own
             continue
-        stay = 0
-        for at in range(starts[v], starts[v + 1]):
-            p = order[at]
-            x, y, z = points[p, 0] - surface[v, 0], points[p, 1] - surface[v, 1], points[p, 2] - surface[v, 2]
+        count, stay = starts[v + 1] - starts[v], 0
+        if count > len(nearest):
+            places, nearest = np.empty((2 * count, 3)), np.empty(2 * count, np.int32)
+        for m in range(count):  # first, so that points far apart in memory are fetched side by side
+            p = order[starts[v] + m]
+            places[m, 0], places[m, 1], places[m, 2] = points[p, 0], points[p, 1], points[p, 2]
+        for m in range(count):
+            px, py, pz = places[m, 0], places[m, 1], places[m, 2]
+            x, y, z = px - surface[v, 0], py - surface[v, 1], pz - surface[v, 2]
             off = surface[v, 3] * x + surface[v, 4] * y + surface[v, 5] * z - surface[v, 6]
-            least = off * off + weight * (x * x + y * y + z * z)
+            least, label = off * off + weight * (x * x + y * y + z * z), own
             for i in range(n):
-                x, y, z = points[p, 0] - near[i, 0], points[p, 1] - near[i, 1], points[p, 2] - near[i, 2]
+                x, y, z = px - near[i, 0], py - near[i, 1], pz - near[i, 2]
                 away = weight * (x * x + y * y + z * z)
                 if away < least:
                     off = near[i, 3] * x + near[i, 4] * y + near[i, 5] * z - near[i, 6]
                     if off * off + away < least:
-                        least, chosen[p] = off * off + away, label[i]
-            stay += chosen[p] == own
-        if stay == 0:
-            for at in range(starts[v], starts[v + 1]):
-                chosen[order[at]] = own
+                        least, label = off * off + away, labels[i]
+            nearest[m] = label
+            stay += label == own
+        for m in range(count):
+            chosen[order[starts[v] + m]] = nearest[m] if stay > 0 else own

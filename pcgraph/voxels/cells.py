@@ -12,6 +12,7 @@ from pcgraph.parallel import in_blocks, kernel, routine
 
 _MAX_KEY = float(1 << 62)
 _DIGIT = 8  # bits
+_BITS = 63  # of a number that is not negative
 _POINTS_OF_BLOCK = 1 << 16  # that are looked through in less time than it takes to start a thread
 
 
@@ -72,8 +73,13 @@ def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
 
     By their digits, the last first: keys span few bits, so this is four to seven times as fast as comparing them.
     """
-    n_digits = max(-(-int(keys.max()).bit_length() // _DIGIT), 1)
-    return _sort_by_digits(keys, n_digits)
+    place_bits, key_bits = len(keys).bit_length(), int(keys.max()).bit_length()
+    low_bits = _BITS - place_bits
+    if key_bits <= low_bits:
+        return _sort_by_digits(keys, place_bits, max(-(-key_bits // _DIGIT), 1))
+    order = sorted_keys(keys & ((1 << low_bits) - 1))[1]
+    order = order[sorted_keys(keys[order] >> low_bits)[1]]
+    return keys[order], order
 
 
 def starts_of_runs(ordered: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -96,17 +102,22 @@ def gallop(keys: NDArray[np.int64], at: int, key: int) -> int:
 
 
 @kernel
-def _sort_by_digits(keys: NDArray[np.int64], n_digits: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5)."""
+def _sort_by_digits(
+    keys: NDArray[np.int64], place_bits: int, n_digits: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5).
+
+    A key and its place, of so many bits, are moved as one number.
+    """
     n, mask = len(keys), (1 << _DIGIT) - 1
     starts = np.zeros((n_digits, 1 << _DIGIT), np.int64)
+    ordered, room = np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
+        ordered[i] = keys[i] << place_bits | i
         for digit in range(n_digits):
             starts[digit, (keys[i] >> (digit * _DIGIT)) & mask] += 1
-    ordered, order = keys.copy(), np.arange(n)
-    room, places = np.empty_like(ordered), np.empty_like(order)
     for digit in range(n_digits):
-        start, shift = starts[digit], digit * _DIGIT
+        start, shift = starts[digit], place_bits + digit * _DIGIT
         if start.max() == n:
             continue  # all have the same
         total = 0
@@ -116,8 +127,12 @@ def _sort_by_digits(keys: NDArray[np.int64], n_digits: int) -> tuple[NDArray[np.
             value = (ordered[i] >> shift) & mask
             at = start[value]
             start[value] = at + 1
-            room[at], places[at] = ordered[i], order[i]
-        ordered, room, order, places = room, ordered, places, order
+            room[at] = ordered[i]
+        ordered, room = room, ordered
+    order = room
+    for i in range(n):
+        order[i] = ordered[i] & ((1 << place_bits) - 1)
+        ordered[i] >>= place_bits
     return ordered, order
 
 

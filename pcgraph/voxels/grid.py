@@ -421,24 +421,29 @@ def _within(
     """The lists one after the other, and their lengths in `counts`: pointers gallop along the sorted keys, one per
     row."""
     keys, places = sought.keys, sought.means
-    n, cells = len(keys), int(np.ceil(reach))
-    rows = 2 * cells + 1
-    first_row = rows * rows // 2 if later else 0
-    pointers = np.zeros(rows * rows, np.int64)
-    ahead = np.full(rows * rows, keys[0] if n else 0)  # keys at the pointers
+    n, cells, n_rows = len(keys), int(np.ceil(reach)), 0
+    shifts = np.empty((2 * cells + 1) ** 2, np.int64)  # of the rows' middles, ascending
+    for x in range(0 if later else -cells, cells + 1):
+        for y in range(0 if later and x == 0 else -cells, cells + 1):
+            if max(abs(x) - 1, 0) ** 2 + max(abs(y) - 1, 0) ** 2 <= reach * reach:
+                shifts[n_rows] = x * pitch[0] + y * pitch[1]
+                n_rows += 1
+    pointers = np.zeros(n_rows, np.int64)
+    ahead = np.full(n_rows, keys[0] if n else 0)  # keys at the pointers
     n_found, found = 0, np.empty(1024, np.int32)
     for v in range(start, stop):
-        own, mean, before = around.keys[v], around.means[v], n_found
-        for row in range(first_row, rows * rows):
-            middle = own + (row // rows - cells) * pitch[0] + (row % rows - cells) * pitch[1]
+        own, before = around.keys[v], n_found
+        mean_x, mean_y, mean_z = around.means[v, 0], around.means[v, 1], around.means[v, 2]
+        for row in range(n_rows):
+            middle = own + shifts[row]
             if ahead[row] > middle + cells:
                 continue
-            first = own + 1 if later and row == first_row else middle - cells
+            first = own + 1 if later and row == 0 else middle - cells
             at = pointers[row] = gallop(keys, pointers[row], first)
             ahead[row] = keys[at] if at < n else _END
             while at < n and keys[at] <= middle + cells:
                 if keys[at] != own:
-                    x, y, z = places[at, 0] - mean[0], places[at, 1] - mean[1], places[at, 2] - mean[2]
+                    x, y, z = places[at, 0] - mean_x, places[at, 1] - mean_y, places[at, 2] - mean_z
                     if x * x + y * y + z * z <= reach * reach:
                         if n_found == len(found):
                             found = np.concatenate((found, np.empty_like(found)))

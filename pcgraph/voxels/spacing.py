@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.parallel import in_blocks, kernel
+from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box, cell_keys, gallop, sorted_keys, starts_of_runs
 from pcgraph.voxels.warp import Warp
@@ -29,6 +30,7 @@ _THINNED = 1 << 14  # points among which the law of spacing is looked for,
 _READINGS = 1 << 10  # and how many readings of the spacing count
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
 _NEIGHBOUR = 8
+_MIN_SAMPLE = 512  # places of a block whose neighbours are sought
 _STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths in half diagonals
 _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
@@ -172,16 +174,20 @@ def _find_near(
 
 def _each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """One point per place, in the order of their hashes: the first are as good as random, yet the points' own."""
-    ordered, order = sorted_keys((_hashes(points) >> np.uint64(1)).astype(np.int64))
+    hashes = np.empty(len(points), np.int64)
+    in_blocks(_hash, len(points), points, hashes)
+    ordered, order = sorted_keys(hashes)
     return points.take(order[starts_of_runs(ordered)[:-1]], axis=0)
 
 
-def _hashes(points: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """A whole number per point that depends on its place alone, and differs between places."""
-    bits = (points + 0.0).view(np.uint64)  # + 0.0 makes one zero of the two
-    odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    mixed = _mixed(bits * odd)
-    return _mixed(mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(1)) ^ (mixed[:, 2] >> np.uint64(2)))
+@kernel
+def _hash(start: int, stop: int, points: NDArray[np.float64], hashes: NDArray[np.int64]) -> None:
+    """Set a whole number per point, 0 to 2**63 - 1, that depends on its place alone, and differs between places."""
+    for p in range(start, stop):  # + 0.0 makes one zero of the two
+        x = _mix(np.float64(points[p, 0] + 0.0).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
+        y = _mix(np.float64(points[p, 1] + 0.0).view(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F))
+        z = _mix(np.float64(points[p, 2] + 0.0).view(np.uint64) * np.uint64(0x165667B19E3779F9))
+        hashes[p] = np.int64(_mix(x ^ (y >> np.uint64(1)) ^ (z >> np.uint64(2))) >> np.uint64(1))
 
 
 def _some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -233,6 +239,13 @@ def _find_block(
 def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Whole numbers without a pattern, by one step of a multiplicative hash."""
     spread = values * np.uint64(0xD6E8FEB86659FD93)
+    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+
+
+@routine
+def _mix(value: np.uint64) -> np.uint64:
+    """What `_mixed` returns, of one number."""
+    spread = value * np.uint64(0xD6E8FEB86659FD93)
     return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
 
 
@@ -361,7 +374,7 @@ class _Readings(NamedTuple):
 
     def some(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> _Readings:
         """Those of some places."""
-        return _Readings(self.places[which], self.normals[which], self.logs[which])
+        return _Readings(*(np.ascontiguousarray(column[which]) for column in self))
 
 
 def _readings(points: NDArray[np.float64], number: int) -> _Readings:
@@ -375,14 +388,23 @@ def _readings(points: NDArray[np.float64], number: int) -> _Readings:
         chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
-    sample = chosen[:number]
-    near, around = cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(sample, k=_NEIGHBOUR + 1)
+    sample, tree = chosen[:number], cKDTree(chosen, balanced_tree=False, compact_nodes=False)
+    of_blocks = in_blocks(partial(_spacing_and_normals, tree, sample), len(sample), smallest=_MIN_SAMPLE)
+    usable, spacing, normals = (np.concatenate(column) for column in zip(*of_blocks, strict=True))
+    return _Readings(sample[usable], normals, np.log(spacing))
+
+
+def _spacing_and_normals(
+    tree: cKDTree, sample: NDArray[np.float64], start: int, stop: int
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Whether the eighth neighbours of a block of places tell a spacing, and where they do, it and the normals."""
+    near, around = tree.query(sample[start:stop], k=_NEIGHBOUR + 1)
     usable = np.isfinite(near[:, -1]) & (near[:, -1] > 0.0)
-    sample, spacing, patches = sample[usable], near[usable, -1], chosen[around[usable]]
+    spacing, patches = near[usable, -1], tree.data[around[usable]]
     patches = (patches - patches.mean(axis=1, keepdims=True)) / spacing[:, None, None]
     spreads, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))
     in_a_row = spreads[:, 1] < _ROW * spreads[:, 2]
-    return _Readings(sample, np.where(in_a_row[:, None], 0.0, axes[:, :, 0]), np.log(spacing))
+    return usable, spacing, np.where(in_a_row[:, None], 0.0, axes[:, :, 0])
 
 
 def _between_points_and_surface(readings: _Readings) -> NDArray[np.int64]:

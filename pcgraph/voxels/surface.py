@@ -277,10 +277,29 @@ def local_planes(grid: VoxelGrid, viewpoints: NDArray[np.float64], reach: int) -
         held, better = windows.residuals[best], np.empty_like(best)
         in_blocks(_take_best, n, neighbourhood, grid.centroids, windows, held, best, costs, better)
         best = better
-    normals = windows.normals[best]
-    x, y, z = (normals * towards).T
-    normals[x + y + z < 0.0] *= -1.0
-    return LocalPlanes(normals, windows.moments[best, 1:4])
+    planes = LocalPlanes(np.empty((n, 3)), np.empty((n, 3)))
+    in_blocks(_set_planes, n, best, windows, towards, planes.normals, planes.origins)
+    return planes
+
+
+@kernel
+def _set_planes(
+    start: int,
+    stop: int,
+    best: NDArray[np.int32],
+    windows: Windows,
+    towards: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    origins: NDArray[np.float64],
+) -> None:
+    """Set the plane of each voxel to that of its window, its normal on the side of the viewpoint."""
+    for i in range(start, stop):
+        w, facing = best[i], 0.0
+        for axis in range(3):
+            facing += windows.normals[w, axis] * towards[i, axis]
+            origins[i, axis] = windows.moments[w, 1 + axis]
+        for axis in range(3):
+            normals[i, axis] = windows.normals[w, axis] * (-1.0 if facing < 0.0 else 1.0)
 
 
 @kernel

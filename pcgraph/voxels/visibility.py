@@ -131,7 +131,8 @@ def visible_sides(
     votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
     step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
     if step > 1.0:  # some, evenly spread on any plane, which hide as much if so much larger
-        looked_at, widths = np.flatnonzero(grid.cells @ _SPREAD_OUT % step == 0.0), math.sqrt(step) * widths
+        steps = grid.cells @ _SPREAD_OUT
+        looked_at, widths = np.flatnonzero(steps == step * np.rint(steps / step)), math.sqrt(step) * widths
     centres, widths, sides = centres[looked_at], widths[looked_at], normals[looked_at]
     seen, towards = seen_from(places, centres, widths, sides), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
@@ -602,7 +603,7 @@ def _compare_normals(
         for a in range(around.indptr[i], around.indptr[i + 1]):
             j = around.neighbours[a]
             cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
-            alike[a] = 1 if cosine > _SAME else (-1 if cosine < -_SAME else 0)
+            alike[a] = np.int8(cosine > _SAME) - np.int8(cosine < -_SAME)  # without a branch
 
 
 @kernel
