@@ -37,16 +37,16 @@ class RegionLinkage(Linkage):
     -----
     Two regions A and B merge at
 
-        (c + c0 + c1 ln(1 + l / l0))  E / (E + e0)  (l / (l + l0))^1/2  (w / (b + w))^3/4  (1 + M / (r m))^1/4
+        (c + c0 + c1 ln(1 + l / l0)) E / (E + e0) (l / (l + l0))^1/2 (w / (b + w))^3/4 (1 + M / (r m))^1/4 m / (m + m0)
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
     increase of the squared distances to the regions' best planes and mean colours by the merge, and l = E / b that per
     length b of the contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean
     supervoxel; w is the width of the smaller region; m and M are the masses of the smaller and the larger one. So what
     lies on one plane and has one colour merges first, whatever its normals; a small piece merges early, as its contact
-    says little, but later with a surface a hundred times as large, so that a thing is whole before it joins what it
-    stands on; and a valley counts most between two large surfaces that meet along a line short for their size. Contacts
-    are touching voxels and, at a price, gaps (`pcgraph.graph.gaps.gaps`).
+    says little, and a handful of points at once, but a piece later with a surface a hundred times as large, so that a
+    thing is whole before it joins what it stands on; and a valley counts most between two large surfaces that meet
+    along a line short for their size. Contacts are touching voxels and, at a price, gaps (`pcgraph.graph.gaps.gaps`).
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -89,9 +89,10 @@ class _Shape(NamedTuple):
     l0: float
     width: float
     r: float
+    m0: float
 
 
-_SHAPE = _Shape(c0=0.08, c1=0.04, e0=1.0, l0=0.1, width=7.7, r=100.0)
+_SHAPE = _Shape(c0=0.08, c1=0.04, e0=1.0, l0=0.1, width=7.7, r=100.0, m0=0.1)
 
 
 def region_linkage(
@@ -187,4 +188,5 @@ def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, 
     evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
+    evidence *= smaller / (smaller + shape.m0)
     return round(evidence * _STEPS) / _STEPS

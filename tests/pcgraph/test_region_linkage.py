@@ -36,9 +36,9 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large):
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
     evidence = cost + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
-    weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25
+    weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
-    assert found > 1e-3
+    assert found > 1e-4
 
 
 @pytest.mark.parametrize("kind", ["random", "chain", "star"])
