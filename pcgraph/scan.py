@@ -106,8 +106,8 @@ def segment(
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
     voxel_size : float, metres, optional
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit; of a camera's, as if
-        all lay at the median depth. More where surfaces would fall apart, less, half as much at least, where points
-        lie so evenly that they stay whole, as the vertices of a mesh.
+        all lay at the median depth; larger where surfaces would fall apart, and smaller, down to a half, where points
+        lie so evenly that surfaces stay whole, as the vertices of a mesh do.
     seed_size : float, metres, optional
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
         least, where that would leave fewer than some 800 supervoxels.

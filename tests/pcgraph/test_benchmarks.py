@@ -12,6 +12,7 @@ import room
 import scanned_elsewhere
 from baselines import felzenszwalb, normal_graph, plane_and_clusters
 from clouds import two_boxes_on_a_plane
+from meshed_rooms import meshed
 from peers import PclSetting, run_lin, run_pcl
 from scanned_scenes import Scene, ball, box, rod, scan, sphere_of_rays
 from scanned_streets import GROUND, SENSOR_M, street, sweep
@@ -50,6 +51,19 @@ def test_a_solid_is_where_it_was_put(solid, distance):
     found = scan(scene, np.zeros((1, 3)), [np.eye(3)], 0.0, np.random.default_rng(0))
     assert len(found.points) == 1  # the rays along y and z miss it
     np.testing.assert_allclose(found.points, [[distance, 0.0, 0.0]], atol=0.02)
+
+
+def test_a_meshed_room_lies_on_its_walls_and_says_which():
+    scene = Scene()
+    for wall in (box((-1.6, -1.6, -1.0), (-1.5, 1.6, 1.0)), box((-1.6, 1.5, -1.0), (1.6, 1.6, 1.0))):
+        scene.add(scene.thing("wall"), wall)
+    fine, coarse = (meshed(scene, np.zeros((1, 3)), 0, 0.06, faces) for faces in (None, 100))
+    for found in (fine, coarse):
+        walls = [found.points[found.things == thing] for thing in (0, 1)]
+        assert np.abs(np.median(walls[0][:, 0]) + 1.5) < 0.01
+        assert np.abs(np.median(walls[1][:, 1]) - 1.5) < 0.01
+        assert np.mean(found.things < 0) < 0.05
+    assert len(coarse.points) < 0.5 * len(fine.points)
 
 
 def test_a_sweep_lies_on_the_ground_and_is_the_same_for_the_same_seed():
