@@ -60,8 +60,9 @@ _ENLARGEMENTS = 10
 # Voxels can be smaller by steps of a quarter of a power of two
 _REFINEMENTS = 4  # at most,
 _FEW_VOXELS = 120_000  # if they are so few,
-_ALL_JOINED = 0.92  # and of them, less
-_PRICE_OF_ROUGHNESS = 0.5  # of their roughness, stay joined,
+_ALL_JOINED = 0.92  # and of them,
+_STILL_JOINED = 0.97  # or of those that are,
+_PRICE_OF_ROUGHNESS = 0.5  # less half of their roughness, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
@@ -467,7 +468,8 @@ def _fitting_grid(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGr
     On a surface most voxels have at least five others around them.
     """
     degrees = np.diff(grid.indptr)
-    return _without_dust(cloud, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else _with_detail(cloud, grid)
+    larger = _without_dust(cloud, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else grid
+    return _with_detail(cloud, grid, degrees) if larger is grid else larger
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
@@ -499,25 +501,27 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]
     return grid
 
 
-def _with_detail(cloud: CleanCloud, grid: VoxelGrid) -> VoxelGrid:
+def _with_detail(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]) -> VoxelGrid:
     """The grid, or one of voxels smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
-    than those of points at random. The rougher the surface, the more have to stay joined: noise needs larger voxels.
-    Both are read off a slab in the middle. Grids of one scan stay as they are, as its points lie less densely where
-    surfaces slant; so do those of many voxels, for the time's sake.
+    than those of points at random. Where not all are joined, as in a sweep thinned to a point per cube, nearly as many
+    have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is read off a slab
+    in the middle. Grids of one scan stay as they are, as its points lie less densely where surfaces slant; so do those
+    of many voxels, for the time's sake.
     """
     n, size = grid.n_voxels, grid.size
-    if grid.warp.of_one_scan or n > _FEW_VOXELS or _joined(np.diff(grid.indptr)) < _ALL_JOINED:
+    if grid.warp.of_one_scan or n > _FEW_VOXELS or _joined(degrees) < _HALF_JOINED:
         return grid
-    slab = grid.starts[[max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2)]]
-    points = cloud.points[grid.order[slab[0] : slab[1]]]
+    slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
+    least = min(_ALL_JOINED, _STILL_JOINED * _joined(degrees[slab]))
+    points = cloud.points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, _REFINEMENTS + 1):
         finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
         joined = _joined(np.diff(finer.indptr))
-        if joined < _ALL_JOINED:
+        if joined < least:
             break
-        if joined - _PRICE_OF_ROUGHNESS * roughness(finer) >= _ALL_JOINED:
+        if joined - _PRICE_OF_ROUGHNESS * roughness(finer) >= least:
             size = finer.size
     return grid if size == grid.size else voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
 
