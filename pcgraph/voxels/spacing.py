@@ -242,11 +242,7 @@ def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
 
 
-@routine
-def _mix(value: np.uint64) -> np.uint64:
-    """What `_mixed` returns, of one number."""
-    spread = value * np.uint64(0xD6E8FEB86659FD93)
-    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+_mix = routine(_mixed)  # of one number, for kernels
 
 
 def _order_of_draw(numbers: NDArray[np.uint64], weights: NDArray[np.number]) -> NDArray[np.int64]:
