@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import VIEWPOINT, box, patch
+from clouds import SPACING, VIEWPOINT, box, patch
 from solids import sphere
 
 import pcgraph
@@ -31,11 +31,11 @@ def test_objects_on_the_ground_stand_in_their_boxes(boxes):
 
 
 def test_a_scan_of_bare_table_takes_no_object_away():
-    """Two boxes that touch, one farther back; after a scan without them `Segmentation.objects` still knows them."""
-    low, high = box(0.4, 0.3, 0.2), box(0.6, 0.36, 0.2) * [1, 1, 1.5]
+    """Two boxes that touch, of different height; only `Segmentation.objects` knows them after a scan without them."""
+    low, high = box(0.4, 0.3, 0.2), box(0.6, 0.3, 0.2) * [1, 1, 1.5]
     table = patch((0, 0, 0), (1.2, 0, 0), (0, 0.8, 0))
     table = table[~((table[:, 0] > 0.39) & (table[:, 0] < 0.81) & (table[:, 1] > 0.29))]
-    first = pcgraph.segment(np.vstack((table, low, high)), viewpoint=VIEWPOINT)
+    first = pcgraph.segment(np.vstack((table, low, high)), viewpoint=VIEWPOINT, voxel_size=3.5 * SPACING)
     before = objects_on(first)
     assert len(before) == 2
     second = pcgraph.update(first, table[table[:, 0] < 0.2], viewpoint=VIEWPOINT)

@@ -15,7 +15,7 @@ import pcgraph
 from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
 
 
-@pytest.mark.parametrize("times_as_large", [1, 300])
+@pytest.mark.parametrize("times_as_large", [1, 100])
 def test_the_altitude_of_two_regions_is_the_formula(times_as_large):
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
     grown = leaves.counts * np.array([1, times_as_large])
@@ -38,7 +38,7 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large):
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
     weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
-    assert found > 1e-4
+    assert found > 1e-3
 
 
 @pytest.mark.parametrize("kind", ["random", "chain", "star"])

@@ -57,8 +57,7 @@ def test_results_print_in_five_lines(boxes):
     assert f"({k} nodes, {m} edges, edges=int32[{m}, 2], " in repr(result.graph).replace("\n    ", "")
     said = f"({k} leaves, {2 * k - 1} nodes, parents=int32[{2 * k - 1}], "
     assert said in repr(result.tree).replace("\n    ", "")
-    level = int((planes.roles == "horizontal").sum())
-    assert f"({len(planes)} planes ({level} horizontal, " in repr(planes).replace("\n    ", "")
+    assert f"({len(planes)} planes (3 horizontal, " in repr(planes).replace("\n    ", "")
     assert f", normals=float64[{len(planes)}, 3]," in repr(planes).replace("\n    ", "")
     apart = pcgraph.segment([[0.0, 0.0, 1.0], [5.0, 0.0, 1.0]], voxel_size=0.1)
     assert "2 leaves, 3 nodes, 2 parts that do not touch" in repr(apart.tree)
