@@ -11,7 +11,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from importlib.util import find_spec
 from pathlib import Path
 
 import meshed_rooms
@@ -250,8 +249,6 @@ def simulated_room(name: str) -> list[Sample]:
 
 def meshed_room(name: str) -> list[Sample]:
     """The same room as the vertices of a mesh fused from depth images: A as fused, B simplified."""
-    if find_spec("skimage") is None:
-        raise MissingDataError("scikit-image (the extra ct) is not installed")
     if name == "A":
         return [_kept("mesh A", lambda: _room_sample(*office(), meshed(*office(), 0, 0.04), colored=True))]
     return [_kept("mesh B", lambda: _room_sample(*flat(), meshed(*flat(), 0, 0.025, 80_000), colored=False))]

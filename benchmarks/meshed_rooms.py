@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rooms as meshes: depth images along a walk, fused to signed distances, and the vertices of their zero level.
+"""Rooms as meshes: depth images along a walk, fused by weighted signed distances, and the vertices of the mesh.
 
-Such are the meshes that indoor data sets consist of: smooth, evenly sampled, with holes where nobody looked. Source of
-the fusion: Curless and Levoy 1996; of the noise: Nguyen et al. 2012.
+Such are the meshes that indoor data sets consist of: smooth, evenly sampled, with holes where nobody looked. Noise of
+the depth images: Nguyen et al. 2012.
 """
 
 from __future__ import annotations
@@ -10,14 +10,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scanned_scenes import Floats, Scan, Scene, caster_of
+from scanned_scenes import Floats, Scan, Scene, caster_of, rays_at
 
-WIDTH, HEIGHT = 320, 240
-FOCAL = WIDTH / 2.0 / np.tan(np.radians(30.0))  # pixels
+from rangesim import RangeImage, Status, look_at
+from rangesim.fusion import fuse
+from rangesim.rig import Intrinsics
+from rangesim.triangle_mesh import TriangleMesh
+
+CAMERA = Intrinsics.from_fov(320, 240, 60.0)
 NEAREST, FARTHEST = 0.4, 4.5  # metres of depth
 VIEWS = 8  # from each place
 SWAY = (0.15, 0.15, 0.08)  # metres, of the camera about a place
+POSE_ERROR = 0.003  # metres
 TRUNCATION = 4.0  # voxels
 LEAST_VIEWS = 2  # of a voxel that counts
 FARTHEST_LABEL = 0.06  # metres between a vertex and the surface that it takes its label from
@@ -43,8 +47,10 @@ def meshed(scene: Scene, places: Floats, seed: int, voxel: float, faces: int | N
         Vertices too far from any surface have the labels -1.
     """
     rng = np.random.default_rng(seed)
-    vertices = _simplified(*_zero_level(scene, places, voxel, rng), faces)
     caster, part_of_triangle = caster_of(scene)
+    views = [_view(caster, place, view, rng) for place in places for view in range(VIEWS)]
+    fused = fuse(views, voxel, truncation_m=TRUNCATION * voxel, weights="uniform", min_weight=LEAST_VIEWS)
+    vertices = _simplified(fused.mesh, faces)
     nearest = caster.compute_closest_points(vertices.astype(np.float32))
     part = part_of_triangle[nearest["primitive_ids"].numpy()]
     is_far = np.linalg.norm(nearest["points"].numpy() - vertices, axis=1) > FARTHEST_LABEL
@@ -53,78 +59,35 @@ def meshed(scene: Scene, places: Floats, seed: int, voxel: float, faces: int | N
     return Scan(vertices, places[place], things.astype(np.int32), np.where(is_far, -1, part).astype(np.int32))
 
 
-def _zero_level(
-    scene: Scene, places: Floats, voxel: float, rng: np.random.Generator
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Vertices (n, 3), metres, and triangles (m, 3) of the surface between seen free space and what lies behind."""
-    from skimage.measure import marching_cubes
-
-    corners = np.concatenate(scene.corners).reshape(-1, 3)
-    low, high = corners.min(axis=0) - 0.1, corners.max(axis=0) + 0.1
-    shape = tuple(np.ceil((high - low) / voxel).astype(int))
-    centres = (low + voxel * np.indices(shape).reshape(3, -1).T).astype(np.float32)
-    sums, weights = np.zeros(len(centres), np.float32), np.zeros(len(centres), np.float32)
-    caster, _ = caster_of(scene)
-    for place in places:
-        for view in range(VIEWS):
-            camera = place + rng.normal(0.0, SWAY)
-            axes = _axes(2.0 * np.pi * (view + 0.5 * rng.random()) / VIEWS, np.radians(rng.uniform(-35.0, 15.0)))
-            depth = _depth_image(caster, camera, axes, rng)
-            _integrate(centres, depth, camera + rng.normal(0.0, 0.003, 3), axes, TRUNCATION * voxel, sums, weights)
-    distances = np.where(weights >= LEAST_VIEWS, sums / np.maximum(weights, 1.0), np.nan)
-    vertices, triangles, *_ = marching_cubes(distances.reshape(shape), 0.0)
-    is_known = np.isfinite(vertices).all(axis=1)
-    return low + voxel * vertices, triangles[is_known[triangles].all(axis=1)]
+def _view(caster: Any, place: Floats, number: int, rng: np.random.Generator) -> RangeImage:
+    """What a camera held at a place sees on one of its turns; half of its noise is alike over four by four pixels."""
+    azimuth, elevation = 360.0 * (number + 0.5 * rng.random(1)) / VIEWS, rng.uniform(-35.0, 15.0, 1)
+    centre = place + rng.normal(0.0, SWAY)
+    pose = look_at(centre, centre + rays_at(azimuth, elevation)[0])
+    width, height = CAMERA.width, CAMERA.height
+    u, v = np.meshgrid(np.arange(width) + 0.5 - CAMERA.cx, np.arange(height) + 0.5 - CAMERA.cy)
+    rays = np.stack((u / CAMERA.fx, v / CAMERA.fy, np.ones_like(u)), axis=-1)
+    along = rays.reshape(-1, 3) @ pose[:3, :3].T
+    cast = np.concatenate((np.broadcast_to(centre, along.shape), along), axis=1).astype(np.float32)
+    z = caster.cast_rays(cast)["t_hit"].numpy().astype(np.float64).reshape(height, width)
+    z[(z < NEAREST) | (z > FARTHEST)] = np.nan
+    coarse = rng.standard_normal((height // 4, width // 4)).repeat(4, axis=0).repeat(4, axis=1)
+    noise = (coarse + rng.standard_normal(z.shape)) / np.sqrt(2.0)
+    z = (z + (0.0012 + 0.0019 * (z - 0.4) ** 2) * noise).astype(np.float32)
+    pose[:3, 3] += rng.normal(0.0, POSE_ERROR, 3)
+    seen = np.isfinite(z)
+    ones, status = seen.astype(np.float32), np.where(seen, Status.OK, Status.LOW_SIGNAL).astype(np.uint8)
+    ranges = z * np.linalg.norm(rays, axis=2).astype(np.float32)
+    return RangeImage(z, ranges, ones, status, ones, CAMERA, pose)
 
 
-def _axes(yaw: float, pitch: float) -> Floats:
-    """Axes of a level camera, (3, 3), columns x right, y down, z forward, in the world."""
-    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
-    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    return np.stack((right, np.cross(forward, right), forward), axis=1)
-
-
-def _depth_image(caster: Any, camera: Floats, axes: Floats, rng: np.random.Generator) -> Floats:
-    """Depth, (HEIGHT, WIDTH), metres, 0 where there is none; half of the noise is alike over four by four pixels."""
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
-    rays = np.stack((u / FOCAL, v / FOCAL, np.ones_like(u)), axis=-1).reshape(-1, 3) @ axes.T
-    cast = np.concatenate((np.broadcast_to(camera, rays.shape), rays), axis=1).astype(np.float32)
-    depth = caster.cast_rays(cast)["t_hit"].numpy().astype(np.float64).reshape(HEIGHT, WIDTH)
-    depth[(depth < NEAREST) | (depth > FARTHEST)] = 0.0
-    coarse = rng.standard_normal((HEIGHT // 4, WIDTH // 4)).repeat(4, axis=0).repeat(4, axis=1)
-    noise = (coarse + rng.standard_normal(depth.shape)) / np.sqrt(2.0)
-    return np.where(depth > 0.0, depth + (0.0012 + 0.0019 * (depth - 0.4) ** 2) * noise, 0.0)
-
-
-def _integrate(
-    centres: NDArray[np.float32],
-    depth: Floats,
-    camera: Floats,
-    axes: Floats,
-    truncation: float,
-    sums: NDArray[np.float32],
-    weights: NDArray[np.float32],
-) -> None:
-    """Add what one depth image says of the signed distance at voxels' centres, metres, positive before the surface."""
-    seen = (centres - camera.astype(np.float32)) @ axes.astype(np.float32)
-    voxel = np.flatnonzero(seen[:, 2] > NEAREST)
-    seen = seen[voxel]
-    column, row = (np.floor(FOCAL * seen[:, k] / seen[:, 2] + half) for k, half in ((0, WIDTH / 2), (1, HEIGHT / 2)))
-    inside = (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
-    voxel, measured = voxel[inside], depth[row[inside].astype(int), column[inside].astype(int)]
-    distance = measured - seen[inside, 2]
-    counts = (measured > 0.0) & (distance > -truncation)
-    sums[voxel[counts]] += np.minimum(distance[counts], truncation)
-    weights[voxel[counts]] += 1.0
-
-
-def _simplified(vertices: Floats, triangles: NDArray[np.int64], faces: int | None) -> Floats:
+def _simplified(mesh: TriangleMesh, faces: int | None) -> Floats:
     """Vertices that are left, (n, 3)."""
+    if faces is None:
+        return mesh.vertices
     import open3d as o3d
 
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(triangles.astype(np.int32))
+    triangles = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces)
     )
-    if faces is not None:
-        mesh = mesh.simplify_quadric_decimation(faces)
-    return np.asarray(mesh.remove_unreferenced_vertices().vertices)
+    return np.asarray(triangles.simplify_quadric_decimation(faces).remove_unreferenced_vertices().vertices)

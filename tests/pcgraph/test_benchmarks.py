@@ -57,7 +57,7 @@ def test_a_meshed_room_lies_on_its_walls_and_says_which():
     scene = Scene()
     for wall in (box((-1.6, -1.6, -1.0), (-1.5, 1.6, 1.0)), box((-1.6, 1.5, -1.0), (1.6, 1.6, 1.0))):
         scene.add(scene.thing("wall"), wall)
-    fine, coarse = (meshed(scene, np.zeros((1, 3)), 0, 0.06, faces) for faces in (None, 100))
+    fine, coarse = (meshed(scene, np.zeros((2, 3)), 0, 0.06, faces) for faces in (None, 100))
     for found in (fine, coarse):
         walls = [found.points[found.things == thing] for thing in (0, 1)]
         assert np.abs(np.median(walls[0][:, 0]) + 1.5) < 0.01
