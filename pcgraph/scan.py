@@ -60,9 +60,9 @@ _ENLARGEMENTS = 10
 # Voxels can be smaller by steps of a quarter of a power of two
 _REFINEMENTS = 4  # at most,
 _FEW_VOXELS = 120_000  # if they are so few,
-_ALL_JOINED = 0.92  # and of them,
-_STILL_JOINED = 0.97  # or of those that are,
-_PRICE_OF_ROUGHNESS = 0.5  # less half of their roughness, stay joined,
+_ALL_JOINED = 0.93  # and of them,
+_STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
+_PRICE_OF_ROUGHNESS = 0.25  # less a quarter of their roughness, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
@@ -514,7 +514,8 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64])
     if grid.warp.of_one_scan or n > _FEW_VOXELS or _joined(degrees) < _HALF_JOINED:
         return grid
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
-    least = min(_ALL_JOINED, _STILL_JOINED * _joined(degrees[slab]))
+    joined = _joined(degrees[slab])
+    least = _ALL_JOINED if joined >= _MIN_JOINED else _STILL_JOINED * joined
     points = cloud.points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, _REFINEMENTS + 1):
         finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)

@@ -60,23 +60,22 @@ def fitted_windows(grid: VoxelGrid, towards: NDArray[np.float64]) -> Windows:
 
 
 def roughness(grid: VoxelGrid) -> float:
-    """How far voxels lie off the planes of their windows where the surface is smooth, voxel edges.
+    """How far voxels and those that touch them lie off a plane where the surface is smooth, voxel edges.
 
-    It is the lower quartile, over voxels of some evenly spread stretches, of the root mean square distance of the
-    window's voxels to its plane.
+    It is the lower quartile, over voxels of some evenly spread stretches, of the root mean square distance of one ring
+    to its plane. Windows of two rings would read the edges of things of some voxels' size as noise.
     """
     n = grid.n_voxels
     stretches = max(1, min(n // _LOOKED_AT, _STRETCHES))
-    ring, windows = np.empty((n, 10)), Windows(np.empty((n, 10)), np.empty((n, 3)), np.full(n, np.nan))
-    in_blocks(_first_ring, n, grid.neighbourhood, grid.centroids, ring)
+    rings = Windows(np.empty((n, 10)), np.empty((n, 3)), np.full(n, np.nan))
     towards = np.zeros((n, 3))
     towards[:, 2] = 1.0
     for stretch in range(stretches):
         start = n * stretch // stretches
         stop = min(start + _LOOKED_AT // stretches, n)
-        _second_ring(start, stop, grid.neighbourhood, ring, windows.moments)
-        _fit(start, stop, towards, windows)
-    return float(np.nanquantile(np.sqrt(windows.residuals) / grid.edge_lengths, 0.25))
+        _first_ring(start, stop, grid.neighbourhood, grid.centroids, rings.moments)
+        _fit(start, stop, towards, rings)
+    return float(np.nanquantile(np.sqrt(rings.residuals) / grid.edge_lengths, 0.25))
 
 
 @kernel
