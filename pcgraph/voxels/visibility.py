@@ -41,6 +41,7 @@ _CLOSED = 0.96  # of all directions hit by something, from places inside: all wa
 _DECIDED, _OUTSIDE_IN, _UPPER, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
+_SEEN_BY_CAMERA, _OF_OTHERS = 0.75, 0.9  # of the cells, at least, and of the most that any other place sees
 _VIEWS = 12  # places that the voxels themselves are looked at from
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
 _SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # along x, y and z, times these, add up to a multiple of seven or three
@@ -113,9 +114,9 @@ def visible_sides(
     so the right one is that whose places see all of the surface, where others have furniture hidden by walls. Where
     two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
     sides, then how much of what is seen from outside has its outside there, and how much of what is seen from the
-    upper half of these places, or from the origin if all lies before it as before a camera that looks along z. The
-    voxels then take the mean direction to the places that see them, those that none sees, and of many voxels most,
-    from the voxels around.
+    upper half of these places, or from the origin if all lies before it as before a camera that looks along z, and most
+    is visible from there. The voxels then take the mean direction to the places that see them, those that none sees,
+    and of many voxels most, from the voxels around.
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
@@ -207,23 +208,22 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
     outside = (low + high) / 2.0 + _DISTANCE * _lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
-    from_origin = coarse.centroids - origin
-    aside = np.abs(from_origin[:, :2]).max(axis=1)
-    is_image = bool((aside < _WIDE * from_origin[:, 2]).all() and np.mean(aside > _NARROW * from_origin[:, 2]) > 0.1)
-    if viewpoint is None and is_image:
-        viewpoint = origin  # of a camera
-    places = np.concatenate((outside, inside, outside[:0] if viewpoint is None else viewpoint[None]))
-    upper = np.arange(len(places)) < _OUTSIDE // 2
-    likely = upper if viewpoint is None else np.arange(len(places)) == len(places) - 1
     normals = _either_normals(coarse)
+    may_be_camera = viewpoint is None and _has_in_view(origin, coarse.centroids)
+    from_viewpoint = [origin] if may_be_camera else [] if viewpoint is None else [viewpoint]
+    places = np.concatenate((outside, inside, *(place[None] for place in from_viewpoint)))
     seen = seen_from(places, coarse.centroids, coarse.edge_lengths, normals)
+    if may_be_camera and not _sees_most(seen[-1], seen[:-1]):
+        from_viewpoint, places, seen = [], places[:-1], seen[:-1]
+    upper = np.arange(len(places)) < _OUTSIDE // 2
+    likely = np.arange(len(places)) == len(places) - 1 if from_viewpoint else upper
     sides = np.empty(seen.shape, np.float32)
     in_blocks(_find_sides, len(places), places, coarse.centroids, normals, seen, sides, smallest=1)
     closed = np.zeros(len(places))
     hits = closed[_OUTSIDE : _OUTSIDE + len(inside)]
     in_blocks(_count_hits, len(inside), inside, coarse.centroids, hits, smallest=1)
     found = _agreements(sides, _starts(sides, outside, likely))
-    weights = _most_telling(found, sides, coarse, closed, likely, viewpoint is not None)
+    weights = _most_telling(found, sides, coarse, closed, likely, bool(from_viewpoint))
     chosen = _spread_choice(seen, weights)
     return TellingPlaces(places[chosen], weights[chosen])
 
@@ -244,6 +244,19 @@ def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: ND
         unseen[0, sides[leader] > 0.0] = 0.0
         unseen[1, sides[leader] < 0.0] = 0.0
     return starts[starts.any(axis=1)]
+
+
+def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bool:
+    """Whether all lies before a camera at a place, (3,), that looks along z, and not in the middle of its image."""
+    rays = centres - place
+    aside = np.abs(rays[:, :2]).max(axis=1)
+    return bool((aside < _WIDE * rays[:, 2]).all() and np.mean(aside > _NARROW * rays[:, 2]) > 0.1)
+
+
+def _sees_most(seen: NDArray[np.bool_], from_others: NDArray[np.bool_]) -> bool:
+    """Whether a place sees most of n cells, (n,), and hardly fewer than any of k others, (k, n), as a camera does."""
+    fraction = float(seen.mean())
+    return fraction >= _SEEN_BY_CAMERA and fraction >= _OF_OTHERS * float(from_others.mean(axis=1).max())
 
 
 @summing_routine
