@@ -50,6 +50,9 @@ VOXELS_PER_SPACING = 3.5
 VOXELS_PER_SEED = 5.0  # voxel edges between seeds, at most,
 _MIN_VOXELS_PER_SEED = 3.0  # and at least
 _MANY_SUPERVOXELS = 800
+_MANY_ON_SMOOTH = 3200  # where surfaces are
+_SMOOTH = 0.1  # smooth, in voxel edges of roughness at most,
+_WELL_JOINED = 0.9  # and so many of the voxels are joined
 _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 RANGE_GROWTH = 0.5
 _FEW_OUTLIERS = 0.95  # of the points are left
@@ -111,7 +114,7 @@ def segment(
         lie so evenly that surfaces stay whole, as the vertices of a mesh do.
     seed_size : float, metres, optional
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
-        least, where that would leave fewer than some 800 supervoxels.
+        least, where that would leave fewer than some 800 supervoxels, or 3200 on smooth surfaces.
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
         depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, with x/z
@@ -457,8 +460,15 @@ def _voxel_size(cloud: CleanCloud, warp: Warp, voxel_size: float | None, seed_si
 
 
 def _seed_size(grid: VoxelGrid) -> float:
-    """Five voxel edges; less, but three at least, where that leaves few supervoxels."""
-    edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * _MANY_SUPERVOXELS))
+    """Five voxel edges; less, but three at least, where that leaves few supervoxels.
+
+    On smooth surfaces that are seen from all around, as those of meshes and of thinned clouds, many are better: their
+    normals are exact, and small things need supervoxels of their own.
+    """
+    few = _MANY_SUPERVOXELS
+    if not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _WELL_JOINED and roughness(grid) <= _SMOOTH:
+        few = _MANY_ON_SMOOTH
+    edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * few))
     return grid.size * min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 

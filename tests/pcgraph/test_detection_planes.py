@@ -54,7 +54,7 @@ def test_rigid_motion_moves_the_answer_along(boxes):
     assert there.normals[0] == pytest.approx(turn @ here.normals[0], abs=1e-4)
     assert there.offsets[0] == pytest.approx(here.offsets[0] + there.normals[0] @ shift, abs=1e-4)
     area = SPACING**2 * (truth == 0).sum()
-    assert (here.areas[0], there.areas[0]) == pytest.approx((area, area), rel=0.035)
+    assert (here.areas[0], there.areas[0]) == pytest.approx((area, area), rel=0.04)  # each supervoxel as a rectangle
     ours = objects_on(result, points=points)
     theirs = objects_on(moved, points=points @ turn.T + shift)
     assert len(theirs) == len(ours) == 2

@@ -181,6 +181,12 @@ def test_voxels_are_smaller_where_points_lie_evenly_on_smooth_surfaces(noise: fl
     assert pcgraph.segment(points, voxel_size=0.05).voxel_size == 0.05
 
 
+@pytest.mark.parametrize(("noise", "edges"), [(0.0, 3.0), (0.1, 3.0), (0.3, 4.26)])
+def test_supervoxels_are_smaller_on_smooth_surfaces(noise: float, edges: float) -> None:
+    result = pcgraph.segment(three_faces(noise))
+    assert result.seed_size / result.voxel_size == pytest.approx(edges, rel=0.05)
+
+
 def test_spacing_of_many_random_points_is_that_of_a_tree_over_all():
     rng = np.random.default_rng(1)
     points = rng.random((300_000, 3)) * (4.0, 3.0, 0.0)
