@@ -104,7 +104,8 @@ def regions_of(
     if color > 0.0 and leaves.colors is not None:
         columns.append(color * leaves.colors)
     values = np.hstack(columns) if columns else np.zeros((len(leaves), 0))
-    return Regions(leaves.counts / mean_count, values, centroids, leaves.scatters / (unit**2 * mean_count), plane)
+    scatters = leaves.scatters / unit / unit / mean_count  # the square of a tiny unit may be zero
+    return Regions(leaves.counts / mean_count, values, centroids, scatters, plane)
 
 
 _AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
