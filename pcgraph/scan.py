@@ -42,7 +42,7 @@ from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_ce
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import SpacingLaw, median_spacing, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface, roughness
-from pcgraph.voxels.visibility import telling_places, visible_fraction, visible_sides
+from pcgraph.voxels.visibility import likelier_place, telling_places, visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
@@ -397,14 +397,12 @@ def _law_and_warp(
 
 
 def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
-    """The place that spacing tells, (3,), unless more is visible from its mirror image, or less than of one scan."""
+    """The place that spacing tells, (3,), or its mirror image; none if less than of one scan is visible from it."""
     if not law.tells_place:
         return None
-    if law.holds and law.mirrored is None:
-        return law.viewpoint
-    places = [law.viewpoint] if law.mirrored is None else [law.viewpoint, law.mirrored]
-    visible = [visible_fraction(grid, place) for place in places]
-    return places[int(np.argmax(visible))] if law.holds or max(visible) >= _OF_ONE_SCAN else None
+    if law.mirrored is not None:
+        return likelier_place(grid, law.viewpoint, law.mirrored)
+    return law.viewpoint if law.holds or visible_fraction(grid, law.viewpoint) >= _OF_ONE_SCAN else None
 
 
 def _without(

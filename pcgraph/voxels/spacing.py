@@ -545,12 +545,21 @@ def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDAr
 
 
 def _mirrored(place: NDArray[np.float64], readings: _Readings) -> NDArray[np.float64]:
-    """A place, (3,), on the other side of the plane on which most lies: at the narrowest quarter of all offsets."""
-    normal = np.linalg.eigh(readings.normals.T @ readings.normals)[1][:, -1]
-    offsets = np.sort(readings.places @ normal)
+    """A place, (3,), on the other side of the plane on which most lies."""
+    normal, offset = densest_plane(readings.places, readings.normals)
+    return place - 2.0 * (place @ normal - offset) * normal
+
+
+def densest_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The plane on which most of n places lie, (n, 3), with normals towards either side: unit normal, (3,), and offset.
+
+    It has the commonest normal, and lies amid the narrowest quarter of all offsets along it.
+    """
+    normal = np.linalg.eigh(normals.T @ normals)[1][:, -1]
+    offsets = np.sort(places @ normal)
     quarter = len(offsets) // 4
-    first = int(np.argmin(offsets[quarter:] - offsets[:-quarter]))
-    return place - 2.0 * (place @ normal - offsets[first + quarter // 2]) * normal
+    first = int(np.argmin(offsets[quarter:] - offsets[: len(offsets) - quarter]))
+    return normal, float(offsets[first + quarter // 2])
 
 
 def _searched(

@@ -18,15 +18,15 @@ from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
-from pcgraph.voxels.spacing import sphere_directions
+from pcgraph.voxels.spacing import densest_plane, sphere_directions
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 
-_CELLS = 5000  # of the coarse grid on which places are compared, about
+_CELLS = 4200  # of the coarse grid on which places are compared, about
 _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
 _INSIDE = 64  # free places within the bounding box, of a lattice of
-_LATTICE = 12  # along each side
+_LATTICE = 10  # along each side
 _CLEARANCE = 2.0  # cells between a free place and the next surface
 _SOME = 1500  # cells are looked for in all directions from a place, about
 _AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
@@ -41,11 +41,12 @@ _CLOSED = 0.96  # of all directions hit by something, from places inside: all wa
 _DECIDED, _OUTSIDE_IN, _UPPER, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
-_SEEN_BY_CAMERA, _OF_OTHERS = 0.75, 0.9  # of the cells, at least, and of the most that any other place sees
+_OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
+_MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _VIEWS = 12  # places that the voxels themselves are looked at from
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
 _SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # along x, y and z, times these, add up to a multiple of seven or three
-_SMOOTHING = 4  # rounds of votes by the voxels around
+_SMOOTHING = 2  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
@@ -113,10 +114,10 @@ def visible_sides(
     several such agreements: within a room, around it, above it, below. All that was measured was seen from somewhere,
     so the right one is that whose places see all of the surface, where others have furniture hidden by walls. Where
     two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
-    sides, then how much of what is seen from outside has its outside there, and how much of what is seen from the
-    upper half of these places, or from the origin if all lies before it as before a camera that looks along z, and most
-    is visible from there. The voxels then take the mean direction to the places that see them, those that none sees,
-    and of many voxels most, from the voxels around.
+    sides, then how much of what is seen from outside has its outside there, and how much of what is seen from those of
+    these places before the plane that bears most, as the ground or a table does, on which things stand; or from the
+    origin, if that lies there and all before it, as before a camera that looks along z. The voxels then take the mean
+    direction to the places that see them, those that none sees, and of many voxels most, from the voxels around.
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
@@ -152,6 +153,20 @@ def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     middle, reach = _unit_frame(grid, np.concatenate((grid.centroids, place[None])))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
     return float(seen_from((place - middle)[None] / reach, centres, widths, _either_normals(grid)).mean())
+
+
+def likelier_place(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of two places, (3,) float64, metres, that from which a quarter more is visible; else that before which things
+    stand on what bears them; else that from which more is visible."""
+    visible, other_is = visible_fraction(grid, place), visible_fraction(grid, other)
+    if max(visible, other_is) <= _MUCH_MORE * min(visible, other_is):
+        middle, reach = _unit_frame(grid, grid.centroids)
+        coarse = _coarse((grid.centroids - middle) / reach, float(np.median(grid.edge_lengths)) / reach)
+        upwards, offset = _support(coarse, _either_normals(coarse))
+        before = [bool((one - middle) / reach @ upwards >= offset) for one in (place, other)]
+        if before[0] != before[1]:
+            return place if before[0] else other
+    return place if visible >= other_is else other
 
 
 def seen_from(
@@ -209,14 +224,17 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
     normals = _either_normals(coarse)
-    may_be_camera = viewpoint is None and _has_in_view(origin, coarse.centroids)
-    from_viewpoint = [origin] if may_be_camera else [] if viewpoint is None else [viewpoint]
+    upwards, offset = _support(coarse, normals)
+    from_viewpoint = [] if viewpoint is None else [viewpoint]
+    if viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids):
+        from_viewpoint = [origin]
     places = np.concatenate((outside, inside, *(place[None] for place in from_viewpoint)))
+    likely = np.zeros(len(places), np.bool_)
+    if from_viewpoint:
+        likely[-1] = True
+    else:
+        likely[:_OUTSIDE] = sphere_directions(_OUTSIDE) @ upwards > 0.0
     seen = seen_from(places, coarse.centroids, coarse.edge_lengths, normals)
-    if may_be_camera and not _sees_most(seen[-1], seen[:-1]):
-        from_viewpoint, places, seen = [], places[:-1], seen[:-1]
-    upper = np.arange(len(places)) < _OUTSIDE // 2
-    likely = np.arange(len(places)) == len(places) - 1 if from_viewpoint else upper
     sides = np.empty(seen.shape, np.float32)
     in_blocks(_find_sides, len(places), places, coarse.centroids, normals, seen, sides, smallest=1)
     closed = np.zeros(len(places))
@@ -246,17 +264,26 @@ def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: ND
     return starts[starts.any(axis=1)]
 
 
+def _support(coarse: VoxelGrid, normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The plane that bears most: its unit normal, (3,), to where nearly all the rest stands, and offset along it.
+
+    It is the ground, a table, or a wall behind things. Where the rest lies on both sides, the normal is z, and nothing
+    lies behind the plane.
+    """
+    normal, offset = densest_plane(coarse.centroids, normals)
+    beyond = coarse.centroids @ normal - offset
+    beyond = beyond[np.abs(beyond) > _OFF_PLANE * coarse.size]
+    before, behind = beyond[beyond > 0.0].sum(), -beyond[beyond < 0.0].sum()
+    if max(before, behind) <= _NEARLY_ALL * (before + behind):
+        return np.array([0.0, 0.0, 1.0]), -np.inf
+    return (normal, offset) if before > behind else (-normal, -offset)
+
+
 def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bool:
     """Whether all lies before a camera at a place, (3,), that looks along z, and not in the middle of its image."""
     rays = centres - place
     aside = np.abs(rays[:, :2]).max(axis=1)
     return bool((aside < _WIDE * rays[:, 2]).all() and np.mean(aside > _NARROW * rays[:, 2]) > 0.1)
-
-
-def _sees_most(seen: NDArray[np.bool_], from_others: NDArray[np.bool_]) -> bool:
-    """Whether a place sees most of n cells, (n,), and hardly fewer than any of k others, (k, n), as a camera does."""
-    fraction = float(seen.mean())
-    return fraction >= _SEEN_BY_CAMERA and fraction >= _OF_OTHERS * float(from_others.mean(axis=1).max())
 
 
 @summing_routine

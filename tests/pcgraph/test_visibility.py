@@ -239,6 +239,14 @@ def test_what_lies_before_a_camera_is_seen_from_there(seed):
     assert fraction_facing(points, pcgraph.segment(points), np.zeros(3)) > 0.97
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_thinned_image_of_a_table_is_seen_from_above_it_however_turned(seed):
+    """From below as much is visible; but things stand on tables, and none hangs under this one."""
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    points = thinned(image_of_a_table(seed), 0.008) @ turn.T + 100.0
+    assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.97
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_wooded_ground_above_an_origin_in_its_middle_is_seen_from_above(seed):
     """Seen from the air, x and y centred and the elevation kept: as before a camera, but the ground hides trees."""
