@@ -555,8 +555,8 @@ def densest_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> 
 
     It has the commonest normal, and lies amid the narrowest quarter of all offsets along it.
     """
-    normal = np.linalg.eigh(normals.T @ normals)[1][:, -1]
-    offsets = np.sort(places @ normal)
+    normal = np.linalg.eigh(np.einsum("ij,ik->jk", normals, normals))[1][:, -1]
+    offsets = np.sort(np.einsum("ij,j->i", places, normal))
     quarter = len(offsets) // 4
     first = int(np.argmin(offsets[quarter:] - offsets[: len(offsets) - quarter]))
     return normal, float(offsets[first + quarter // 2])

@@ -133,7 +133,7 @@ def visible_sides(
     votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
     step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
     if step > 1.0:  # some, evenly spread on any plane, which hide as much if so much larger
-        steps = grid.cells @ _SPREAD_OUT
+        steps = np.einsum("ij,j->i", grid.cells, _SPREAD_OUT)  # a product of matrices would start threads of its own
         looked_at, widths = np.flatnonzero(steps == step * np.rint(steps / step)), math.sqrt(step) * widths
     centres, widths, sides = centres[looked_at], widths[looked_at], normals[looked_at]
     seen, towards = seen_from(places, centres, widths, sides), np.empty((len(centres), 3))
@@ -271,7 +271,7 @@ def _support(coarse: VoxelGrid, normals: NDArray[np.float64]) -> tuple[NDArray[n
     lies behind the plane.
     """
     normal, offset = densest_plane(coarse.centroids, normals)
-    beyond = coarse.centroids @ normal - offset
+    beyond = np.einsum("ij,j->i", coarse.centroids, normal) - offset
     beyond = beyond[np.abs(beyond) > _OFF_PLANE * coarse.size]
     before, behind = beyond[beyond > 0.0].sum(), -beyond[beyond < 0.0].sum()
     if max(before, behind) <= _NEARLY_ALL * (before + behind):
