@@ -513,10 +513,10 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64])
     """The grid, or one of voxels smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
-    than those of points at random. Where not all are joined, as in a sweep thinned to a point per cube, nearly as many
-    have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is read off a slab
-    in the middle. Grids of one scan stay as they are, as its points lie less densely where surfaces slant; so do those
-    of many voxels, for the time's sake.
+    than those of points at random. Where not even three quarters are joined, as in a sweep thinned to a point per cube,
+    nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
+    read off a slab in the middle. Grids of one scan stay as they are, as its points lie less densely where surfaces
+    slant; so do those of many voxels, for the time's sake.
     """
     n, size = grid.n_voxels, grid.size
     if grid.warp.of_one_scan or n > _FEW_VOXELS or _joined(degrees) < _HALF_JOINED:

@@ -38,7 +38,7 @@ _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
 _TOLD = 40.0  # votes of the viewpoint for one of the places
 _CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
-_DECIDED, _OUTSIDE_IN, _UPPER, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
+_DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
@@ -396,7 +396,7 @@ def _most_telling(
     visible = np.abs(sides).sum(axis=1)
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
     is_closed = any(float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0 for s in different)
-    likely_counts = _FROM_VIEWPOINT if likely_is_told else _UPPER
+    likely_counts = _FROM_VIEWPOINT if likely_is_told else _BEFORE
     shown = np.empty(len(different))
     in_blocks(_show, len(different), different, sides, found, coarse.neighbourhood, is_closed, shown, smallest=1)
     most, best = -np.inf, found.weights[0]
