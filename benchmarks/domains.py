@@ -179,7 +179,7 @@ def _segmented(domain: Domain, sample: Sample, **knobs: Any) -> tuple[Row, pcgra
 def _of_tree(domain: Domain, sample: Sample, result: pcgraph.Segmentation) -> Row:
     """Scores of the tree and of its cut into the domain's number of segments."""
     number = min(_segments(domain, sample), result.tree.n_leaves)
-    row = {"oracle": _oracle(result, sample.truth)} | _voted(sample.truth, result.cut(n=number))
+    row = {"oracle": _oracle(result, sample.truth)} | voted(sample.truth, result.cut(n=number))
     if sample.parts is not None:
         row["parts"] = _oracle(result, sample.parts)
     return row
@@ -249,7 +249,7 @@ def _felzenszwalb(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, 
         seconds = time.perf_counter() - start
         cut = {}
         if "purity" in domain.scores:  # else not worth the time
-            cut = _voted(sample.truth, _spread(finite, _felzenszwalb_cut(graph, _segments(domain, sample))))
+            cut = voted(sample.truth, _spread(finite, felzenszwalb_cut(graph, _segments(domain, sample))))
         for scale in SCALES:
             start = time.perf_counter()
             labels = _spread(finite, felzenszwalb(graph, scale))
@@ -259,7 +259,7 @@ def _felzenszwalb(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, 
         yield f"k {scale:g}", _mean(found)
 
 
-def _felzenszwalb_cut(graph: NormalGraph, number: int) -> NDArray[np.integer]:
+def felzenszwalb_cut(graph: NormalGraph, number: int) -> NDArray[np.integer]:
     """Most segments that are no more than a number, by bisection of k."""
     low, high = np.log(SCALES[0]) - 7.0, np.log(SCALES[-1]) + 7.0
     best = _largest(felzenszwalb(graph, float(np.exp(high))), number)  # more if there are gaps
@@ -314,7 +314,7 @@ def _missing_pcl() -> bool:
 
 def _brought(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
     if all(sample.superpoints is not None for sample in samples):
-        yield "", _mean([_voted(sample.truth, sample.superpoints) for sample in samples])
+        yield "", _mean([voted(sample.truth, sample.superpoints) for sample in samples])
 
 
 BASELINES = {"Felzenszwalb": _felzenszwalb, "DBSCAN": _dbscan, "PCL": _pcl, "superpoints": _brought}
@@ -325,13 +325,13 @@ BASELINES = {"Felzenszwalb": _felzenszwalb, "DBSCAN": _dbscan, "PCL": _pcl, "sup
 
 def _of_labels(domain: Domain, sample: Sample, labels: NDArray[np.integer]) -> Row:
     """Scores of labels that have no tree."""
-    return _judged(sample, labels) | _voted(sample.truth, _largest(labels, _segments(domain, sample)))
+    return _judged(sample, labels) | voted(sample.truth, _largest(labels, _segments(domain, sample)))
 
 
 def _judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
     """Scores of objects."""
     sizes = np.bincount(labels[labels >= 0])
-    complete = _completed(labels)
+    complete = completed(labels)
     row = {"wov": weighted_overlap(complete, sample.truth)}
     row |= {"objects": float(np.count_nonzero(sizes)), "single": float(np.count_nonzero(sizes == 1))}
     row["one"] = 1.0 / max(row["objects"], 1.0)
@@ -353,10 +353,10 @@ def _mean_overlap(labels: NDArray[np.integer], truth: NDArray[np.int32], chosen:
     return float(np.mean(best[np.isin(names, chosen)]))
 
 
-def _voted(truth: NDArray[np.int32], segments: NDArray[np.integer] | None) -> Row:
+def voted(truth: NDArray[np.int32], segments: NDArray[np.integer] | None) -> Row:
     """Purity, and mean IoU of the true segments, if every segment takes its most frequent true label."""
     assert segments is not None
-    table = contingency(_completed(segments), truth)
+    table = contingency(completed(segments), truth)
     order = np.argsort(table.data, kind="stable")
     vote = np.empty(table.shape[0], np.int64)
     vote[table.row[order]] = table.col[order]
@@ -367,14 +367,14 @@ def _voted(truth: NDArray[np.int32], segments: NDArray[np.integer] | None) -> Ro
     return {"purity": float(common.sum() / true.sum()), "mIoU": float(np.mean(common / (voted + true - common)))}
 
 
-def _completed(labels: NDArray[np.integer]) -> NDArray[np.int64]:
+def completed(labels: NDArray[np.integer]) -> NDArray[np.int64]:
     """Labels with one more for all points that have none."""
     return np.where(labels >= 0, labels, labels.max() + 1).astype(np.int64)
 
 
 def _largest(labels: NDArray[np.integer], n: int) -> NDArray[np.int64]:
     """The n - 1 largest segments, and one of the others."""
-    names, segment, sizes = np.unique(_completed(labels), return_inverse=True, return_counts=True)
+    names, segment, sizes = np.unique(completed(labels), return_inverse=True, return_counts=True)
     rank = np.empty(len(names), np.int64)
     rank[np.argsort(-sizes, kind="stable")] = np.arange(len(names))
     return np.minimum(rank[segment], n - 1).reshape(labels.shape)
