@@ -26,7 +26,7 @@ _CELLS = 4200  # of the coarse grid on which places are compared, about
 _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
 _INSIDE = 64  # free places within the bounding box, of a lattice of
-_LATTICE = 10  # along each side
+_LATTICE = 12  # along each side
 _CLEARANCE = 2.0  # cells between a free place and the next surface
 _SOME = 1500  # cells are looked for in all directions from a place, about
 _AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
@@ -42,6 +42,7 @@ _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # wh
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
+_LEVEL = 0.996  # cosine between a plane's normal and z: 5 degrees
 _MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _VIEWS = 12  # places that the voxels themselves are looked at from
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
@@ -115,9 +116,10 @@ def visible_sides(
     so the right one is that whose places see all of the surface, where others have furniture hidden by walls. Where
     two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
     sides, then how much of what is seen from outside has its outside there, and how much of what is seen from those of
-    these places before the plane that bears most, as the ground or a table does, on which things stand; or from the
-    origin, if that lies there and all before it, as before a camera that looks along z. The voxels then take the mean
-    direction to the places that see them, those that none sees, and of many voxels most, from the voxels around.
+    these places before the plane that bears most, as the ground or a table does, on which things stand (above it, if it
+    is level); or from the origin, if that lies there and all before it, as before a camera that looks along z. The
+    voxels then take the mean direction to the places that see them, those that none sees, and of many voxels most, from
+    the voxels around.
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
@@ -228,6 +230,8 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
     from_viewpoint = [] if viewpoint is None else [viewpoint]
     if viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids):
         from_viewpoint = [origin]
+    elif upwards[2] < -_LEVEL:  # no accident: the frame stands upright, and things lie in a pit
+        upwards = -upwards
     places = np.concatenate((outside, inside, *(place[None] for place in from_viewpoint)))
     likely = np.zeros(len(places), np.bool_)
     if from_viewpoint:
@@ -280,10 +284,14 @@ def _support(coarse: VoxelGrid, normals: NDArray[np.float64]) -> tuple[NDArray[n
 
 
 def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bool:
-    """Whether all lies before a camera at a place, (3,), that looks along z, and not in the middle of its image."""
+    """Whether all lies before a camera at a place, (3,), that looks along z, around its axis, and not all near that."""
     rays = centres - place
-    aside = np.abs(rays[:, :2]).max(axis=1)
-    return bool((aside < _WIDE * rays[:, 2]).all() and np.mean(aside > _NARROW * rays[:, 2]) > 0.1)
+    if not (rays[:, 2] > 0.0).all():
+        return False
+    slopes = rays[:, :2] / rays[:, 2:]
+    is_around = (slopes.min(axis=0) < 0.0).all() and (slopes.max(axis=0) > 0.0).all()
+    aside = np.abs(slopes).max(axis=1)
+    return bool(is_around and aside.max() < _WIDE and np.mean(aside > _NARROW) > 0.1)
 
 
 @summing_routine

@@ -89,6 +89,15 @@ def test_things_on_the_ground_are_seen_from_above():
     assert fraction_outward(points[~hidden], normals[~hidden]) > 0.97
 
 
+@pytest.mark.parametrize("place", [(0.0, 0.0, 14.0), (8.0, 1.0, 14.0)])
+def test_bare_hills_are_seen_from_above_unless_a_camera_points_at_them(place):
+    """Nothing tells their sides; a camera at the origin would have to look aside to have the second in view."""
+    x, y = (np.mgrid[0:120, 0:120].reshape(2, -1) - 60.0) / 12.0
+    points = np.column_stack((x, y, np.sin(x) + np.cos(1.3 * y))) + place
+    upwards = pcgraph.segment(points).surface.normals[:, 2] > 0.0
+    assert upwards.mean() > 0.97 if place[0] else upwards.mean() < 0.03
+
+
 def test_what_lies_high_above_the_origin_is_not_seen_from_there():
     """Coordinates centred in x and y, with the elevation kept."""
     ground = faces((-4, -4, 499), (4, 4, 500), 0.05, "+z")
@@ -224,6 +233,17 @@ def ranges_with_box(ranges, rays, low, high, nearest=0.0):
 def thinned(points, edge):
     """One point of each cube, so that no law of spacing tells where the sensor was."""
     return points[np.unique(np.floor(points / edge), axis=0, return_index=True)[1]]
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.5), (0.04, -0.03, 2.0)])
+def test_a_pool_is_seen_from_above(turn):
+    """All that is not on its largest plane lies below that, as things do under a table turned over."""
+    around = faces((0, 0, -1), (12, 8, 0), 0.08, "+z")
+    is_pool = (np.abs(around[0][:, 0] - 6.0) < 3.0) & (np.abs(around[0][:, 1] - 4.0) < 1.5)
+    points, normals = faces((3.0, 2.5, -1.8), (9.0, 5.5, 0.0), 0.08, "-x +x -y +y -z")
+    assert (
+        fraction_outward(*turned(joined(tuple(column[~is_pool] for column in around), (points, -normals)), turn)) > 0.9
+    )
 
 
 @pytest.mark.parametrize("seed", range(8))
