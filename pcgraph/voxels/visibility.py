@@ -22,7 +22,7 @@ from pcgraph.voxels.spacing import densest_plane, sphere_directions
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 
-_CELLS = 4200  # of the coarse grid on which places are compared, about
+_CELLS = 5000  # of the coarse grid on which places are compared, about
 _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
 _INSIDE = 64  # free places within the bounding box, of a lattice of
@@ -47,7 +47,7 @@ _MUCH_MORE = 1.25  # times as much visible from one place as from another: enoug
 _VIEWS = 12  # places that the voxels themselves are looked at from
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
 _SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # along x, y and z, times these, add up to a multiple of seven or three
-_SMOOTHING = 2  # rounds of votes by the voxels around
+_SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = 0.8  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
