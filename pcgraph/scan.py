@@ -463,11 +463,16 @@ def _seed_size(grid: VoxelGrid) -> float:
     On smooth surfaces that are seen from all around, as those of meshes and of thinned clouds, many are better: their
     normals are exact, and small things need supervoxels of their own.
     """
-    few = _MANY_SUPERVOXELS
-    if not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _WELL_JOINED and roughness(grid) <= _SMOOTH:
-        few = _MANY_ON_SMOOTH
-    edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * few))
-    return grid.size * min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
+    usual, smaller = _edges_per_seed(grid, _MANY_SUPERVOXELS), _edges_per_seed(grid, _MANY_ON_SMOOTH)
+    if smaller < usual and not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _WELL_JOINED:
+        usual = smaller if roughness(grid) <= _SMOOTH else usual
+    return grid.size * usual
+
+
+def _edges_per_seed(grid: VoxelGrid, many: int) -> float:
+    """Voxel edges between seeds that give so many supervoxels, within what is sensible."""
+    edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * many))
+    return min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 
 def _fitting_grid(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
