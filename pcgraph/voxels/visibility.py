@@ -152,18 +152,23 @@ def visible_sides(
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     """Fraction of the voxels that are visible from a place, (3,) float64, metres."""
+    return _visible_fraction(grid, place, _either_normals(grid))
+
+
+def _visible_fraction(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
     middle, reach = _unit_frame(grid, np.concatenate((grid.centroids, place[None])))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
-    return float(seen_from((place - middle)[None] / reach, centres, widths, _either_normals(grid)).mean())
+    return float(seen_from((place - middle)[None] / reach, centres, widths, normals).mean())
 
 
 def likelier_place(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
     """Of two places, (3,) float64, metres, that from which a quarter more is visible; else that before which things
     stand on what bears them; else that from which more is visible."""
-    visible, other_is = visible_fraction(grid, place), visible_fraction(grid, other)
+    normals = _either_normals(grid)
+    visible, other_is = _visible_fraction(grid, place, normals), _visible_fraction(grid, other, normals)
     if max(visible, other_is) <= _MUCH_MORE * min(visible, other_is):
         middle, reach = _unit_frame(grid, grid.centroids)
-        coarse = _coarse((grid.centroids - middle) / reach, float(np.median(grid.edge_lengths)) / reach)
+        coarse = _coarse(grid, middle, reach)
         upwards, offset = _support(coarse, _either_normals(coarse))
         before = [bool((one - middle) / reach @ upwards >= offset) for one in (place, other)]
         if before[0] != before[1]:
@@ -219,7 +224,7 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
     middle, reach = _unit_frame(grid, grid.centroids)
     origin = -middle / reach
     viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
-    coarse = _coarse((grid.centroids - middle) / reach, float(np.median(grid.edge_lengths)) / reach)
+    coarse = _coarse(grid, middle, reach)
     low, high = bounding_box(coarse.centroids)
     inside = _free_places(coarse, low, high)
     outside = (low + high) / 2.0 + _DISTANCE * _lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
@@ -466,8 +471,10 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
     return places[chosen]
 
 
-def _coarse(centres: NDArray[np.float64], width: float) -> VoxelGrid:
-    """Voxels in larger ones, as few as still show their shape; the outermost surfaces amid a layer of them."""
+def _coarse(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> VoxelGrid:
+    """Voxels in larger ones, as few as still show their shape, in the frame of `_unit_frame`; the outermost surfaces
+    amid a layer of them."""
+    centres, width = (grid.centroids - middle) / reach, float(np.median(grid.edge_lengths)) / reach
     size = width * max(1.0, math.sqrt(len(centres) / (1.5 * _CELLS)))  # as many as a surface would have
     low = bounding_box(centres)[0]
     while True:
