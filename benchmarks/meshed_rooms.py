@@ -65,8 +65,7 @@ def _view(caster: Any, place: Floats, number: int, rng: np.random.Generator) -> 
     centre = place + rng.normal(0.0, SWAY)
     pose = look_at(centre, centre + rays_at(azimuth, elevation)[0])
     width, height = CAMERA.width, CAMERA.height
-    u, v = np.meshgrid(np.arange(width) + 0.5 - CAMERA.cx, np.arange(height) + 0.5 - CAMERA.cy)
-    rays = np.stack((u / CAMERA.fx, v / CAMERA.fy, np.ones_like(u)), axis=-1)
+    rays = CAMERA.directions(CAMERA.pixel_centres())
     along = rays.reshape(-1, 3) @ pose[:3, :3].T
     cast = np.concatenate((np.broadcast_to(centre, along.shape), along), axis=1).astype(np.float32)
     z = caster.cast_rays(cast)["t_hit"].numpy().astype(np.float64).reshape(height, width)
