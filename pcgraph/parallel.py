@@ -5,22 +5,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from numba import config, njit
 
-kernel = njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
+kernel = njit(**_OPTIONS)
 """Decorator of a compiled function that Python calls; kernels may call it, too.
 
-Wrappers that nobody calls are left out here and below: they would cost a third of the time that compiling takes.
+What is divided by zero is infinite or NaN, as in NumPy: checks would keep loops from being done in lanes. Wrappers that
+nobody calls are left out here and below: they would cost a third of the time that compiling takes.
 """
-routine = njit(cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)
+routine = njit(**_OPTIONS, no_cpython_wrapper=True)
 """Decorator of a compiled function that only kernels call."""
-summing_routine = njit(cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True, fastmath={"reassoc"})
+summing_routine = njit(**_OPTIONS, no_cpython_wrapper=True, fastmath={"reassoc"})
 """The same for one whose sums are taken in lanes, as wide as the processor's, and five times as fast.
 
 Their last digits then depend on the kind of processor, as NumPy's own do, but not on the number of threads.
 """
+inlined = njit(**_OPTIONS, inline="always")
+"""The same for a small one of many arguments that is called often: handing them over would take as long as its work."""
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")

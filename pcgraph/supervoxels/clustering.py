@@ -10,11 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pcgraph.disjoint_sets import root_of
-from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 
@@ -149,7 +148,7 @@ def sum_features(features: NDArray[np.float64], labels: NDArray[np.int32], n_lab
     return sums
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64], s: int, sign: float) -> None:
     """Update the sums: voxel i joins supervoxel s (sign 1) or leaves it (sign -1)."""
     for column in range(9):

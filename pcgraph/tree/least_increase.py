@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
-from pcgraph.parallel import kernel, routine
+from pcgraph.parallel import inlined, kernel
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.linkage import Linkage, Merges, check_numbers
-from pcgraph.voxels.eigen import least_eigenvalue
+from pcgraph.voxels.eigen import AXES, least_eigenvalue
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,6 @@ def regions_of(
     return Regions(leaves.counts / mean_count, values, centroids, scatters, plane)
 
 
-_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
 class Regions(NamedTuple):
     """What the energy of n regions is made of.
 
@@ -182,7 +179,7 @@ class RegionState(NamedTuple):
     def of(cls, regions: Regions) -> RegionState:
         """The regions before they merge; residuals are not set."""
         masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
-        upper = np.stack([scatters[:, i, j] for i, j in _AXES], axis=1)
+        upper = np.stack([scatters[:, i, j] for i, j in AXES], axis=1)
         return cls(masses, values, centroids, upper, np.zeros(len(masses)), float(regions.plane))
 
 
@@ -225,7 +222,7 @@ def _cost(state: RegionState, lengths: NDArray[np.float64], edge: int, a: int, b
     return increase / lengths[0, edge] if len(lengths) > 0 else increase
 
 
-@kernel
+@inlined
 def energy_increase(state: RegionState, a: int, b: int) -> float:
     """Energy of the union of two regions less the sum of theirs."""
     reduced = state.masses[a] * state.masses[b] / (state.masses[a] + state.masses[b])
@@ -248,7 +245,7 @@ def unite(state: RegionState, kept: int, gone: int) -> None:
         reduced = masses[kept] * fraction
         residuals[kept] = _least_of_union(state, kept, gone, reduced)
         for column in range(6):
-            i, j = _AXES[column]
+            i, j = AXES[column]
             shift = (centroids[kept, i] - centroids[gone, i]) * (centroids[kept, j] - centroids[gone, j])
             scatters[kept, column] += scatters[gone, column] + reduced * shift
     for i in range(values.shape[1]):
@@ -258,7 +255,7 @@ def unite(state: RegionState, kept: int, gone: int) -> None:
     masses[kept] = total
 
 
-@routine
+@inlined
 def _least_of_union(state: RegionState, a: int, b: int, reduced: float) -> float:
     """Sum of squared distances of the union of two regions to its plane."""
     p, q = state.scatters[a], state.scatters[b]

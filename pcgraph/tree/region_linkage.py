@@ -14,7 +14,7 @@ from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
 from pcgraph.inputs import non_negative
-from pcgraph.parallel import kernel
+from pcgraph.parallel import inlined, kernel
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, unite
 from pcgraph.tree.linkage import Linkage, Merges, check_cost
@@ -176,7 +176,7 @@ def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
 
 
-@kernel
+@inlined
 def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, shape: _Shape) -> float:
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
@@ -125,7 +124,7 @@ def _second_ring(
         _set_moments(moments, i, ox, oy, oz, n, sx, sy, sz, xx, yy, zz, xy, xz, yz)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _set_moments(to, i, ox, oy, oz, n, sx, sy, sz, xx, yy, zz, xy, xz, yz):  # type: ignore[no-untyped-def]
     """Write number, mean, and scatter about the mean, given sums about the place (ox, oy, oz)."""
     to[i, 0], to[i, 1], to[i, 2], to[i, 3] = n, ox + sx / n, oy + sy / n, oz + sz / n
