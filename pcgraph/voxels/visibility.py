@@ -48,14 +48,15 @@ _VIEWS = 12  # places that the voxels themselves are looked at from
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
 _SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # along x, y and z, times these, add up to a multiple of seven or three
 _SMOOTHING = 4  # rounds of votes by the voxels around
-_SAME = 0.8  # cosine between normals on one surface, and more
+_SAME = np.float32(0.8)  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
-_SLANTED = 8.0  # widths between squares of one surface of which one may seem to hide the other
-_STEEPEST = 4.0  # of a square that is seen at a slant: tangent of its angle
+_SLANTED = np.float32(8.0)  # widths between squares of one surface of which one may seem to hide the other
+_STEEPEST = np.float32(4.0)  # of a square that is seen at a slant: tangent of its angle
 _TINY = 1e-12
 _NOTHING = np.iinfo(np.int64).max
 _NUMBER = (1 << 32) - 1
+_FAR = np.float32(np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +125,12 @@ def visible_sides(
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
     middle, reach = _unit_frame(grid, grid.centroids)
-    centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
     told = np.zeros(grid.n_voxels)
     if viewpoint is not None:
-        rays = (viewpoint - middle) / reach - centres
-        told = np.einsum("ij,ij->i", rays, normals) / _lengths(rays)
+        in_blocks(_face, grid.n_voxels, viewpoint, reach, grid.centroids, normals, told)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
-            return VisibleSides(viewpoint, np.where(told[:, None] < 0.0, -normals, normals))
+            return VisibleSides(viewpoint, _turned(normals, told))
+    centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
     places, weights = telling_places(grid, viewpoint) if telling is None else telling
     votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
     step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
@@ -147,7 +147,14 @@ def visible_sides(
         in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
         votes, smoothed = smoothed, votes
     seen_most = middle + reach * places[0] if viewpoint is None else viewpoint
-    return VisibleSides(seen_most, np.where(votes[:, None] < 0.0, -normals, normals))
+    return VisibleSides(seen_most, _turned(normals, votes))
+
+
+def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normals, (v, 3), turned round where votes for their side, (v,), are below zero."""
+    turned = np.empty_like(normals)
+    in_blocks(_turn, len(normals), normals, votes, turned)
+    return turned
 
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
@@ -186,9 +193,10 @@ def seen_from(
 
     Parameters
     ----------
-    places : (k, 3) float64, metres
-    centres : (n, 3) float64, metres
-    widths : (n,) float64, metres
+    places : (k, 3) float64
+        In a frame where all are of the order of 1, as single precision is enough there.
+    centres : (n, 3) float64
+    widths : (n,) float64
     normals : (n, 3) float64
         Towards either side. A square that is seen at a slant hides little of what lies beside it on the same surface.
     """
@@ -197,8 +205,22 @@ def seen_from(
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
-    in_blocks(_look, len(places), places, bins, centres, widths, normals, seen, smallest=1)
+    squares = _Squares(_columns(centres), _columns(normals), widths.astype(np.float32))
+    in_blocks(_look, len(places), places.astype(np.float32), bins, squares, seen, smallest=1)
     return seen
+
+
+class _Squares(NamedTuple):
+    """Squares that stand for a surface, in columns, as loops take them in lanes: (3, n) float32, and widths, (n,)."""
+
+    centres: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    widths: NDArray[np.float32]
+
+
+def _columns(rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The columns of (n, 3) rows, each in one piece, (3, n)."""
+    return np.ascontiguousarray(rows.T, np.float32)
 
 
 def _unit_frame(grid: VoxelGrid, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -248,7 +270,7 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
     in_blocks(_find_sides, len(places), places, coarse.centroids, normals, seen, sides, smallest=1)
     closed = np.zeros(len(places))
     hits = closed[_OUTSIDE : _OUTSIDE + len(inside)]
-    in_blocks(_count_hits, len(inside), inside, coarse.centroids, hits, smallest=1)
+    in_blocks(_count_hits, len(inside), inside.astype(np.float32), _columns(coarse.centroids), hits, smallest=1)
     found = _agreements(sides, _starts(sides, outside, likely))
     weights = _most_telling(found, sides, coarse, closed, likely, bool(from_viewpoint))
     chosen = _spread_choice(seen, weights)
@@ -497,8 +519,8 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
     if not len(free):
         return places[:0]
     places, clearance, hits = places[free], clearance[free], np.empty(len(free))
-    some = coarse.centroids[:: max(1, coarse.n_voxels // _SOME)]
-    in_blocks(_count_hits, len(free), places, some, hits, smallest=1)
+    some = _columns(coarse.centroids[:: max(1, coarse.n_voxels // _SOME)])
+    in_blocks(_count_hits, len(free), places.astype(np.float32), some, hits, smallest=1)
     among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
     chosen = [among[np.argmax(clearance[among])]]
     nearest = np.full(len(among), np.inf)
@@ -514,46 +536,44 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
 
 
 @routine
-def _bin_of(x: float, y: float, z: float, bins: int) -> tuple[float, float]:
-    """Place of a direction on the octahedral map of bins x bins."""
-    per_total = 1.0 / (abs(x) + abs(y) + abs(z))
-    u, v = x * per_total, y * per_total
-    if z < 0.0:
-        u, v = (1.0 - abs(v)) * (1.0 if u >= 0.0 else -1.0), (1.0 - abs(u)) * (1.0 if v >= 0.0 else -1.0)
-    return 0.5 * (u + 1.0) * bins, 0.5 * (v + 1.0) * bins
+def _on_map(x: np.float32, y: np.float32, z: np.float32, total: np.float32) -> tuple[np.float32, np.float32]:
+    """Place of a direction on the octahedral map, -1..1 each; `total` is the sum of its sizes along the axes."""
+    nothing, one = np.float32(0.0), np.float32(1.0)
+    u, v = x / total, y / total
+    folded_u, folded_v = one - abs(v), one - abs(u)
+    folded_u = folded_u if u >= nothing else -folded_u
+    folded_v = folded_v if v >= nothing else -folded_v
+    return (folded_u if z < nothing else u), (folded_v if z < nothing else v)
 
 
 @kernel
 def _count_hits(
-    start: int, stop: int, places: NDArray[np.float64], centres: NDArray[np.float64], hits: NDArray[np.float64]
+    start: int, stop: int, places: NDArray[np.float32], centres: NDArray[np.float32], hits: NDArray[np.float64]
 ) -> None:
     """Set the fraction of directions in which there is something, from each place, on a map of 8 x 8 bins."""
-    bins = 8
+    bins = np.empty(centres.shape[1], np.uint64)
     for k in range(start, stop):
-        hit = np.zeros(bins * bins, np.bool_)
-        for i in range(len(centres)):
-            x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
-            u, v = _bin_of(x, y, z, bins)
-            hit[min(int(u), bins - 1) * bins + min(int(v), bins - 1)] = True
+        _find_bins(places[k], centres, bins)
+        hit = np.uint64(0)  # one bit per bin
+        for i in range(len(bins)):
+            hit |= np.uint64(1) << bins[i]
         n_hits = 0
-        for b in range(bins * bins):
-            n_hits += hit[b]
-        hits[k] = n_hits / (bins * bins)
+        while hit:
+            hit &= hit - np.uint64(1)
+            n_hits += 1
+        hits[k] = n_hits / 64
 
 
 @routine
-def _on_one_surface(
-    i: int, j: int, centres: NDArray[np.float64], widths: NDArray[np.float64], normals: NDArray[np.float64]
-) -> bool:
-    """Whether two squares lie on each other's planes and near: at a slant one may seem to hide the other."""
-    if abs(normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]) < _SAME:
-        return False
-    x, y, z = centres[i, 0] - centres[j, 0], centres[i, 1] - centres[j, 1], centres[i, 2] - centres[j, 2]
-    off = max(
-        abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]),
-        abs(x * normals[j, 0] + y * normals[j, 1] + z * normals[j, 2]),
-    )
-    return off < widths[i] and x * x + y * y + z * z < (_SLANTED * widths[i]) ** 2
+def _find_bins(place: NDArray[np.float32], centres: NDArray[np.float32], bins: NDArray[np.uint64]) -> None:
+    """Set in which of 8 x 8 bins each centre lies, seen from a place."""
+    px, py, pz = place
+    one, four, last = np.float32(1.0), np.float32(4.0), np.float32(7.0)
+    for i in range(centres.shape[1]):
+        x, y, z = centres[0, i] - px, centres[1, i] - py, centres[2, i] - pz
+        u, v = _on_map(x, y, z, abs(x) + abs(y) + abs(z))
+        u, v = (u + one) * four, (v + one) * four
+        bins[i] = np.int32(u if u < last else last) * 8 + np.int32(v if v < last else last)
 
 
 @kernel
@@ -575,56 +595,148 @@ def _find_sides(
             sides[k, i] = cosine if seen[k, i] else 0.0
 
 
+class _Views(NamedTuple):
+    """How squares look from a place, (n,) float32 each.
+
+    Attributes
+    ----------
+    u, v : on the octahedral map, in bins
+    halves : half widths on it, a little more, in bins
+    ranges : of their centres
+    slopes : how much farther a square is per bin beside its centre, as it is deeper than wide if seen at a slant
+    limits : what is nearer than this hides the square
+    """
+
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    halves: NDArray[np.float32]
+    ranges: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+    limits: NDArray[np.float32]
+
+
 @kernel
 def _look(
     start: int,
     stop: int,
-    places: NDArray[np.float64],
+    places: NDArray[np.float32],
     bins_of: NDArray[np.int64],
-    centres: NDArray[np.float64],
-    widths: NDArray[np.float64],
-    normals: NDArray[np.float64],
+    squares: _Squares,
     seen: NDArray[np.bool_],
 ) -> None:
     """Set what is seen from each place, by the least range in each bin of directions that a square may cover.
 
     A bin holds the range, whose bits as a float32 sort as it does, above the number of the square that has it.
     """
-    n = len(centres)
-    at, before = np.empty(n, np.int32), np.empty(n, np.float32)  # what is nearer than this hides the square
+    n, nothing, half_bin = squares.centres.shape[1], np.float32(0.0), np.float32(0.5)
+    at, doubtful = np.empty(n, np.int64), np.empty(n + 1, np.int64)
+    views = _Views(
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+    )
     for k in range(start, stop):
-        bins = bins_of[k]
+        bins, last = bins_of[k], bins_of[k] - 1
         nearest = np.full(bins * bins, _NOTHING)
+        _view(places[k], bins, squares, views)
         for i in range(n):
-            x, y, z = centres[i, 0] - places[k, 0], centres[i, 1] - places[k, 1], centres[i, 2] - places[k, 2]
-            distance = math.sqrt(x * x + y * y + z * z)
-            if distance <= 0.0:
-                at[i] = -1
+            at[i] = 0
+            if views.ranges[i] <= nothing:
                 continue
-            u, v = _bin_of(x, y, z, bins)
-            at[i] = min(int(u), bins - 1) * bins + min(int(v), bins - 1)
-            bin_width = 2.0 * (abs(x) + abs(y) + abs(z)) / bins  # across the direction, at least, as of the square
-            # A square seen at a slant is deeper than wide, and so is what a bin shows of a surface.
-            before[i] = distance - widths[i] - 0.5 * bin_width
-            depth = abs(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2])
-            across = math.sqrt(max(distance * distance - depth * depth, 0.0))
-            slope = bin_width * (across / depth if across < _STEEPEST * depth else _STEEPEST)
-            half = min(0.6 * widths[i] / bin_width, 24.0)
-            first, last = max(int(v - half), 0), min(int(v + half), bins - 1)
-            for p in range(max(int(u - half), 0), min(int(u + half), bins - 1) + 1):
-                off = max(abs(p + 0.5 - u) - 0.5, 0.0)
-                for q in range(first, last + 1):
-                    beside = max(off, abs(q + 0.5 - v) - 0.5)  # beside its centre it may be farther
-                    bits = np.float32(distance + slope * beside).view(np.int32)
+            u, v, half = views.u[i], views.v[i], views.halves[i]
+            at[i] = min(int(u), last) * bins + min(int(v), last)
+            first, final = int(max(v - half, nothing)), min(int(v + half), last)
+            for p in range(int(max(u - half, nothing)), min(int(u + half), last) + 1):
+                off = max(abs(np.float32(p) + half_bin - u) - half_bin, nothing)
+                for q in range(first, final + 1):
+                    beside = max(off, abs(np.float32(q) + half_bin - v) - half_bin)
+                    bits = np.float32(views.ranges[i] + views.slopes[i] * beside).view(np.int32)
                     nearest[p * bins + q] = min(nearest[p * bins + q], np.int64(bits) << 32 | i)
-        for i in range(n):
-            seen[k, i] = at[i] >= 0
-            if seen[k, i]:
-                front = nearest[at[i]]
-                too_far = before[i] - np.int32(front >> 32).view(np.float32)
-                seen[k, i] = too_far <= 0.0 or (
-                    too_far < _SLANTED * widths[i] and _on_one_surface(i, front & _NUMBER, centres, widths, normals)
-                )
+        n_doubtful = 0
+        for i in range(n):  # without a branch, which would often be guessed wrongly
+            too_far = views.limits[i] - np.int32(nearest[at[i]] >> 32).view(np.float32)
+            seen[k, i] = too_far <= nothing
+            doubtful[n_doubtful] = i
+            n_doubtful += (too_far > nothing) & (too_far < _SLANTED * squares.widths[i])
+        for i in doubtful[:n_doubtful]:
+            seen[k, i] = _on_one_surface(i, nearest[at[i]] & _NUMBER, squares)
+
+
+@routine
+def _view(place: NDArray[np.float32], bins: int, squares: _Squares, views: _Views) -> None:
+    """Set how squares look from a place, on a map of bins x bins. One at the place has range 0 and is not seen."""
+    centres, normals, widths = squares
+    px, py, pz = place
+    nothing, one, halves, bin_size = np.float32(0.0), np.float32(1.0), np.float32(0.5 * bins), np.float32(2.0 / bins)
+    margin, widest = np.float32(0.6), np.float32(24.0)
+    for i in range(len(widths)):
+        x, y, z = centres[0, i] - px, centres[1, i] - py, centres[2, i] - pz
+        total = abs(x) + abs(y) + abs(z)
+        u, v = _on_map(x, y, z, total)
+        views.u[i], views.v[i] = (u + one) * halves, (v + one) * halves
+        square = x * x + y * y + z * z
+        distance = math.sqrt(square)
+        bin_width = bin_size * total  # across the direction, at least, as of the square
+        half = margin * widths[i] / bin_width
+        views.halves[i] = half if half < widest else widest
+        depth = abs(x * normals[0, i] + y * normals[1, i] + z * normals[2, i])
+        across = square - depth * depth
+        across = math.sqrt(across if across > nothing else nothing)
+        slope = across / depth
+        views.slopes[i] = bin_width * (slope if across < _STEEPEST * depth else _STEEPEST)
+        views.ranges[i] = distance
+        limit = distance - widths[i] - np.float32(0.5) * bin_width
+        views.limits[i] = limit if distance > nothing else _FAR
+
+
+@routine
+def _on_one_surface(i: int, j: int, squares: _Squares) -> bool:
+    """Whether two squares lie on each other's planes and near: at a slant one may seem to hide the other."""
+    centres, normals, width = squares.centres, squares.normals, squares.widths[i]
+    cosine = off = off_other = square = np.float32(0.0)
+    for axis in range(3):
+        way = centres[axis, i] - centres[axis, j]
+        square += way * way
+        cosine += normals[axis, i] * normals[axis, j]
+        off += way * normals[axis, i]
+        off_other += way * normals[axis, j]
+    reach = _SLANTED * width
+    return bool(abs(cosine) >= _SAME and max(abs(off), abs(off_other)) < width and square < reach * reach)
+
+
+@kernel
+def _face(
+    start: int,
+    stop: int,
+    place: NDArray[np.float64],
+    unit: float,
+    centres: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    cosines: NDArray[np.float64],
+) -> None:
+    """Set the cosine between each normal and the direction to a place, about as many units off."""
+    for i in range(start, stop):
+        x, y, z = (
+            (place[0] - centres[i, 0]) / unit,
+            (place[1] - centres[i, 1]) / unit,
+            (place[2] - centres[i, 2]) / unit,
+        )
+        length = max(math.sqrt(x * x + y * y + z * z), _TINY)
+        cosines[i] = (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / length
+
+
+@kernel
+def _turn(
+    start: int, stop: int, normals: NDArray[np.float64], votes: NDArray[np.float64], turned: NDArray[np.float64]
+) -> None:
+    """Set what `_turned` returns."""
+    for i in range(start, stop):
+        sign = -1.0 if votes[i] < 0.0 else 1.0
+        for axis in range(3):
+            turned[i, axis] = sign * normals[i, axis]
 
 
 @kernel
