@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box, cell_keys, gallop, sorted_keys, starts_of_runs
+from pcgraph.voxels.eigen import AXES, plane_normal
 from pcgraph.voxels.warp import Warp
 
 _SAMPLE = 4096  # points whose nearest neighbour is sought
@@ -34,7 +35,7 @@ _MIN_SAMPLE = 512  # places of a block whose neighbours are sought
 _STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths in half diagonals
 _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
-_TINY = float(np.finfo(np.float64).tiny)
+_TINY, _FAR = float(np.finfo(np.float64).tiny), float(np.finfo(np.float32).max)
 _MIN_EXPLAINED = 0.55  # mean of what law and range explain
 _MIN_HINT, _MIN_BY_RANGE = 0.2, 0.1  # the same, and what range explains alone, of a piece of a scan
 _MIN_EXPONENT = 0.5
@@ -117,8 +118,8 @@ def _median_spacing(crowd: NDArray[np.float64]) -> float:
 
 def _edge_for_neighbours(points: NDArray[np.float64], low: NDArray[np.float64], extent: float) -> float:
     """Edge of cells that hold four points each, about, where these lie on surfaces."""
-    blocks = np.bincount(_blocks_of(points, low, max(extent, _TINY) / _BLOCKS))
-    return 2.0 * extent / _BLOCKS * math.sqrt(np.count_nonzero(blocks) / len(points))
+    counts = _blocks_of(points, low, extent / _BLOCKS)[1]
+    return 2.0 * extent / _BLOCKS * math.sqrt(np.count_nonzero(counts) / len(points))
 
 
 def _near(
@@ -160,11 +161,8 @@ def _find_near(
                 x, y, z = places[at, 0] - places[own, 0], places[at, 1] - places[own, 1], places[at, 2] - places[own, 2]
                 square = x * x + y * y + z * z
                 if square < squares[_NEIGHBOUR - 1] and at != own:
-                    rank = _NEIGHBOUR - 1
-                    while rank > 0 and squares[rank - 1] > square:
-                        squares[rank] = squares[rank - 1]
-                        rank -= 1
-                    squares[rank] = square
+                    for rank in range(_NEIGHBOUR):  # into its place, without a branch
+                        squares[rank], square = min(squares[rank], square), max(squares[rank], square)
                 beside += 1
                 at += 1
         is_cut_off[s] = beside >= _MANY_BESIDE
@@ -182,12 +180,15 @@ def _each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @kernel
 def _hash(start: int, stop: int, points: NDArray[np.float64], hashes: NDArray[np.int64]) -> None:
-    """Set a whole number per point, 0 to 2**63 - 1, that depends on its place alone, and differs between places."""
+    """Set a whole number per point, 0 to 2**40 - 1, that depends on its place alone, and is hardly ever another's.
+
+    In one of five hundred crowds two of 65 536 places share one, and count as one.
+    """
     for p in range(start, stop):  # + 0.0 makes one zero of the two
         x = _mix(np.float64(points[p, 0] + 0.0).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
         y = _mix(np.float64(points[p, 1] + 0.0).view(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F))
         z = _mix(np.float64(points[p, 2] + 0.0).view(np.uint64) * np.uint64(0x165667B19E3779F9))
-        hashes[p] = np.int64(_mix(x ^ (y >> np.uint64(1)) ^ (z >> np.uint64(2))) >> np.uint64(1))
+        hashes[p] = np.int64(_mix(x ^ (y >> np.uint64(1)) ^ (z >> np.uint64(2))) >> np.uint64(24))
 
 
 def _some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -206,34 +207,46 @@ def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
     edge = float((high - low).max()) / _BLOCKS
     if not edge > 0.0:
         return points
-    block = _blocks_of(points, low, edge)
-    counts = np.bincount(block)
+    block, counts = _blocks_of(points, low, edge)
     occupied = np.flatnonzero(counts)
     counts = counts[occupied]
     order = _order_of_draw(occupied.astype(np.uint64), counts)
     taken = np.zeros(_BLOCKS**3, bool)
     taken[occupied[order]] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
-    return points.take(np.flatnonzero(taken[block]), axis=0)
+    return points.take(np.concatenate(in_blocks(_in_taken, len(points), block, taken)), axis=0)
 
 
-def _blocks_of(points: NDArray[np.float64], low: NDArray[np.float64], edge: float) -> NDArray[np.int32]:
-    """Number of the block of space in which each point lies, (n,)."""
-    block = np.empty(len(points), np.int32)
-    in_blocks(_find_block, len(points), points, low, edge, block)
-    return block
+def _blocks_of(
+    points: NDArray[np.float64], low: NDArray[np.float64], edge: float
+) -> tuple[NDArray[np.int16], NDArray[np.int64]]:
+    """Number of the block of space in which each point lies, (n,), and how many points each block holds."""
+    block = np.empty(len(points), np.int16)
+    return block, sum(in_blocks(_find_block, len(points), points, low, 1.0 / max(edge, _TINY), block))
 
 
 @kernel
 def _find_block(
-    start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], edge: float, block: NDArray[np.int32]
-) -> None:
-    """Set the number of the block of space in which each point lies."""
-    last = _BLOCKS - 1
+    start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], scale: float, block: NDArray[np.int16]
+) -> NDArray[np.int64]:
+    """Set the number of the block of space in which each point lies; how many each block holds."""
+    last, counts = _BLOCKS - 1, np.zeros(_BLOCKS**3, np.int64)
     for p in range(start, stop):
-        x = min(int((points[p, 0] - low[0]) / edge), last)
-        y = min(int((points[p, 1] - low[1]) / edge), last)
-        z = min(int((points[p, 2] - low[2]) / edge), last)
+        x = min(int((points[p, 0] - low[0]) * scale), last)
+        y = min(int((points[p, 1] - low[1]) * scale), last)
+        z = min(int((points[p, 2] - low[2]) * scale), last)
         block[p] = (x * _BLOCKS + y) * _BLOCKS + z
+        counts[block[p]] += 1
+    return counts
+
+
+@kernel
+def _in_taken(start: int, stop: int, block: NDArray[np.int16], taken: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Which of some points lie in blocks that are taken."""
+    found, n = np.empty(stop - start + 1, np.int64), 0
+    for p in range(start, stop):
+        found[n] = p
+        n += taken[block[p]]
+    return found[:n]
 
 
 def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -331,7 +344,7 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         spread_out = found.some(_between_points_and_surface(found))
         place, mirrored = _most_telling_places(spread_out)
         near_line = spread_out.some(_on_line(spread_out, place))
-        place = _searched(near_line.some(slice(None, None, 2)), place, _SHORT_STEP, 8)[0]
+        place = _searched(near_line.some(slice(None, None, 2)), place[None], np.array([_SHORT_STEP]), 8)[0][0]
     else:
         place = (viewpoint - middle) / reach
     kept = _on_line(every, place)
@@ -358,8 +371,8 @@ class _Readings(NamedTuple):
     ----------
     places : (m, 3) float64
     normals : (m, 3) float64
-        Unit normals of the surface; zero where the points around lie in a row and tell none, as on one ring of a sweep:
-        they lie on the cone of its beam.
+        Unit normals of the surface; zero where the points around tell none, as they lie in a row, like those on one
+        ring of a sweep, which lie on the cone of its beam.
     logs : (m,) float64
         Logarithms of the spacing.
     """
@@ -377,14 +390,13 @@ def _readings(points: NDArray[np.float64], number: int) -> _Readings:
     """Readings at so many places in a cloud thinned by the points' hashes, in an order as good as random."""
     chosen = points
     if len(points) > _THINNED:
-        taken = np.empty(len(points), np.bool_)
-        in_blocks(_thin, len(points), points, np.uint64(_THINNED / len(points) * 2.0**64), taken)
-        chosen = points.take(np.flatnonzero(taken), axis=0)
+        limit = np.uint64(_THINNED / len(points) * 2.0**64)
+        chosen = points.take(np.concatenate(in_blocks(_thin, len(points), points, limit)), axis=0)
     if len(chosen):
         chosen = _each_place_once(chosen)
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
-    sample, tree = chosen[:number], cKDTree(chosen, balanced_tree=False, compact_nodes=False)
+    sample, tree = chosen[:number], cKDTree(chosen, 24, balanced_tree=False, compact_nodes=False)
     of_blocks = in_blocks(partial(_spacing_and_normals, tree, sample), len(sample), smallest=_MIN_SAMPLE)
     usable, spacing, normals = (np.concatenate(column) for column in zip(*of_blocks, strict=True))
     return _Readings(sample[usable], normals, np.log(spacing))
@@ -396,11 +408,36 @@ def _spacing_and_normals(
     """Whether the eighth neighbours of a block of places tell a spacing, and where they do, it and the normals."""
     near, around = tree.query(sample[start:stop], k=_NEIGHBOUR + 1)
     usable = np.isfinite(near[:, -1]) & (near[:, -1] > 0.0)
-    spacing, patches = near[usable, -1], tree.data[around[usable]]
-    patches = (patches - patches.mean(axis=1, keepdims=True)) / spacing[:, None, None]
-    spreads, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", patches, patches))
-    in_a_row = spreads[:, 1] < _ROW * spreads[:, 2]
-    return usable, spacing, np.where(in_a_row[:, None], 0.0, axes[:, :, 0])
+    spacing = near[usable, -1]
+    normals = np.empty((len(spacing), 3))
+    _fit_normals(np.asarray(tree.data), around[usable], spacing, normals)
+    return usable, spacing, normals
+
+
+@kernel
+def _fit_normals(
+    places: NDArray[np.float64], around: NDArray[np.int64], spacing: NDArray[np.float64], normals: NDArray[np.float64]
+) -> None:
+    """Set the normals of the planes through patches of places, zero where these lie in a row, or on no plane."""
+    scatter, mean, way = np.empty(6), np.empty(3), np.empty(3)
+    for m in range(len(around)):
+        mean[:] = 0.0
+        for p in around[m]:
+            for axis in range(3):
+                mean[axis] += (places[p, axis] - places[around[m, 0], axis]) / spacing[m]
+        mean /= around.shape[1]
+        scatter[:] = 0.0
+        for p in around[m]:
+            for axis in range(3):
+                way[axis] = (places[p, axis] - places[around[m, 0], axis]) / spacing[m] - mean[axis]
+            for column in range(6):
+                scatter[column] += way[AXES[column][0]] * way[AXES[column][1]]
+        least = plane_normal(scatter, normals[m])
+        xx, yy, zz, xy, xz, yz = scatter
+        others = xx + yy + zz - least  # sum and product of the other two spreads
+        product = xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz - least * others
+        if least < 0.0 or product < _ROW / (1.0 + _ROW) ** 2 * others * others:
+            normals[m] = 0.0
 
 
 def _between_points_and_surface(readings: _Readings) -> NDArray[np.int64]:
@@ -416,38 +453,47 @@ def _between_points_and_surface(readings: _Readings) -> NDArray[np.int64]:
 
 def _on_line(readings: _Readings, place: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which readings lie near the line through all of them about a place; others may be noise."""
-    log_range, log_spacing = _on_law(readings, place)
-    residuals = log_spacing - _regressions(readings, place[None]).exponents[0] * log_range
+    log_range, log_spacing = _on_law(readings, place[None])
+    residuals = log_spacing[0] - _regressions(readings, place[None]).exponents[0] * log_range[0]
     residuals -= np.median(residuals)
     return np.abs(residuals) <= 2.5 * max(1.4826 * float(np.median(np.abs(residuals))), 0.1)
 
 
-def _on_law(readings: _Readings, viewpoint: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Log range, (m,), and log spacing as it were if rays from a viewpoint met the surface at right angles, (m,)."""
-    x, y = np.empty((2, len(readings.logs)))
-    _place_on_law(readings, viewpoint, x, y)
-    return x, y
+def _on_law(readings: _Readings, viewpoints: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Log range, (k, m), and log spacing as it were if rays from each of k viewpoints met the surface at right angles.
+
+    Logarithms of NumPy in single precision are taken in lanes, and so is all else here: most of the search's time.
+    """
+    ranges, slants = np.empty((2, len(viewpoints), len(readings.logs)), np.float32)
+    places, normals = np.ascontiguousarray(readings.places.T), np.ascontiguousarray(readings.normals.T)
+    _look_along_rays(places, normals, viewpoints, ranges, slants)
+    np.log(ranges, out=ranges)
+    np.log(slants, out=slants)
+    slants *= np.float32(0.5)
+    slants += readings.logs.astype(np.float32)
+    return ranges, slants
 
 
 @kernel
-def _place_on_law(
-    readings: _Readings, viewpoint: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
+def _look_along_rays(
+    places: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    viewpoints: NDArray[np.float64],
+    ranges: NDArray[np.float32],
+    slants: NDArray[np.float32],
 ) -> None:
-    """Set what `_on_law` returns; no range is so short that its logarithm outweighs all others."""
-    places, normals, logs = readings
-    for i in range(len(logs)):
-        square = along = 0.0
-        has_normal = False
-        for axis in range(3):
-            ray = places[i, axis] - viewpoint[axis]
-            square += ray * ray
-            along += ray * normals[i, axis]
-            has_normal |= normals[i, axis] != 0.0
-        reach = math.sqrt(square) + _LEAST_RANGE
-        x[i] = math.log(reach)
-        y[i] = logs[i]
-        if has_normal:
-            y[i] += 0.5 * math.log(max(abs(along) / reach, _MIN_COSINE))
+    """Set the range of each of m places, (3, m), from each of k viewpoints, (k, m), and the cosine between ray and
+    normal, 1 where there is no normal. No range is so short that its logarithm outweighs all others."""
+    for v in range(len(viewpoints)):
+        px, py, pz = viewpoints[v]
+        for i in range(places.shape[1]):
+            x, y, z = places[0, i] - px, places[1, i] - py, places[2, i] - pz
+            nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
+            reach = math.sqrt(x * x + y * y + z * z) + _LEAST_RANGE
+            cosine = abs(x * nx + y * ny + z * nz) / reach
+            cosine = cosine if cosine > _MIN_COSINE else _MIN_COSINE
+            ranges[v, i] = reach if reach < _FAR else _FAR
+            slants[v, i] = 1.0 if nx * nx + ny * ny + nz * nz == 0.0 else cosine
 
 
 class _Lines(NamedTuple):
@@ -464,32 +510,22 @@ def _regressions(readings: _Readings, viewpoints: NDArray[np.float64], prior: fl
     A prior, in variances, draws exponents to 1 and counts against what is explained.
     """
     found = _Lines(*np.empty((3, len(viewpoints))))
-    _regress(readings, viewpoints, prior, found)
+    _regress(readings.logs, *_on_law(readings, viewpoints), prior, found)
     return found
 
 
 @kernel
-def _regress(readings: _Readings, viewpoints: NDArray[np.float64], prior: float, found: _Lines) -> None:
+def _regress(
+    logs: NDArray[np.float64],
+    log_ranges: NDArray[np.float32],
+    log_spacings: NDArray[np.float32],
+    prior: float,
+    found: _Lines,
+) -> None:
     """Set what `_regressions` returns."""
-    logs = readings.logs
-    n, mean = len(logs), 0.0
-    for i in range(n):
-        mean += logs[i] / n
-    variance = 0.0
-    for i in range(n):
-        variance += (logs[i] - mean) ** 2
-    x, y = np.empty(n), np.empty(n)
-    for v in range(len(viewpoints)):
-        _place_on_law(readings, viewpoints[v], x, y)
-        mean_x = mean_y = 0.0
-        for i in range(n):
-            mean_x += x[i] / n
-            mean_y += y[i] / n
-        of_x = of_y = products = 0.0
-        for i in range(n):
-            of_x += (x[i] - mean_x) ** 2
-            of_y += (y[i] - mean_y) ** 2
-            products += (x[i] - mean_x) * (y[i] - mean_y)
+    variance = _sums_of_squares(logs, logs)[0]
+    for v in range(len(log_ranges)):
+        of_x, of_y, products = _sums_of_squares(log_ranges[v], log_spacings[v])
         slope = (products + prior * variance) / max(of_x + prior * variance, _TINY)
         slope = min(max(slope, 0.0), _MAX_EXPONENT)
         left = of_y - slope * (2.0 * products - slope * of_x)
@@ -498,9 +534,25 @@ def _regress(readings: _Readings, viewpoints: NDArray[np.float64], prior: float,
         found.exponents[v] = slope
 
 
+@summing_routine
+def _sums_of_squares(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[float, float, float]:
+    """Sums of the squares of two columns, and of their products, about their means."""
+    n = len(x)
+    sum_x = sum_y = of_x = of_y = products = 0.0
+    for i in range(n):
+        sum_x += x[i]
+        sum_y += y[i]
+    for i in range(n):
+        from_x, from_y = x[i] - sum_x / n, y[i] - sum_y / n
+        of_x += from_x * from_x
+        of_y += from_y * from_y
+        products += from_x * from_y
+    return of_x, of_y, products
+
+
 def _least_exponent(readings: _Readings, viewpoint: NDArray[np.float64], exponent: float) -> float:
     """The lesser of the exponents in the near and the far half, by medians; `exponent` where the span is small."""
-    x, y = _on_law(readings, viewpoint)
+    x, y = (column[0] for column in _on_law(readings, viewpoint[None]))
     order = np.argsort(x, kind="stable")
     if x[order[len(x) * 9 // 10]] - x[order[len(x) // 10]] < math.log(_WIDE_SPAN):
         return exponent
@@ -533,11 +585,11 @@ def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDAr
             starts.append(place)
             if len(starts) == _STARTS:
                 break
-    found = [_searched(some, start, _FIRST_STEP * reach, 5) for start in starts]
-    best = int(np.argmax(_regressions(half, np.stack([place for place, _ in found]), _PRIOR).explained))
-    place, _ = _searched(half, *found[best], 8)
+    found, steps = _searched(some, np.stack(starts), np.full(len(starts), _FIRST_STEP * reach), 5)
+    best = np.argmax(_regressions(half, found, _PRIOR).explained, keepdims=True)
+    place = _searched(half, found[best], steps[best], 8)[0][0]
     other = _mirrored(place, half)
-    other, _ = _searched(half, other, float(np.linalg.norm(other - place)) / 8.0, 5)
+    other = _searched(half, other[None], np.array([float(np.linalg.norm(other - place)) / 8.0]), 5)[0][0]
     first, second = _regressions(half, np.stack((place, other)), _PRIOR).explained
     if second > first:
         place, other = other, place
@@ -563,19 +615,18 @@ def densest_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> 
 
 
 def _searched(
-    readings: _Readings, place: NDArray[np.float64], step: float, rounds: int
-) -> tuple[NDArray[np.float64], float]:
-    """A place, (3,), after steps to where the law explains more, and how long the next step would be."""
-    best = _regressions(readings, place[None], _PRIOR).explained[0]
-    moves = np.concatenate((np.eye(3), -np.eye(3), sphere_directions(8)))
+    readings: _Readings, places: NDArray[np.float64], steps: NDArray[np.float64], rounds: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Each of k places, (k, 3), after steps to where the law explains more, and the length of its next step, (k,)."""
+    each = np.arange(len(places))
     for _ in range(rounds):
-        tried = place + step * moves
-        explained = _regressions(readings, tried, _PRIOR).explained
-        if explained.max() > best + 1e-4:
-            place, best = tried[int(np.argmax(explained))], float(explained.max())
-        else:
-            step *= 0.5
-    return place, step
+        tried = places[:, None] + steps[:, None, None] * _MOVES
+        explained = _regressions(readings, tried.reshape(-1, 3), _PRIOR).explained.reshape(tried.shape[:2])
+        best = np.argmax(explained, axis=1)
+        is_better = explained[each, best] > explained[:, 0] + 1e-4
+        places = np.where(is_better[:, None], tried[each, best], places)
+        steps = np.where(is_better, steps, 0.5 * steps)
+    return places, steps
 
 
 def sphere_directions(n: int) -> NDArray[np.float64]:
@@ -587,10 +638,14 @@ def sphere_directions(n: int) -> NDArray[np.float64]:
     return np.stack((across * np.cos(angle), across * np.sin(angle), z), axis=1)
 
 
+_MOVES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3), sphere_directions(8)))  # of a search
+
+
 @kernel
-def _thin(start: int, stop: int, points: NDArray[np.float64], limit: np.uint64, taken: NDArray[np.bool_]) -> None:
-    """Set whether a hash of each point's place lies below a limit."""
+def _thin(start: int, stop: int, points: NDArray[np.float64], limit: np.uint64) -> NDArray[np.int64]:
+    """Those of some points of whose place a hash lies below a limit."""
     bits = points.view(np.uint64)
+    found, n = np.empty(stop - start + 1, np.int64), np.int64(0)
     for p in range(start, stop):
         h = np.uint64(0x9E3779B97F4A7C15)
         for axis in range(3):
@@ -600,4 +655,6 @@ def _thin(start: int, stop: int, points: NDArray[np.float64], limit: np.uint64, 
         h *= np.uint64(0xC2B2AE3D27D4EB4F)
         h ^= h >> np.uint64(29)
         h *= np.uint64(0xD6E8FEB86659FD93)
-        taken[p] = h < limit
+        found[n] = p
+        n += h < limit
+    return found[:n]

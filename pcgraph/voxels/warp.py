@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
 
+_SOME = 2048  # values
 _MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
 
 
@@ -134,6 +135,18 @@ class RangeWarp(Warp):
         return (_ranges(points, self.viewpoint) / self.reference_range) ** self.growth
 
 
+def _median(values: NDArray[np.float64]) -> float:
+    """Median of values, (n,), of many in a third of the time: only those near it, as some tell, are put in order."""
+    n = len(values)
+    some = np.sort(values[:: n // _SOME + 1])
+    low, high = some[[int(0.45 * len(some)), int(0.55 * len(some))]]
+    near, at = values[(values >= low) & (values <= high)], n // 2 - np.count_nonzero(values < low)
+    if n < 4 * _SOME or not 1 <= at < len(near):
+        return float(np.median(values))
+    near.partition((at - 1, at))
+    return float(near[at] if n % 2 else near[at - 1 : at + 1].mean())
+
+
 def _ranges(points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
     """Ranges of points from a viewpoint, (n,) float64, metres; at least `_MIN_LENGTH`."""
     ranges = np.empty(len(points))
@@ -219,10 +232,10 @@ def choose_warp(
     if camera and range_growth:
         raise ValueError("expected camera=True or a range_growth above 0, got both; voxels grow in one way")
     if range_growth:
-        distance = float(np.median(_ranges(points, viewpoint)))
+        distance = _median(_ranges(points, viewpoint))
         return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
     if not camera:
         return Warp()
-    warp = CameraWarp(viewpoint, float(np.median(points[:, 2])) - float(viewpoint[2]))
+    warp = CameraWarp(viewpoint, _median(points[:, 2]) - float(viewpoint[2]))
     warp.check(points)
     return warp
