@@ -21,6 +21,7 @@ from pcgraph.supervoxels.clustering import (
     voxel_graph,
 )
 from pcgraph.supervoxels.method import SupervoxelMethod
+from pcgraph.voxels.cells import end_of_batch, fetch_batch
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 from pcgraph.voxels.surface import LocalPlanes, local_planes
 
@@ -145,39 +146,41 @@ def _assign(
     points, order, starts = members
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
     near, labels = np.empty((MAX_NEIGHBOURS, 8)), np.empty(MAX_NEIGHBOURS, np.int32)
-    places, nearest = np.empty((64, 3)), np.empty(64, np.int32)
-    for v in range(start, stop):
-        own, n = supervoxels[v], 0
-        for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around
-            i = neighbours[a]
-            if supervoxels[i] != own:
-                for column in range(7):
-                    near[n, column] = surface[i, column]
-                labels[n] = supervoxels[i]
-                n += 1
-        if n == 0:
-            for at in range(starts[v], starts[v + 1]):
-                chosen[order[at]] = own
-            continue
-        count, stay = starts[v + 1] - starts[v], 0
-        if count > len(nearest):
-            places, nearest = np.empty((2 * count, 3)), np.empty(2 * count, np.int32)
-        for m in range(count):  # first, so that points far apart in memory are fetched side by side
-            p = order[starts[v] + m]
-            places[m, 0], places[m, 1], places[m, 2] = points[p, 0], points[p, 1], points[p, 2]
-        for m in range(count):
-            px, py, pz = places[m, 0], places[m, 1], places[m, 2]
-            x, y, z = px - surface[v, 0], py - surface[v, 1], pz - surface[v, 2]
-            off = surface[v, 3] * x + surface[v, 4] * y + surface[v, 5] * z - surface[v, 6]
-            least, label = off * off + weight * (x * x + y * y + z * z), own
-            for i in range(n):
-                x, y, z = px - near[i, 0], py - near[i, 1], pz - near[i, 2]
-                away = weight * (x * x + y * y + z * z)
-                if away < least:
-                    off = near[i, 3] * x + near[i, 4] * y + near[i, 5] * z - near[i, 6]
-                    if off * off + away < least:
-                        least, label = off * off + away, labels[i]
-            nearest[m] = label
-            stay += label == own
-        for m in range(count):
-            chosen[order[starts[v] + m]] = nearest[m] if stay > 0 else own
+    places, nearest = np.empty((0, 3)), np.empty(0, np.int32)
+    first = start
+    while first < stop:
+        last = end_of_batch(starts, first, stop)
+        begin, end = starts[first], starts[last]
+        places = fetch_batch(points, order, begin, end, places)
+        if len(places) > len(nearest):
+            nearest = np.empty(len(places), np.int32)
+        for v in range(first, last):
+            own, n = supervoxels[v], 0
+            for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around
+                i = neighbours[a]
+                if supervoxels[i] != own:
+                    for column in range(7):
+                        near[n, column] = surface[i, column]
+                    labels[n] = supervoxels[i]
+                    n += 1
+            own_points, stay = range(starts[v] - begin, starts[v + 1] - begin), n == 0
+            for m in own_points:
+                px, py, pz = places[m, 0], places[m, 1], places[m, 2]
+                x, y, z = px - surface[v, 0], py - surface[v, 1], pz - surface[v, 2]
+                off = surface[v, 3] * x + surface[v, 4] * y + surface[v, 5] * z - surface[v, 6]
+                least, label = off * off + weight * (x * x + y * y + z * z), own
+                for i in range(n):
+                    x, y, z = px - near[i, 0], py - near[i, 1], pz - near[i, 2]
+                    away = weight * (x * x + y * y + z * z)
+                    if away < least:
+                        off = near[i, 3] * x + near[i, 4] * y + near[i, 5] * z - near[i, 6]
+                        if off * off + away < least:
+                            least, label = off * off + away, labels[i]
+                nearest[m] = label
+                stay = stay or label == own
+            if not stay:
+                for m in own_points:
+                    nearest[m] = own
+        for m in range(end - begin):
+            chosen[order[begin + m]] = nearest[m]
+        first = last
