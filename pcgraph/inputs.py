@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from os import PathLike
 from typing import NamedTuple
 
@@ -133,6 +134,11 @@ class CleanCloud(ShortRepr):
     features: NDArray[np.float32] | None = None
     scaling: RobustScaling | None = None
 
+    @cached_property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest coordinates, (3,) each."""
+        return bounding_box(self.points)
+
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""
         if len(labels) == math.prod(self.shape):
@@ -185,11 +191,11 @@ def clean_cloud(
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
     with np.errstate(over="ignore"):  # long doubles
         places = _rows(flat, kept).astype(np.float64, order="C")
-    largest = float(np.abs(bounding_box(places)).max())
-    if largest > _LARGEST:
-        raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
     none = np.empty(0, np.int64)
     clean = CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
+    largest = float(np.abs(clean.bounds).max())
+    if largest > _LARGEST:
+        raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
     if features is None:
         return clean
     numbers = _features(features, shape, kept)

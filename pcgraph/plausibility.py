@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.voxels.cells import bounding_box
+from pcgraph.inputs import CleanCloud
 from pcgraph.voxels.grid import VoxelGrid
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.visibility import visible_fraction
@@ -26,23 +26,23 @@ class CloudWarning(UserWarning):
     """Something about a cloud, or about what became of it, that cannot be right."""
 
 
-def warn_of_rounding(given: ArrayLike, points: NDArray[np.float64], spacing: float | None) -> None:
+def warn_of_rounding(given: ArrayLike, cloud: CleanCloud, spacing: float | None) -> None:
     """Warn where float32 cannot tell neighbours apart, so far from the origin are they.
 
     Parameters
     ----------
     given : array
         Points as they came in.
-    points : (n, 3) float64, metres
-        The finite ones.
+    cloud : CleanCloud
+        What is left of them.
     spacing : float, metres, optional
         If it is known; else it is read where it matters.
     """
     dtype = getattr(given, "dtype", None)
     if dtype is None or dtype.kind != "f" or dtype.itemsize > 4:
         return
-    spacing = median_spacing(points) if spacing is None else spacing
-    farthest = float(np.abs(bounding_box(points)).max())
+    spacing = median_spacing(cloud.points) if spacing is None else spacing
+    farthest = float(np.abs(cloud.bounds).max())
     step = float(np.spacing(np.asarray(farthest, dtype)))
     if _STEPS_PER_SPACING * step > spacing:
         _warn(
@@ -51,9 +51,9 @@ def warn_of_rounding(given: ArrayLike, points: NDArray[np.float64], spacing: flo
         )
 
 
-def warn_of_duplicates(points: NDArray[np.float64], spacing: float) -> None:
+def warn_of_duplicates(cloud: CleanCloud, spacing: float) -> None:
     """Warn where points lie so close together that they are likely to be copies of each other."""
-    low, high = bounding_box(points)
+    low, high = cloud.bounds
     extent = float((high - low).max())
     if 0.0 < spacing < _LEAST_SPACING * extent:
         _warn(

@@ -162,9 +162,9 @@ def segment(
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
             break  # else spacing and place were those of noise, to a good part
     spacing = voxel / VOXELS_PER_SPACING if voxel_size is None else None
-    warn_of_rounding(points, cloud.points, spacing)  # type: ignore[arg-type]
+    warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
     if spacing is not None:
-        warn_of_duplicates(cloud.points, spacing)
+        warn_of_duplicates(cloud, spacing)
         grid = _fitting_grid(cloud, grid, math.inf if seed_size is None else float(seed_size))
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
