@@ -31,8 +31,13 @@ Columns, means over a domain's clouds; those that count in the domain are named 
 
 A point without a label belongs to one more segment, that of all such points. A cloud turned about z and shifted is
 another draw of voxels, and scores of one cloud change by some hundredths; with --turns all rows of domains that have
-only one cloud are means over so many copies of it. The last line is JSON: for each domain
-default, best, baselines; and worst_loss, the least of default - max(best, baselines) over the scores that count.
+only one cloud are means over so many copies of it.
+
+After the domains come settings of the grid as if each were the default everywhere (without what it says of the
+viewpoint where none is known), the twelve best of them: the mean over all domains' first scores and over all scores
+that count, how many of these are within 0.01 of the best of all rows, and the largest loss. The last line is JSON: for
+each domain default, best, baselines; and worst_loss, the least of default - max(best, baselines) over the scores that
+count.
 """
 
 from __future__ import annotations
@@ -65,8 +70,8 @@ COLUMNS = ("wov", "oracle", "parts", "things", "ground", "purity", "mIoU", "one"
 COUNTS = ("objects", "single", "s")
 ALTITUDES = (0.25, 0.5, 2.0, 4.0)  # times the default
 SPACINGS = 3.5  # median distances between nearest points: the voxels that others get, and the unit of the next two
-VOXELS = (None, 2.0, 4.0)
-VOXELS_OF_LARGE = (None, 4.0, 8.0)
+VOXELS = (None, 2.0, 4.0)  # twice as many where clouds are large
+SHOWN = 12  # settings
 SCALES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 BISECTIONS = 10
 MIN_POINTS = (3, 10)
@@ -84,6 +89,7 @@ def main() -> None:
     chosen = _chosen(domains(args.superpoints), args.domains, args.quick)
     _warm_up()
     report: dict[str, Any] = {}
+    settings: dict[str, dict[str, Row]] = {}
     for domain in chosen:
         try:
             samples = domain.samples()
@@ -92,7 +98,9 @@ def main() -> None:
             continue
         if len(samples) == 1:
             samples = _turned(samples[0], args.turns)
-        report[domain.name] = _measure(domain, samples, with_best=not args.quick)
+        report[domain.name], settings[domain.name] = _measure(domain, samples, with_best=not args.quick)
+    if not args.quick:
+        _one_for_all(report, settings)
     losses = {name: rows["loss"] for name, rows in report.items() if rows["loss"] is not None}
     worst = min(losses, key=losses.__getitem__, default=None)
     print(json.dumps(report | {"worst_loss": losses[worst] if worst else None, "worst_domain": worst}))
@@ -129,7 +137,8 @@ def _warm_up() -> None:
     felzenszwalb(normal_graph(points), 1.0)
 
 
-def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> dict[str, Any]:
+def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> tuple[dict[str, Any], dict[str, Row]]:
+    """What the report says of a domain, and all settings of its grid, the default's name being empty."""
     sizes = sum(int(np.isfinite(sample.points).all(axis=-1).sum()) for sample in samples) // len(samples)
     number = _segments(domain, samples[0])
     print(f"\n{domain.name}: {len(samples)} x {sizes} points; counts: {', '.join(domain.scores)}; cuts of {number}")
@@ -145,20 +154,45 @@ def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> dict[
         if found is not None:
             rows["baselines"][name] = found[0]
             _show(name, *found)
+    settings = {"": default, "Mumford-Shah": plain} | (dict(_grid(domain, samples)) if with_best else {})
     if with_best:
-        found = _best(domain, [("default", default), ("Mumford-Shah", plain), *_grid(domain, samples)])
+        found = _best(domain, list(settings.items()))
         assert found is not None
         rows["best"] = found[0] | {"knobs": found[1]}
         _show("best knobs", *found)
     rivals = [row for row in (rows["best"], *rows["baselines"].values()) if row is not None]
-    losses = {
-        score: round(default[score] - max(rival[score] for rival in rivals if score in rival), 4)
+    tops = {
+        score: max(rival[score] for rival in rivals if score in rival)
         for score in domain.scores
         if score in default and any(score in rival for rival in rivals)
     }
+    losses = {score: round(default[score] - top, 4) for score, top in tops.items()}
     rows["losses"], rows["loss"] = losses, min(losses.values(), default=None)
     print(" " * 14 + f"default against the best of the others: {losses}", flush=True)
-    return rows
+    return rows, settings
+
+
+def _one_for_all(report: dict[str, Any], settings: dict[str, dict[str, Row]]) -> None:
+    """Show what each setting would be worth as the default of all domains, the best of them first."""
+    table = []
+    for name in {name: None for every in settings.values() for name in every}:
+        first, scores, losses = [], [], []
+        for domain, every in settings.items():
+            row = next((every[other] for other in (name, name.split("/ ")[-1]) if other in every), None)
+            if row is None:
+                break
+            default, values = report[domain]["default"], []
+            for score, loss in report[domain]["losses"].items():
+                values.append(row[score])
+                losses.append(loss + row[score] - default[score])  # against the best of all rows
+            first += values[:1]
+            scores += values
+        else:
+            within = sum(loss >= -0.01 for loss in losses)
+            table.append((np.mean(first), np.mean(scores), within, min(losses), name or "default"))
+    print(f"\nOne setting for all, of {len(table)}; of {len(losses)} scores\n   first     all  within   worst")
+    for mean_first, mean, within, worst, name in sorted(table, reverse=True)[:SHOWN]:
+        print(f"{mean_first:8.4f}{mean:8.4f}{within:8d}{worst:8.3f}  {name}")
 
 
 # --- pcgraph ------------------------------------------------------------------------------------------------------
@@ -204,13 +238,12 @@ def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
     linkages += [
         other for other in (pcgraph.ConvexityLinkage(), pcgraph.MumfordShahLinkage()) if other != first.linkage
     ]
-    sizes = VOXELS_OF_LARGE if domain.large else VOXELS
-    for view, linkage, size in itertools.product(views, linkages, sizes):
+    for view, linkage, size in itertools.product(views, linkages, VOXELS):
         rows: dict[float, list[Row]] = {altitude: [] for altitude in (1.0, *ALTITUDES)}
         for sample in samples:
             knobs = view | {"linkage": linkage}
             if size is not None:
-                knobs["voxel_size"] = size * _usual_voxel(sample)
+                knobs["voxel_size"] = size * (2.0 if domain.large else 1.0) * _usual_voxel(sample)
             if "viewpoint" in view:
                 knobs["viewpoint"] = _one_viewpoint(sample) if "range_growth" in view else sample.viewpoint
             row, result = _segmented(domain, sample, **knobs)
@@ -218,11 +251,11 @@ def _grid(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
             for altitude in ALTITUDES:
                 labels = result.cut(altitude=altitude * result.object_altitude)
                 rows[altitude].append(row | _judged(sample, labels))
-        told = [f"{name}={value}" if name == "range_growth" else name for name, value in view.items()]
+        told = " + ".join(f"{name}={value}" if name == "range_growth" else name for name, value in view.items())
         for altitude, found in rows.items():
-            sized = [] if size is None else [f"voxels x{size:g}"]
-            named = [*told, type(linkage).__name__, *sized, f"altitude x{altitude:g}"]
-            yield ", ".join(named), _mean(found)
+            sized = [] if size is None else [f"voxels x{size:g} (of large clouds x{2.0 * size:g})"]
+            named = ", ".join([type(linkage).__name__, *sized, f"altitude x{altitude:g}"])
+            yield f"{told} / {named}" if told else named, _mean(found)
 
 
 def _one_viewpoint(sample: Sample) -> NDArray[np.float64]:
