@@ -12,11 +12,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scores import largest
 
 NEIGHBOURS = 8
 NORMAL_NEIGHBOURS = 15
 MIN_SIZE = 20  # points of a segment, as on meshes of rooms
 BLOCK = 100_000  # points whose normals are computed at a time
+BISECTIONS = 10
+LOG_SCALE = np.log(100.0) + 7.0  # of the largest k that is tried, and of one over the least
 CELLS_PER_RADIUS = 5.0  # DBSCAN sees one point per cube of this fraction of its radius
 
 
@@ -72,6 +75,21 @@ def _joined(n, edges, weights, scale, min_size):  # type: ignore[no-untyped-def]
                 sizes[a] += sizes[b]
                 limits[a] = weights[k] + scale / sizes[a]
     return np.array([_root(parents, node) for node in range(n)])
+
+
+def felzenszwalb_cut(graph: NormalGraph, number: int) -> NDArray[np.integer]:
+    """Most segments that are no more than a number, by bisection of k."""
+    low, high = -LOG_SCALE, LOG_SCALE
+    best = largest(felzenszwalb(graph, float(np.exp(high))), number)  # more if there are gaps
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        labels = felzenszwalb(graph, float(np.exp(middle)))
+        if labels.max() < number:
+            high = middle
+            best = labels if labels.max() >= best.max() else best
+        else:
+            low = middle
+    return best
 
 
 def plane_and_clusters(points: NDArray[np.number], ground: float, radius: float, min_points: int) -> NDArray[np.int32]:

@@ -53,19 +53,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from baselines import NormalGraph, felzenszwalb, normal_graph, plane_and_clusters
+from baselines import felzenszwalb, felzenszwalb_cut, normal_graph, plane_and_clusters
 from domain_clouds import NOISE, Domain, MissingDataError, Sample, domains
 from numpy.typing import NDArray
 from peers import PclSetting, pcl_driver, run_pcl
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scores import Row, completed, largest, mean_overlap, voted
 
 import pcgraph
 from pcgraph.metrics import tree_oracle, weighted_overlap
-from pcgraph.metrics.labellings import contingency, intersections_over_union, largest_of_groups
 from pcgraph.tree.linkage import Linkage
 
-Row = dict[str, float]
 COLUMNS = ("wov", "oracle", "parts", "things", "ground", "purity", "mIoU", "one", "change", "noise")
 COUNTS = ("objects", "single", "s")
 ALTITUDES = (0.25, 0.5, 2.0, 4.0)  # times the default
@@ -73,7 +72,6 @@ SPACINGS = 3.5  # median distances between nearest points: the voxels that other
 VOXELS = (None, 2.0, 4.0)  # twice as many where clouds are large
 SHOWN = 12  # settings
 SCALES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-BISECTIONS = 10
 MIN_POINTS = (3, 10)
 
 
@@ -292,21 +290,6 @@ def _felzenszwalb(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, 
         yield f"k {scale:g}", _mean(found)
 
 
-def felzenszwalb_cut(graph: NormalGraph, number: int) -> NDArray[np.integer]:
-    """Most segments that are no more than a number, by bisection of k."""
-    low, high = np.log(SCALES[0]) - 7.0, np.log(SCALES[-1]) + 7.0
-    best = _largest(felzenszwalb(graph, float(np.exp(high))), number)  # more if there are gaps
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2.0
-        labels = felzenszwalb(graph, float(np.exp(middle)))
-        if labels.max() < number:
-            high = middle
-            best = labels if labels.max() >= best.max() else best
-        else:
-            low = middle
-    return best
-
-
 def _dbscan(domain: Domain, samples: list[Sample]) -> Iterator[tuple[str, Row]]:
     for radius, least in itertools.product(domain.radii, MIN_POINTS):
         rows = []
@@ -358,7 +341,7 @@ BASELINES = {"Felzenszwalb": _felzenszwalb, "DBSCAN": _dbscan, "PCL": _pcl, "sup
 
 def _of_labels(domain: Domain, sample: Sample, labels: NDArray[np.integer]) -> Row:
     """Scores of labels that have no tree."""
-    return _judged(sample, labels) | voted(sample.truth, _largest(labels, _segments(domain, sample)))
+    return _judged(sample, labels) | voted(sample.truth, largest(labels, _segments(domain, sample)))
 
 
 def _judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
@@ -369,48 +352,13 @@ def _judged(sample: Sample, labels: NDArray[np.integer]) -> Row:
     row |= {"objects": float(np.count_nonzero(sizes)), "single": float(np.count_nonzero(sizes == 1))}
     row["one"] = 1.0 / max(row["objects"], 1.0)
     if sample.things is not None:
-        row["things"] = _mean_overlap(complete, sample.truth, sample.things)
+        row["things"] = mean_overlap(complete, sample.truth, sample.things)
     if sample.clean is not None:
         lost, noise = labels < 0, sample.truth == NOISE
         row["noise"] = float(np.count_nonzero(lost & noise) / np.count_nonzero(lost | noise))
     if sample.ground >= 0:
-        row["ground"] = _mean_overlap(complete, sample.truth, np.array([sample.ground]))
+        row["ground"] = mean_overlap(complete, sample.truth, np.array([sample.ground]))
     return row
-
-
-def _mean_overlap(labels: NDArray[np.integer], truth: NDArray[np.int32], chosen: NDArray[np.integer]) -> float:
-    """Mean over some true segments of the IoU of the best segment."""
-    table = contingency(labels, truth)
-    names = np.unique(truth[(truth >= 0) & (labels >= 0)])
-    best = largest_of_groups(intersections_over_union(table), table.col, len(names))
-    return float(np.mean(best[np.isin(names, chosen)]))
-
-
-def voted(truth: NDArray[np.int32], segments: NDArray[np.integer] | None) -> Row:
-    """Purity, and mean IoU of the true segments, if every segment takes its most frequent true label."""
-    assert segments is not None
-    table = contingency(completed(segments), truth)
-    order = np.argsort(table.data, kind="stable")
-    vote = np.empty(table.shape[0], np.int64)
-    vote[table.row[order]] = table.col[order]
-    n = table.shape[1]
-    right = vote[table.row] == table.col
-    common = np.bincount(table.col[right], table.data[right], n)
-    voted, true = np.bincount(vote[table.row], table.data, n), np.bincount(table.col, table.data, n)
-    return {"purity": float(common.sum() / true.sum()), "mIoU": float(np.mean(common / (voted + true - common)))}
-
-
-def completed(labels: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Labels with one more for all points that have none."""
-    return np.where(labels >= 0, labels, labels.max() + 1).astype(np.int64)
-
-
-def _largest(labels: NDArray[np.integer], n: int) -> NDArray[np.int64]:
-    """The n - 1 largest segments, and one of the others."""
-    names, segment, sizes = np.unique(completed(labels), return_inverse=True, return_counts=True)
-    rank = np.empty(len(names), np.int64)
-    rank[np.argsort(-sizes, kind="stable")] = np.arange(len(names))
-    return np.minimum(rank[segment], n - 1).reshape(labels.shape)
 
 
 def _segments(domain: Domain, sample: Sample) -> int:

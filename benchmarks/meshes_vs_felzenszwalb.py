@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import json
 
-from baselines import normal_graph
-from domains import completed, felzenszwalb_cut, voted
+from baselines import felzenszwalb_cut, normal_graph
 from meshed_rooms import meshed
 from scanned_rooms import flat, office
+from scores import completed, voted
 
 import pcgraph
 from pcgraph.metrics import tree_oracle, weighted_overlap
