@@ -65,6 +65,7 @@ _REFINEMENTS = 4  # at most,
 _FEW_VOXELS = 120_000  # if they are so few,
 _ALL_JOINED = 0.93  # and of them,
 _STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
+_JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
 _PRICE_OF_ROUGHNESS = 0.25  # less a quarter of their roughness, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
@@ -520,15 +521,17 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64])
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
     than those of points at random. Where not even three quarters are joined, as in a sweep thinned to a point per cube,
     nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
-    read off a slab in the middle. Grids of one scan stay as they are, as its points lie less densely where surfaces
-    slant; so do those of many voxels, for the time's sake.
+    read off a slab in the middle. Points of one scan lie less densely where surfaces slant, and its rows far apart, so
+    its grid stays as it is, unless it was thinned, too: then nearly as many stay joined. Grids of many voxels stay for
+    the time's sake.
     """
-    n, size = grid.n_voxels, grid.size
-    if grid.warp.of_one_scan or n > _FEW_VOXELS or _joined(degrees) < _HALF_JOINED:
+    n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
+    if n > _FEW_VOXELS or not _HALF_JOINED <= _joined(degrees) < (_ALL_JOINED if of_one_scan else math.inf):
         return grid
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
     joined = _joined(degrees[slab])
     least = _ALL_JOINED if joined >= _MIN_JOINED else _STILL_JOINED * joined
+    least = _JOINED_OF_SCAN * joined if of_one_scan else least
     points = cloud.points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, _REFINEMENTS + 1):
         finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)

@@ -17,6 +17,7 @@ from peers import PclSetting, run_lin, run_pcl
 from scanned_scenes import Scene, ball, box, rod, scan, sphere_of_rays
 from scanned_streets import GROUND, SENSOR_M, street, sweep
 from scipy.spatial import cKDTree
+from scores import completed, mean_overlap
 
 import pcgraph
 from pcgraph.metrics import weighted_overlap
@@ -174,3 +175,16 @@ def test_a_sweep_keeps_its_things_when_it_is_thinned_to_one_point_per_cell(seed)
     result = pcgraph.segment(found.points[kept])
     assert result.voxel_size < 1.0
     assert weighted_overlap(result.labels, found.things[kept]) > 0.6
+
+
+def test_voxels_of_a_sweep_thinned_to_the_mean_of_each_cell_are_smaller():
+    """Points that lie evenly tell smaller things apart: at voxels of 27 cm people and poles are lost, at 22 found."""
+    found = sweep(street(6, half_length=60.0), 0)
+    group = np.unique(np.floor(found.points / 0.1), axis=0, return_inverse=True)[1]
+    first = np.unique(group, return_index=True)[1]
+    means = np.stack([np.bincount(group, x) / np.bincount(group) for x in found.points.T], axis=1)
+    result = pcgraph.segment(means)
+    truth = found.things[first]
+    things = np.flatnonzero(np.bincount(truth) >= 20)[2:]  # without nothing and the ground
+    assert result.voxel_size < 0.24
+    assert mean_overlap(completed(result.labels), truth, things) > 0.8
