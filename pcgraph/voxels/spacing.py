@@ -36,6 +36,7 @@ _STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths
 _LEAST_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
 _TINY, _FAR = float(np.finfo(np.float64).tiny), float(np.finfo(np.float32).max)
+_ROUNDING = 1e-12  # variance of readings that are all alike, about, as logarithms are in single precision
 _MIN_EXPLAINED = 0.55  # mean of what law and range explain
 _MIN_HINT, _MIN_BY_RANGE = 0.2, 0.1  # the same, and what range explains alone, of a piece of a scan
 _MIN_EXPONENT = 0.5
@@ -523,14 +524,14 @@ def _regress(
     found: _Lines,
 ) -> None:
     """Set what `_regressions` returns."""
-    variance = _sums_of_squares(logs, logs)[0]
+    variance, least = _sums_of_squares(logs, logs)[0], _ROUNDING * len(logs)
     for v in range(len(log_ranges)):
         of_x, of_y, products = _sums_of_squares(log_ranges[v], log_spacings[v])
-        slope = (products + prior * variance) / max(of_x + prior * variance, _TINY)
+        slope = (products + prior * variance) / max(of_x + prior * variance, least)
         slope = min(max(slope, 0.0), _MAX_EXPONENT)
         left = of_y - slope * (2.0 * products - slope * of_x)
-        found.by_range[v] = 1.0 - left / max(of_y, _TINY)
-        found.explained[v] = 1.0 - left / max(variance, _TINY) - prior * (slope - 1.0) ** 2
+        found.by_range[v] = 1.0 - left / max(of_y, least)
+        found.explained[v] = 1.0 - left / max(variance, least) - prior * (slope - 1.0) ** 2
         found.exponents[v] = slope
 
 

@@ -648,8 +648,8 @@ def _look(
                 continue
             u, v, half = views.u[i], views.v[i], views.halves[i]
             at[i] = min(int(u), last) * bins + min(int(v), last)
-            first, final = int(max(v - half, nothing)), min(int(v + half), last)
-            for p in range(int(max(u - half, nothing)), min(int(u + half), last) + 1):
+            first, final = min(int(max(v - half, nothing)), last), min(int(v + half), last)
+            for p in range(min(int(max(u - half, nothing)), last), min(int(u + half), last) + 1):
                 off = max(abs(np.float32(p) + half_bin - u) - half_bin, nothing)
                 for q in range(first, final + 1):
                     beside = max(off, abs(np.float32(q) + half_bin - v) - half_bin)

@@ -62,6 +62,12 @@ def test_a_viewpoint_that_sees_nothing_is_noticed():
     pcgraph.segment(POINTS, viewpoint=VIEWPOINT)
 
 
+@pytest.mark.parametrize("place", [(0.0, 0.0, 1e10), (-1e10, 0.0, 3e9), (1e8, 2e8, 1e8)])
+def test_a_viewpoint_is_never_too_far_off(place):
+    random = np.random.default_rng(0)
+    pcgraph.segment(np.c_[random.uniform(0.0, 100.0, (20_000, 2)), 0.02 * random.normal(size=20_000)], viewpoint=place)
+
+
 def test_noise_alone_is_warned_of():
     noise = np.random.default_rng(0).random((20000, 3))
     with pytest.warns(CloudWarning, match="expected points on surfaces, but they fill a volume"):

@@ -370,6 +370,13 @@ def test_even_spacing_follows_no_law():
     assert not spacing_law(scanned_scene()[:200]).holds  # too few to say
 
 
+def test_a_lattice_follows_no_law():
+    """All readings are the same, so that there is nothing to explain."""
+    lattice = np.stack(np.meshgrid(np.arange(49.0), np.arange(49.0), np.arange(2.0), indexing="ij"), -1).reshape(-1, 3)
+    assert not spacing_law(lattice).tells_place
+    assert pcgraph.segment(lattice).objects.max() == 0
+
+
 def test_a_fine_scan_within_a_coarse_one_follows_no_law():
     fine = faces((1.6, 1.1, 0.7), (2.4, 1.9, 1.1), 0.005)[0]
     law = spacing_law(np.concatenate((ROOM[0], fine)) - (2.0, 1.5, 0.0))
