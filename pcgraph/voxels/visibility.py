@@ -717,7 +717,7 @@ def _face(
     normals: NDArray[np.float64],
     cosines: NDArray[np.float64],
 ) -> None:
-    """Set the cosine between each normal and the direction to a place, about as many units off."""
+    """Set the cosine between each normal and the way to a place; in units, as squares of tiny lengths are zero."""
     for i in range(start, stop):
         x, y, z = (
             (place[0] - centres[i, 0]) / unit,
