@@ -172,7 +172,7 @@ def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> tuple
 
 def _one_for_all(report: dict[str, Any], settings: dict[str, dict[str, Row]]) -> None:
     """Show what each setting would be worth as the default of all domains, the best of them first."""
-    table = []
+    table: dict[tuple[float, ...], str] = {}  # settings that say the same once
     for name in {name: None for every in settings.values() for name in every}:
         first, scores, losses = [], [], []
         for domain, every in settings.items():
@@ -187,10 +187,10 @@ def _one_for_all(report: dict[str, Any], settings: dict[str, dict[str, Row]]) ->
             scores += values
         else:
             within = sum(loss >= -0.01 for loss in losses)
-            table.append((np.mean(first), np.mean(scores), within, min(losses), name or "default"))
+            table.setdefault((float(np.mean(first)), float(np.mean(scores)), within, min(losses)), name or "default")
     print(f"\nOne setting for all, of {len(table)}; of {len(losses)} scores\n   first     all  within   worst")
-    for mean_first, mean, within, worst, name in sorted(table, reverse=True)[:SHOWN]:
-        print(f"{mean_first:8.4f}{mean:8.4f}{within:8d}{worst:8.3f}  {name}")
+    for numbers, name in sorted(table.items(), reverse=True)[:SHOWN]:
+        print("{:8.4f}{:8.4f}{:8d}{:8.3f}  ".format(*numbers) + name)
 
 
 # --- pcgraph ------------------------------------------------------------------------------------------------------
