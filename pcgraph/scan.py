@@ -66,6 +66,7 @@ _FEW_VOXELS = 120_000  # if they are so few,
 _ALL_JOINED = 0.93  # and of them,
 _STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
 _JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
+_THINNED = 0.7  # whose spacing grows by a smaller power of range, near or far,
 _PRICE_OF_ROUGHNESS = 0.25  # less a quarter of their roughness, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
@@ -166,7 +167,7 @@ def segment(
     warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
-        grid = _fitting_grid(cloud, grid, math.inf if seed_size is None else float(seed_size))
+        grid = _fitting_grid(cloud, grid, law, math.inf if seed_size is None else float(seed_size))
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     warn_of_volume(grid)
@@ -476,14 +477,14 @@ def _edges_per_seed(grid: VoxelGrid, many: int) -> float:
     return min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 
-def _fitting_grid(cloud: CleanCloud, grid: VoxelGrid, largest: float) -> VoxelGrid:
+def _fitting_grid(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, largest: float) -> VoxelGrid:
     """The grid, or one of larger voxels where surfaces fall apart, or of smaller ones where they would stay whole.
 
     On a surface most voxels have at least five others around them.
     """
     degrees = np.diff(grid.indptr)
     larger = _without_dust(cloud, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else grid
-    return _with_detail(cloud, grid, degrees) if larger is grid else larger
+    return _with_detail(cloud, grid, law, degrees) if larger is grid else larger
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
@@ -515,18 +516,20 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]
     return grid
 
 
-def _with_detail(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]) -> VoxelGrid:
+def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]) -> VoxelGrid:
     """The grid, or one of voxels smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
     than those of points at random. Where not even three quarters are joined, as in a sweep thinned to a point per cube,
     nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
     read off a slab in the middle. Points of one scan lie less densely where surfaces slant, and its rows far apart, so
-    its grid stays as it is, unless it was thinned, too: then nearly as many stay joined. Grids of many voxels stay for
-    the time's sake.
+    its grid stays as it is; unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly
+    as many stay joined. Grids of many voxels stay for the time's sake.
     """
     n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
-    if n > _FEW_VOXELS or not _HALF_JOINED <= _joined(degrees) < (_ALL_JOINED if of_one_scan else math.inf):
+    if of_one_scan and (law is None or law.in_halves >= _THINNED or _joined(degrees) >= _ALL_JOINED):
+        return grid
+    if n > _FEW_VOXELS or _joined(degrees) < _HALF_JOINED:
         return grid
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
     joined = _joined(degrees[slab])

@@ -181,6 +181,19 @@ def test_voxels_are_smaller_where_points_lie_evenly_on_smooth_surfaces(noise: fl
     assert pcgraph.segment(points, voxel_size=0.05).voxel_size == 0.05
 
 
+@pytest.mark.filterwarnings("ignore:expected far fewer objects")
+def test_voxels_of_an_image_do_not_depend_on_what_flies_before_it() -> None:
+    """Small pieces all over the depth, as seen through glass, are joined to nothing at any size."""
+    v, u = np.mgrid[:240, :320]
+    z = np.where(v < 100, 1.5, 1.2)
+    random = np.random.default_rng(0)
+    flying = np.where(random.random((60, 80)) < 0.05, random.uniform(0.6, 1.6, (60, 80)), 1.0)
+    z = np.stack((z, z * np.kron(flying, np.ones((4, 4)))))
+    images = np.stack(((u - 160.0) / 300.0 * z, (v - 120.0) / 300.0 * z, z), axis=-1)
+    clean, seen = (pcgraph.segment(image).voxel_size for image in images)
+    assert seen == pytest.approx(clean, rel=0.1)
+
+
 @pytest.mark.parametrize(("noise", "edges"), [(0.0, 3.0), (0.1, 3.0), (0.3, 4.26)])
 def test_supervoxels_are_smaller_on_smooth_surfaces(noise: float, edges: float) -> None:
     result = pcgraph.segment(three_faces(noise))
