@@ -136,7 +136,7 @@ def _warm_up() -> None:
 
 
 def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> tuple[dict[str, Any], dict[str, Row]]:
-    """What the report says of a domain, and all settings of its grid, the default's name being empty."""
+    """What the report says of a domain, and the rows of all settings by their names."""
     sizes = sum(int(np.isfinite(sample.points).all(axis=-1).sum()) for sample in samples) // len(samples)
     number = _segments(domain, samples[0])
     print(f"\n{domain.name}: {len(samples)} x {sizes} points; counts: {', '.join(domain.scores)}; cuts of {number}")
@@ -152,19 +152,18 @@ def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> tuple
         if found is not None:
             rows["baselines"][name] = found[0]
             _show(name, *found)
-    settings = {"": default, "Mumford-Shah": plain} | (dict(_grid(domain, samples)) if with_best else {})
+    settings = {"default": default, "Mumford-Shah": plain} | (dict(_grid(domain, samples)) if with_best else {})
     if with_best:
         found = _best(domain, list(settings.items()))
         assert found is not None
         rows["best"] = found[0] | {"knobs": found[1]}
         _show("best knobs", *found)
     rivals = [row for row in (rows["best"], *rows["baselines"].values()) if row is not None]
-    tops = {
-        score: max(rival[score] for rival in rivals if score in rival)
+    losses = {
+        score: round(default[score] - max(rival[score] for rival in rivals if score in rival), 4)
         for score in domain.scores
         if score in default and any(score in rival for rival in rivals)
     }
-    losses = {score: round(default[score] - top, 4) for score, top in tops.items()}
     rows["losses"], rows["loss"] = losses, min(losses.values(), default=None)
     print(" " * 14 + f"default against the best of the others: {losses}", flush=True)
     return rows, settings
@@ -174,20 +173,18 @@ def _one_for_all(report: dict[str, Any], settings: dict[str, dict[str, Row]]) ->
     """Show what each setting would be worth as the default of all domains, the best of them first."""
     table: dict[tuple[float, ...], str] = {}  # settings that say the same once
     for name in {name: None for every in settings.values() for name in every}:
-        first, scores, losses = [], [], []
-        for domain, every in settings.items():
-            row = next((every[other] for other in (name, name.split("/ ")[-1]) if other in every), None)
-            if row is None:
-                break
-            default, values = report[domain]["default"], []
-            for score, loss in report[domain]["losses"].items():
-                values.append(row[score])
-                losses.append(loss + row[score] - default[score])  # against the best of all rows
-            first += values[:1]
-            scores += values
-        else:
-            within = sum(loss >= -0.01 for loss in losses)
-            table.setdefault((float(np.mean(first)), float(np.mean(scores)), within, min(losses)), name or "default")
+        found = {domain: every.get(name, every.get(name.split("/ ")[-1])) for domain, every in settings.items()}
+        rows = {domain: row for domain, row in found.items() if row is not None and report[domain]["losses"]}
+        if None in found.values():
+            continue
+        scores = [[row[score] for score in report[domain]["losses"]] for domain, row in rows.items()]
+        losses = [
+            loss + row[score] - report[domain]["default"][score]  # against the best of all rows
+            for domain, row in rows.items()
+            for score, loss in report[domain]["losses"].items()
+        ]
+        means = float(np.mean([values[0] for values in scores])), float(np.mean(np.concatenate(scores)))
+        table.setdefault((*means, sum(loss >= -0.01 for loss in losses), min(losses)), name)
     print(f"\nOne setting for all, of {len(table)}; of {len(losses)} scores\n   first     all  within   worst")
     for numbers, name in sorted(table.items(), reverse=True)[:SHOWN]:
         print("{:8.4f}{:8.4f}{:8d}{:8.3f}  ".format(*numbers) + name)

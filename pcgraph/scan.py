@@ -527,9 +527,9 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, deg
     as many stay joined. Grids of many voxels stay for the time's sake.
     """
     n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
-    if of_one_scan and (law is None or law.in_halves >= _THINNED or _joined(degrees) >= _ALL_JOINED):
+    if n > _FEW_VOXELS or (of_one_scan and (law is None or law.in_halves >= _THINNED)):
         return grid
-    if n > _FEW_VOXELS or _joined(degrees) < _HALF_JOINED:
+    if not _HALF_JOINED <= _joined(degrees) < (_ALL_JOINED if of_one_scan else math.inf):
         return grid
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
     joined = _joined(degrees[slab])

@@ -21,7 +21,7 @@ from pcgraph.supervoxels.clustering import (
     voxel_graph,
 )
 from pcgraph.supervoxels.method import SupervoxelMethod
-from pcgraph.voxels.cells import end_of_batch, fetch_batch
+from pcgraph.voxels.cells import fetch_batch
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 from pcgraph.voxels.surface import LocalPlanes, local_planes
 
@@ -149,9 +149,8 @@ def _assign(
     places, nearest = np.empty((0, 3)), np.empty(0, np.int32)
     first = start
     while first < stop:
-        last = end_of_batch(starts, first, stop)
-        begin, end = starts[first], starts[last]
-        places = fetch_batch(points, order, begin, end, places)
+        last, places = fetch_batch(points, order, starts, first, stop, places)
+        begin = starts[first]
         if len(places) > len(nearest):
             nearest = np.empty(len(places), np.int32)
         for v in range(first, last):
@@ -181,6 +180,6 @@ def _assign(
             if not stay:
                 for m in own_points:
                     nearest[m] = own
-        for m in range(end - begin):
+        for m in range(starts[last] - begin):
             chosen[order[begin + m]] = nearest[m]
         first = last

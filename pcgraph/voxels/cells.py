@@ -103,31 +103,30 @@ def gallop(keys: NDArray[np.int64], at: int, key: int) -> int:
 
 
 @routine
-def end_of_batch(starts: NDArray[np.int64], first: int, stop: int) -> int:
-    """Where a batch of voxels ends that starts with the first: they hold about a thousand points, or it is one voxel.
+def fetch_batch(
+    values: NDArray[np.float64],
+    order: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    first: int,
+    stop: int,
+    rows: NDArray[np.float64],
+) -> tuple[int, NDArray[np.float64]]:
+    """Where a batch of voxels ends that starts with the first, and its points' rows, of which it needs the first ones.
 
-    ``starts[i]:starts[i + 1]`` are the points of voxel i.
+    ``order[starts[i]:starts[i + 1]]`` are the points of voxel i; a batch has about a thousand, or is one voxel. Rows
+    far apart in memory are fetched side by side, in half the time of one by one amid other work, and into the room of
+    those before where they fit.
     """
     last = first
     while last < stop and starts[last] - starts[first] < _AT_ONCE:
         last += 1
-    return last
-
-
-@routine
-def fetch_batch(
-    values: NDArray[np.float64], order: NDArray[np.int64], begin: int, end: int, rows: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Rows ``values[order[begin:end]]`` in the room of some, or in a larger one: (m, 3), of which the first count.
-
-    Rows far apart in memory are fetched side by side, which takes half the time of one by one amid other work.
-    """
-    if end - begin > len(rows):
-        rows = np.empty((max(2 * (end - begin), 2 * _AT_ONCE), 3))
-    for m in range(end - begin):
-        p = order[begin + m]
+    count = starts[last] - starts[first]
+    if count > len(rows):
+        rows = np.empty((2 * max(count, _AT_ONCE), 3))
+    for m in range(count):
+        p = order[starts[first] + m]
         rows[m, 0], rows[m, 1], rows[m, 2] = values[p, 0], values[p, 1], values[p, 2]
-    return rows
+    return last, rows
 
 
 @kernel

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.cells import cell_keys, end_of_batch, fetch_batch, gallop, sorted_keys, starts_of_runs
+from pcgraph.voxels.cells import cell_keys, fetch_batch, gallop, sorted_keys, starts_of_runs
 from pcgraph.voxels.warp import Warp
 
 # Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
@@ -236,9 +236,8 @@ def _gather(
     """Set the voxel of each point, each voxel's cell, and the mean of its points in units of a voxel."""
     rows, first = np.empty((0, 3)), start
     while first < stop:
-        last = end_of_batch(starts, first, stop)
+        last, rows = fetch_batch(scaled, order, starts, first, stop, rows)
         begin = starts[first]
-        rows = fetch_batch(scaled, order, begin, starts[last], rows)
         for v in range(first, last):
             x = y = z = np.int64(0)
             m = starts[v] - begin
@@ -265,20 +264,15 @@ def _average(
     means: NDArray[np.float64],
 ) -> None:
     """Means of vectors by voxel, summed as whole numbers."""
-    rows, first = np.empty((0, 3)), start
-    while first < stop:
-        last = end_of_batch(starts, first, stop)
-        begin = starts[first]
-        rows = fetch_batch(values, order, begin, starts[last], rows)
-        for v in range(first, last):
-            x = y = z = np.int64(0)
-            for m in range(starts[v] - begin, starts[v + 1] - begin):
-                x += np.int64(np.rint(rows[m, 0] * steps))
-                y += np.int64(np.rint(rows[m, 1] * steps))
-                z += np.int64(np.rint(rows[m, 2] * steps))
-            total = max(starts[v + 1] - starts[v], 1) * steps
-            means[v, 0], means[v, 1], means[v, 2] = x / total, y / total, z / total
-        first = last
+    for v in range(start, stop):
+        x = y = z = np.int64(0)
+        for at in range(starts[v], starts[v + 1]):
+            p = order[at]
+            x += np.int64(np.rint(values[p, 0] * steps))
+            y += np.int64(np.rint(values[p, 1] * steps))
+            z += np.int64(np.rint(values[p, 2] * steps))
+        total = max(starts[v + 1] - starts[v], 1) * steps
+        means[v, 0], means[v, 1], means[v, 2] = x / total, y / total, z / total
 
 
 # --- which occupied voxels touch ---

@@ -589,10 +589,7 @@ def _find_sides(
     """Set the cosine between each normal and the direction to each place, 0 where hidden."""
     for k in range(start, stop):
         for i in range(len(centres)):
-            x, y, z = places[k, 0] - centres[i, 0], places[k, 1] - centres[i, 1], places[k, 2] - centres[i, 2]
-            length = max(math.sqrt(x * x + y * y + z * z), _TINY)
-            cosine = (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / length
-            sides[k, i] = cosine if seen[k, i] else 0.0
+            sides[k, i] = _facing(places[k], 1.0, centres, normals, i) if seen[k, i] else 0.0
 
 
 class _Views(NamedTuple):
@@ -717,15 +714,19 @@ def _face(
     normals: NDArray[np.float64],
     cosines: NDArray[np.float64],
 ) -> None:
-    """Set the cosine between each normal and the way to a place; in units, as squares of tiny lengths are zero."""
+    """Set the cosine between each normal and the way to a place, given a unit of about that length."""
     for i in range(start, stop):
-        x, y, z = (
-            (place[0] - centres[i, 0]) / unit,
-            (place[1] - centres[i, 1]) / unit,
-            (place[2] - centres[i, 2]) / unit,
-        )
-        length = max(math.sqrt(x * x + y * y + z * z), _TINY)
-        cosines[i] = (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / length
+        cosines[i] = _facing(place, unit, centres, normals, i)
+
+
+@routine
+def _facing(
+    place: NDArray[np.float64], unit: float, centres: NDArray[np.float64], normals: NDArray[np.float64], i: int
+) -> float:
+    """Cosine between a normal and the way to a place; in units, as squares of tiny lengths are zero."""
+    x, y, z = (place[0] - centres[i, 0]) / unit, (place[1] - centres[i, 1]) / unit, (place[2] - centres[i, 2]) / unit
+    length = max(math.sqrt(x * x + y * y + z * z), _TINY)
+    return (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / length
 
 
 @kernel
