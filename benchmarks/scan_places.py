@@ -43,7 +43,7 @@ from scanned_streets import place_over_lane, street
 
 import pcgraph
 from pcgraph.metrics import weighted_overlap
-from pcgraph.voxels.spacing import spacing_law
+from pcgraph.voxels.spacing_law import spacing_law
 
 Kept = NDArray[np.int64] | NDArray[np.bool_]
 

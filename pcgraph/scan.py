@@ -40,7 +40,8 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
-from pcgraph.voxels.spacing import SpacingLaw, median_spacing, spacing_law
+from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.spacing_law import SpacingLaw, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface, roughness
 from pcgraph.voxels.visibility import likelier_place, telling_places, visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
@@ -105,8 +106,8 @@ def segment(
     viewpoint : (3,) or points' shape float, metres, the points' frame, optional
         Where the sensor stood, for all points or for each; estimated normals point to its side, and convexity
         depends on that. Default: the origin for organised clouds. A list of points whose spacing grows with range
-        from one place (`pcgraph.voxels.spacing.spacing_law`) was seen from there; of any other, the outside is found
-        from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
+        from one place (`pcgraph.voxels.spacing_law`) was seen from there; of any other, the outside is found from what
+        is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
     features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
         What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.

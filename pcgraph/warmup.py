@@ -37,7 +37,9 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels import visibility
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
-from pcgraph.voxels.spacing import median_spacing, some_blocks, spacing_law
+from pcgraph.voxels.sampling import some_blocks
+from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
 

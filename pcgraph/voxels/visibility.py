@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.directions import densest_plane, sphere_directions
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
-from pcgraph.voxels.spacing import densest_plane, sphere_directions
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 

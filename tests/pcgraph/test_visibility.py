@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcgraph
-from pcgraph.voxels.spacing import spacing_law
+from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.visibility import seen_from
 
 

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Directions all around, and the plane on which most of a cloud lies."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def densest_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The plane on which most of n places lie, (n, 3), with normals towards either side: unit normal, (3,), and offset.
+
+    It has the commonest normal, and lies amid the narrowest quarter of all offsets along it.
+    """
+    normal = np.linalg.eigh(np.einsum("ij,ik->jk", normals, normals))[1][:, -1]
+    offsets = np.sort(np.einsum("ij,j->i", places, normal))
+    quarter = len(offsets) // 4
+    first = int(np.argmin(offsets[quarter:] - offsets[: len(offsets) - quarter]))
+    return normal, float(offsets[first + quarter // 2])
+
+
+def sphere_directions(n: int) -> NDArray[np.float64]:
+    """Unit vectors evenly over the sphere, (n, 3) float64, from +z downwards: a Fibonacci lattice."""
+    number = np.arange(n) + 0.5
+    z = 1.0 - 2.0 * number / n
+    angle = np.pi * (3.0 - np.sqrt(5.0)) * number
+    across = np.sqrt(1.0 - z * z)
+    return np.stack((across * np.cos(angle), across * np.sin(angle), z), axis=1)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of a cloud that do not depend on the order of its points: drawn by hashes of their places."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.voxels.cells import bounding_box, sorted_keys, starts_of_runs
+
+BLOCKS = 32
+"""Blocks of space along each axis."""
+
+_CROWD = 1 << 16  # points of a crowd, about
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+def each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """One point per place, in the order of their hashes: the first are as good as random, yet the points' own."""
+    hashes = np.empty(len(points), np.int64)
+    in_blocks(_hash, len(points), points, hashes)
+    ordered, order = sorted_keys(hashes)
+    return points.take(order[starts_of_runs(ordered)[:-1]], axis=0)
+
+
+@kernel
+def _hash(start: int, stop: int, points: NDArray[np.float64], hashes: NDArray[np.int64]) -> None:
+    """Set a whole number per point, 0 to 2**40 - 1, that depends on its place alone, and is hardly ever another's.
+
+    In one of five hundred crowds two of 65 536 places share one, and count as one.
+    """
+    for p in range(start, stop):  # + 0.0 makes one zero of the two
+        x = _mix(np.float64(points[p, 0] + 0.0).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
+        y = _mix(np.float64(points[p, 1] + 0.0).view(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F))
+        z = _mix(np.float64(points[p, 2] + 0.0).view(np.uint64) * np.uint64(0x165667B19E3779F9))
+        hashes[p] = np.int64(_mix(x ^ (y >> np.uint64(1)) ^ (z >> np.uint64(2))) >> np.uint64(24))
+
+
+def some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All points, or of large clouds those in some blocks of space."""
+    while len(points) > 2 * _CROWD and len(smaller := some_blocks(points)) < len(points):
+        points = smaller
+    return points
+
+
+def some_blocks(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The points of as many blocks of space as it takes for a crowd, the blocks by their hashes.
+
+    A block is as likely as it holds points: the crowd is as dense as the cloud, however that lies to the axes.
+    """
+    low, high = bounding_box(points)
+    edge = float((high - low).max()) / BLOCKS
+    if not edge > 0.0:
+        return points
+    block, counts = blocks_of(points, low, edge)
+    occupied = np.flatnonzero(counts)
+    counts = counts[occupied]
+    order = order_of_draw(occupied.astype(np.uint64), counts)
+    taken = np.zeros(BLOCKS**3, bool)
+    taken[occupied[order]] = np.concatenate(([0], np.cumsum(counts[order])[:-1])) < _CROWD
+    return points.take(np.concatenate(in_blocks(_in_taken, len(points), block, taken)), axis=0)
+
+
+def blocks_of(
+    points: NDArray[np.float64], low: NDArray[np.float64], edge: float
+) -> tuple[NDArray[np.int16], NDArray[np.int64]]:
+    """Number of the block of space in which each point lies, (n,), and how many points each block holds."""
+    block = np.empty(len(points), np.int16)
+    return block, sum(in_blocks(_find_block, len(points), points, low, 1.0 / max(edge, _TINY), block))
+
+
+@kernel
+def _find_block(
+    start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], scale: float, block: NDArray[np.int16]
+) -> NDArray[np.int64]:
+    """Set the number of the block of space in which each point lies; how many each block holds."""
+    last, counts = BLOCKS - 1, np.zeros(BLOCKS**3, np.int64)
+    for p in range(start, stop):
+        x = min(int((points[p, 0] - low[0]) * scale), last)
+        y = min(int((points[p, 1] - low[1]) * scale), last)
+        z = min(int((points[p, 2] - low[2]) * scale), last)
+        block[p] = (x * BLOCKS + y) * BLOCKS + z
+        counts[block[p]] += 1
+    return counts
+
+
+@kernel
+def _in_taken(start: int, stop: int, block: NDArray[np.int16], taken: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Which of some points lie in blocks that are taken."""
+    found, n = np.empty(stop - start + 1, np.int64), 0
+    for p in range(start, stop):
+        found[n] = p
+        n += taken[block[p]]
+    return found[:n]
+
+
+def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Whole numbers without a pattern, by one step of a multiplicative hash."""
+    spread = values * np.uint64(0xD6E8FEB86659FD93)
+    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+
+
+_mix = routine(_mixed)  # of one number, for kernels
+
+
+def order_of_draw(numbers: NDArray[np.uint64], weights: NDArray[np.number]) -> NDArray[np.int64]:
+    """Order in which things are drawn, each as likely the next as its weight says, by what their numbers hash to.
+
+    Notes
+    -----
+    Source: Efraimidis and Spirakis 2006.
+    """
+    chances = (_mixed(numbers) >> np.uint64(11)) * 2.0**-53 + 2.0**-54  # 0..1, without both
+    return np.argsort(-np.log(chances) / weights, kind="stable")
+
+
+def thinned(points: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    """About so many of some points, those of least hash, or all where they are no more."""
+    if len(points) <= number:
+        return points
+    limit = np.uint64(number / len(points) * 2.0**64)
+    return points.take(np.concatenate(in_blocks(_thin, len(points), points, limit)), axis=0)
+
+
+@kernel
+def _thin(start: int, stop: int, points: NDArray[np.float64], limit: np.uint64) -> NDArray[np.int64]:
+    """Those of some points of whose place a hash lies below a limit."""
+    bits = points.view(np.uint64)
+    found, n = np.empty(stop - start + 1, np.int64), np.int64(0)
+    for p in range(start, stop):
+        h = np.uint64(0x9E3779B97F4A7C15)
+        for axis in range(3):
+            h ^= bits[p, axis] if points[p, axis] != 0.0 else np.uint64(0)
+            h *= np.uint64(0xD6E8FEB86659FD93)
+            h ^= h >> np.uint64(32)
+        h *= np.uint64(0xC2B2AE3D27D4EB4F)
+        h ^= h >> np.uint64(29)
+        h *= np.uint64(0xD6E8FEB86659FD93)
+        found[n] = p
+        n += h < limit
+    return found[:n]

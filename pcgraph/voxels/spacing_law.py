@@ -1,0 +1,385 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Spacing that grows with range: one scan, and the place from which it was taken."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pcgraph.parallel import in_blocks, kernel, summing_routine
+from pcgraph.short_repr import ShortRepr
+from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.directions import densest_plane, sphere_directions
+from pcgraph.voxels.eigen import AXES, plane_normal
+from pcgraph.voxels.sampling import each_place_once, order_of_draw, thinned
+
+_THINNED = 1 << 14  # points among which the law is looked for,
+_READINGS = 1 << 10  # and how many readings of the spacing count
+_MIN_READINGS = 1 << 8  # with fewer the law is not looked for
+_NEIGHBOUR = 8
+_MIN_SAMPLE = 512  # places of a block whose neighbours are sought
+_STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths in half diagonals
+_MOVES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3), sphere_directions(8)))
+_LEAST_RANGE = 1e-3  # in half extents
+_SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
+_TINY, _FAR = float(np.finfo(np.float64).tiny), float(np.finfo(np.float32).max)
+_ROUNDING = 1e-12  # variance of readings that are all alike, about, as logarithms are in single precision
+_MIN_EXPLAINED = 0.55  # mean of what law and range explain
+_MIN_HINT, _MIN_BY_RANGE = 0.2, 0.1  # the same, and what range explains alone, of a piece of a scan
+_MIN_EXPONENT = 0.5
+_MAX_EXPONENT = 1.5
+_WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
+_MIN_EXPONENT_OF_HALF = 0.3
+_ALIKE = 0.02  # explained variance: what explains less than this more is no better
+_OWN_ORIGIN = 0.05  # explained variance by which another place must beat the frame's origin
+_MIN_COSINE = 0.1  # between a surface and the rays that meet it: at less a beam's spacing is that along its rows
+_ROW = 0.1  # of the variance along a row of points is at most across it
+_PRIOR = 0.1  # of the variance for a deviation of 1 from the exponent of a beam of constant angle, in search of a place
+
+
+@dataclass(frozen=True, eq=False)
+class SpacingLaw(ShortRepr):
+    """Spacing in proportion to a power of the range from one place, and to the inverse root of the cosine at which rays
+    from there meet the surface: the cloud is one scan, and was taken from there.
+
+    Attributes
+    ----------
+    viewpoint : (3,) float64, metres
+    exponent : float, 0..1.5
+        About 1 for a beam of constant angle, more where noise grows with range as well.
+    explained : float, at most 1
+        Fraction of the variance of the spacing's logarithm that the law explains; negative if it is worse than none.
+    by_range : float, 0..1
+        Fraction that range explains of what cosines leave. About 0 where all is far, and only the slant of the surfaces
+        makes a difference, as seen from the air.
+    in_halves : float
+        The lesser of the exponents in the near and in the far half of the readings, where ranges differ enough to tell;
+        else `exponent`. About 0 where a fine scan of a thing lies within a coarse one of its surroundings.
+    mirrored : (3,) float64, metres, or None
+        A place on the other side of what is nearly one plane, if spacing does not tell which of the two it was.
+    """
+
+    viewpoint: NDArray[np.float64]
+    exponent: float
+    explained: float
+    by_range: float
+    in_halves: float
+    mirrored: NDArray[np.float64] | None = None
+
+    @property
+    def holds(self) -> bool:
+        """Whether the law says more than chance would, near and far."""
+        return self._tells(_MIN_EXPLAINED) and self.in_halves >= _MIN_EXPONENT_OF_HALF
+
+    @property
+    def tells_place(self) -> bool:
+        """Whether the place is told, be it by a piece of a scan, over whose ranges spacing hardly changes."""
+        return self.holds or (self._tells(_MIN_HINT) and self.by_range >= _MIN_BY_RANGE and self.mirrored is None)
+
+    def _tells(self, least: float) -> bool:
+        """Whether law and range explain so much, and spacing grows with range."""
+        return (self.explained + self.by_range) / 2.0 >= least and self.exponent >= _MIN_EXPONENT
+
+
+def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None) -> SpacingLaw:
+    """The power law between spacing and range that explains most, over a sample free of the points' order.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+        Finite, n >= 1.
+    viewpoint : (3,) float64, metres, optional
+        From where the cloud was seen. Default: the place that explains most, or the origin if it does as well.
+
+    Notes
+    -----
+    Rays of constant solid angle meet a surface at distances of r / sqrt(cos), r the range and cos that of the angle
+    between ray and normal. Log spacing, by the distance to the eighth neighbour in a thinned cloud, and with the cosine
+    taken out, is regressed on log range. Places all around and within the cloud are tried, then moved by ever smaller
+    steps; readings far off the line, such as noise, are left out.
+    """
+    found = _readings(points, _READINGS if viewpoint is not None else 2 * _READINGS)
+    if len(found.logs) < _MIN_READINGS:
+        return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0)
+    low, high = bounding_box(found.places)
+    middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
+    found = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
+    every, own, mirrored = found.some(slice(None, _READINGS)), viewpoint, None
+    if viewpoint is None:
+        spread_out = found.some(_between_points_and_surface(found))
+        place, mirrored = _most_telling_places(spread_out)
+        near_line = spread_out.some(_on_line(spread_out, place))
+        place = _searched(near_line.some(slice(None, None, 2)), place[None], np.array([_SHORT_STEP]), 8)[0][0]
+    else:
+        place = (viewpoint - middle) / reach
+    kept = _on_line(every, place)
+    line = _regressions(every.some(kept), place[None])
+    if viewpoint is None:
+        origin = -middle / reach
+        line_of_origin = _regressions(every.some(kept), origin[None])
+        if line_of_origin.explained[0] >= line.explained[0] - _OWN_ORIGIN:
+            place, line, own, mirrored = origin, line_of_origin, np.zeros(3), None
+    return SpacingLaw(
+        viewpoint=middle + reach * place if own is None else own,
+        exponent=float(line.exponents[0]),
+        explained=float(line.explained[0]),
+        by_range=float(line.by_range[0]),
+        in_halves=_least_exponent(every, place, float(line.exponents[0])),
+        mirrored=None if mirrored is None else middle + reach * mirrored,
+    )
+
+
+class _Readings(NamedTuple):
+    """How densely a surface is sampled at m places.
+
+    Attributes
+    ----------
+    places : (m, 3) float64
+    normals : (m, 3) float64
+        Unit normals of the surface; zero where the points around tell none, as they lie in a row, like those on one
+        ring of a sweep, which lie on the cone of its beam.
+    logs : (m,) float64
+        Logarithms of the spacing.
+    """
+
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    logs: NDArray[np.float64]
+
+    def some(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> _Readings:
+        """Those of some places."""
+        return _Readings(*(np.ascontiguousarray(column[which]) for column in self))
+
+
+def _readings(points: NDArray[np.float64], number: int) -> _Readings:
+    """Readings at so many places in a cloud thinned by the points' hashes, in an order as good as random."""
+    chosen = thinned(points, _THINNED)
+    if len(chosen):
+        chosen = each_place_once(chosen)
+    if len(chosen) <= _NEIGHBOUR:
+        return _Readings(chosen[:0], chosen[:0], np.empty(0))
+    sample, tree = chosen[:number], cKDTree(chosen, 24, balanced_tree=False, compact_nodes=False)
+    of_blocks = in_blocks(partial(_spacing_and_normals, tree, sample), len(sample), smallest=_MIN_SAMPLE)
+    usable, spacing, normals = (np.concatenate(column) for column in zip(*of_blocks, strict=True))
+    return _Readings(sample[usable], normals, np.log(spacing))
+
+
+def _spacing_and_normals(
+    tree: cKDTree, sample: NDArray[np.float64], start: int, stop: int
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Whether the eighth neighbours of a block of places tell a spacing, and where they do, it and the normals."""
+    near, around = tree.query(sample[start:stop], k=_NEIGHBOUR + 1)
+    usable = np.isfinite(near[:, -1]) & (near[:, -1] > 0.0)
+    spacing = near[usable, -1]
+    normals = np.empty((len(spacing), 3))
+    _fit_normals(np.asarray(tree.data), around[usable], spacing, normals)
+    return usable, spacing, normals
+
+
+@kernel
+def _fit_normals(
+    places: NDArray[np.float64], around: NDArray[np.int64], spacing: NDArray[np.float64], normals: NDArray[np.float64]
+) -> None:
+    """Set the normals of the planes through patches of places, zero where these lie in a row, or on no plane."""
+    scatter, mean, way = np.empty(6), np.empty(3), np.empty(3)
+    for m in range(len(around)):
+        mean[:] = 0.0
+        for p in around[m]:
+            for axis in range(3):
+                mean[axis] += (places[p, axis] - places[around[m, 0], axis]) / spacing[m]
+        mean /= around.shape[1]
+        scatter[:] = 0.0
+        for p in around[m]:
+            for axis in range(3):
+                way[axis] = (places[p, axis] - places[around[m, 0], axis]) / spacing[m] - mean[axis]
+            for column in range(6):
+                scatter[column] += way[AXES[column][0]] * way[AXES[column][1]]
+        least = plane_normal(scatter, normals[m])
+        xx, yy, zz, xy, xz, yz = scatter
+        others = xx + yy + zz - least  # sum and product of the other two spreads
+        product = xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz - least * others
+        if least < 0.0 or product < _ROW / (1.0 + _ROW) ** 2 * others * others:
+            normals[m] = 0.0
+
+
+def _between_points_and_surface(readings: _Readings) -> NDArray[np.int64]:
+    """Which readings, ascending, count in the search for a place: drawn by the root of their spacing.
+
+    So they lie between as points and as surface lie: at the pole of a scanner that turns by equal angles points are
+    many, and not as far apart as the law says.
+    """
+    logs = np.minimum(readings.logs, np.percentile(readings.logs, 90))  # not for points far off
+    order = order_of_draw(np.arange(len(logs), dtype=np.uint64) + np.uint64(1), np.exp(0.5 * (logs - logs.max())))
+    return np.sort(order[:_READINGS])
+
+
+def _on_line(readings: _Readings, place: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which readings lie near the line through all of them about a place; others may be noise."""
+    log_range, log_spacing = _on_law(readings, place[None])
+    residuals = log_spacing[0] - _regressions(readings, place[None]).exponents[0] * log_range[0]
+    residuals -= np.median(residuals)
+    return np.abs(residuals) <= 2.5 * max(1.4826 * float(np.median(np.abs(residuals))), 0.1)
+
+
+def _on_law(readings: _Readings, viewpoints: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Log range, (k, m), and log spacing as it were if rays from each of k viewpoints met the surface at right angles.
+
+    Logarithms of NumPy in single precision are taken in lanes, and so is all else here: most of the search's time.
+    """
+    ranges, slants = np.empty((2, len(viewpoints), len(readings.logs)), np.float32)
+    places, normals = np.ascontiguousarray(readings.places.T), np.ascontiguousarray(readings.normals.T)
+    _look_along_rays(places, normals, viewpoints, ranges, slants)
+    np.log(ranges, out=ranges)
+    np.log(slants, out=slants)
+    slants *= np.float32(0.5)
+    slants += readings.logs.astype(np.float32)
+    return ranges, slants
+
+
+@kernel
+def _look_along_rays(
+    places: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    viewpoints: NDArray[np.float64],
+    ranges: NDArray[np.float32],
+    slants: NDArray[np.float32],
+) -> None:
+    """Set the range of each of m places, (3, m), from each of k viewpoints, (k, m), and the cosine between ray and
+    normal, 1 where there is no normal. No range is so short that its logarithm outweighs all others."""
+    for v in range(len(viewpoints)):
+        px, py, pz = viewpoints[v]
+        for i in range(places.shape[1]):
+            x, y, z = places[0, i] - px, places[1, i] - py, places[2, i] - pz
+            nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
+            reach = math.sqrt(x * x + y * y + z * z) + _LEAST_RANGE
+            cosine = abs(x * nx + y * ny + z * nz) / reach
+            cosine = cosine if cosine > _MIN_COSINE else _MIN_COSINE
+            ranges[v, i] = reach if reach < _FAR else _FAR
+            slants[v, i] = 1.0 if nx * nx + ny * ny + nz * nz == 0.0 else cosine
+
+
+class _Lines(NamedTuple):
+    """Regressions about k viewpoints: what each explains of the variance, exponent, what range explains, (k,) each."""
+
+    explained: NDArray[np.float64]
+    exponents: NDArray[np.float64]
+    by_range: NDArray[np.float64]
+
+
+def _regressions(readings: _Readings, viewpoints: NDArray[np.float64], prior: float = 0.0) -> _Lines:
+    """The law about each of k viewpoints, (k, 3).
+
+    A prior, in variances, draws exponents to 1 and counts against what is explained.
+    """
+    found = _Lines(*np.empty((3, len(viewpoints))))
+    _regress(readings.logs, *_on_law(readings, viewpoints), prior, found)
+    return found
+
+
+@kernel
+def _regress(
+    logs: NDArray[np.float64],
+    log_ranges: NDArray[np.float32],
+    log_spacings: NDArray[np.float32],
+    prior: float,
+    found: _Lines,
+) -> None:
+    """Set what `_regressions` returns."""
+    variance, least = _sums_of_squares(logs, logs)[0], _ROUNDING * len(logs)
+    for v in range(len(log_ranges)):
+        of_x, of_y, products = _sums_of_squares(log_ranges[v], log_spacings[v])
+        slope = (products + prior * variance) / max(of_x + prior * variance, least)
+        slope = min(max(slope, 0.0), _MAX_EXPONENT)
+        left = of_y - slope * (2.0 * products - slope * of_x)
+        found.by_range[v] = 1.0 - left / max(of_y, least)
+        found.explained[v] = 1.0 - left / max(variance, least) - prior * (slope - 1.0) ** 2
+        found.exponents[v] = slope
+
+
+@summing_routine
+def _sums_of_squares(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[float, float, float]:
+    """Sums of the squares of two columns, and of their products, about their means."""
+    n = len(x)
+    sum_x = sum_y = of_x = of_y = products = 0.0
+    for i in range(n):
+        sum_x += x[i]
+        sum_y += y[i]
+    for i in range(n):
+        from_x, from_y = x[i] - sum_x / n, y[i] - sum_y / n
+        of_x += from_x * from_x
+        of_y += from_y * from_y
+        products += from_x * from_y
+    return of_x, of_y, products
+
+
+def _least_exponent(readings: _Readings, viewpoint: NDArray[np.float64], exponent: float) -> float:
+    """The lesser of the exponents in the near and the far half, by medians; `exponent` where the span is small."""
+    x, y = (column[0] for column in _on_law(readings, viewpoint[None]))
+    order = np.argsort(x, kind="stable")
+    if x[order[len(x) * 9 // 10]] - x[order[len(x) // 10]] < math.log(_WIDE_SPAN):
+        return exponent
+    slopes = []
+    for half in np.array_split(order, 2):
+        third = len(half) // 3
+        near, far = half[:third], half[-third:]
+        rise = float(np.median(y[far]) - np.median(y[near]))
+        slopes.append(rise / max(float(np.median(x[far]) - np.median(x[near])), _TINY))
+    return min(slopes)
+
+
+def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """The place, (3,), about which spacing follows the law best, found by pattern searches around the cloud.
+
+    In a room only places near the true one lead to it, so the search starts from several, far apart. A plane looks the
+    same from its other side. Only what stands on it tells them apart, so both are compared; where that does not tell
+    either, the second place is the other.
+    """
+    low, high = bounding_box(readings.places)
+    reach = float(np.linalg.norm(high - low)) / 2.0
+    some, half = readings.some(slice(None, None, 4)), readings.some(slice(None, None, 2))
+    steps = (np.arange(5) + 0.5) / 5
+    inside = low + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
+    outside = [(low + high) / 2.0 + far * reach * sphere_directions(40) for far in (1.2, 2.0)]
+    candidates = np.concatenate((inside, *outside))
+    starts: list[NDArray[np.float64]] = []
+    for place in candidates[np.argsort(-_regressions(some, candidates, _PRIOR).explained, kind="stable")]:
+        if all(np.linalg.norm(place - start) > _APART * reach for start in starts):
+            starts.append(place)
+            if len(starts) == _STARTS:
+                break
+    found, steps = _searched(some, np.stack(starts), np.full(len(starts), _FIRST_STEP * reach), 5)
+    best = np.argmax(_regressions(half, found, _PRIOR).explained, keepdims=True)
+    place = _searched(half, found[best], steps[best], 8)[0][0]
+    other = _mirrored(place, half)
+    other = _searched(half, other[None], np.array([float(np.linalg.norm(other - place)) / 8.0]), 5)[0][0]
+    first, second = _regressions(half, np.stack((place, other)), _PRIOR).explained
+    if second > first:
+        place, other = other, place
+    return place, other if abs(first - second) < _ALIKE else None
+
+
+def _mirrored(place: NDArray[np.float64], readings: _Readings) -> NDArray[np.float64]:
+    """A place, (3,), on the other side of the plane on which most lies."""
+    normal, offset = densest_plane(readings.places, readings.normals)
+    return place - 2.0 * (place @ normal - offset) * normal
+
+
+def _searched(
+    readings: _Readings, places: NDArray[np.float64], steps: NDArray[np.float64], rounds: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Each of k places, (k, 3), after steps to where the law explains more, and the length of its next step, (k,)."""
+    each = np.arange(len(places))
+    for _ in range(rounds):
+        tried = places[:, None] + steps[:, None, None] * _MOVES
+        explained = _regressions(readings, tried.reshape(-1, 3), _PRIOR).explained.reshape(tried.shape[:2])
+        best = np.argmax(explained, axis=1)
+        is_better = explained[each, best] > explained[:, 0] + 1e-4
+        places = np.where(is_better[:, None], tried[each, best], places)
+        steps = np.where(is_better, steps, 0.5 * steps)
+    return places, steps
