@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -40,8 +41,8 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
-from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.spacing_law import SpacingLaw, spacing_law
+from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
+from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface, roughness
 from pcgraph.voxels.visibility import likelier_place, telling_places, visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
@@ -374,29 +375,35 @@ def _scale(
     if camera is None:
         camera = position is not None and _is_camera(cloud, position, range_growth)
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
+    may_grow = range_growth is None and not camera
     if camera:
-        law, warp = _law_and_warp(cloud, position, camera, growth, range_growth is None)
-        return _voxel_size(cloud, warp, voxel_size, seed_size), law, warp
-    voxel, (law, warp) = side_by_side(
-        partial(_voxel_size, cloud, Warp(), voxel_size, seed_size),
-        partial(_law_and_warp, cloud, position, camera, growth, range_growth is None),
-    )
-    return voxel, law, warp
+        law = None if position is not None else spacing_law(cloud.points)
+        warp = _warp(cloud, position, law, camera, growth)
+        return _voxel_size(voxel_size, seed_size, partial(median_spacing, cloud.points, warp)), law, warp
+    if position is None:
+        (spacing, rows), of_all = side_by_side(
+            partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points)
+        )
+        law = law_on_rings(cloud.points, of_all, rows)
+        voxel = _voxel_size(voxel_size, seed_size, lambda: spacing)
+    else:
+        voxel, law = side_by_side(
+            partial(_voxel_size, voxel_size, seed_size, partial(median_spacing, cloud.points)),
+            lambda: spacing_law(cloud.points, position) if may_grow and position.ndim == 1 else None,
+        )
+    growth = RANGE_GROWTH if may_grow and law is not None and law.holds else growth
+    return voxel, law, _warp(cloud, position, law, camera, growth)
 
 
-def _law_and_warp(
-    cloud: CleanCloud, position: NDArray[np.float64] | None, camera: bool, growth: float, may_grow: bool
-) -> tuple[SpacingLaw | None, Warp]:
-    """How spacing depends on range, where that counts; and how voxels grow, with range too if they may."""
-    law = None
-    if position is None or (may_grow and position.ndim == 1 and not camera):
-        law = spacing_law(cloud.points, position)
-        if law.holds:
-            position = law.viewpoint
-            growth = RANGE_GROWTH if may_grow and not camera else growth
-    if position is None and not (camera or growth):
-        return law, Warp()
-    return law, choose_warp(cloud.points, np.zeros(3) if position is None else position, camera, growth)
+def _warp(
+    cloud: CleanCloud, position: NDArray[np.float64] | None, law: SpacingLaw | None, camera: bool, growth: float
+) -> Warp:
+    """How voxels grow, about the place from which the cloud was seen, which a law may tell, or else the origin."""
+    if not (camera or growth):
+        return Warp()
+    if position is None:
+        position = law.viewpoint if law is not None and law.holds else np.zeros(3)
+    return choose_warp(cloud.points, position, camera, growth)
 
 
 def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
@@ -449,11 +456,11 @@ def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.f
     return grid.centroids + directions * (1e3 * grid.edge_lengths)[:, None]
 
 
-def _voxel_size(cloud: CleanCloud, warp: Warp, voxel_size: float | None, seed_size: float | None) -> float:
-    """The voxel size, given or found in the warped space, no larger than the seed size; both checked."""
+def _voxel_size(voxel_size: float | None, seed_size: float | None, spacing: Callable[[], float]) -> float:
+    """The voxel size, given or from the spacing, no larger than the seed size; both checked."""
     seed = math.inf if seed_size is None else positive("seed_size", seed_size)
     if voxel_size is None:
-        return positive("voxel_size", min(VOXELS_PER_SPACING * median_spacing(cloud.points, warp), seed))
+        return positive("voxel_size", min(VOXELS_PER_SPACING * spacing(), seed))
     voxel = positive("voxel_size", voxel_size)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.directions import densest_plane, sphere_directions
 from pcgraph.voxels.eigen import AXES, plane_normal
+from pcgraph.voxels.rings import Rows, scanner_of_rings
 from pcgraph.voxels.sampling import each_place_once, order_of_draw, thinned
 
 _THINNED = 1 << 14  # points among which the law is looked for,
@@ -31,6 +32,7 @@ _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings th
 _TINY, _FAR = float(np.finfo(np.float64).tiny), float(np.finfo(np.float32).max)
 _ROUNDING = 1e-12  # variance of readings that are all alike, about, as logarithms are in single precision
 _MIN_EXPLAINED = 0.55  # mean of what law and range explain
+_MIN_ON_RINGS = 0.2  # the same where rings tell the place
 _MIN_HINT, _MIN_BY_RANGE = 0.2, 0.1  # the same, and what range explains alone, of a piece of a scan
 _MIN_EXPONENT = 0.5
 _MAX_EXPONENT = 1.5
@@ -63,6 +65,8 @@ class SpacingLaw(ShortRepr):
         else `exponent`. About 0 where a fine scan of a thing lies within a coarse one of its surroundings.
     mirrored : (3,) float64, metres, or None
         A place on the other side of what is nearly one plane, if spacing does not tell which of the two it was.
+    axis : (3,) float64, or None
+        About which a scanner turned, of length 1, either way, if its rings told the place.
     """
 
     viewpoint: NDArray[np.float64]
@@ -71,11 +75,13 @@ class SpacingLaw(ShortRepr):
     by_range: float
     in_halves: float
     mirrored: NDArray[np.float64] | None = None
+    axis: NDArray[np.float64] | None = None
 
     @property
     def holds(self) -> bool:
-        """Whether the law says more than chance would, near and far."""
-        return self._tells(_MIN_EXPLAINED) and self.in_halves >= _MIN_EXPONENT_OF_HALF
+        """Whether the law says more than chance would, near and far; or does not gainsay what rings told."""
+        least = _MIN_EXPLAINED if self.axis is None else _MIN_ON_RINGS
+        return self._tells(least) and self.in_halves >= _MIN_EXPONENT_OF_HALF
 
     @property
     def tells_place(self) -> bool:
@@ -133,6 +139,25 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         in_halves=_least_exponent(every, place, float(line.exponents[0])),
         mirrored=None if mirrored is None else middle + reach * mirrored,
     )
+
+
+def law_on_rings(points: NDArray[np.float64], law: SpacingLaw, rows: Rows) -> SpacingLaw:
+    """The law about the place that rings of a turning scanner tell, if they do and it holds there; else as it was.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+    law : SpacingLaw
+        Of these points: the place from which that of the rings is searched, or the frame's origin, or the middle.
+    rows : Rows
+        Of these points.
+    """
+    middle = np.median(rows.points, axis=0) if len(rows.points) else np.zeros(3)
+    scanner = scanner_of_rings(rows, np.stack((law.viewpoint, np.zeros(3), middle)))
+    if scanner is None:
+        return law
+    about = replace(spacing_law(points, scanner.place), axis=scanner.axis)
+    return about if about.holds else law
 
 
 class _Readings(NamedTuple):
