@@ -47,7 +47,7 @@ def scanner_of_rings(rows: Rows, near: NDArray[np.float64]) -> Scanner | None:
     rows : Rows
         In an order as good as random: the first 512 are looked at.
     near : (k, 3) float64
-        Places from the best of which to search: half the median range off will do.
+        Places from which to search, the best first: half the median range off will do.
 
     Notes
     -----
@@ -59,28 +59,33 @@ def scanner_of_rings(rows: Rows, near: NDArray[np.float64]) -> Scanner | None:
     if len(rows.points) < _MIN_ROWS:
         return None
     low, high = rows.points.min(axis=0), rows.points.max(axis=0)
-    middle, reach = (low + high) / 2.0, max(float((high - low).max()) / 2.0, np.finfo(float).tiny)
+    middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
+    if reach == 0.0:
+        return None
     rows = rows._replace(points=(rows.points - middle) / reach)
     squares, frame = np.linalg.eigh(rows.directions.T @ rows.directions)  # the axis first, as rings are nearly level
     if squares[1] < _NOT_PARALLEL * len(rows.points):  # as rows of an image are, which tell no place
         return None
     some = Rows(*(column[:_SOME_ROWS] for column in rows))
     starts = np.column_stack(((near - middle) / reach, np.zeros((len(near), 2))))
-    unknown = min(starts, key=lambda start: _steepness(some, frame, start, _COARSE))
-    if _steepness(some, frame, unknown, _COARSE) > _TOO_STEEP:
-        return None
-    unknown = _flattest(some, frame, unknown, _MIDDLE)
-    if _steepness(some, frame, unknown, _MIDDLE) > _MOST_OFF:
-        return None
-    unknown = _flattest(rows, frame, unknown, _FINE)
-    if _steepness(rows, frame, unknown, _FINE) > _MOST_OFF:
-        return None
+    steepness = np.array([_steepness(some, frame, start, _COARSE) for start in starts])
+    for start in starts[np.argsort(steepness, kind="stable")[: np.count_nonzero(steepness <= _TOO_STEEP)]]:
+        unknown = _flattest(some, frame, start, _MIDDLE)
+        if _steepness(some, frame, unknown, _MIDDLE) > _MOST_OFF:
+            continue
+        unknown = _flattest(rows, frame, unknown, _FINE)
+        if _steepness(rows, frame, unknown, _FINE) <= _MOST_OFF and _is_certain(rows, frame, unknown):
+            return Scanner(middle + reach * unknown[:3], _axis(frame, unknown)[0])
+    return None
+
+
+def _is_certain(rows: Rows, frame: NDArray[np.float64], unknown: NDArray[np.float64]) -> bool:
+    """Whether the slopes tell the place, and not only that it lies along some line, as those of parallel rows do."""
     slopes, derivatives = _slopes(rows, frame, unknown)
     trusted = derivatives / np.hypot(1.0, slopes / _FINE)[:, None]
-    uncertain = _FINE * np.sqrt(np.linalg.eigvalsh(np.linalg.pinv(trusted.T @ trusted)[:3, :3])[-1])
-    if uncertain > _MOST_UNCERTAIN * np.median(np.linalg.norm(rows.points - unknown[:3], axis=1)):
-        return None
-    return Scanner(middle + reach * unknown[:3], _axis(frame, unknown)[0])
+    variance = np.linalg.eigvalsh(np.linalg.pinv(trusted.T @ trusted)[:3, :3])[-1]
+    ranges = np.linalg.norm(rows.points - unknown[:3], axis=1)
+    return bool(_FINE * np.sqrt(variance) <= _MOST_UNCERTAIN * np.median(ranges))
 
 
 def _flattest(rows: Rows, frame: NDArray[np.float64], start: NDArray[np.float64], scale: float) -> NDArray[np.float64]:

@@ -80,7 +80,7 @@ def test_what_is_on_no_scanners_rings_tells_nothing():
     level /= np.linalg.norm(level, axis=1)[:, None]
     assert scanner_of_rings(rows._replace(directions=level), NOWHERE) is None
     assert scanner_of_rings(Rows(rows.points[:39], rows.directions[:39]), NOWHERE) is None
-    assert scanner_of_rings(Rows(np.zeros((300, 3)), directions), NOWHERE) is None
+    assert scanner_of_rings(Rows(np.full((300, 3), 5.0), directions), NOWHERE) is None
     assert scanner_of_rings(Rows(*np.empty((2, 0, 3))), NOWHERE) is None
 
 
