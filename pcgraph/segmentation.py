@@ -88,6 +88,24 @@ class Segmentation:
         return self.labels == OUTLIER
 
     @property
+    def parts(self) -> NDArray[np.int32]:
+        """Part of each point, in the input's shape, negative as in `labels`: faces and smooth pieces.
+
+        Each lies within one object: the cut at the linkage's altitude of parts, or at that of the objects if that is
+        lower.
+        """
+        return self.cut(altitude=min(self.linkage.default_part_altitude, self.object_altitude))
+
+    @property
+    def groups(self) -> NDArray[np.int32]:
+        """Group of each point, in the input's shape, negative as in `labels`: what hangs together, such as a table with
+        all that stands on it.
+
+        Each holds whole objects, and comes near no other: the cut below infinity.
+        """
+        return self.cut(altitude=np.finfo(np.float64).max)
+
+    @property
     def camera(self) -> bool:
         """Whether voxels grew with depth."""
         return isinstance(self.surface.grid.warp, CameraWarp)

@@ -95,7 +95,7 @@ class SegmentationTree(ShortRepr):
         return horizontal_cut(self.parents, self.altitudes, self.moments.counts, n, altitude, min_size)
 
     def levels(self, altitudes: ArrayLike) -> NDArray[np.int32]:
-        """Segment of each leaf at several altitudes, (n_leaves, l) int32: supervoxel, part, object, scene.
+        """Segment of each leaf at several altitudes, (n_leaves, l) int32.
 
         With rising altitudes every column refines the next one.
 

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 
 import numpy as np
 import pytest
-from clouds import refines
+from clouds import refines, two_boxes_on_a_plane
 from graphs import hand_graph, hand_tree, leaf_sets, random_graph, tree_of
 
+from pcgraph import segment
 from pcgraph.features.moments import Moments
 from pcgraph.hierarchy import binary_children
 from pcgraph.tree.average_linkage import ConvexityLinkage
@@ -283,6 +285,19 @@ def test_faces_of_boxes_are_parts_and_boxes_are_objects(boxes):
     assert objects.max() + 1 == 3
     assert refines(parts, objects)
     assert len(np.unique(truth)) == objects.max() + 1
+
+
+def test_parts_lie_within_objects_and_objects_within_groups():
+    """Two planes far apart, with two boxes on each, of which three faces are seen: 14 parts, 6 objects, 2 groups."""
+    points, _, viewpoint = two_boxes_on_a_plane()
+    aside = np.array([0.0, 30.0, 0.0])
+    twice = np.concatenate((points, points + aside))
+    result = segment(twice, viewpoint=np.repeat([viewpoint, viewpoint + aside], len(points), axis=0))
+    levels = result.supervoxels, result.parts, result.labels, result.groups
+    assert [len(np.unique(level[level >= 0])) for level in levels[1:]] == [14, 6, 2]
+    assert all(refines(finer, coarser) for finer, coarser in itertools.pairwise(levels))
+    fine = segment(points, viewpoint=viewpoint, object_altitude=0.01)
+    assert np.array_equal(fine.parts, fine.labels)
 
 
 @pytest.mark.parametrize("shape", ["chain", "balanced"])
