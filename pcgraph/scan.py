@@ -44,7 +44,7 @@ from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_v
 from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface, roughness
-from pcgraph.voxels.visibility import likelier_place, telling_places, visible_fraction, visible_sides
+from pcgraph.voxels.visibility import likelier_place, sides_towards, telling_places, visible_fraction, visible_sides
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
@@ -376,23 +376,16 @@ def _scale(
         camera = position is not None and _is_camera(cloud, position, range_growth)
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
-    if camera:
-        law = None if position is not None else spacing_law(cloud.points)
+    if camera or (position is not None and not (may_grow and position.ndim == 1)):
+        law = spacing_law(cloud.points) if position is None else None
         warp = _warp(cloud, position, law, camera, growth)
         return _voxel_size(voxel_size, seed_size, partial(median_spacing, cloud.points, warp)), law, warp
-    if position is None:
-        (spacing, rows), of_all = side_by_side(
-            partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points)
-        )
-        law = law_on_rings(cloud.points, of_all, rows)
-        voxel = _voxel_size(voxel_size, seed_size, lambda: spacing)
-    else:
-        voxel, law = side_by_side(
-            partial(_voxel_size, voxel_size, seed_size, partial(median_spacing, cloud.points)),
-            lambda: spacing_law(cloud.points, position) if may_grow and position.ndim == 1 else None,
-        )
-    growth = RANGE_GROWTH if may_grow and law is not None and law.holds else growth
-    return voxel, law, _warp(cloud, position, law, camera, growth)
+    (spacing, rows), of_all = side_by_side(
+        partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position)
+    )
+    law = law_on_rings(cloud.points, of_all, rows, position)
+    growth = RANGE_GROWTH if may_grow and law.holds else growth
+    return _voxel_size(voxel_size, seed_size, lambda: spacing), law, _warp(cloud, position, law, camera, growth)
 
 
 def _warp(
@@ -442,10 +435,14 @@ def _outward_planes(
             )
         else:
             planes, telling = method.planes(grid, told), None
-        sides = visible_sides(grid, planes.normals, told, telling)
+        axis = None if law is None or told is None else law.axis
+        sides = visible_sides(grid, planes.normals, told, telling, axis)
         return sides.viewpoint, replace(planes, normals=sides.normals)
     if given.ndim == 1:
-        return given, method.planes(grid, given)
+        planes = method.planes(grid, given)
+        if law is not None and law.axis is not None:
+            planes = replace(planes, normals=sides_towards(grid, planes.normals, given, law.axis))
+        return given, planes
     low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
     return given, method.planes(grid, middle + reach * voxel_means((given - middle) / reach, grid))

@@ -32,6 +32,7 @@ _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings th
 _TINY, _FAR = float(np.finfo(np.float64).tiny), float(np.finfo(np.float32).max)
 _ROUNDING = 1e-12  # variance of readings that are all alike, about, as logarithms are in single precision
 _MIN_EXPLAINED = 0.55  # mean of what law and range explain
+_AT_VIEWPOINT = 0.05  # median ranges: so near to a viewpoint is the place that rings tell
 _MIN_ON_RINGS = 0.2  # the same where rings tell the place
 _MIN_HINT, _MIN_BY_RANGE = 0.2, 0.1  # the same, and what range explains alone, of a piece of a scan
 _MIN_EXPONENT = 0.5
@@ -141,7 +142,9 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
     )
 
 
-def law_on_rings(points: NDArray[np.float64], law: SpacingLaw, rows: Rows) -> SpacingLaw:
+def law_on_rings(
+    points: NDArray[np.float64], law: SpacingLaw, rows: Rows, viewpoint: NDArray[np.float64] | None = None
+) -> SpacingLaw:
     """The law about the place that rings of a turning scanner tell, if they do and it holds there; else as it was.
 
     Parameters
@@ -151,13 +154,27 @@ def law_on_rings(points: NDArray[np.float64], law: SpacingLaw, rows: Rows) -> Sp
         Of these points: the place from which that of the rings is searched, or the frame's origin, or the middle.
     rows : Rows
         Of these points.
+    viewpoint : (3,) float64, metres, optional
+        From where they were seen, which stays; rings about it tell the axis alone.
     """
     middle = np.median(rows.points, axis=0) if len(rows.points) else np.zeros(3)
-    scanner = scanner_of_rings(rows, np.stack((law.viewpoint, np.zeros(3), middle)))
+    starts = np.stack((law.viewpoint, np.zeros(3), middle)) if viewpoint is None else viewpoint[None]
+    scanner = scanner_of_rings(rows, starts)
     if scanner is None:
         return law
-    about = replace(spacing_law(points, scanner.place), axis=scanner.axis)
+    if viewpoint is None:
+        there = spacing_law(points, scanner.place)
+    elif _off(scanner.place, viewpoint, rows) <= _AT_VIEWPOINT:
+        there = law
+    else:
+        return law
+    about = replace(there, axis=scanner.axis)
     return about if about.holds else law
+
+
+def _off(place: NDArray[np.float64], viewpoint: NDArray[np.float64], rows: Rows) -> float:
+    """Distance of a place from a viewpoint, over the median range of rows."""
+    return float(np.linalg.norm(place - viewpoint) / np.median(np.linalg.norm(rows.points - viewpoint, axis=1)))
 
 
 class _Readings(NamedTuple):

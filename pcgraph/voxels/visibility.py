@@ -36,6 +36,7 @@ _HALVES = 14  # of space, whose outer places agreement starts from; and from all
 _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
+_NEARLY_EDGE_ON, _NEARLY_LEVEL = 0.1, 0.9  # cosines of the angles to the rays, and between a normal and the axis
 _TOLD = 40.0  # votes of the viewpoint for one of the places
 _CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
@@ -94,6 +95,7 @@ def visible_sides(
     normals: NDArray[np.float64],
     viewpoint: NDArray[np.float64] | None = None,
     telling: TellingPlaces | None = None,
+    axis: NDArray[np.float64] | None = None,
 ) -> VisibleSides:
     """The outer side of the surface at each voxel, found from what is visible.
 
@@ -107,6 +109,8 @@ def visible_sides(
         what is visible; if little does, nothing else is asked.
     telling : TellingPlaces, optional
         `telling_places(grid, viewpoint)`, where that is known.
+    axis : (3,) float64, optional
+        Of a scanner at the viewpoint, as for `sides_towards`.
 
     Notes
     -----
@@ -127,7 +131,7 @@ def visible_sides(
     middle, reach = _unit_frame(grid, grid.centroids)
     told = np.zeros(grid.n_voxels)
     if viewpoint is not None:
-        in_blocks(_face, grid.n_voxels, viewpoint, reach, grid.centroids, normals, told)
+        told = _cosines(grid, normals, viewpoint, axis, reach)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
             return VisibleSides(viewpoint, _turned(normals, told))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
@@ -148,6 +152,36 @@ def visible_sides(
         votes, smoothed = smoothed, votes
     seen_most = middle + reach * places[0] if viewpoint is None else viewpoint
     return VisibleSides(seen_most, _turned(normals, votes))
+
+
+def sides_towards(
+    grid: VoxelGrid, normals: NDArray[np.float64], place: NDArray[np.float64], axis: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Unit normals, (v, 3) float64, towards the place, (3,), of a scanner that turned about an axis, (3,) of length 1.
+
+    What is nearly level and seen edge-on, as the ground far from a sweep's scanner, and that between rings of which one
+    alone runs through a voxel, is taken to be level: normals that are two degrees off turned a tenth of it upside down.
+    """
+    reach = _unit_frame(grid, grid.centroids)[1]
+    return _turned(normals, _cosines(grid, normals, place, axis, reach))
+
+
+def _cosines(
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    place: NDArray[np.float64],
+    axis: NDArray[np.float64] | None,
+    reach: float,
+) -> NDArray[np.float64]:
+    """Cosine between each normal and the way to a place, (v,); about an axis, as `sides_towards` says."""
+    cosines = np.empty(grid.n_voxels)
+    in_blocks(_face, grid.n_voxels, place, reach, grid.centroids, normals, cosines)
+    if axis is not None:
+        along = np.einsum("ij,j->i", normals, axis)
+        level = np.flatnonzero((np.abs(cosines) < _NEARLY_EDGE_ON) & (np.abs(along) > _NEARLY_LEVEL))
+        ways = (place - grid.centroids[level]) / reach
+        cosines[level] = np.sign(along[level]) * np.einsum("ij,j->i", ways, axis) / _lengths(ways)
+    return cosines
 
 
 def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
