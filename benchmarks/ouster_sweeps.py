@@ -14,7 +14,7 @@ nothing else is said of it.
 
     told        by `rings`, `spacing`, or neither
     off, worst  distance of the place from the true one, over the median range
-    facing      voxels whose normals are turned to the scanner, in the worst turn
+    facing      voxels whose normals are turned to the scanner, of those not seen edge-on, in the worst turn
     objects     least and most of the four turns
 """
 
@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-TURNS = 4
+TURNS, EDGE_ON = 4, 0.1
 CAPTURES = (
     *("osfs/osf_fw_3.2_10scans.osf", "pcaps/OS-0-32-U1_v2.2.0_1024x10.pcap", "pcaps/OS-1-32-G_v2.1.1_1024x10.pcap"),
     *("pcaps/OS-2-32-U0_v2.0.0_1024x10.pcap", "pcaps/OS-1-64_1024x10_fw20.pcap", "osfs/single_scan_016.osf"),
@@ -91,7 +91,8 @@ def measure(folder: Path, pictures: Path | None) -> None:
             result = pcgraph.segment(moved)
             off.append(np.linalg.norm(result.viewpoint - place) / np.median(np.linalg.norm(points, axis=1)))
             rays = place - result.surface.grid.centroids
-            facing.append((np.einsum("ij,ij->i", rays, result.surface.normals) > 0.0).mean())
+            cosines = np.einsum("ij,ij->i", rays, result.surface.normals) / np.linalg.norm(rays, axis=1)
+            facing.append((cosines[np.abs(cosines) > EDGE_ON] > 0.0).mean())
             objects.append(int(result.objects.max()) + 1)
         how = max(set(told), key=told.count)
         row = {"told": how, "off": np.median(off), "worst": max(off), "facing": min(facing)}

@@ -5,10 +5,11 @@
 
 Every cloud is turned and moved by 100 m, N times. Columns:
 
-    told        fraction of the clouds that `spacing_law` says are one scan
+    told, rings fraction of the clouds that are said to be one scan, and of those whose rings told the place
     off, worst  distance from the true place to the one that `pcgraph.segment` returns, over the median range: median
                 and largest; of single scans
-    facing      fraction of the voxels whose normals are turned to the true place, least over the clouds; likewise
+    facing      fraction of the voxels whose normals are turned to the true place, of those that are not seen edge-on
+                (cosine below 0.1), least over the clouds; likewise
     covering    weighted overlap of the objects with the true segments, mean
 
 The last line is JSON: the same by kind.
@@ -43,7 +44,10 @@ from scanned_streets import place_over_lane, street
 
 import pcgraph
 from pcgraph.metrics import weighted_overlap
-from pcgraph.voxels.spacing_law import spacing_law
+from pcgraph.voxels.spacing import spacing_and_rows
+from pcgraph.voxels.spacing_law import law_on_rings, spacing_law
+
+EDGE_ON = 0.1  # cosine between a normal and the way to the scanner, below which noise says which way it faces
 
 Kept = NDArray[np.int64] | NDArray[np.bool_]
 
@@ -53,7 +57,7 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=4, metavar="N")
     turns = parser.parse_args().turns
     warnings.simplefilter("ignore")  # of viewpoints edge-on and the like: none is given here
-    print(f"{'':28s}{'clouds':>8s}{'told':>8s}{'off':>8s}{'worst':>8s}{'facing':>8s}{'covering':>10s}")
+    print(f"{'':28s}{'clouds':>8s}{'told':>8s}{'rings':>8s}{'off':>8s}{'worst':>8s}{'facing':>8s}{'covering':>10s}")
     report = {}
     for name, load in KINDS.items():
         try:
@@ -62,25 +66,41 @@ def main() -> None:
             print(f"{name}: left out, {missing}")
             continue
         rows = [_measured(turned(cloud, seed)) for cloud in clouds for seed in range(turns)]
-        told, off, facing, covering = (np.array(column, float) for column in zip(*rows, strict=True))
-        row = {"told": told.mean(), "off": np.median(off), "worst": off.max(), "facing": facing.min()}
+        told, rings, off, facing, covering = (np.array(column, float) for column in zip(*rows, strict=True))
+        row = {
+            "told": told.mean(),
+            "rings": rings.mean(),
+            "off": np.median(off),
+            "worst": off.max(),
+            "facing": facing.min(),
+        }
         row = {key: float(value) for key, value in row.items() if np.isfinite(value)}
         report[name] = {"clouds": len(rows), **row, "covering": float(covering.mean())}
-        numbers = "".join(f"{row[key]:8.3f}" if key in row else " " * 8 for key in ("told", "off", "worst", "facing"))
+        numbers = "".join(
+            f"{row[key]:8.3f}" if key in row else " " * 8 for key in ("told", "rings", "off", "worst", "facing")
+        )
         print(f"{name:28s}{len(rows):8d}{numbers}{covering.mean():10.3f}", flush=True)
     print(json.dumps(report))
 
 
-def _measured(sample: Sample) -> tuple[bool, float, float, float]:
+def _measured(sample: Sample) -> tuple[bool, bool, float, float, float]:
     result = pcgraph.segment(sample.points)
-    told = spacing_law(sample.points.astype(np.float64)).holds
+    points = sample.points.astype(np.float64)
+    told = law_on_rings(points, spacing_law(points), spacing_and_rows(points)[1])
     covering = float(weighted_overlap(result.labels, sample.truth))
     if sample.viewpoint is None:
-        return told, np.nan, np.nan, covering
+        return told.holds, told.axis is not None, np.nan, np.nan, covering
     far = np.median(np.linalg.norm(sample.points - sample.viewpoint, axis=1))
     rays = sample.viewpoint - result.surface.grid.centroids
-    facing = float((np.einsum("ij,ij->i", rays, result.surface.normals) > 0.0).mean())
-    return told, float(np.linalg.norm(result.viewpoint - sample.viewpoint) / far), facing, covering
+    cosines = np.einsum("ij,ij->i", rays, result.surface.normals) / np.linalg.norm(rays, axis=1)
+    facing = float((cosines[np.abs(cosines) > EDGE_ON] > 0.0).mean())
+    return (
+        told.holds,
+        told.axis is not None,
+        float(np.linalg.norm(result.viewpoint - sample.viewpoint) / far),
+        facing,
+        covering,
+    )
 
 
 def _sweeps() -> list[Sample]:
