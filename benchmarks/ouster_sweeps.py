@@ -9,8 +9,8 @@ contradict ours, so it reads them in an environment of its own:
     sdk/bin/python benchmarks/ouster_sweeps.py --unpack ouster_sdk-*/sdk/tests sweeps/
     python benchmarks/ouster_sweeps.py sweeps/ [--pictures out/]
 
-The scanner stands at the origin of its own frame; each sweep is turned and moved four times, as a list of points, and
-nothing else is said of it.
+The true place is that of the lenses in the scanner's own frame, by its calibration. Each sweep is turned and moved four
+times, as a list of points, and nothing else is said of it.
 
     told        by `rings`, `spacing`, or neither
     off, worst  distance of the place from the true one, over the median range
@@ -63,7 +63,8 @@ def unpack(tests: Path, folder: Path) -> None:
             points[ranges == 0] = np.nan
             image = {"points": points, "reflectivity": scan.field(ChanField.REFLECTIVITY)}
             image = {name: destagger(scan.sensor_info, values) for name, values in image.items()}
-            np.savez_compressed(folder / f"{Path(capture).stem}_{number}.npz", **image)
+            lenses = scan.sensor_info.lidar_to_sensor_transform[:3, 3] / 1000.0
+            np.savez_compressed(folder / f"{Path(capture).stem}_{number}.npz", **image, place=lenses)
 
 
 def measure(folder: Path, pictures: Path | None) -> None:
@@ -79,17 +80,17 @@ def measure(folder: Path, pictures: Path | None) -> None:
     report = {}
     for file in sorted(folder.glob("*.npz")):
         with np.load(file) as columns:
-            image, reflectivity = columns["points"], columns["reflectivity"]
+            image, reflectivity, lenses = columns["points"], columns["reflectivity"], columns["place"]
         points = image[np.isfinite(image).all(axis=-1)]
         off, facing, objects, told = [], [], [], []
         for seed in range(TURNS):
             rng = np.random.default_rng(seed)
-            turn, place = Rotation.random(rng=rng).as_matrix(), rng.uniform(-100.0, 100.0, 3)
-            moved = points @ turn.T + place
+            turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-100.0, 100.0, 3)
+            moved, place = points @ turn.T + shift, turn @ lenses + shift
             law = law_on_rings(moved, spacing_law(moved), spacing_and_rows(moved)[1])
             told.append("rings" if law.axis is not None else "spacing" if law.tells_place else "neither")
             result = pcgraph.segment(moved)
-            off.append(np.linalg.norm(result.viewpoint - place) / np.median(np.linalg.norm(points, axis=1)))
+            off.append(np.linalg.norm(result.viewpoint - place) / np.median(np.linalg.norm(points - lenses, axis=1)))
             rays = place - result.surface.grid.centroids
             cosines = np.einsum("ij,ij->i", rays, result.surface.normals) / np.linalg.norm(rays, axis=1)
             facing.append((cosines[np.abs(cosines) > EDGE_ON] > 0.0).mean())
@@ -115,7 +116,8 @@ def _picture(image: np.ndarray, reflectivity: np.ndarray, labels: np.ndarray, pa
     low_high = [np.nanpercentile(band[labels >= 0], (2, 98)) for band in bands]
     greys = [np.clip((band - low) / (high - low), 0.0, 1.0) for band, (low, high) in zip(bands, low_high, strict=True)]
     rows = [np.repeat((255 * np.nan_to_num(grey)).astype(np.uint8)[..., None], 3, axis=2) for grey in greys]
-    colors = label_colors(labels.reshape(-1)).reshape(*labels.shape, 3)
+    by_size = np.argsort(np.argsort(-np.bincount(labels[labels >= 0]), kind="stable"))  # colours of large ones differ
+    colors = label_colors(np.where(labels >= 0, by_size[labels], -1).reshape(-1)).reshape(*labels.shape, 3)
     tall = max(1, round(image.shape[1] / 4 / len(image)))
     path.parent.mkdir(parents=True, exist_ok=True)
     seen = np.isfinite(ranges)[..., None]
