@@ -21,6 +21,8 @@ _COARSE, _MIDDLE, _FINE = 0.2, 0.1, 0.02  # slopes of rows against their cones, 
 _TOO_STEEP = 0.6  # mean of g^2 / (g^2 + s^2), g being slopes and s the coarse one: no place from which to search
 _MOST_OFF = 0.3  # the same with the finer ones: no rings
 _MOST_UNCERTAIN = 0.05  # standard deviation of the place, in ranges
+_SINGULAR = 1e4  # condition of the derivatives: with more, some line of places does as well
+_NEAR = 0.2  # median ranges
 _LEAST_COSINE = 1e-3  # of an elevation
 _STEPS = 15  # of a search
 
@@ -80,12 +82,16 @@ def scanner_of_rings(rows: Rows, near: NDArray[np.float64]) -> Scanner | None:
 
 
 def _is_certain(rows: Rows, frame: NDArray[np.float64], unknown: NDArray[np.float64]) -> bool:
-    """Whether the slopes tell the place, and not only that it lies along some line, as those of parallel rows do."""
+    """Whether the slopes tell the place, and not only that it lies on some line, as those of level circles do."""
     slopes, derivatives = _slopes(rows, frame, unknown)
-    trusted = derivatives / np.hypot(1.0, slopes / _FINE)[:, None]
-    variance = np.linalg.eigvalsh(np.linalg.pinv(trusted.T @ trusted)[:3, :3])[-1]
     ranges = np.linalg.norm(rows.points - unknown[:3], axis=1)
-    return bool(_FINE * np.sqrt(variance) <= _MOST_UNCERTAIN * np.median(ranges))
+    typical = float(np.median(ranges))
+    far = ranges > _NEAR * typical  # rows beside any place that is asked about seem to tell it
+    trusted = derivatives[far] / np.hypot(1.0, slopes[far] / _FINE)[:, None]
+    if np.linalg.cond(trusted) > _SINGULAR:
+        return False
+    variance = np.linalg.eigvalsh(np.linalg.inv(trusted.T @ trusted)[:3, :3])[-1]
+    return bool(_FINE * np.sqrt(variance) <= _MOST_UNCERTAIN * typical)
 
 
 def _flattest(rows: Rows, frame: NDArray[np.float64], start: NDArray[np.float64], scale: float) -> NDArray[np.float64]:

@@ -36,7 +36,8 @@ _HALVES = 14  # of space, whose outer places agreement starts from; and from all
 _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
-_NEARLY_EDGE_ON, _NEARLY_LEVEL = 0.1, 0.9  # cosines of the angles to the rays, and between a normal and the axis
+_NEARLY_EDGE_ON, _SEEN_WELL = 0.1, 0.2  # cosines between normals and rays, less and more
+_NEARLY_LEVEL, _LEVEL_INDEED, _FEW_LEVEL = 0.9, 0.97, 20  # cosines to the axis, and to what is level; voxels
 _TOLD = 40.0  # votes of the viewpoint for one of the places
 _CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
@@ -160,7 +161,9 @@ def sides_towards(
     """Unit normals, (v, 3) float64, towards the place, (3,), of a scanner that turned about an axis, (3,) of length 1.
 
     What is nearly level and seen edge-on, as the ground far from a sweep's scanner, and that between rings of which one
-    alone runs through a voxel, is taken to be level: normals that are two degrees off turned a tenth of it upside down.
+    alone runs through a voxel, faces as what is level and seen well does, if that is the side of the scanner: normals
+    that are two degrees off turned a tenth of it upside down. Level is what lies across the mean normal of that, as
+    scanners may be tilted. The other way, as ground that rises above the scanner, its own normals decide.
     """
     reach = _unit_frame(grid, grid.centroids)[1]
     return _turned(normals, _cosines(grid, normals, place, axis, reach))
@@ -176,12 +179,33 @@ def _cosines(
     """Cosine between each normal and the way to a place, (v,); about an axis, as `sides_towards` says."""
     cosines = np.empty(grid.n_voxels)
     in_blocks(_face, grid.n_voxels, place, reach, grid.centroids, normals, cosines)
-    if axis is not None:
-        along = np.einsum("ij,j->i", normals, axis)
-        level = np.flatnonzero((np.abs(cosines) < _NEARLY_EDGE_ON) & (np.abs(along) > _NEARLY_LEVEL))
-        ways = (place - grid.centroids[level]) / reach
-        cosines[level] = np.sign(along[level]) * np.einsum("ij,j->i", ways, axis) / _lengths(ways)
+    if axis is None:
+        return cosines
+    upwards = _upwards(normals, cosines, axis)
+    along = np.einsum("ij,j->i", normals, upwards)
+    level = np.flatnonzero((np.abs(cosines) < _NEARLY_EDGE_ON) & (np.abs(along) > _NEARLY_LEVEL))
+    ways = (place - grid.centroids[level]) / reach
+    heights = np.einsum("ij,j->i", ways, upwards) / _lengths(ways)
+    below = heights > 0.0
+    cosines[level[below]] = (np.sign(along[level]) * heights)[below]
     return cosines
+
+
+def _upwards(
+    normals: NDArray[np.float64], cosines: NDArray[np.float64], axis: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Where most of what is nearly level and seen well faces, (3,) of length 1: near an axis, which may be tilted."""
+    clear = np.abs(cosines) > _SEEN_WELL
+    facing = normals[clear] * np.sign(cosines[clear])[:, None]
+    upwards = axis
+    for least in (_NEARLY_LEVEL, _LEVEL_INDEED):
+        along = np.einsum("ij,j->i", facing, upwards)
+        near = np.abs(along) > least
+        if np.count_nonzero(near) < _FEW_LEVEL:
+            break
+        mean = np.sign(along[near]) @ facing[near]
+        upwards = mean / np.linalg.norm(mean) * (1.0 if np.sign(along[near]).sum() >= 0.0 else -1.0)
+    return upwards
 
 
 def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:

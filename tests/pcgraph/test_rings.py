@@ -134,19 +134,52 @@ def test_rows_are_free_of_order():
     assert len(one[1].points) > 400
 
 
+def ground_before_a_ramp(seed, beams, tilt, slope):
+    """Street of 30 m width whose ground rises by a slope from 10 m on, and a scanner 1.8 m above it, 2 cm of noise.
+
+    Points, the place, and the height of the ground below each x.
+    """
+    rng, place = np.random.default_rng(seed), np.array([0.0, 0.0, 1.8])
+    rays = rays_at(np.radians(beams), np.radians(np.arange(0.1, 360.0, 0.2)))
+    rays = rays @ Rotation.from_euler("y", tilt, degrees=True).as_matrix().T
+    with np.errstate(divide="ignore"):
+        level, walls = -1.8 / rays[:, 2], 15.0 / np.abs(rays[:, 1])
+        ramp = (-1.8 - 10.0 * slope) / (rays[:, 2] - slope * rays[:, 0])
+    level = np.where((level > 0.0) & (level * rays[:, 0] < 10.0), level, np.inf)
+    ramp = np.where((ramp > 0.0) & (ramp * rays[:, 0] >= 10.0), ramp, np.inf)
+    ranges = np.minimum(np.minimum(level, ramp), walls) + rng.normal(0.0, 0.02, len(rays))
+    points = (rays * ranges[:, None])[ranges < 80.0] + place
+    return points, place, lambda x: slope * np.maximum(x - 10.0, 0.0)
+
+
 @pytest.mark.parametrize("given", [False, True])
-def test_the_ground_far_from_a_scanner_is_seen_from_above(given):
-    """At 30 m rays from 1.5 m above meet it at three degrees, of which noise of the normals takes a good part."""
-    turn, rng = turned(1), np.random.default_rng(1)
-    rays = rays_at(np.radians(np.linspace(-24.0, -2.0, 64)), np.radians(np.arange(0.1, 360.0, 0.2)))
-    walls = (
-        np.where(rays[:, 0] > 0.0, 28.0, -25.0) / rays[:, 0]
-    )  # of which none is seen: the rays meet the ground first
-    ranges = np.minimum(-1.5 / rays[:, 2], walls) + rng.normal(0.0, 0.02, len(rays))
-    place = np.array([7.0, -4.0, 30.0])
-    moved = (rays * ranges[:, None]) @ turn.T + place
-    result = pcgraph.segment(moved, viewpoint=place if given else None)
-    assert np.linalg.norm(result.viewpoint - place) < 0.1  # m
-    heights = (result.surface.grid.centroids - place) @ turn[:, 2]
-    upwards = (result.surface.normals @ turn[:, 2])[heights < -1.4]
-    assert (upwards[np.abs(upwards) > 0.9] > 0.0).mean() > 0.99
+@pytest.mark.parametrize(
+    ("beams", "tilt", "slope"),
+    [
+        (np.linspace(-24.9, 2.0, 64), 0.0, 0.0),
+        (np.linspace(-24.9, 2.0, 64), 0.0, 0.08),
+        (np.linspace(-15.0, 15.0, 16), 15.0, 0.0),
+        (np.linspace(-15.0, 15.0, 16), 0.0, 0.12),
+    ],
+)
+def test_the_ground_is_seen_from_above(beams, tilt, slope, given):
+    """Far off, rays meet it at two degrees, of which noise of the normals takes a good part; it may rise above the
+    scanner, and that may be tilted."""
+    points, place, height = ground_before_a_ramp(0, beams, tilt, slope)
+    turn, shift = turned(1), np.array([7.0, -4.0, 30.0])
+    result = pcgraph.segment(points @ turn.T + shift, viewpoint=turn @ place + shift if given else None)
+    assert np.linalg.norm(result.viewpoint - shift - turn @ place) < 0.05  # m
+    where = (result.surface.grid.centroids - shift) @ turn
+    upwards = (result.surface.normals @ turn)[:, 2]
+    on_ground = (np.abs(where[:, 2] - height(where[:, 0])) < 0.25) & (np.abs(where[:, 1]) < 14.5)
+    assert (upwards[on_ground & (np.abs(upwards) > 0.9)] > 0.0).mean() > 0.98
+
+
+def test_circles_about_an_axis_are_no_rings():
+    """Of a cone, a bowl or a disc in rings: any place on the axis would do."""
+    angles, radii = np.arange(500) * 2.0 * np.pi / 500, np.geomspace(0.02, 1.0, 60)
+    circle = np.stack((np.cos(angles), np.sin(angles), np.zeros(500)), axis=1)
+    for heights in (2.0 - 2.0 * radii, -np.sqrt(1.0 - radii**2), 0.3 * radii, 0.0 * radii):
+        rings = radii[:, None, None] * circle + heights[:, None, None] * (0.0, 0.0, 1.0)
+        points = rings.reshape(-1, 3) @ turned(0).T + 2.0
+        assert law_on_rings(points, spacing_law(points), spacing_and_rows(points)[1]).axis is None
