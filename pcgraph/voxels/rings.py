@@ -60,14 +60,14 @@ def scanner_of_rings(rows: Rows, near: NDArray[np.float64]) -> Scanner | None:
     rows = Rows(*(column[:_MAX_ROWS] for column in rows))
     if len(rows.points) < _MIN_ROWS:
         return None
+    squares, frame = np.linalg.eigh(rows.directions.T @ rows.directions)  # the axis first, as rings are nearly level
+    if squares[1] < _NOT_PARALLEL * len(rows.points):  # as rows of an image are, which tell no place
+        return None
     low, high = rows.points.min(axis=0), rows.points.max(axis=0)
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
     if reach == 0.0:
         return None
     rows = rows._replace(points=(rows.points - middle) / reach)
-    squares, frame = np.linalg.eigh(rows.directions.T @ rows.directions)  # the axis first, as rings are nearly level
-    if squares[1] < _NOT_PARALLEL * len(rows.points):  # as rows of an image are, which tell no place
-        return None
     some = Rows(*(column[:_SOME_ROWS] for column in rows))
     starts = np.column_stack(((near - middle) / reach, np.zeros((len(near), 2))))
     steepness = np.array([_steepness(some, frame, start, _COARSE) for start in starts])

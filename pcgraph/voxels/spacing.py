@@ -21,6 +21,7 @@ _NEIGHBOUR = 8
 _MANY_BESIDE = 512  # points in 27 cells, at most, that are looked at
 _FEW_CUT_OFF = 0.05  # of the points have more beside them
 _NEARLY_ALL = 0.95  # of the points (in one place: the others are outliers)
+_ROWS_OF_CELLS = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))  # the near ones first
 _NO_SPACING_M = 0.01
 _IN_ROWS = 1280  # points of which it is asked whether they lie in a row
 _ROW = 0.25  # of the way between a point's two nearest: it lies no farther off their line
@@ -113,10 +114,11 @@ def _rows(crowd: NDArray[np.float64], found: _Near, edge: float) -> Rows:
     points = crowd[: found.nearest.shape[1]][has_two]
     one, other = (crowd[found.nearest[:, has_two]] - points) / edge
     way = other - one
-    length = np.linalg.norm(way, axis=1)
-    off = np.linalg.norm(np.cross(one, other), axis=1)
-    in_row = (np.einsum("ij,ij->i", one, other) < 0.0) & (off <= _ROW * length * length) & (length > 0.0)
-    return Rows(points[in_row], way[in_row] / length[in_row, None])
+    squares = np.einsum("ij,ij->i", way, way)
+    between = np.einsum("ij,ij->i", one, other)
+    off = np.einsum("ij,ij->i", one, one) * np.einsum("ij,ij->i", other, other) - between * between  # area, squared
+    in_row = (between < 0.0) & (off <= (_ROW * squares) ** 2) & (squares > 0.0)
+    return Rows(points[in_row], way[in_row] / np.sqrt(squares[in_row])[:, None])
 
 
 def _edge_for_neighbours(points: NDArray[np.float64], low: NDArray[np.float64], extent: float) -> float:
@@ -164,7 +166,7 @@ def _find_near(
     sample: NDArray[np.int64],
     found: _Near,
 ) -> None:
-    """Set what `_near` returns, within a reach: nine pointers gallop along the sorted keys, the own row's first.
+    """Set what `_near` returns, within a reach: nine pointers gallop along the sorted keys.
 
     Rows of cells that lie farther off than the eighth nearest are left out.
     """
@@ -173,7 +175,7 @@ def _find_near(
         own, beside, s = sample[i], 0, order[sample[i]]
         squares[:] = np.inf
         for row in range(9):
-            across, along = (row + 4) % 9 // 3 - 1, (row + 4) % 3 - 1
+            across, along = _ROWS_OF_CELLS[row]
             x = reach * (in_cell[s, 0] if across < 0 else across * (1.0 - in_cell[s, 0]))
             y = reach * (in_cell[s, 1] if along < 0 else along * (1.0 - in_cell[s, 1]))
             if x * x + y * y >= squares[_NEIGHBOUR - 1]:
