@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-TURNS, EDGE_ON = 4, 0.1
+TURNS = 4
 CAPTURES = (
     *("osfs/osf_fw_3.2_10scans.osf", "pcaps/OS-0-32-U1_v2.2.0_1024x10.pcap", "pcaps/OS-1-32-G_v2.1.1_1024x10.pcap"),
     *("pcaps/OS-2-32-U0_v2.0.0_1024x10.pcap", "pcaps/OS-1-64_1024x10_fw20.pcap", "osfs/single_scan_016.osf"),
@@ -70,6 +70,7 @@ def unpack(tests: Path, folder: Path) -> None:
 def measure(folder: Path, pictures: Path | None) -> None:
     """Print one line per sweep, and JSON."""
     from scipy.spatial.transform import Rotation
+    from scores import fraction_facing
 
     import pcgraph
     from pcgraph.voxels.spacing import spacing_and_rows
@@ -91,9 +92,7 @@ def measure(folder: Path, pictures: Path | None) -> None:
             told.append("rings" if law.axis is not None else "spacing" if law.tells_place else "neither")
             result = pcgraph.segment(moved)
             off.append(np.linalg.norm(result.viewpoint - place) / np.median(np.linalg.norm(points - lenses, axis=1)))
-            rays = place - result.surface.grid.centroids
-            cosines = np.einsum("ij,ij->i", rays, result.surface.normals) / np.linalg.norm(rays, axis=1)
-            facing.append((cosines[np.abs(cosines) > EDGE_ON] > 0.0).mean())
+            facing.append(fraction_facing(result, place))
             objects.append(int(result.objects.max()) + 1)
         how = max(set(told), key=told.count)
         row = {"told": how, "off": np.median(off), "worst": max(off), "facing": min(facing)}
@@ -108,6 +107,7 @@ def measure(folder: Path, pictures: Path | None) -> None:
 def _picture(image: np.ndarray, reflectivity: np.ndarray, labels: np.ndarray, path: Path) -> None:
     """Range, reflectivity and objects, one above the other, a column per azimuth."""
     from PIL import Image
+    from scores import largest
 
     from pcgraph.io.segmentation_files import label_colors
 
@@ -116,8 +116,8 @@ def _picture(image: np.ndarray, reflectivity: np.ndarray, labels: np.ndarray, pa
     low_high = [np.nanpercentile(band[labels >= 0], (2, 98)) for band in bands]
     greys = [np.clip((band - low) / (high - low), 0.0, 1.0) for band, (low, high) in zip(bands, low_high, strict=True)]
     rows = [np.repeat((255 * np.nan_to_num(grey)).astype(np.uint8)[..., None], 3, axis=2) for grey in greys]
-    by_size = np.argsort(np.argsort(-np.bincount(labels[labels >= 0]), kind="stable"))  # colours of large ones differ
-    colors = label_colors(np.where(labels >= 0, by_size[labels], -1).reshape(-1)).reshape(*labels.shape, 3)
+    by_size = np.where(labels >= 0, largest(labels, labels.size), -1)  # so that the colours of large ones differ
+    colors = label_colors(by_size.reshape(-1)).reshape(*labels.shape, 3)
     tall = max(1, round(image.shape[1] / 4 / len(image)))
     path.parent.mkdir(parents=True, exist_ok=True)
     seen = np.isfinite(ranges)[..., None]

@@ -41,13 +41,12 @@ from numpy.typing import NDArray
 from scanned_rooms import flat, office, stations
 from scanned_scenes import Floats, rays_at, scan, sphere_of_rays
 from scanned_streets import place_over_lane, street
+from scores import fraction_facing
 
 import pcgraph
 from pcgraph.metrics import weighted_overlap
 from pcgraph.voxels.spacing import spacing_and_rows
 from pcgraph.voxels.spacing_law import law_on_rings, spacing_law
-
-EDGE_ON = 0.1  # cosine between a normal and the way to the scanner, below which noise says which way it faces
 
 Kept = NDArray[np.int64] | NDArray[np.bool_]
 
@@ -91,9 +90,7 @@ def _measured(sample: Sample) -> tuple[bool, bool, float, float, float]:
     if sample.viewpoint is None:
         return told.holds, told.axis is not None, np.nan, np.nan, covering
     far = np.median(np.linalg.norm(sample.points - sample.viewpoint, axis=1))
-    rays = sample.viewpoint - result.surface.grid.centroids
-    cosines = np.einsum("ij,ij->i", rays, result.surface.normals) / np.linalg.norm(rays, axis=1)
-    facing = float((cosines[np.abs(cosines) > EDGE_ON] > 0.0).mean())
+    facing = fraction_facing(result, sample.viewpoint)
     return (
         told.holds,
         told.axis is not None,

@@ -6,10 +6,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+import pcgraph
 from pcgraph.metrics.labellings import contingency, intersections_over_union, largest_of_groups
 
 Row = dict[str, float]
 """Scores by name."""
+
+EDGE_ON = 0.1  # cosine between a normal and the way to a place, below which noise says which way it faces
+
+
+def fraction_facing(result: pcgraph.Segmentation, place: NDArray[np.float64]) -> float:
+    """Fraction of the voxels that face a place, (3,), of those that are not seen edge-on from there."""
+    rays = place - result.surface.grid.centroids
+    cosines = np.einsum("ij,ij->i", rays, result.surface.normals) / np.linalg.norm(rays, axis=1)
+    return float((cosines[np.abs(cosines) > EDGE_ON] > 0.0).mean())
 
 
 def mean_overlap(labels: NDArray[np.integer], truth: NDArray[np.int32], chosen: NDArray[np.integer]) -> float:
