@@ -39,6 +39,7 @@ from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
@@ -324,7 +325,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     (leaf_of_point, leaves), touching = side_by_side(with_points, lambda: contacts(grid, normals, supervoxels))
     nodes = node_features(leaves)
     near = gaps(grid, normals, supervoxels, nodes, touching.edges)
-    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near)
+    told_by_colors = color_evidence(grid, normals)
+    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near, told_by_colors)
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(

@@ -107,12 +107,15 @@ class AdjacencyGraph(ShortRepr):
         One row per supervoxel.
     gaps : Gaps, optional
         Supervoxels that nearly touch. They are no edges, but a linkage may merge across them.
+    color_evidence : float, 0..1
+        How far colours change where surfaces do (`pcgraph.voxels.evidence.edge_evidence`): what they are worth.
     """
 
     edges: NDArray[np.int32]
     edge_features: EdgeFeatures
     node_features: NodeFeatures
     gaps: Gaps | None = None
+    color_evidence: float = 1.0
 
     def _counts(self) -> str:
         return f"{self.n_nodes} nodes, {len(self.edges)} edges"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import root_of
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
+from pcgraph.voxels.evidence import autocorrelation
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 
 EARLY_SWEEPS = 1.8
@@ -104,35 +105,6 @@ def _contrast(features: NDArray[np.float64], i: int, means: NDArray[np.float64],
     for column in range(9, features.shape[1]):
         squares += (features[i, column] - means[s, column]) ** 2
     return weight * np.sqrt(squares)
-
-
-def autocorrelation(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
-    """How alike touching voxels are in each of d columns, (v, d), (d,) float64: 0 for noise, near 1 for a smooth field.
-
-    Notes
-    -----
-    1 - C, no less than 0, where C is the mean square difference of touching voxels over twice the variance of all
-    (Geary 1954); 0 where all are equal.
-    """
-    squares = _sums_of_squares(values, values.mean(axis=0), grid.indptr, grid.neighbours)
-    pairs = max(len(grid.neighbours), 1)
-    twice = 2.0 * squares[1] / max(grid.n_voxels - 1, 1)
-    ratio = np.divide(squares[0] / pairs, twice, out=np.ones_like(twice), where=twice > 0.0)
-    return np.maximum(1.0 - ratio, 0.0) if len(grid.neighbours) else np.zeros_like(twice)
-
-
-@kernel
-def _sums_of_squares(
-    values: NDArray[np.float64], means: NDArray[np.float64], indptr: NDArray[np.int64], neighbours: NDArray[np.int32]
-) -> NDArray[np.float64]:
-    """Sums of squared differences of touching voxels, and of squared distances to the mean, (2, d)."""
-    sums = np.zeros((2, values.shape[1]))
-    for i in range(len(values)):
-        for column in range(values.shape[1]):
-            sums[1, column] += (values[i, column] - means[column]) ** 2
-            for a in range(indptr[i], indptr[i + 1]):
-                sums[0, column] += (values[i, column] - values[neighbours[a], column]) ** 2
-    return sums
 
 
 @routine

@@ -22,6 +22,7 @@ from pcgraph.supervoxels.clustering import (
 )
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.voxels.cells import fetch_batch
+from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
 from pcgraph.voxels.surface import LocalPlanes, local_planes
 
@@ -36,10 +37,11 @@ class SurfaceGrowth(SupervoxelMethod):
     ----------
     color_weight, spatial_weight, normal_weight : float, >= 0
         What counts in the distance of a voxel to a supervoxel: colours in 0..1, metres over the seed size, and one
-        minus the cosine of normals; w_c, w_s and w_n of Papon et al. 2013, equation 7.
+        minus the cosine of normals; w_c, w_s and w_n of Papon et al. 2013, equation 7. Colours count so much if they
+        change where surfaces do; noise and patterns count for nothing (`pcgraph.voxels.evidence.edge_evidence`).
     feature_weight : float, >= 0
         The same for the features given to `pcgraph.segment`, in robust spreads: what one spread counts, if touching
-        voxels are alike in it; noise counts for nothing (`pcgraph.supervoxels.clustering.autocorrelation`).
+        voxels are alike in it; noise counts for nothing (`pcgraph.voxels.evidence.autocorrelation`).
 
     Notes
     -----
@@ -49,7 +51,7 @@ class SurfaceGrowth(SupervoxelMethod):
     surface, its voxel's or one that touches it, on whose plane it lies.
     """
 
-    color_weight: float = 0.1
+    color_weight: float = 1.0
     spatial_weight: float = 0.2
     normal_weight: float = 1.0
     feature_weight: float = 0.1
@@ -66,7 +68,8 @@ class SurfaceGrowth(SupervoxelMethod):
         self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, initial: NDArray[np.int32]
     ) -> NDArray[np.int32]:
         """Supervoxels by expansion and k-means sweeps along their boundaries."""
-        weights = self.spatial_weight / seed_size, self.normal_weight, self.color_weight
+        color = self.color_weight * color_evidence(grid, normals)
+        weights = self.spatial_weight / seed_size, self.normal_weight, color
         metric = Metric(*weights, two_sided=False, feature=self.feature_weight)
         voxels = voxel_graph(grid, normals, metric)
         seeds = seed_voxels(grid, normals, seed_size, two_sided=False)

@@ -31,7 +31,8 @@ class RegionLinkage(Linkage):
     gap : float, radians per voxel edge, >= 0
         What a gap costs beyond one voxel edge.
     color : float, voxel edges, >= 0
-        Distance that a difference of 1 counts for, in a colour of 0..1.
+        Distance that a difference of 1 counts for, in a colour of 0..1, if colours change where surfaces do; less as
+        they do not (`AdjacencyGraph.color_evidence`).
 
     Notes
     -----
@@ -54,7 +55,7 @@ class RegionLinkage(Linkage):
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     gap: float = 0.15
-    color: float = 1.0
+    color: float = 2.0
 
     default_object_altitude = 0.4
     default_part_altitude = 0.06
@@ -73,7 +74,7 @@ class RegionLinkage(Linkage):
             across = self.cost(gaps.edge_features) + self.gap * (gaps.widths - 1.0)
             edges, costs = np.concatenate((edges, gaps.edges)), np.concatenate((costs, across))
             weights = np.concatenate((weights, gaps.weights))
-        return region_linkage(graph, leaves, edges, costs, weights, self.color)
+        return region_linkage(graph, leaves, edges, costs, weights, self.color * graph.color_evidence)
 
 
 _STEPS = float(1 << 20)

@@ -17,9 +17,6 @@ from pcgraph.columns import CLIP, RobustScaling
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.io.ply import encode_ply
 from pcgraph.metrics import undersegmentation_error
-from pcgraph.supervoxels.clustering import autocorrelation
-from pcgraph.voxels.grid import voxel_grid
-from pcgraph.voxels.warp import Warp
 
 SQUARE = patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0))
 HALF = (SQUARE[:, 0] > 0.4133).astype(int)
@@ -184,17 +181,6 @@ def test_features_without_points_change_no_other_moment():
     with_features = moments_of_groups(points, None, groups, 3, rng.random((90, 2)).astype(np.float32))
     assert with_features.colors is None
     assert np.array_equal(with_features.scatters, moments_of_groups(points, None, groups, 3).scatters)
-
-
-def test_autocorrelation_of_noise_and_of_fields():
-    grid = voxel_grid(SQUARE, None, 0.011, Warp())
-    x = grid.centroids[:, 0]
-    noise = np.random.default_rng(0).standard_normal(grid.n_voxels)
-    columns = np.stack((noise, x, np.round(x), np.zeros_like(x), x + noise * x.std()), axis=1)
-    found = autocorrelation(columns, grid)
-    assert found == pytest.approx([0.0, 1.0, 1.0, 0.0, 0.5], abs=0.05)
-    lone = voxel_grid(np.eye(3), None, 0.01, Warp())
-    assert autocorrelation(np.eye(3), lone).tolist() == [0, 0, 0]
 
 
 # --- scans that follow ------------------------------------------------------------------------------------------------
