@@ -16,3 +16,20 @@ def root_of(links: NDArray[np.integer], element: int) -> int:
         links[element] = links[links[element]]
         element = links[element]
     return element
+
+
+@kernel
+def connected_components(edges: NDArray[np.int32], n: int) -> NDArray[np.int32]:
+    """Component of each of n nodes that edges, (m, 2) int32, join, (n,) int32, numbered in the order of first nodes."""
+    links = np.arange(n)
+    for edge in range(len(edges)):
+        a, b = root_of(links, edges[edge, 0]), root_of(links, edges[edge, 1])
+        links[max(a, b)] = min(a, b)
+    components, found = np.empty(n, np.int32), 0
+    for node in range(n):
+        root = root_of(links, node)
+        if root == node:
+            components[node], found = found, found + 1
+        else:
+            components[node] = components[root]
+    return components

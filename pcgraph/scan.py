@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import (
@@ -325,8 +326,9 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     (leaf_of_point, leaves), touching = side_by_side(with_points, lambda: contacts(grid, normals, supervoxels))
     nodes = node_features(leaves)
     near = gaps(grid, normals, supervoxels, nodes, touching.edges)
+    across = bridges(grid, supervoxels, np.concatenate((touching.edges, near.edges)))
     told_by_colors = color_evidence(grid, normals)
-    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near, told_by_colors)
+    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near, across, told_by_colors)
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(

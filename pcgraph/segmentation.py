@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.columns import RobustScaling
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.supervoxels.method import SupervoxelMethod
@@ -101,9 +102,12 @@ class Segmentation:
         """Group of each point, in the input's shape, negative as in `labels`: what hangs together, such as a table with
         all that stands on it.
 
-        Each holds whole objects, and comes near no other: the cut below infinity.
+        Each holds whole objects, and comes near no other: what contacts, gaps and objects join.
         """
-        return self.cut(altitude=np.finfo(np.float64).max)
+        k = len(self.objects)
+        first = np.unique(self.objects, return_index=True)[1][self.objects]
+        whole = np.stack((np.arange(k), first), axis=1).astype(np.int32)
+        return self._segments_on_points(connected_components(np.concatenate((self.graph.joined, whole)), k))
 
     @property
     def camera(self) -> bool:
@@ -117,9 +121,7 @@ class Segmentation:
 
     def cut(self, n: int | None = None, altitude: float | None = None, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each point in the input's shape, negative as in `labels`; see `SegmentationTree.cut`."""
-        segments = self.on_points(self.tree.cut(n, altitude, min_size))
-        segments[self.outliers] = OUTLIER
-        return segments
+        return self._segments_on_points(self.tree.cut(n, altitude, min_size))
 
     def on_points(self, values: ArrayLike) -> NDArray[Any]:
         """Values of supervoxels on the points, in the input's shape + s.
@@ -202,6 +204,11 @@ class Segmentation:
             normals = normals[surface.grid.voxel_of_point]
         leaves = primitive_moments(places, normals, groups, self.tree.n_leaves)
         return fit_primitives(primitive_moments_up_tree(leaves, self.tree.parents))
+
+    def _segments_on_points(self, of_leaf: NDArray[np.int32]) -> NDArray[np.int32]:
+        segments = self.on_points(of_leaf)
+        segments[self.outliers] = OUTLIER
+        return segments
 
     def _spread(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
         """Values of the finite points in the input's shape."""

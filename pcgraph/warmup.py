@@ -29,6 +29,7 @@ from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.bridges import bridges
 from pcgraph.graph.gaps import gaps
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
@@ -131,7 +132,7 @@ def compile_the_rest() -> None:
 
 def _compile_graph_and_tree() -> None:
     """Compile what it takes from supervoxels to objects."""
-    places = np.array([[0.0, 0, 1], [0.1, 0, 1], [0.2, 0, 1], [0.2, 0.1, 1.1]])
+    places = np.array([[0.0, 0, 1], [0.1, 0, 1], [0.2, 0, 1], [1.2, 0.1, 1.1]])  # three in a row and one apart
     n = len(places)
     labels, each = np.arange(n, dtype=np.int32), np.arange(n)
     grid = VoxelGrid(
@@ -146,14 +147,15 @@ def _compile_graph_and_tree() -> None:
         centroids=places,
         edge_lengths=np.full(n, 0.1),
         colors=None,
-        indptr=np.array([0, 1, 3, 5, 6]),
-        neighbours=np.array([1, 0, 2, 1, 3, 2], np.int32),
+        indptr=np.array([0, 1, 3, 4, 4]),
+        neighbours=np.array([1, 0, 2, 1], np.int32),
     )
     normals = np.tile([0.0, 0, -1], (n, 1))
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
     near = gaps(grid, normals, labels, nodes, touching.edges)
-    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near)
+    across = bridges(grid, labels, np.concatenate((touching.edges, near.edges)))
+    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, across)
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
 from pcgraph.short_repr import ShortRepr
@@ -94,6 +95,23 @@ class Gaps(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
+class Bridges(ShortRepr):
+    """Ways between components, which neither contacts nor gaps join; one row per pair of components.
+
+    Attributes
+    ----------
+    edges : (b, 2) int32
+        The two supervoxels of both that lie nearest to each other, i < j, in ascending order. With contacts and
+        gaps they join all supervoxels.
+    widths : (b,) float64, voxel edges
+        Distance between centroids of two of their voxels, each the other's nearest; a million at most.
+    """
+
+    edges: NDArray[np.int32]
+    widths: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class AdjacencyGraph(ShortRepr):
     """Supervoxels as nodes and their contacts as edges.
 
@@ -107,6 +125,8 @@ class AdjacencyGraph(ShortRepr):
         One row per supervoxel.
     gaps : Gaps, optional
         Supervoxels that nearly touch. They are no edges, but a linkage may merge across them.
+    bridges : Bridges, optional
+        Ways between what does not come that near. They are no edges either.
     color_evidence : float, 0..1
         How far colours change where surfaces do (`pcgraph.voxels.evidence.edge_evidence`): what they are worth.
     """
@@ -115,6 +135,7 @@ class AdjacencyGraph(ShortRepr):
     edge_features: EdgeFeatures
     node_features: NodeFeatures
     gaps: Gaps | None = None
+    bridges: Bridges | None = None
     color_evidence: float = 1.0
 
     def _counts(self) -> str:
@@ -124,6 +145,16 @@ class AdjacencyGraph(ShortRepr):
     def n_nodes(self) -> int:
         """Number of supervoxels."""
         return len(self.node_features.size)
+
+    @property
+    def joined(self) -> NDArray[np.int32]:
+        """Pairs of supervoxels that touch or nearly touch, (m + g, 2) int32."""
+        return self.edges if self.gaps is None else np.concatenate((self.edges, self.gaps.edges))
+
+    @property
+    def components(self) -> NDArray[np.int32]:
+        """Component of each supervoxel, (k,) int32: what contacts and gaps join, in the order of first supervoxels."""
+        return connected_components(self.joined, self.n_nodes)
 
     def to_networkx(self, occlusions: Occlusions | None = None) -> networkx.Graph:
         """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names.

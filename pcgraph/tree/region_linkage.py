@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
-from pcgraph.inputs import non_negative
 from pcgraph.parallel import inlined, kernel
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, unite
-from pcgraph.tree.linkage import Linkage, Merges, check_cost
+from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
 
 
 @dataclass(frozen=True)
@@ -30,6 +29,8 @@ class RegionLinkage(Linkage):
         Cost of an edge, radians.
     gap : float, radians per voxel edge, >= 0
         What a gap costs beyond one voxel edge.
+    bridge : float, radians per voxel edge, >= 0
+        What a bridge between parts that come no nearer costs.
     color : float, voxel edges, >= 0
         Distance that a difference of 1 counts for, in a colour of 0..1, if colours change where surfaces do; less as
         they do not (`AdjacencyGraph.color_evidence`).
@@ -47,7 +48,10 @@ class RegionLinkage(Linkage):
     lies on one plane and has one colour merges first, whatever its normals; a small piece merges early, as its contact
     says little, and a handful of points at once, but a piece later with a surface a hundred times as large, so that a
     thing is whole before it joins what it stands on; and a valley counts most between two large surfaces that meet
-    along a line short for their size. Contacts are touching voxels and, at a price, gaps (`pcgraph.graph.gaps.gaps`).
+    along a line short for their size. Contacts are touching voxels and, at a price, gaps (`pcgraph.graph.gaps.gaps`)
+    and bridges (`pcgraph.graph.bridges.bridges`), contacts of one voxel. Where nothing but bridges joins two regions, a
+    factor m / (m + m1) lets specks go first, and across one wider than the smaller region, or than 12 voxel edges, the
+    altitude is above that of objects: what stands that far apart is never one.
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -55,6 +59,7 @@ class RegionLinkage(Linkage):
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     gap: float = 0.15
+    bridge: float = 0.1
     color: float = 2.0
 
     default_object_altitude = 0.4
@@ -62,23 +67,26 @@ class RegionLinkage(Linkage):
 
     def __post_init__(self) -> None:
         check_cost(self.cost)
-        non_negative("gap", self.gap)
-        non_negative("color", self.color)
+        check_numbers(self, "gap", "bridge", "color")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least altitude first."""
-        features, gaps = graph.edge_features, graph.gaps
-        edges, costs = graph.edges, self.cost(features)
-        weights = features.contact_voxels.astype(np.float64)
-        if gaps is not None and len(gaps.edges):
-            across = self.cost(gaps.edge_features) + self.gap * (gaps.widths - 1.0)
-            edges, costs = np.concatenate((edges, gaps.edges)), np.concatenate((costs, across))
+        edges, costs = graph.joined, self.cost(graph.edge_features)
+        weights = graph.edge_features.contact_voxels.astype(np.float64)
+        if (gaps := graph.gaps) is not None:
+            costs = np.concatenate((costs, self.cost(gaps.edge_features) + self.gap * (gaps.widths - 1.0)))
             weights = np.concatenate((weights, gaps.weights))
-        return region_linkage(graph, leaves, edges, costs, weights, self.color * graph.color_evidence)
+        widths = np.zeros(len(edges))
+        if (bridges := graph.bridges) is not None:
+            edges, widths = np.concatenate((edges, bridges.edges)), np.concatenate((widths, bridges.widths))
+            costs = np.concatenate((costs, self.bridge * bridges.widths))
+            weights = np.concatenate((weights, np.full(len(bridges.edges), _BRIDGE_VOXELS)))
+        return region_linkage(graph, leaves, edges, costs, weights, widths, self.color * graph.color_evidence)
 
 
 _STEPS = float(1 << 20)
 _MANY = 40  # edges of a region
+_BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact: one on each side
 
 
 class _Shape(NamedTuple):
@@ -91,9 +99,25 @@ class _Shape(NamedTuple):
     width: float
     r: float
     m0: float
+    m1: float
+    near: float  # mean width of what joins two regions, voxel edges, beyond which it is a bridge,
+    apart: float  # and beyond which they are no object
+    objects: float  # altitude of objects, radians
 
 
-_SHAPE = _Shape(c0=0.08, c1=0.04, e0=1.0, l0=0.1, width=7.7, r=100.0, m0=0.1)
+_SHAPE = _Shape(
+    c0=0.08,
+    c1=0.04,
+    e0=1.0,
+    l0=0.1,
+    width=7.7,
+    r=100.0,
+    m0=0.1,
+    m1=1.0,
+    near=3.0,
+    apart=12.0,
+    objects=RegionLinkage.default_object_altitude,
+)
 
 
 def region_linkage(
@@ -102,6 +126,7 @@ def region_linkage(
     edges: NDArray[np.int32],
     costs: NDArray[np.float64],
     weights: NDArray[np.float64],
+    widths: NDArray[np.float64] | None = None,
     color: float = 0.0,
 ) -> Merges:
     """Merges of regions along edges, the least altitude of `RegionLinkage` first.
@@ -116,6 +141,8 @@ def region_linkage(
     costs : (m,) float64, radians, >= 0
     weights : (m,) float64, > 0
         Contacts in voxels, of both sides.
+    widths : (m,) float64, voxel edges, >= 0, optional
+        Of bridges; 0 for contacts and gaps. Default: there are none.
     color : float, voxel edges, >= 0
         What colours count, if there are any.
 
@@ -126,7 +153,10 @@ def region_linkage(
         first edge merges first.
     """
     state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, color, 1.0))
-    sums = np.stack((costs * weights, weights))
+    rows = [costs * weights, weights]
+    if widths is not None and widths.any():
+        rows.append(widths * weights)
+    sums = np.stack(rows)
     contracted = ContractedGraph.of(graph.n_nodes, edges, _first_altitudes(state, edges, sums, _SHAPE), sums)
     _merge(state, contracted, _SHAPE)
     merges = contracted.merges()
@@ -190,4 +220,10 @@ def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, 
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
     evidence *= smaller / (smaller + shape.m0)
+    if len(sums) > 2:
+        apart = sums[2, edge] / sums[1, edge]
+        if apart > shape.near:
+            evidence *= smaller / (smaller + shape.m1)
+        floor = shape.objects * max(apart / width, apart / shape.apart)
+        evidence = max(evidence, min(floor, shape.objects + 1.0 / _STEPS))
     return round(evidence * _STEPS) / _STEPS

@@ -180,7 +180,7 @@ def test_a_sweep_keeps_its_things_when_it_is_thinned_to_one_point_per_cell(seed)
 def test_voxels_of_a_sweep_thinned_to_the_mean_of_each_cell_are_smaller():
     """Points that lie evenly tell smaller things apart: at voxels of 27 cm people and poles are lost, at 22 found.
 
-    Another draw of voxels, as a rounding in sines is enough for, changes the overlap by 0.05: the mean of several counts.
+    Another draw of voxels, as a rounding in sines is enough for, changes the overlap by 0.05: what counts is the mean.
     """
     found = sweep(street(6, half_length=60.0), 0)
     group = np.unique(np.floor(found.points / 0.1), axis=0, return_inverse=True)[1]
