@@ -50,8 +50,7 @@ class RegionLinkage(Linkage):
     thing is whole before it joins what it stands on; and a valley counts most between two large surfaces that meet
     along a line short for their size. Contacts are touching voxels and, at a price, gaps (`pcgraph.graph.gaps.gaps`)
     and bridges (`pcgraph.graph.bridges.bridges`), contacts of one voxel. Where nothing but bridges joins two regions, a
-    factor m / (m + m1) lets specks go first, and across one wider than the smaller region, or than 12 voxel edges, the
-    altitude is above that of objects: what stands that far apart is never one.
+    factor m / (m + m1) lets specks go first, and the altitude is above that of objects: what stands apart is never one.
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -100,9 +99,8 @@ class _Shape(NamedTuple):
     r: float
     m0: float
     m1: float
-    near: float  # mean width of what joins two regions, voxel edges, beyond which it is a bridge,
-    apart: float  # and beyond which they are no object
-    objects: float  # altitude of objects, radians
+    near: float  # mean width of what joins two regions, voxel edges, beyond which it is bridges,
+    objects: float  # and they are no object: its altitude, radians
 
 
 _SHAPE = _Shape(
@@ -115,7 +113,6 @@ _SHAPE = _Shape(
     m0=0.1,
     m1=1.0,
     near=3.0,
-    apart=12.0,
     objects=RegionLinkage.default_object_altitude,
 )
 
@@ -220,10 +217,6 @@ def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, 
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
     evidence *= smaller / (smaller + shape.m0)
-    if len(sums) > 2:
-        apart = sums[2, edge] / sums[1, edge]
-        if apart > shape.near:
-            evidence *= smaller / (smaller + shape.m1)
-        floor = shape.objects * max(apart / width, apart / shape.apart)
-        evidence = max(evidence, min(floor, shape.objects + 1.0 / _STEPS))
+    if len(sums) > 2 and sums[2, edge] > shape.near * sums[1, edge]:
+        evidence = max(evidence * smaller / (smaller + shape.m1), shape.objects + 1.0 / _STEPS)
     return round(evidence * _STEPS) / _STEPS

@@ -92,13 +92,6 @@ def test_widths_are_found_of_supervoxels_of_any_size():
     assert bridges(grid, result.surface.supervoxels, result.graph.joined).widths == pytest.approx([11.0])
 
 
-def test_a_gap_wider_than_the_smaller_region_parts_two_objects():
-    floor, gap = sheet(3.0, 3.0, (0.0, 0.0, 0.0)), 0.5
-    for side, n_objects in ((0.1, 2), (1.0, 1)):
-        near = sheet(side, side, (3.0 + gap, 1.0, 0.0))
-        assert pcgraph.segment(np.concatenate((floor, near)), **SETTINGS).labels.max() + 1 == n_objects
-
-
 def test_a_cut_into_few_segments_spends_none_on_specks():
     """Forty specks in the air: joined last, they were all that a cut into few segments showed of three things."""
     points, truth, viewpoint = two_boxes_on_a_plane()
@@ -111,13 +104,16 @@ def test_a_cut_into_few_segments_spends_none_on_specks():
     assert pcgraph.metrics.weighted_overlap(cut, truth) > 0.99
 
 
-def test_what_lies_far_apart_is_never_one_object():
-    """Not even of one plane: that far is what the default altitude of objects means; cuts above it weigh it."""
-    tables = np.concatenate([sheet(1.2, 0.8, (2.5 * i, 0.0, 0.75)) for i in range(4)])
+def test_what_stands_apart_is_never_one_object_but_above_it():
+    """Tables of one height are four, whatever they have in common; cuts above the objects' altitude weigh that."""
+    tables = np.concatenate([sheet(1.2, 0.8, (1.5 * i, 0.0, 0.75)) for i in range(4)])
     result = pcgraph.segment(tables, **SETTINGS)
     truth = np.repeat(np.arange(4), len(tables) // 4)
     assert pcgraph.metrics.weighted_overlap(result.labels, truth) == 1.0
+    assert np.array_equal(result.groups, result.labels)
     assert np.isfinite(result.tree.altitudes).all()
-    assert result.tree.cut(altitude=result.object_altitude * 1.001).max() == 0
+    assert result.cut(altitude=result.object_altitude * 1.001).max() == 0
+    higher = pcgraph.segment(tables, object_altitude=0.5, **SETTINGS)
+    assert higher.labels.max() == higher.groups.max() == 0
     apart = cKDTree(tables[truth == 0]).query(tables[truth == 1])[0].min() / result.voxel_size
     assert result.graph.bridges.widths == pytest.approx(apart, abs=1.0)

@@ -25,25 +25,20 @@ def two_sheets(empty: int, **settings) -> pcgraph.Segmentation:
     return pcgraph.segment(points, **settings)
 
 
-@pytest.mark.parametrize(
-    ("empty", "joined"), [(0, True), (1, True), (2, True), (3, True), (6, True), (11, True), (13, False), (40, False)]
-)
-def test_what_lies_in_one_plane_merges_across_gaps_and_bridges_of_up_to_twelve_voxel_edges(empty, joined):
+@pytest.mark.parametrize(("empty", "joined"), [(0, True), (1, True), (2, True), (3, False), (6, False)])
+def test_what_lies_in_one_plane_merges_across_gaps_of_up_to_three_voxel_edges(empty, joined):
     result = two_sheets(empty)
     assert result.labels.max() + 1 == (1 if joined else 2)
-    assert result.graph.gaps is not None
     assert bool(len(result.graph.gaps.edges)) == (0 < empty < 3)
 
 
-def test_rows_of_a_scan_from_one_place_have_wider_gaps():
+def test_rows_of_a_scan_from_one_place_merge_across_wider_gaps():
     rings = [np.arange(0, 2 * np.pi, 0.04 / r)[:, None] * (1.0, 0.0) + (0.0, r) for r in np.arange(4.0, 6.0, 0.35)]
     angle, radius = np.concatenate(rings).T
     ground = np.stack((radius * np.cos(angle), radius * np.sin(angle), np.full(len(angle), -1.8)), axis=1)
     settings = {"voxel_size": 0.08, "viewpoint": (0.0, 0.0, 0.0)}
-    grown, alike = (pcgraph.segment(ground, range_growth=growth, **settings) for growth in (0.5, 0.0))
-    assert grown.labels.max() == grown.groups.max() == 0
-    assert grown.graph.components.max() == 0
-    assert alike.graph.components.max() + 1 == len(rings)
+    assert pcgraph.segment(ground, range_growth=0.5, **settings).labels.max() == 0
+    assert pcgraph.segment(ground, range_growth=0.0, **settings).labels.max() + 1 == len(rings)
 
 
 def test_a_linkage_of_contacts_alone_merges_across_no_gap():
