@@ -195,10 +195,11 @@ def stable_nodes(
     """Whether each node is chosen, (k,) bool: nodes of the largest total stability, none above another.
 
     A branch is a segment from where it first has `min_size` points; a merge with something smaller does not end
-    it. Its stability is the sum of points x persistence over its nodes. Persistence ends at the largest finite
-    altitude at which two parts of `min_size` points merge: what is smaller may come in at any altitude (a voxel far off
-    at pi), and would make the whole scene last. The nodes chosen are the tops of branches; of equal stability the
-    coarser one is taken. Leaves below no chosen node are left to the caller.
+    it. Its stability is the sum of points x life over its nodes, and life the difference of the square roots of two
+    altitudes: the highest merges lie far from each other, and would make a scene in two pieces last; roots choose the
+    same whatever the unit. Life ends at the largest finite altitude at which two parts of `min_size` points merge: what
+    is smaller may come in at any altitude (a voxel far off at pi). The nodes chosen are the tops of branches; of equal
+    stability the coarser one is taken. Leaves below no chosen node are left to the caller.
 
     Parameters
     ----------
@@ -210,14 +211,13 @@ def stable_nodes(
 
     Notes
     -----
-    Source: Campello et al. 2015 (excess of mass, HDBSCAN), with altitude in place of 1 / density, so what lasts long
-    at high altitude counts as much as what lasts long at low altitude.
+    Source: Campello et al. 2015 (excess of mass, HDBSCAN), with the root of altitude in place of 1 / density.
     """
     across_gap, pairs = np.isinf(altitudes), binary_children(parents)
     smaller = np.where(pairs[:, 0] >= 0, counts[pairs].min(axis=1), 0)
-    levels = np.minimum(altitudes, altitudes[~across_gap & (smaller >= min_size)].max(initial=0.0))
-    persistence = levels[parents] - levels
-    taken = _more_stable(pairs, persistence, counts, (counts >= min_size) & ~across_gap, min_size)
+    levels = np.sqrt(np.minimum(altitudes, altitudes[~across_gap & (smaller >= min_size)].max(initial=0.0)))
+    life = levels[parents] - levels
+    taken = _more_stable(pairs, life, counts, (counts >= min_size) & ~across_gap, min_size)
     taken = propagate_sequential(parents, taken, ~taken)
     below = taken[parents]
     below[-1] = False

@@ -115,10 +115,10 @@ class SegmentationTree(ShortRepr):
     def cut_stable(self, min_size: int = 1) -> NDArray[np.int32]:
         """Segment of each leaf in the most stable segmentation, (n_leaves,) int32, numbered as in `cut`.
 
-        Of all ways to choose nodes, none above another, the one with the largest sum of points x persistence
-        (excess of mass, Campello et al. 2015). Segments may come from different altitudes. Persistence ends at
-        the largest finite altitude at which two parts of `min_size` points merge, so a scene that is one piece is never
-        one segment for that alone.
+        Of all ways to choose nodes, none above another, the one with the largest sum of points x life (excess of mass,
+        Campello et al. 2015), the difference of the square roots of the altitudes at which a node comes to be and ends.
+        Segments may come from different altitudes. Life ends at the largest finite altitude at which two parts of
+        `min_size` points merge, so a scene that is one piece is never one segment for that alone.
 
         Parameters
         ----------
@@ -274,9 +274,9 @@ def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
 
     Notes
     -----
-    Parts that do not touch are joined at infinite altitude, the smallest (in points) first, each to the
+    Parts that the merges leave apart are joined at infinite altitude, the smallest (in points) first, each to the
     nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large
-    parts apart.
+    parts apart. `RegionLinkage` leaves none in the graph of a segmentation, which has bridges.
     """
     n_leaves, n_merges = len(leaves), len(merges.pairs)
     parents = np.arange(2 * n_leaves - 1, dtype=np.int32)
