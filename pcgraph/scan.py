@@ -326,7 +326,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     (leaf_of_point, leaves), touching = side_by_side(with_points, lambda: contacts(grid, normals, supervoxels))
     nodes = node_features(leaves)
     near = gaps(grid, normals, supervoxels, nodes, touching.edges)
-    across = bridges(grid, supervoxels, np.concatenate((touching.edges, near.edges)))
+    across = bridges(grid, supervoxels, leaves.counts, np.concatenate((touching.edges, near.edges)))
     told_by_colors = color_evidence(grid, normals)
     graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near, across, told_by_colors)
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)

@@ -154,7 +154,7 @@ def _compile_graph_and_tree() -> None:
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
     near = gaps(grid, normals, labels, nodes, touching.edges)
-    across = bridges(grid, labels, np.concatenate((touching.edges, near.edges)))
+    across = bridges(grid, labels, leaves.counts, np.concatenate((touching.edges, near.edges)))
     graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, across)
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
 

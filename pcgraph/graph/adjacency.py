@@ -96,13 +96,12 @@ class Gaps(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Bridges(ShortRepr):
-    """Ways between components, which neither contacts nor gaps join; one row per pair of components.
+    """Ways from specks, components of fewer points than a mean supervoxel, to those around; one row per pair.
 
     Attributes
     ----------
     edges : (b, 2) int32
-        The two supervoxels of both that lie nearest to each other, i < j, in ascending order. With contacts and
-        gaps they join all supervoxels.
+        The two supervoxels of both components whose means lie nearest to each other, i < j, in ascending order.
     widths : (b,) float64, voxel edges
         Distance between centroids of two of their voxels, each the other's nearest; a million at most.
     """
@@ -126,7 +125,7 @@ class AdjacencyGraph(ShortRepr):
     gaps : Gaps, optional
         Supervoxels that nearly touch. They are no edges, but a linkage may merge across them.
     bridges : Bridges, optional
-        Ways between what does not come that near. They are no edges either.
+        Ways from specks to what is around them. They are no edges either.
     color_evidence : float, 0..1
         How far colours change where surfaces do (`pcgraph.voxels.evidence.edge_evidence`): what they are worth.
     """

@@ -30,7 +30,7 @@ class RegionLinkage(Linkage):
     gap : float, radians per voxel edge, >= 0
         What a gap costs beyond one voxel edge.
     bridge : float, radians per voxel edge, >= 0
-        What a bridge between parts that come no nearer costs.
+        What a bridge from a speck costs.
     color : float, voxel edges, >= 0
         Distance that a difference of 1 counts for, in a colour of 0..1, if colours change where surfaces do; less as
         they do not (`AdjacencyGraph.color_evidence`).
@@ -49,8 +49,8 @@ class RegionLinkage(Linkage):
     says little, and a handful of points at once, but a piece later with a surface a hundred times as large, so that a
     thing is whole before it joins what it stands on; and a valley counts most between two large surfaces that meet
     along a line short for their size. Contacts are touching voxels and, at a price, gaps (`pcgraph.graph.gaps.gaps`)
-    and bridges (`pcgraph.graph.bridges.bridges`), contacts of one voxel. Where nothing but bridges joins two regions, a
-    factor m / (m + m1) lets specks go first, and the altitude is above that of objects: what stands apart is never one.
+    and, so that specks are the first to go in coarser cuts, bridges (`pcgraph.graph.bridges.bridges`): two regions that
+    nothing but bridges joins merge above the altitude of objects, at their mean cost times m / (m + 1).
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -75,17 +75,16 @@ class RegionLinkage(Linkage):
         if (gaps := graph.gaps) is not None:
             costs = np.concatenate((costs, self.cost(gaps.edge_features) + self.gap * (gaps.widths - 1.0)))
             weights = np.concatenate((weights, gaps.weights))
-        widths = np.zeros(len(edges))
         if (bridges := graph.bridges) is not None:
-            edges, widths = np.concatenate((edges, bridges.edges)), np.concatenate((widths, bridges.widths))
-            costs = np.concatenate((costs, self.bridge * bridges.widths))
+            edges, costs = np.concatenate((edges, bridges.edges)), np.concatenate((costs, self.bridge * bridges.widths))
             weights = np.concatenate((weights, np.full(len(bridges.edges), _BRIDGE_VOXELS)))
-        return region_linkage(graph, leaves, edges, costs, weights, widths, self.color * graph.color_evidence)
+        n_bridges = 0 if bridges is None else len(bridges.edges)
+        return region_linkage(graph, leaves, edges, costs, weights, self.color * graph.color_evidence, n_bridges)
 
 
 _STEPS = float(1 << 20)
 _MANY = 40  # edges of a region
-_BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact: one on each side
+_BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact where others join it: one on each side
 
 
 class _Shape(NamedTuple):
@@ -99,8 +98,7 @@ class _Shape(NamedTuple):
     r: float
     m0: float
     m1: float
-    near: float  # mean width of what joins two regions, voxel edges, beyond which it is bridges,
-    objects: float  # and they are no object: its altitude, radians
+    objects: float  # altitude of objects, radians
 
 
 _SHAPE = _Shape(
@@ -112,7 +110,6 @@ _SHAPE = _Shape(
     r=100.0,
     m0=0.1,
     m1=1.0,
-    near=3.0,
     objects=RegionLinkage.default_object_altitude,
 )
 
@@ -123,8 +120,8 @@ def region_linkage(
     edges: NDArray[np.int32],
     costs: NDArray[np.float64],
     weights: NDArray[np.float64],
-    widths: NDArray[np.float64] | None = None,
     color: float = 0.0,
+    n_bridges: int = 0,
 ) -> Merges:
     """Merges of regions along edges, the least altitude of `RegionLinkage` first.
 
@@ -138,10 +135,10 @@ def region_linkage(
     costs : (m,) float64, radians, >= 0
     weights : (m,) float64, > 0
         Contacts in voxels, of both sides.
-    widths : (m,) float64, voxel edges, >= 0, optional
-        Of bridges; 0 for contacts and gaps. Default: there are none.
     color : float, voxel edges, >= 0
         What colours count, if there are any.
+    n_bridges : int
+        So many of the last edges are bridges.
 
     Returns
     -------
@@ -150,10 +147,8 @@ def region_linkage(
         first edge merges first.
     """
     state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, color, 1.0))
-    rows = [costs * weights, weights]
-    if widths is not None and widths.any():
-        rows.append(widths * weights)
-    sums = np.stack(rows)
+    sums = np.stack((costs * weights, weights, weights) if n_bridges else (costs * weights, weights))
+    sums[2:, : len(edges) - n_bridges] = 0.0  # what is left are the bridges' weights
     contracted = ContractedGraph.of(graph.n_nodes, edges, _first_altitudes(state, edges, sums, _SHAPE), sums)
     _merge(state, contracted, _SHAPE)
     merges = contracted.merges()
@@ -208,15 +203,15 @@ def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
 def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, shape: _Shape) -> float:
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
+    smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
+    if len(sums) > 2 and sums[2, edge] == sums[1, edge]:  # nothing but bridges
+        return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), round(shape.objects * _STEPS) + 1) / _STEPS
     increase = max(energy_increase(state, a, b), 0.0)
     scale = increase / length
-    smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
     width = shape.width * math.sqrt(smaller)
     shortness = width / (length + width)
     evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
     evidence *= smaller / (smaller + shape.m0)
-    if len(sums) > 2 and sums[2, edge] > shape.near * sums[1, edge]:
-        evidence = max(evidence * smaller / (smaller + shape.m1), shape.objects + 1.0 / _STEPS)
     return round(evidence * _STEPS) / _STEPS

@@ -276,7 +276,7 @@ def segmentation_tree(merges: Merges, leaves: Moments) -> SegmentationTree:
     -----
     Parts that the merges leave apart are joined at infinite altitude, the smallest (in points) first, each to the
     nearest larger part. So cuts below infinity never mix them, and a cut into few segments keeps the large
-    parts apart. `RegionLinkage` leaves none in the graph of a segmentation, which has bridges.
+    parts apart. `RegionLinkage` has specks joined before, across bridges.
     """
     n_leaves, n_merges = len(leaves), len(merges.pairs)
     parents = np.arange(2 * n_leaves - 1, dtype=np.int32)
