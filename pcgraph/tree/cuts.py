@@ -196,10 +196,10 @@ def stable_nodes(
 
     A branch is a segment from where it first has `min_size` points; a merge with something smaller does not end
     it. Its stability is the sum of points x life over its nodes, and life the difference of the square roots of two
-    altitudes: the highest merges lie far from each other, and would make a scene in two pieces last; roots choose the
-    same whatever the unit. Life ends at the largest finite altitude at which two parts of `min_size` points merge: what
-    is smaller may come in at any altitude (a voxel far off at pi). The nodes chosen are the tops of branches; of equal
-    stability the coarser one is taken. Leaves below no chosen node are left to the caller.
+    altitudes: the highest merges lie far from each other, and would make a scene in two pieces last. Life ends at the
+    largest finite altitude at which two parts of `min_size` points merge: what is smaller may come in at any altitude
+    (a voxel far off at pi). The nodes chosen are the tops of branches; of equal stability the coarser one is taken.
+    Leaves below no chosen node are left to the caller.
 
     Parameters
     ----------

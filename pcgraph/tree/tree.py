@@ -140,7 +140,7 @@ class SegmentationTree(ShortRepr):
         """Segment of each leaf in the cut of least energy, (n_leaves,) int32, numbered as in `cut`.
 
         Of all ways to cut the tree, at one altitude or at several, the one with the least sum over its segments
-        of data + scale x complexity. Cuts at rising scales nest. Parts that do not touch stay apart.
+        of data + scale x complexity. Cuts at rising scales nest. What joins at infinite altitude stays apart.
 
         Parameters
         ----------
