@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csgraph
 
 from pcgraph.parallel import kernel
 
@@ -18,18 +19,7 @@ def root_of(links: NDArray[np.integer], element: int) -> int:
     return element
 
 
-@kernel
-def connected_components(edges: NDArray[np.int32], n: int) -> NDArray[np.int32]:
-    """Component of each of n nodes that edges, (m, 2) int32, join, (n,) int32, numbered in the order of first nodes."""
-    links = np.arange(n)
-    for edge in range(len(edges)):
-        a, b = root_of(links, edges[edge, 0]), root_of(links, edges[edge, 1])
-        links[max(a, b)] = min(a, b)
-    components, found = np.empty(n, np.int32), 0
-    for node in range(n):
-        root = root_of(links, node)
-        if root == node:
-            components[node], found = found, found + 1
-        else:
-            components[node] = components[root]
-    return components
+def connected_components(edges: NDArray[np.integer], n: int) -> NDArray[np.int32]:
+    """Component of each of n nodes that edges, (m, 2) int, join, (n,) int32, numbered in the order of first nodes."""
+    matrix = coo_array((np.ones(len(edges), np.bool_), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    return np.asarray(csgraph.connected_components(matrix, directed=False)[1], np.int32)

@@ -12,13 +12,12 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pcgraph.detection.boxes import OrientedBox, inside_outline, outline, plane_basis, standing_box, tight_box
 from pcgraph.detection.plane_detection import Planes, find_planes, members, voxel_edges
 from pcgraph.detection.shapes import Shape, fit_shape
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.inputs import non_negative
 from pcgraph.segmentation import Segmentation
 from pcgraph.short_repr import ShortRepr
@@ -264,8 +263,7 @@ def connected_pieces(segmentation: Segmentation, support: _Support, above: NDArr
     n, segment, surface = segmentation.tree.n_leaves, segmentation.objects, segmentation.surface
     i, j = segmentation.graph.edges.T
     kept = above[i] & above[j] & (segment[i] == segment[j])
-    links = csr_array((np.ones(int(kept.sum()), np.int8), (i[kept], j[kept])), shape=(n, n))
-    _, part = connected_components(links, directed=False)
+    part = connected_components(segmentation.graph.edges[kept], n)
     chosen, part_of_leaf = np.flatnonzero(above), np.full(n, -1, np.int32)
     numbers, part_of_leaf[chosen] = np.unique(part[chosen], return_inverse=True)
     touches = np.zeros(n, bool)
@@ -342,9 +340,7 @@ def linked_pieces(pieces: list[Piece], edge: float) -> NDArray[np.int32]:
         gaps = [_gap(pieces[i], pieces[j], edge) for j in others]
         if gaps and np.isfinite(min(gaps)):
             links.append((int(i), int(others[int(np.argmin(gaps))])))
-    ends = np.array(links, np.int64).reshape(-1, 2)
-    joined = csr_array((np.ones(len(ends), bool), ends.T), shape=(q, q))
-    return np.asarray(connected_components(joined, directed=False)[1], np.int32)
+    return connected_components(np.array(links, np.int64).reshape(-1, 2), q)
 
 
 def _containing_pieces(pieces: list[Piece], edge: float) -> NDArray[np.int64]:

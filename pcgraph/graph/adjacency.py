@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.boundary import BoundaryStrength
 from pcgraph.short_repr import ShortRepr
@@ -149,11 +148,6 @@ class AdjacencyGraph(ShortRepr):
     def joined(self) -> NDArray[np.int32]:
         """Pairs of supervoxels that touch or nearly touch, (m + g, 2) int32."""
         return self.edges if self.gaps is None else np.concatenate((self.edges, self.gaps.edges))
-
-    @property
-    def components(self) -> NDArray[np.int32]:
-        """Component of each supervoxel, (k,) int32: what contacts and gaps join, in the order of first supervoxels."""
-        return connected_components(self.joined, self.n_nodes)
 
     def to_networkx(self, occlusions: Occlusions | None = None) -> networkx.Graph:
         """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names.

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.eigen import least_eigenvalue
@@ -143,10 +142,8 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     number = np.full(grid.n_voxels, -1)
     number[few] = np.arange(len(few))
     inner = number[target] >= 0
-    ones = np.ones(int(inner.sum()), np.bool_)
-    joined = coo_array((ones, (number[source[inner]], number[target[inner]])), shape=(len(few), len(few)))
-    n_pieces, piece = connected_components(joined, directed=False)
-    held = np.bincount(piece, grid.counts[few], n_pieces)
+    piece = connected_components(np.stack((number[source[inner]], number[target[inner]]), axis=1), len(few))
+    held = np.bincount(piece, grid.counts[few])
     held[piece[number[source[~inner]]]] = _PIECE
     detached[few[held[piece] < _PIECE]] = True
     if grid.counts[detached].sum() > _MANY_DETACHED * grid.counts.sum():

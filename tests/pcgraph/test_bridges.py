@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bridges join what neither contacts nor gaps do, at a price that tells an object from its neighbour."""
+"""Bridges lead from specks to what is around them: coarser cuts lose these first, and no object takes them in."""
 
 from __future__ import annotations
 

@@ -79,8 +79,7 @@ def test_wrong_weights_are_refused(coloured, wrong):
 
 
 def test_networkx_holds_plain_numbers_that_json_and_gexf_take(coloured, boxes, plate, lone, tmp_path):
-    apart = np.array([[0.0, 0, 1], [5.0, 0, 1]])
-    gap = pcgraph.segment(apart, viewpoint=(0, 0, 0), voxel_size=0.1, linkage=pcgraph.ConvexityLinkage()).tree
+    gap = pcgraph.segment(np.array([[0.0, 0, 1], [5.0, 0, 1]]), viewpoint=(0, 0, 0), voxel_size=0.1).tree
     assert np.isinf(gap.altitudes[-1])
     trees = [boxes[2].tree.to_networkx(), gap.to_networkx()]
     for network in (coloured.to_networkx(), plate[0].to_networkx(plate[1]), lone.to_networkx(), *trees):

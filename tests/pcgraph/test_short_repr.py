@@ -59,8 +59,7 @@ def test_results_print_in_five_lines(boxes):
     assert said in repr(result.tree).replace("\n    ", "")
     assert f"({len(planes)} planes (3 horizontal, " in repr(planes).replace("\n    ", "")
     assert f", normals=float64[{len(planes)}, 3]," in repr(planes).replace("\n    ", "")
-    two = [[0.0, 0.0, 1.0], [5.0, 0.0, 1.0]]
-    apart = pcgraph.segment(two, voxel_size=0.1, linkage=pcgraph.ConvexityLinkage())
+    apart = pcgraph.segment([[0.0, 0.0, 1.0], [5.0, 0.0, 1.0]], voxel_size=0.1)
     assert "2 leaves, 3 nodes, 2 parts that do not touch" in repr(apart.tree)
     assert "(0 planes, normals" in repr(detection.find_planes(apart)).replace("\n    ", "")
     assert "node_features=NodeFeatures(...)" in repr(result.graph)
