@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
+from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import (
     CleanCloud,
@@ -75,6 +77,7 @@ _PRICE_OF_ROUGHNESS = 0.25  # less a quarter of their roughness, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
+_LOOKED_FROM = 3  # places, where the cloud was not seen from one
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
 
 
@@ -177,9 +180,9 @@ def segment(
     warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
-    position, planes = _outward_planes(grid, settings.method, law, place)
+    outside = _outward_planes(grid, settings.method, law, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
-    result = segment_scan(Scan(cloud, position, grid, planes, initial_labels, seed), None, settings)
+    result = segment_scan(Scan(cloud, outside.viewpoint, outside.places, grid, outside.planes, initial_labels, seed), None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
 
@@ -247,12 +250,12 @@ def update(
     union = grid_union(before.grid, seen)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
-    outside = np.empty((union.grid.n_voxels, 3))
-    position, planes = _outward_planes(seen, settings.method, None, place)
-    outside[union.second] = _far_along(seen, planes.normals)
-    outside[union.first] = _far_along(before.grid, before.normals)
-    planes = settings.method.planes(union.grid, outside)
-    scan = Scan(cloud, position, union.grid, planes, labels, earlier.seed_size)
+    far_off = np.empty((union.grid.n_voxels, 3))
+    outside = _outward_planes(seen, settings.method, None, place)
+    far_off[union.second] = _far_along(seen, outside.planes.normals)
+    far_off[union.first] = _far_along(before.grid, before.normals)
+    planes = settings.method.planes(union.grid, far_off)
+    scan = Scan(cloud, outside.viewpoint, outside.places, union.grid, planes, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
 
 
@@ -264,6 +267,8 @@ class Scan:
     ----------
     cloud : CleanCloud of n points
     viewpoint : (3,) or (n, 3) float64, metres
+    places : (p, 3) float64, metres
+        From which continuations are looked for.
     grid : VoxelGrid of v voxels
         All that has been seen; its `voxel_of_point` speaks of these points.
     planes : LocalPlanes of v voxels
@@ -275,6 +280,7 @@ class Scan:
 
     cloud: CleanCloud
     viewpoint: NDArray[np.float64]
+    places: NDArray[np.float64]
     grid: VoxelGrid
     planes: LocalPlanes
     initial_labels: NDArray[np.int32]
@@ -325,10 +331,15 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
 
     (leaf_of_point, leaves), touching = side_by_side(with_points, lambda: contacts(grid, normals, supervoxels))
     nodes = node_features(leaves)
-    near = gaps(grid, normals, supervoxels, nodes, touching.edges)
-    across = bridges(grid, supervoxels, leaves.counts, np.concatenate((touching.edges, near.edges)))
+    near, hidden = side_by_side(
+        lambda: gaps(grid, normals, supervoxels, nodes, touching.edges),
+        lambda: continuations(surface, nodes, scan.places),
+    )
+    hidden = hidden.without(np.concatenate((touching.edges, near.edges)))
+    joined = np.concatenate((touching.edges, near.edges, hidden.pairs))
+    across = bridges(grid, supervoxels, leaves.counts, joined)
     told_by_colors = color_evidence(grid, normals)
-    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near, across, told_by_colors)
+    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near, hidden, across, told_by_colors)
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
@@ -423,10 +434,27 @@ def _without(
     return cloud.without(points), grid_without(grid, voxels), place
 
 
+class Outside(NamedTuple):
+    """From where the cloud was seen, and the planes of its v voxels, their normals on the outer side.
+
+    Attributes
+    ----------
+    viewpoint : (3,) or (n, 3) float64, metres
+        One for all n points or one for each.
+    places : (p, 3) float64, metres
+        The viewpoint, some of the viewpoints, or where none is known, some of the places from which the outside is seen.
+    planes : LocalPlanes
+    """
+
+    viewpoint: NDArray[np.float64]
+    places: NDArray[np.float64]
+    planes: LocalPlanes
+
+
 def _outward_planes(
     grid: VoxelGrid, method: SupervoxelMethod, law: SpacingLaw | None, given: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], LocalPlanes]:
-    """From where the cloud was seen, (3,) or (n, 3), and the plane of each voxel, its normal on the outer side.
+) -> Outside:
+    """From where the cloud was seen, and the plane of each voxel, its normal on the outer side.
 
     A viewpoint that was given counts before one that the spacing tells. Voxels of points that were seen from several
     places take the mean of those.
@@ -441,15 +469,17 @@ def _outward_planes(
             planes, telling = method.planes(grid, told), None
         axis = None if law is None or told is None else law.axis
         sides = visible_sides(grid, planes.normals, told, telling, axis)
-        return sides.viewpoint, replace(planes, normals=sides.normals)
+        return Outside(sides.places[0], sides.places[:_LOOKED_FROM], replace(planes, normals=sides.normals))
     if given.ndim == 1:
         planes = method.planes(grid, given)
         if law is not None and law.axis is not None:
             planes = replace(planes, normals=sides_towards(grid, planes.normals, given, law.axis))
-        return given, planes
+        return Outside(given, given[None], planes)
     low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
-    return given, method.planes(grid, middle + reach * voxel_means((given - middle) / reach, grid))
+    place_of_voxel = middle + reach * voxel_means((given - middle) / reach, grid)
+    some = (np.arange(_LOOKED_FROM) + 0.5) / _LOOKED_FROM * grid.n_voxels
+    return Outside(given, place_of_voxel[some.astype(np.int64)], method.planes(grid, place_of_voxel))
 
 
 def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import networkx
     from scipy.sparse import csr_array
 
+    from pcgraph.graph.continuations import Continuations
     from pcgraph.graph.occlusion import Occlusions
 
 
@@ -123,6 +124,8 @@ class AdjacencyGraph(ShortRepr):
         One row per supervoxel.
     gaps : Gaps, optional
         Supervoxels that nearly touch. They are no edges, but a linkage may merge across them.
+    continuations : Continuations, optional
+        Flat surfaces that go on behind what hides them. They are no edges either.
     bridges : Bridges, optional
         Ways from specks to what is around them. They are no edges either.
     color_evidence : float, 0..1
@@ -133,6 +136,7 @@ class AdjacencyGraph(ShortRepr):
     edge_features: EdgeFeatures
     node_features: NodeFeatures
     gaps: Gaps | None = None
+    continuations: Continuations | None = None
     bridges: Bridges | None = None
     color_evidence: float = 1.0
 
@@ -146,8 +150,10 @@ class AdjacencyGraph(ShortRepr):
 
     @property
     def joined(self) -> NDArray[np.int32]:
-        """Pairs of supervoxels that touch or nearly touch, (m + g, 2) int32."""
-        return self.edges if self.gaps is None else np.concatenate((self.edges, self.gaps.edges))
+        """Pairs of supervoxels that touch or nearly touch, or go on behind what hides them, (m + g + r, 2) int32."""
+        beside = [] if self.gaps is None else [self.gaps.edges]
+        hidden = [] if self.continuations is None else [self.continuations.pairs]
+        return np.concatenate((self.edges, *beside, *hidden))
 
     def to_networkx(self, occlusions: Occlusions | None = None) -> networkx.Graph:
         """The graph as ``networkx.Graph``; features, and `boundary_strength`, as attributes of the same names.

@@ -75,6 +75,9 @@ class RegionLinkage(Linkage):
         if (gaps := graph.gaps) is not None:
             costs = np.concatenate((costs, self.cost(gaps.edge_features) + self.gap * (gaps.widths - 1.0)))
             weights = np.concatenate((weights, gaps.weights))
+        if (hidden := graph.continuations) is not None:
+            costs = np.concatenate((costs, np.zeros(len(hidden.pairs))))
+            weights = np.concatenate((weights, 2.0 * hidden.crossings))
         if (bridges := graph.bridges) is not None:
             edges, costs = np.concatenate((edges, bridges.edges)), np.concatenate((costs, self.bridge * bridges.widths))
             weights = np.concatenate((weights, np.full(len(bridges.edges), _BRIDGE_VOXELS)))

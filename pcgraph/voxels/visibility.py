@@ -67,13 +67,13 @@ class VisibleSides(ShortRepr):
 
     Attributes
     ----------
-    viewpoint : (3,) float64, metres
-        The place that tells most.
+    places : (k, 3) float64, metres
+        From which the outside is seen, the most telling first; or the viewpoint, where that is known.
     normals : (v, 3) float64
         Unit normals, outwards.
     """
 
-    viewpoint: NDArray[np.float64]
+    places: NDArray[np.float64]
     normals: NDArray[np.float64]
 
 
@@ -134,15 +134,11 @@ def visible_sides(
     if viewpoint is not None:
         told = _cosines(grid, normals, viewpoint, axis, reach)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
-            return VisibleSides(viewpoint, _turned(normals, told))
-    centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
+            return VisibleSides(viewpoint[None], _turned(normals, told))
     places, weights = telling_places(grid, viewpoint) if telling is None else telling
-    votes, looked_at = _TOLD * told, np.arange(grid.n_voxels)
-    step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
-    if step > 1.0:  # some, evenly spread on any plane, which hide as much if so much larger
-        steps = np.einsum("ij,j->i", grid.cells, _SPREAD_OUT)  # a product of matrices would start threads of its own
-        looked_at, widths = np.flatnonzero(steps == step * np.rint(steps / step)), math.sqrt(step) * widths
-    centres, widths, sides = centres[looked_at], widths[looked_at], normals[looked_at]
+    votes, (looked_at, stretch) = _TOLD * told, standing_for_all(grid)
+    centres, widths = (grid.centroids[looked_at] - middle) / reach, stretch * grid.edge_lengths[looked_at] / reach
+    sides = normals[looked_at]
     seen, towards = seen_from(places, centres, widths, sides), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
@@ -151,8 +147,17 @@ def visible_sides(
     for _ in range(_SMOOTHING):
         in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
         votes, smoothed = smoothed, votes
-    seen_most = middle + reach * places[0] if viewpoint is None else viewpoint
-    return VisibleSides(seen_most, _turned(normals, votes))
+    seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
+    return VisibleSides(seen_from_places, _turned(normals, votes))
+
+
+def standing_for_all(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
+    """Some of many voxels, evenly spread on any plane, and how many times as wide they hide as much as all do."""
+    step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
+    if step == 1.0:
+        return np.arange(grid.n_voxels), 1.0
+    steps = np.einsum("ij,j->i", grid.cells, _SPREAD_OUT)  # a product of matrices would start threads of its own
+    return np.flatnonzero(steps == step * np.rint(steps / step)), math.sqrt(step)
 
 
 def sides_towards(

@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is seen from a place: the nearest voxel in every direction, and where along lines of that image depth jumps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.voxels.grid import Neighbourhood
+from pcgraph.voxels.surface import Surface
+from pcgraph.voxels.visibility import standing_for_all
+
+_MAX_CELLS = 4e6
+_MAX_CELLS_PER_VOXEL = 16  # to either side; only voxels that nearly touch the sensor are wider
+_MAX_DEPTH = 32  # things one behind the other along a line
+
+
+class View(NamedTuple):
+    """Voxels as they are seen from a place.
+
+    Attributes
+    ----------
+    place : (3,) float64, metres
+    voxels : (s,) int64
+        Those that are looked at; all that follows has a row for each.
+    bearings : (s, 3) float64
+        Unit directions to them.
+    ranges, edge_lengths, widths : (s,) float64, metres
+        Widths are edge lengths, or more where some voxels stand for others beside them.
+    normals : (s, 3) float64
+    supervoxels : (s,) int32
+    neighbourhood : Neighbourhood of s voxels
+        Which of them touch; none where some stand for others.
+    """
+
+    place: NDArray[np.float64]
+    voxels: NDArray[np.int64]
+    bearings: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+    edge_lengths: NDArray[np.float64]
+    widths: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    supervoxels: NDArray[np.int32]
+    neighbourhood: Neighbourhood
+
+
+def view_from(surface: Surface, place: NDArray[np.float64], some: bool = False) -> View:
+    """All voxels as they are seen from a place, (3,), or, of many, some that stand for those beside them."""
+    grid = surface.grid
+    voxels, stretch = standing_for_all(grid) if some else (np.arange(grid.n_voxels), 1.0)
+    normals, supervoxels, touching = surface.normals, surface.supervoxels, grid.neighbourhood
+    edges, centroids = grid.edge_lengths, grid.centroids
+    if len(voxels) < grid.n_voxels:
+        normals, supervoxels, edges, centroids = (of[voxels] for of in (normals, supervoxels, edges, centroids))
+        touching = Neighbourhood(np.zeros(len(voxels) + 1, np.int64), np.empty(0, np.int32))
+    bearings, ranges = np.empty((len(voxels), 3)), np.empty(len(voxels))
+    in_blocks(_look, len(voxels), place, centroids, bearings, ranges)
+    return View(place, voxels, bearings, ranges, edges, stretch * edges, normals, supervoxels, touching)
+
+
+@kernel
+def _look(
+    start: int,
+    stop: int,
+    place: NDArray[np.float64],
+    centroids: NDArray[np.float64],
+    bearings: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+) -> None:
+    """Set the unit direction and the distance from the place to each centroid."""
+    for i in range(start, stop):
+        x, y, z = centroids[i, 0] - place[0], centroids[i, 1] - place[1], centroids[i, 2] - place[2]
+        ranges[i] = max(math.sqrt(x * x + y * y + z * z), 1e-300)
+        bearings[i, 0], bearings[i, 1], bearings[i, 2] = x / ranges[i], y / ranges[i], z / ranges[i]
+
+
+# --- the nearest voxel in every direction ---
+
+
+class Lattice(NamedTuple):
+    """Directions in rows of one elevation and columns of one azimuth.
+
+    Attributes
+    ----------
+    frame : (3, 3) float64
+        Forward, sideways and polar direction.
+    cell : float, radians
+    azimuth, elevation : float, radians
+        Of the first column's and row's outer edge.
+    """
+
+    frame: NDArray[np.float64]
+    cell: float
+    azimuth: float
+    elevation: float
+
+
+@dataclass(frozen=True, eq=False)
+class BearingImage:
+    """A lattice of directions with the voxel seen in each.
+
+    Attributes
+    ----------
+    voxels : (h, w) int32
+        Row of the view that is seen, -1 where none. Cells that touch are neighbouring directions.
+    wraps : bool
+        Whether what lies between the last column and the first is a gap like any other, as in a panorama.
+    lattice : Lattice, or None
+        None for the pixels of a camera.
+    """
+
+    voxels: NDArray[np.int32]
+    wraps: bool = False
+    lattice: Lattice | None = None
+
+
+def bearing_image(view: View) -> BearingImage:
+    """Spherical image in which a voxel at median distance fills about one cell.
+
+    Notes
+    -----
+    The poles lie in the direction and counter-direction in which there is least to see, the seam behind the middle of
+    the view, so that a camera's image has neither. Nearer voxels hide farther ones and fill as many cells as their
+    width needs.
+    """
+    seen = np.flatnonzero(view.ranges > 0.5 * view.edge_lengths)  # the sensor's own voxel lies in no direction
+    if not len(seen):
+        return BearingImage(np.full((1, 1), -1, np.int32))
+    cell = max(float(np.median((view.widths / view.ranges)[seen])), math.sqrt(4.0 * math.pi / _MAX_CELLS))
+    frame, angles = _frame(view.bearings, seen), np.empty((2, len(seen)))
+    in_blocks(_set_angles, len(seen), view.bearings, seen, frame, angles)
+    first, last = angles.min(axis=1), angles.max(axis=1)
+    lattice = Lattice(frame, cell, float(first[0]), float(first[1]))
+    columns, rows = (int((last[i] - first[i]) / cell) + 1 for i in range(2))
+    voxels = _nearest(view.ranges, view.widths, seen, angles, lattice, rows, columns)
+    return BearingImage(voxels, bool(last[0] - first[0] > math.pi), lattice)
+
+
+def _frame(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Forward, sideways and polar direction, rows of (3, 3)."""
+    mean, scatter = _moments(bearings, seen)
+    pole = np.linalg.eigh(scatter)[1][:, 0]
+    forward = mean - pole * (pole @ mean)
+    if np.linalg.norm(forward) < 1e-6:  # as much on one side as on the other: any forward will do
+        forward = np.cross(pole, np.eye(3)[np.abs(pole).argmin()])
+    forward /= np.linalg.norm(forward)
+    return np.stack((forward, np.cross(pole, forward), pole))
+
+
+@kernel
+def _moments(
+    bearings: NDArray[np.float64], seen: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean of some directions, (3,), and the sum of their products, (3, 3)."""
+    mean, scatter = np.zeros(3), np.zeros((3, 3))
+    for i in seen:
+        for a in range(3):
+            mean[a] += bearings[i, a] / len(seen)
+            for b in range(3):
+                scatter[a, b] += bearings[i, a] * bearings[i, b]
+    return mean, scatter
+
+
+@routine
+def _angles(x: float, y: float, z: float, frame: NDArray[np.float64]) -> tuple[float, float]:
+    """Azimuth and elevation of a unit direction."""
+    height = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
+    along, aside = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z, frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z
+    return math.atan2(aside, along), math.asin(min(max(height, -1.0), 1.0))
+
+
+@kernel
+def _set_angles(
+    start: int,
+    stop: int,
+    bearings: NDArray[np.float64],
+    seen: NDArray[np.int64],
+    frame: NDArray[np.float64],
+    angles: NDArray[np.float64],
+) -> None:
+    for at in range(start, stop):
+        i = seen[at]
+        angles[0, at], angles[1, at] = _angles(bearings[i, 0], bearings[i, 1], bearings[i, 2], frame)
+
+
+@kernel
+def _nearest(
+    ranges: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    seen: NDArray[np.int64],
+    angles: NDArray[np.float64],
+    lattice: Lattice,
+    height: int,
+    width: int,
+) -> NDArray[np.int32]:
+    """The nearest voxel of each cell, -1 where there is none."""
+    image = np.full((height, width), np.int32(-1))
+    for at in range(len(seen)):
+        i = np.int32(seen[at])
+        cells = 0.5 * widths[i] / (ranges[i] * lattice.cell)
+        up = int(min(math.ceil(cells - 0.5), _MAX_CELLS_PER_VOXEL))
+        aside = int(min(math.ceil(cells / max(math.cos(angles[1, at]), 1e-3) - 0.5), _MAX_CELLS_PER_VOXEL))
+        row = int((angles[1, at] - lattice.elevation) / lattice.cell)
+        column = int((angles[0, at] - lattice.azimuth) / lattice.cell)
+        for r in range(max(row - up, 0), min(row + up + 1, height)):
+            for c in range(max(column - aside, 0), min(column + aside + 1, width)):
+                if image[r, c] < 0 or ranges[i] < ranges[image[r, c]]:
+                    image[r, c] = i
+    return image
+
+
+@routine
+def range_seen(place: NDArray[np.float64], view: View, voxels: NDArray[np.int32], lattice: Lattice) -> tuple[float, float]:
+    """Distance of what is seen where a place lies, infinite where nothing is, and that of the place itself."""
+    x, y, z = place[0] - view.place[0], place[1] - view.place[1], place[2] - view.place[2]
+    away = max(math.sqrt(x * x + y * y + z * z), 1e-300)
+    azimuth, elevation = _angles(x / away, y / away, z / away, lattice.frame)
+    row, column = (elevation - lattice.elevation) / lattice.cell, (azimuth - lattice.azimuth) / lattice.cell
+    if 0.0 <= row < voxels.shape[0] and 0.0 <= column < voxels.shape[1]:
+        seen = voxels[int(row), int(column)]
+        if seen >= 0:
+            return view.ranges[seen], away
+    return np.inf, away
+
+
+# --- depth edges along the lines of that image ---
+
+
+class Jumps(NamedTuple):
+    """Where depth jumps along the lines of an image.
+
+    Attributes
+    ----------
+    edges : (e, 2) int32
+        Rows of the view in front and behind, next to each other.
+    hidings : (c, 2) int32
+        Where something goes into hiding, and where it, or something else, comes out from behind what hid it.
+    """
+
+    edges: NDArray[np.int32]
+    hidings: NDArray[np.int32]
+
+
+def depth_jumps(view: View, image: BearingImage, reach: float, least_gap: float) -> Jumps:
+    """Where depth jumps along the rows and columns of an image.
+
+    Parameters
+    ----------
+    view : View
+    image : BearingImage of it
+    reach : float, widths
+        How wide a gap without data is looked across.
+    least_gap : float, voxel edges
+        Difference of range above which surfaces are apart.
+    """
+    lines = (image.voxels, image.wraps), (np.ascontiguousarray(image.voxels.T), False)
+    found = [_scan(voxels, wraps, view, reach, least_gap) for voxels, wraps in lines]
+    edges, hidings = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Jumps(edges, hidings)
+
+
+@kernel
+def _scan(  # type: ignore[no-untyped-def]
+    image: NDArray[np.int32], wraps: bool, view: View, reach: float, least_gap: float
+):
+    """Depth edges (e, 2), front and behind, and hidings (c, 2), both int32 rows of the view, along the image's rows.
+
+    Where a line passes from far to near, the far surface goes into hiding; where it passes from near to far, what
+    comes out is paired with what went in last. A hole in the data ends all hiding.
+    """
+    ranges, edge_lengths, supervoxels = view.ranges, view.edge_lengths, view.supervoxels
+    indptr, neighbours = view.neighbourhood
+    depth_edges = np.empty((image.size, 2), np.int32)
+    hidings = np.empty((image.size, 2), np.int32)
+    hidden, line = np.empty(_MAX_DEPTH, np.int32), np.empty(image.shape[1] + 4, np.int32)
+    n_edges = n_hidings = 0
+    for row in range(image.shape[0]):
+        first, last = _voxels_of(image[row], wraps, line)
+        depth = 0
+        for at in range(first, last):
+            before, voxel = line[at], line[at + 1]
+            if supervoxels[before] == supervoxels[voxel]:
+                continue
+            comes_out = ranges[before] < ranges[voxel]
+            front, behind, beyond = (before, voxel, line[at + 2]) if comes_out else (voxel, before, line[at - 1])
+            if _apart(front, behind, view, reach):
+                depth = 0
+                continue
+            edge = max(edge_lengths[front], edge_lengths[behind])
+            if ranges[behind] - ranges[front] < least_gap * edge:
+                continue
+            if beyond >= 0 and _apart(behind, beyond, view, reach):
+                beyond = -1
+            if not _stands_off(front, behind, beyond, view, least_gap * edge) or np.any(
+                neighbours[indptr[front] : indptr[front + 1]] == behind
+            ):
+                continue
+            depth_edges[n_edges, 0], depth_edges[n_edges, 1] = front, behind
+            n_edges += 1
+            if not comes_out:
+                hidden[depth % _MAX_DEPTH] = behind
+                depth += 1
+            elif depth > 0:
+                depth -= 1
+                entered = hidden[depth % _MAX_DEPTH]
+                if ranges[entered] > ranges[front] and supervoxels[entered] != supervoxels[behind]:
+                    hidings[n_hidings, 0], hidings[n_hidings, 1] = entered, behind
+                    n_hidings += 1
+    return depth_edges[:n_edges].copy(), hidings[:n_hidings].copy()
+
+
+@routine
+def _voxels_of(cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32]) -> tuple[int, int]:
+    """First and last place in `line` of the voxels in these cells, each once in a row; -1 is before and after them."""
+    n = 1
+    line[0] = line[1] = -1
+    for cell in cells:
+        if cell >= 0 and cell != line[n]:
+            n += line[n] >= 0
+            line[n] = cell
+    if wraps and n > 1:  # go on to the first voxel again
+        line[n + 1] = line[1]
+        n += 1
+    line[n + 1] = -1
+    return 1, n
+
+
+@routine
+def _apart(front: int, behind: int, view: View, reach: float) -> bool:
+    """Whether two bearings lie further apart than `reach` widths."""
+    bearings, ranges, widths = view.bearings, view.ranges, view.widths
+    squares = 0.0
+    for axis in range(3):
+        squares += (bearings[front, axis] - bearings[behind, axis]) ** 2
+    return squares > (reach * max(widths[front] / ranges[front], widths[behind] / ranges[behind])) ** 2
+
+
+@routine
+def _stands_off(front: int, behind: int, beyond: int, view: View, gap: float) -> bool:
+    """Whether `front`, nearer than `behind` by the gap, is half as far off the surface to which that belongs.
+
+    A surface seen at a slant gets deeper, too, but stays in its plane (the normal's), and in its line (to the voxel
+    beyond): the latter holds where lines are too far apart for normals, as the rings of a spinning scanner.
+    """
+    bearings, ranges, normals = view.bearings, view.ranges, view.normals
+    height = offsets = along = lengths = 0.0
+    for axis in range(3):
+        at = ranges[behind] * bearings[behind, axis]
+        offset = ranges[front] * bearings[front, axis] - at
+        height += offset * normals[behind, axis]
+        if beyond >= 0:
+            further = ranges[beyond] * bearings[beyond, axis] - at
+            offsets, along, lengths = offsets + offset * offset, along + offset * further, lengths + further * further
+    if height < 0.5 * gap:
+        return False
+    return lengths == 0.0 or offsets - along * along / lengths > (0.5 * gap) ** 2
