@@ -20,7 +20,7 @@ from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
-from pcgraph.graph.continuations import continuations
+from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import (
     CleanCloud,
@@ -182,7 +182,9 @@ def segment(
         warn_of_viewpoint(place, grid)
     outside = _outward_planes(grid, settings.method, law, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
-    result = segment_scan(Scan(cloud, outside.viewpoint, outside.places, grid, outside.planes, initial_labels, seed), None, settings)
+    result = segment_scan(
+        Scan(cloud, outside.viewpoint, outside.places, grid, outside.planes, initial_labels, seed), None, settings
+    )
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
 
@@ -331,15 +333,17 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
 
     (leaf_of_point, leaves), touching = side_by_side(with_points, lambda: contacts(grid, normals, supervoxels))
     nodes = node_features(leaves)
+    features = edge_features(nodes, touching)
+    faces = faces_of(touching.edges, features, len(leaves))
     near, hidden = side_by_side(
         lambda: gaps(grid, normals, supervoxels, nodes, touching.edges),
-        lambda: continuations(surface, nodes, scan.places),
+        lambda: continuations(surface, nodes, faces, scan.places),
     )
     hidden = hidden.without(np.concatenate((touching.edges, near.edges)))
     joined = np.concatenate((touching.edges, near.edges, hidden.pairs))
     across = bridges(grid, supervoxels, leaves.counts, joined)
     told_by_colors = color_evidence(grid, normals)
-    graph = AdjacencyGraph(touching.edges, edge_features(nodes, touching), nodes, near, hidden, across, told_by_colors)
+    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, across, told_by_colors)
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
@@ -442,7 +446,7 @@ class Outside(NamedTuple):
     viewpoint : (3,) or (n, 3) float64, metres
         One for all n points or one for each.
     places : (p, 3) float64, metres
-        The viewpoint, some of the viewpoints, or where none is known, some of the places from which the outside is seen.
+        The viewpoint, or some of them, or where none is known, some of the places from which the outside is seen.
     planes : LocalPlanes
     """
 

@@ -30,6 +30,7 @@ from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.bridges import bridges
+from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
@@ -41,6 +42,7 @@ from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.sampling import some_blocks
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.spacing_law import spacing_law
+from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
 from pcgraph.voxels.warp import CameraWarp, Warp
 
@@ -154,8 +156,9 @@ def _compile_graph_and_tree() -> None:
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
     near = gaps(grid, normals, labels, nodes, touching.edges)
+    hidden = continuations(Surface(grid, normals, labels), nodes, labels, np.zeros((1, 3)))
     across = bridges(grid, labels, leaves.counts, np.concatenate((touching.edges, near.edges)))
-    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, across)
+    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden, across)
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
 
 

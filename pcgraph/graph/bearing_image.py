@@ -56,7 +56,7 @@ def view_from(surface: Surface, place: NDArray[np.float64], some: bool = False) 
     normals, supervoxels, touching = surface.normals, surface.supervoxels, grid.neighbourhood
     edges, centroids = grid.edge_lengths, grid.centroids
     if len(voxels) < grid.n_voxels:
-        normals, supervoxels, edges, centroids = (of[voxels] for of in (normals, supervoxels, edges, centroids))
+        normals, supervoxels, edges, centroids = normals[voxels], supervoxels[voxels], edges[voxels], centroids[voxels]
         touching = Neighbourhood(np.zeros(len(voxels) + 1, np.int64), np.empty(0, np.int32))
     bearings, ranges = np.empty((len(voxels), 3)), np.empty(len(voxels))
     in_blocks(_look, len(voxels), place, centroids, bearings, ranges)
@@ -82,24 +82,6 @@ def _look(
 # --- the nearest voxel in every direction ---
 
 
-class Lattice(NamedTuple):
-    """Directions in rows of one elevation and columns of one azimuth.
-
-    Attributes
-    ----------
-    frame : (3, 3) float64
-        Forward, sideways and polar direction.
-    cell : float, radians
-    azimuth, elevation : float, radians
-        Of the first column's and row's outer edge.
-    """
-
-    frame: NDArray[np.float64]
-    cell: float
-    azimuth: float
-    elevation: float
-
-
 @dataclass(frozen=True, eq=False)
 class BearingImage:
     """A lattice of directions with the voxel seen in each.
@@ -110,13 +92,10 @@ class BearingImage:
         Row of the view that is seen, -1 where none. Cells that touch are neighbouring directions.
     wraps : bool
         Whether what lies between the last column and the first is a gap like any other, as in a panorama.
-    lattice : Lattice, or None
-        None for the pixels of a camera.
     """
 
     voxels: NDArray[np.int32]
     wraps: bool = False
-    lattice: Lattice | None = None
 
 
 def bearing_image(view: View) -> BearingImage:
@@ -135,10 +114,10 @@ def bearing_image(view: View) -> BearingImage:
     frame, angles = _frame(view.bearings, seen), np.empty((2, len(seen)))
     in_blocks(_set_angles, len(seen), view.bearings, seen, frame, angles)
     first, last = angles.min(axis=1), angles.max(axis=1)
-    lattice = Lattice(frame, cell, float(first[0]), float(first[1]))
-    columns, rows = (int((last[i] - first[i]) / cell) + 1 for i in range(2))
-    voxels = _nearest(view.ranges, view.widths, seen, angles, lattice, rows, columns)
-    return BearingImage(voxels, bool(last[0] - first[0] > math.pi), lattice)
+    width, height = ((last - first) / cell).astype(np.int64) + 1
+    voxels = np.full((height, width), -1, np.int32)
+    _set_nearest(view.ranges, view.widths, seen, angles, first, cell, voxels)
+    return BearingImage(voxels, bool(last[0] - first[0] > math.pi))
 
 
 def _frame(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -153,9 +132,7 @@ def _frame(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> NDArray[np
 
 
 @kernel
-def _moments(
-    bearings: NDArray[np.float64], seen: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _moments(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean of some directions, (3,), and the sum of their products, (3, 3)."""
     mean, scatter = np.zeros(3), np.zeros((3, 3))
     for i in seen:
@@ -164,14 +141,6 @@ def _moments(
             for b in range(3):
                 scatter[a, b] += bearings[i, a] * bearings[i, b]
     return mean, scatter
-
-
-@routine
-def _angles(x: float, y: float, z: float, frame: NDArray[np.float64]) -> tuple[float, float]:
-    """Azimuth and elevation of a unit direction."""
-    height = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
-    along, aside = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z, frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z
-    return math.atan2(aside, along), math.asin(min(max(height, -1.0), 1.0))
 
 
 @kernel
@@ -183,49 +152,41 @@ def _set_angles(
     frame: NDArray[np.float64],
     angles: NDArray[np.float64],
 ) -> None:
+    """Set azimuth and elevation of some directions, (2, s)."""
     for at in range(start, stop):
-        i = seen[at]
-        angles[0, at], angles[1, at] = _angles(bearings[i, 0], bearings[i, 1], bearings[i, 2], frame)
+        along = aside = height = 0.0
+        for axis in range(3):
+            part = bearings[seen[at], axis]
+            along, aside, height = (
+                along + frame[0, axis] * part,
+                aside + frame[1, axis] * part,
+                height + frame[2, axis] * part,
+            )
+        angles[0, at], angles[1, at] = math.atan2(aside, along), math.asin(min(max(height, -1.0), 1.0))
 
 
 @kernel
-def _nearest(
+def _set_nearest(
     ranges: NDArray[np.float64],
     widths: NDArray[np.float64],
     seen: NDArray[np.int64],
     angles: NDArray[np.float64],
-    lattice: Lattice,
-    height: int,
-    width: int,
-) -> NDArray[np.int32]:
-    """The nearest voxel of each cell, -1 where there is none."""
-    image = np.full((height, width), np.int32(-1))
+    first: NDArray[np.float64],
+    cell: float,
+    image: NDArray[np.int32],
+) -> None:
+    """Set the nearest voxel of each cell; `first` is the angles of the image's corner."""
+    height, width = image.shape
     for at in range(len(seen)):
         i = np.int32(seen[at])
-        cells = 0.5 * widths[i] / (ranges[i] * lattice.cell)
+        cells = 0.5 * widths[i] / (ranges[i] * cell)
         up = int(min(math.ceil(cells - 0.5), _MAX_CELLS_PER_VOXEL))
         aside = int(min(math.ceil(cells / max(math.cos(angles[1, at]), 1e-3) - 0.5), _MAX_CELLS_PER_VOXEL))
-        row = int((angles[1, at] - lattice.elevation) / lattice.cell)
-        column = int((angles[0, at] - lattice.azimuth) / lattice.cell)
+        column, row = int((angles[0, at] - first[0]) / cell), int((angles[1, at] - first[1]) / cell)
         for r in range(max(row - up, 0), min(row + up + 1, height)):
             for c in range(max(column - aside, 0), min(column + aside + 1, width)):
                 if image[r, c] < 0 or ranges[i] < ranges[image[r, c]]:
                     image[r, c] = i
-    return image
-
-
-@routine
-def range_seen(place: NDArray[np.float64], view: View, voxels: NDArray[np.int32], lattice: Lattice) -> tuple[float, float]:
-    """Distance of what is seen where a place lies, infinite where nothing is, and that of the place itself."""
-    x, y, z = place[0] - view.place[0], place[1] - view.place[1], place[2] - view.place[2]
-    away = max(math.sqrt(x * x + y * y + z * z), 1e-300)
-    azimuth, elevation = _angles(x / away, y / away, z / away, lattice.frame)
-    row, column = (elevation - lattice.elevation) / lattice.cell, (azimuth - lattice.azimuth) / lattice.cell
-    if 0.0 <= row < voxels.shape[0] and 0.0 <= column < voxels.shape[1]:
-        seen = voxels[int(row), int(column)]
-        if seen >= 0:
-            return view.ranges[seen], away
-    return np.inf, away
 
 
 # --- depth edges along the lines of that image ---
@@ -280,7 +241,7 @@ def _scan(  # type: ignore[no-untyped-def]
     hidden, line = np.empty(_MAX_DEPTH, np.int32), np.empty(image.shape[1] + 4, np.int32)
     n_edges = n_hidings = 0
     for row in range(image.shape[0]):
-        first, last = _voxels_of(image[row], wraps, line)
+        first, last = voxels_of(image[row], wraps, line)
         depth = 0
         for at in range(first, last):
             before, voxel = line[at], line[at + 1]
@@ -288,13 +249,13 @@ def _scan(  # type: ignore[no-untyped-def]
                 continue
             comes_out = ranges[before] < ranges[voxel]
             front, behind, beyond = (before, voxel, line[at + 2]) if comes_out else (voxel, before, line[at - 1])
-            if _apart(front, behind, view, reach):
+            if apart(front, behind, view, reach):
                 depth = 0
                 continue
             edge = max(edge_lengths[front], edge_lengths[behind])
             if ranges[behind] - ranges[front] < least_gap * edge:
                 continue
-            if beyond >= 0 and _apart(behind, beyond, view, reach):
+            if beyond >= 0 and apart(behind, beyond, view, reach):
                 beyond = -1
             if not _stands_off(front, behind, beyond, view, least_gap * edge) or np.any(
                 neighbours[indptr[front] : indptr[front + 1]] == behind
@@ -315,7 +276,7 @@ def _scan(  # type: ignore[no-untyped-def]
 
 
 @routine
-def _voxels_of(cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32]) -> tuple[int, int]:
+def voxels_of(cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32]) -> tuple[int, int]:
     """First and last place in `line` of the voxels in these cells, each once in a row; -1 is before and after them."""
     n = 1
     line[0] = line[1] = -1
@@ -331,7 +292,7 @@ def _voxels_of(cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32]) -
 
 
 @routine
-def _apart(front: int, behind: int, view: View, reach: float) -> bool:
+def apart(front: int, behind: int, view: View, reach: float) -> bool:
     """Whether two bearings lie further apart than `reach` widths."""
     bearings, ranges, widths = view.bearings, view.ranges, view.widths
     squares = 0.0

@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
-from pcgraph.graph.bearing_image import BearingImage, View, bearing_image, depth_jumps, range_seen, view_from
+from pcgraph.graph.adjacency import EdgeFeatures
+from pcgraph.graph.bearing_image import View, apart, bearing_image, depth_jumps, view_from, voxels_of
 from pcgraph.graph.contacts import angle_between
-from pcgraph.parallel import in_blocks, kernel
+from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
 
@@ -20,9 +23,7 @@ REACH, LEAST_GAP = 8.0, 3.0
 _SMOOTH_RAD = 0.2  # surfaces at most this far apart in angle
 _SMOOTH_VOXELS = 2.0  # and in height may be one
 _LEAST_CROSSINGS = 2
-_SEEN_THROUGH = 0.1  # of the looks at what should be hidden, at most, go through it,
-_THROUGH = 1.5  # voxels at least
-_SAMPLES = 3  # on the way from one side to the other
+_OPEN = 0.5  # of the lines along which borders are hidden, at most, may find them open
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,71 +67,105 @@ class Continuations(ShortRepr):
         return self.chosen(~np.isin(keys, others))
 
 
-def continuations(surface: Surface, nodes: NodeFeatures, places: NDArray[np.float64]) -> Continuations:
+def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArray[np.int32]:
+    """Face of each of k supervoxels, (k,) int32: those that touch, one as smooth as the other goes on, are on one."""
+    smooth = (features.normal_angle <= _SMOOTH_RAD) & (features.step <= features.voxel_edge)
+    return connected_components(edges[smooth], k)
+
+
+def continuations(
+    surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32], places: NDArray[np.float64]
+) -> Continuations:
     """Flat surfaces that go on behind what hides them, as seen from some places; supervoxels may touch elsewhere.
 
     Parameters
     ----------
     surface : Surface of v voxels
     nodes : NodeFeatures of the k supervoxels
+    faces : (k,) int32
+        Which of them lie on one face.
     places : (p, 3) float64, metres
         From where the cloud was seen, or from where its outside is.
 
     Notes
     -----
-    Only pairs that are coplanar, along two lines at least, and whose way from one to the other is hidden: what is seen
-    from one of the places through where the surface should be, is no surface.
+    Pairs are coplanar, along two lines at least. Two faces that lie in one plane by chance, as fronts of houses do, end
+    in the open: their borders are theirs, where those of a floor behind a chair are the chair's. So the borders of both
+    faces decide: on the lines from one to the other they lie open at most half as often as they are hidden.
+
+    Completion behind what hides a surface: Kellman and Shipley 1991; borders: Nakayama et al. 1989.
     """
     views = [view_from(surface, place, some=True) for place in places]
     images = [bearing_image(view) for view in views]
-    found = [_hidings(view, image) for view, image in zip(views, images, strict=True)]
-    hidings = np.concatenate([view.voxels[rows] for view, rows in zip(views, found, strict=True)])
-    all_of_them, pair = continuations_of(surface, nodes, hidings)
-    likely = all_of_them.coplanar & (all_of_them.crossings >= _LEAST_CROSSINGS)
-    looked_at = np.flatnonzero(likely[pair])
-    through = _seen_through(surface, hidings[looked_at], views, images)
-    sums = np.bincount(pair[looked_at], through, len(likely))
-    return all_of_them.chosen(likely & (sums <= _SEEN_THROUGH * all_of_them.crossings))
-
-
-def _hidings(view: View, image: BearingImage) -> NDArray[np.int32]:
-    return depth_jumps(view, image, REACH, LEAST_GAP).hidings
-
-
-def _seen_through(
-    surface: Surface, hidings: NDArray[np.int64], views: list[View], images: list[BearingImage]
-) -> NDArray[np.float64]:
-    """Fraction, for each way between two voxels, of the looks at it that go on to something behind it, (c,)."""
-    looks = np.zeros(len(hidings))
-    edge_lengths = surface.grid.edge_lengths
+    hidings = [
+        view.voxels[depth_jumps(view, image, REACH, LEAST_GAP).hidings]
+        for view, image in zip(views, images, strict=True)
+    ]
+    found = continuations_of(surface, nodes, np.concatenate(hidings))
+    found = found.chosen(found.coplanar & (found.crossings >= _LEAST_CROSSINGS))
+    sides = np.sort(faces[found.pairs], axis=1)
+    between, pair = distinct_pairs(sides[:, 0], sides[:, 1])
+    hidden, opened = np.bincount(pair, found.crossings, len(between)), np.zeros(len(between), np.int64)
+    both_ways = _both_ways(between, int(faces.max()) + 1)
     for view, image in zip(views, images, strict=True):
-        if image.lattice is not None:
-            arguments = surface.grid.centroids, edge_lengths, hidings, view, image.voxels, image.lattice
-            in_blocks(_count_looks_through, len(hidings), *arguments, looks)
-    return looks / (_SAMPLES * len(views))
+        for lines in (image.voxels, np.ascontiguousarray(image.voxels.T)):
+            _count_open(lines, view, faces[view.supervoxels], both_ways, opened)
+    one_face = between[:, 0] == between[:, 1]
+    return found.chosen((one_face | (opened <= _OPEN * hidden))[pair])
+
+
+class _Ways(NamedTuple):
+    """``others[starts[i]:starts[i + 1]]`` are the faces that may go on as face i, by the pairs in `pair`."""
+
+    starts: NDArray[np.int64]
+    others: NDArray[np.int32]
+    pair: NDArray[np.int64]
+
+
+def _both_ways(pairs: NDArray[np.int32], n_faces: int) -> _Ways:
+    ends = np.concatenate((pairs, pairs[:, ::-1]))
+    order = np.argsort(ends[:, 0], kind="stable")
+    starts = np.searchsorted(ends[order, 0], np.arange(n_faces + 1))
+    return _Ways(starts, ends[order, 1], order % max(len(pairs), 1))
 
 
 @kernel
-def _count_looks_through(  # type: ignore[no-untyped-def]
-    start, stop, centroids, edge_lengths, hidings, view, voxels, lattice, looks
-):
-    """Add the samples of each way that something is seen behind."""
-    sample = np.empty(3)
-    for i in range(start, stop):
-        a, b = hidings[i]
-        edge = _THROUGH * max(edge_lengths[a], edge_lengths[b])
-        for step in range(1, _SAMPLES + 1):
-            part = step / (_SAMPLES + 1.0)
-            for axis in range(3):
-                sample[axis] = (1.0 - part) * centroids[a, axis] + part * centroids[b, axis]
-            seen, away = range_seen(sample, view, voxels, lattice)
-            looks[i] += away + edge < seen < np.inf
+def _count_open(
+    image: NDArray[np.int32], view: View, face: NDArray[np.int32], ways: _Ways, opened: NDArray[np.int64]
+) -> None:
+    """Add how often, along the rows of an image, one face of each pair ends in the open on the way to the other.
+
+    A face, `face` says which of each row of the view, ends or begins in the open where something farther, or nothing,
+    lies beside it.
+    """
+    n_faces = len(ways.starts) - 1
+    last, ends_open = np.full(n_faces, -1, np.int64), np.zeros(n_faces, np.bool_)
+    line = np.empty(image.shape[1] + 4, np.int32)
+    for row in range(image.shape[0]):
+        first, stop = voxels_of(image[row], False, line)
+        start = row * image.shape[1]
+        for at in range(first, stop + 1):
+            before, i = line[at - 1], line[at]
+            if i < 0:
+                continue
+            here, begins_open = face[i], False
+            if before >= 0 and face[before] != here:
+                edge, deeper = (
+                    max(view.edge_lengths[before], view.edge_lengths[i]),
+                    view.ranges[i] - view.ranges[before],
+                )
+                hole = apart(before, i, view, REACH)
+                ends_open[face[before]], begins_open = hole or deeper > edge, hole or -deeper > edge
+            if before < 0 or face[before] != here:
+                for way in range(ways.starts[here], ways.starts[here + 1]):
+                    other = ways.others[way]
+                    if last[other] > max(last[here], start) and (begins_open or ends_open[other]):
+                        opened[ways.pair[way]] += 1
+            last[here] = start + at
 
 
-def continuations_of(
-    surface: Surface, nodes: NodeFeatures, hidings: NDArray[np.integer]
-) -> tuple[Continuations, NDArray[np.int64]]:
-    """Hidings, (c, 2) voxels, by pair of supervoxels, and which pair each belongs to, (c,)."""
+def continuations_of(surface: Surface, nodes: NodeFeatures, hidings: NDArray[np.integer]) -> Continuations:
+    """Hidings, (c, 2) voxels, by pair of supervoxels."""
     owners = surface.supervoxels[hidings]
     swap = owners[:, 0] > owners[:, 1]
     hidings, owners = (np.where(swap[:, None], both[:, ::-1], both) for both in (hidings, owners))
@@ -146,7 +181,7 @@ def continuations_of(
     angle, offset = angle_between(nodes.normal[i], nodes.normal[j]), np.maximum(*heights)
     contrast = np.nan_to_num(np.linalg.norm(nodes.color[j] - nodes.color[i], axis=1))
     coplanar = (angle <= _SMOOTH_RAD) & (offset <= np.maximum(_SMOOTH_VOXELS * edge, 0.1 * width))
-    return Continuations(pairs, crossings, width, angle, offset, contrast, coplanar), pair
+    return Continuations(pairs, crossings, width, angle, offset, contrast, coplanar)
 
 
 def _heights(points: NDArray[np.float64], owners: NDArray[np.int32], nodes: NodeFeatures) -> NDArray[np.float64]:

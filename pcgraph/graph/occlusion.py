@@ -94,7 +94,7 @@ def occlusions(
     view = view_from(surface, position)
     seen = bearing_image(view) if image is None else BearingImage(_checked(image, surface.grid.n_voxels))
     jumps = depth_jumps(view, seen, reach, least_gap)
-    return _collected(surface, view, jumps.edges, continuations_of(surface, nodes, jumps.hidings)[0])
+    return _collected(surface, view, jumps.edges, continuations_of(surface, nodes, jumps.hidings))
 
 
 def _checked(image: ArrayLike, n_voxels: int) -> NDArray[np.int32]:
