@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pcgraph.graph.adjacency import EdgeFeatures as EdgeFeatures
     from pcgraph.graph.boundary import BoundaryCost as BoundaryCost
     from pcgraph.graph.boundary import BoundaryStrength as BoundaryStrength
-    from pcgraph.graph.occlusion import Continuations as Continuations
+    from pcgraph.graph.continuations import Continuations as Continuations
     from pcgraph.graph.occlusion import Occlusions as Occlusions
     from pcgraph.io import read_cloud as read_cloud
     from pcgraph.io import write_segmentation as write_segmentation
