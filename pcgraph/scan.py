@@ -339,7 +339,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: gaps(grid, normals, supervoxels, nodes, touching.edges),
         lambda: continuations(surface, nodes, faces, scan.places),
     )
-    hidden = hidden.without(np.concatenate((touching.edges, near.edges)))
+    hidden = hidden.without(touching.edges).without(near.edges)
     joined = np.concatenate((touching.edges, near.edges, hidden.pairs))
     across = bridges(grid, supervoxels, leaves.counts, joined)
     told_by_colors = color_evidence(grid, normals)

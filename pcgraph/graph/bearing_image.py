@@ -20,47 +20,56 @@ _MAX_CELLS_PER_VOXEL = 16  # to either side; only voxels that nearly touch the s
 _MAX_DEPTH = 32  # things one behind the other along a line
 
 
-class View(NamedTuple):
-    """Voxels as they are seen from a place.
+class Squares(NamedTuple):
+    """What stands for a surface when it is looked at: all its voxels, or of many some, larger ones.
 
     Attributes
     ----------
-    place : (3,) float64, metres
     voxels : (s,) int64
-        Those that are looked at; all that follows has a row for each.
-    bearings : (s, 3) float64
-        Unit directions to them.
-    ranges, edge_lengths, widths : (s,) float64, metres
-        Widths are edge lengths, or more where some voxels stand for others beside them.
-    normals : (s, 3) float64
+        All that follows has a row for each.
+    centroids, normals : (s, 3) float64
+    edge_lengths, widths : (s,) float64, metres
+        Of the voxels, and of the squares, which are wider where they stand for voxels beside them.
     supervoxels : (s,) int32
     neighbourhood : Neighbourhood of s voxels
         Which of them touch; none where some stand for others.
     """
 
-    place: NDArray[np.float64]
     voxels: NDArray[np.int64]
-    bearings: NDArray[np.float64]
-    ranges: NDArray[np.float64]
+    centroids: NDArray[np.float64]
+    normals: NDArray[np.float64]
     edge_lengths: NDArray[np.float64]
     widths: NDArray[np.float64]
-    normals: NDArray[np.float64]
     supervoxels: NDArray[np.int32]
     neighbourhood: Neighbourhood
 
 
-def view_from(surface: Surface, place: NDArray[np.float64], some: bool = False) -> View:
-    """All voxels as they are seen from a place, (3,), or, of many, some that stand for those beside them."""
-    grid = surface.grid
+def squares_of(surface: Surface, some: bool = False) -> Squares:
+    """All voxels of a surface, or, if they are many, some."""
+    grid, normals, labels = surface.grid, surface.normals, surface.supervoxels
     voxels, stretch = standing_for_all(grid) if some else (np.arange(grid.n_voxels), 1.0)
-    normals, supervoxels, touching = surface.normals, surface.supervoxels, grid.neighbourhood
-    edges, centroids = grid.edge_lengths, grid.centroids
-    if len(voxels) < grid.n_voxels:
-        normals, supervoxels, edges, centroids = normals[voxels], supervoxels[voxels], edges[voxels], centroids[voxels]
-        touching = Neighbourhood(np.zeros(len(voxels) + 1, np.int64), np.empty(0, np.int32))
-    bearings, ranges = np.empty((len(voxels), 3)), np.empty(len(voxels))
-    in_blocks(_look, len(voxels), place, centroids, bearings, ranges)
-    return View(place, voxels, bearings, ranges, edges, stretch * edges, normals, supervoxels, touching)
+    edges = grid.edge_lengths
+    if len(voxels) == grid.n_voxels:
+        return Squares(voxels, grid.centroids, normals, edges, edges, labels, grid.neighbourhood)
+    none_touch = Neighbourhood(np.zeros(len(voxels) + 1, np.int64), np.empty(0, np.int32))
+    edges = edges[voxels]
+    return Squares(voxels, grid.centroids[voxels], normals[voxels], edges, stretch * edges, labels[voxels], none_touch)
+
+
+class View(NamedTuple):
+    """Squares as they are seen from a place: unit directions to them, (s, 3), and distances, (s,) float64, metres."""
+
+    squares: Squares
+    bearings: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+
+
+def view_from(place: NDArray[np.float64], squares: Squares) -> View:
+    """Squares as they are seen from a place, (3,) float64, metres."""
+    s = len(squares.voxels)
+    bearings, ranges = np.empty((s, 3)), np.empty(s)
+    in_blocks(_look, s, place, squares.centroids, bearings, ranges)
+    return View(squares, bearings, ranges)
 
 
 @kernel
@@ -89,7 +98,7 @@ class BearingImage:
     Attributes
     ----------
     voxels : (h, w) int32
-        Row of the view that is seen, -1 where none. Cells that touch are neighbouring directions.
+        Square that is seen, -1 where none. Cells that touch are neighbouring directions.
     wraps : bool
         Whether what lies between the last column and the first is a gap like any other, as in a panorama.
     """
@@ -107,16 +116,17 @@ def bearing_image(view: View) -> BearingImage:
     the view, so that a camera's image has neither. Nearer voxels hide farther ones and fill as many cells as their
     width needs.
     """
-    seen = np.flatnonzero(view.ranges > 0.5 * view.edge_lengths)  # the sensor's own voxel lies in no direction
+    squares = view.squares
+    seen = np.flatnonzero(view.ranges > 0.5 * squares.edge_lengths)  # the sensor's own voxel lies in no direction
     if not len(seen):
         return BearingImage(np.full((1, 1), -1, np.int32))
-    cell = max(float(np.median((view.widths / view.ranges)[seen])), math.sqrt(4.0 * math.pi / _MAX_CELLS))
+    cell = max(float(np.median((squares.widths / view.ranges)[seen])), math.sqrt(4.0 * math.pi / _MAX_CELLS))
     frame, angles = _frame(view.bearings, seen), np.empty((2, len(seen)))
     in_blocks(_set_angles, len(seen), view.bearings, seen, frame, angles)
     first, last = angles.min(axis=1), angles.max(axis=1)
     width, height = ((last - first) / cell).astype(np.int64) + 1
     voxels = np.full((height, width), -1, np.int32)
-    _set_nearest(view.ranges, view.widths, seen, angles, first, cell, voxels)
+    _set_nearest(view.ranges, squares.widths, seen, angles, first, cell, voxels)
     return BearingImage(voxels, bool(last[0] - first[0] > math.pi))
 
 
@@ -175,7 +185,7 @@ def _set_nearest(
     cell: float,
     image: NDArray[np.int32],
 ) -> None:
-    """Set the nearest voxel of each cell; `first` is the angles of the image's corner."""
+    """Set the nearest square of each cell; `first` is the angles of the image's corner."""
     height, width = image.shape
     for at in range(len(seen)):
         i = np.int32(seen[at])
@@ -198,7 +208,7 @@ class Jumps(NamedTuple):
     Attributes
     ----------
     edges : (e, 2) int32
-        Rows of the view in front and behind, next to each other.
+        Squares in front and behind, next to each other.
     hidings : (c, 2) int32
         Where something goes into hiding, and where it, or something else, comes out from behind what hid it.
     """
@@ -229,13 +239,13 @@ def depth_jumps(view: View, image: BearingImage, reach: float, least_gap: float)
 def _scan(  # type: ignore[no-untyped-def]
     image: NDArray[np.int32], wraps: bool, view: View, reach: float, least_gap: float
 ):
-    """Depth edges (e, 2), front and behind, and hidings (c, 2), both int32 rows of the view, along the image's rows.
+    """Depth edges (e, 2), front and behind, and hidings (c, 2), both int32 squares, along the image's rows.
 
     Where a line passes from far to near, the far surface goes into hiding; where it passes from near to far, what
     comes out is paired with what went in last. A hole in the data ends all hiding.
     """
-    ranges, edge_lengths, supervoxels = view.ranges, view.edge_lengths, view.supervoxels
-    indptr, neighbours = view.neighbourhood
+    ranges, edge_lengths, supervoxels = view.ranges, view.squares.edge_lengths, view.squares.supervoxels
+    indptr, neighbours = view.squares.neighbourhood
     depth_edges = np.empty((image.size, 2), np.int32)
     hidings = np.empty((image.size, 2), np.int32)
     hidden, line = np.empty(_MAX_DEPTH, np.int32), np.empty(image.shape[1] + 4, np.int32)
@@ -294,7 +304,7 @@ def voxels_of(cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32]) ->
 @routine
 def apart(front: int, behind: int, view: View, reach: float) -> bool:
     """Whether two bearings lie further apart than `reach` widths."""
-    bearings, ranges, widths = view.bearings, view.ranges, view.widths
+    bearings, ranges, widths = view.bearings, view.ranges, view.squares.widths
     squares = 0.0
     for axis in range(3):
         squares += (bearings[front, axis] - bearings[behind, axis]) ** 2
@@ -308,7 +318,7 @@ def _stands_off(front: int, behind: int, beyond: int, view: View, gap: float) ->
     A surface seen at a slant gets deeper, too, but stays in its plane (the normal's), and in its line (to the voxel
     beyond): the latter holds where lines are too far apart for normals, as the rings of a spinning scanner.
     """
-    bearings, ranges, normals = view.bearings, view.ranges, view.normals
+    bearings, ranges, normals = view.bearings, view.ranges, view.squares.normals
     height = offsets = along = lengths = 0.0
     for axis in range(3):
         at = ranges[behind] * bearings[behind, axis]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
-from pcgraph.graph.bearing_image import View, apart, bearing_image, depth_jumps, view_from, voxels_of
+from pcgraph.graph.bearing_image import View, apart, bearing_image, depth_jumps, squares_of, view_from, voxels_of
 from pcgraph.graph.contacts import angle_between
 from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
@@ -62,9 +62,9 @@ class Continuations(ShortRepr):
         return Continuations(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
 
     def without(self, pairs: NDArray[np.int32]) -> Continuations:
-        """Those that are not among these pairs, (m, 2), the smaller first."""
+        """Those that are not among these pairs, (m, 2) int32, the smaller first, in ascending order."""
         keys, others = (both[:, 0].astype(np.int64) << 32 | both[:, 1] for both in (self.pairs, pairs))
-        return self.chosen(~np.isin(keys, others))
+        return self.chosen(np.searchsorted(others, keys, "left") == np.searchsorted(others, keys, "right"))
 
 
 def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArray[np.int32]:
@@ -95,21 +95,20 @@ def continuations(
 
     Completion behind what hides a surface: Kellman and Shipley 1991; borders: Nakayama et al. 1989.
     """
-    views = [view_from(surface, place, some=True) for place in places]
+    squares = squares_of(surface, some=True)
+    views = [view_from(place, squares) for place in places]
     images = [bearing_image(view) for view in views]
-    hidings = [
-        view.voxels[depth_jumps(view, image, REACH, LEAST_GAP).hidings]
-        for view, image in zip(views, images, strict=True)
-    ]
-    found = continuations_of(surface, nodes, np.concatenate(hidings))
+    jumps = [depth_jumps(view, image, REACH, LEAST_GAP) for view, image in zip(views, images, strict=True)]
+    hidings = squares.voxels[np.concatenate([of_view.hidings for of_view in jumps])]
+    found = continuations_of(surface, nodes, hidings)
     found = found.chosen(found.coplanar & (found.crossings >= _LEAST_CROSSINGS))
     sides = np.sort(faces[found.pairs], axis=1)
     between, pair = distinct_pairs(sides[:, 0], sides[:, 1])
     hidden, opened = np.bincount(pair, found.crossings, len(between)), np.zeros(len(between), np.int64)
-    both_ways = _both_ways(between, int(faces.max()) + 1)
+    both_ways, face = _both_ways(between, int(faces.max()) + 1), faces[squares.supervoxels]
     for view, image in zip(views, images, strict=True):
         for lines in (image.voxels, np.ascontiguousarray(image.voxels.T)):
-            _count_open(lines, view, faces[view.supervoxels], both_ways, opened)
+            _count_open(lines, view, face, both_ways, opened)
     one_face = between[:, 0] == between[:, 1]
     return found.chosen((one_face | (opened <= _OPEN * hidden))[pair])
 
@@ -135,10 +134,10 @@ def _count_open(
 ) -> None:
     """Add how often, along the rows of an image, one face of each pair ends in the open on the way to the other.
 
-    A face, `face` says which of each row of the view, ends or begins in the open where something farther, or nothing,
+    A face, `face` says which of each square, ends or begins in the open where something farther, or nothing,
     lies beside it.
     """
-    n_faces = len(ways.starts) - 1
+    n_faces, edges = len(ways.starts) - 1, view.squares.edge_lengths
     last, ends_open = np.full(n_faces, -1, np.int64), np.zeros(n_faces, np.bool_)
     line = np.empty(image.shape[1] + 4, np.int32)
     for row in range(image.shape[0]):
@@ -150,10 +149,7 @@ def _count_open(
                 continue
             here, begins_open = face[i], False
             if before >= 0 and face[before] != here:
-                edge, deeper = (
-                    max(view.edge_lengths[before], view.edge_lengths[i]),
-                    view.ranges[i] - view.ranges[before],
-                )
+                deeper, edge = view.ranges[i] - view.ranges[before], max(edges[before], edges[i])
                 hole = apart(before, i, view, REACH)
                 ends_open[face[before]], begins_open = hole or deeper > edge, hole or -deeper > edge
             if before < 0 or face[before] != here:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.nodes import NodeFeatures
-from pcgraph.graph.bearing_image import BearingImage, View, bearing_image, depth_jumps, view_from
+from pcgraph.graph.bearing_image import BearingImage, View, bearing_image, depth_jumps, squares_of, view_from
 from pcgraph.graph.continuations import LEAST_GAP, REACH, Continuations, continuations_of, distinct_pairs
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
@@ -91,7 +91,7 @@ def occlusions(
     for name, value in (("reach", reach), ("least_gap", least_gap)):
         if not 0.0 < value < np.inf:
             raise ValueError(f"expected {name} as a finite number of voxels above 0, got {value!r}")
-    view = view_from(surface, position)
+    view = view_from(position, squares_of(surface))
     seen = bearing_image(view) if image is None else BearingImage(_checked(image, surface.grid.n_voxels))
     jumps = depth_jumps(view, seen, reach, least_gap)
     return _collected(surface, view, jumps.edges, continuations_of(surface, nodes, jumps.hidings))
