@@ -257,7 +257,9 @@ def update(
     far_off[union.second] = _far_along(seen, outside.planes.normals)
     far_off[union.first] = _far_along(before.grid, before.normals)
     planes = settings.method.planes(union.grid, far_off)
-    scan = Scan(cloud, outside.viewpoint, outside.places, union.grid, planes, labels, earlier.seed_size)
+    earlier_place = earlier.viewpoint[None] if earlier.viewpoint.ndim == 1 else np.empty((0, 3))
+    places = np.concatenate((outside.places, earlier_place))
+    scan = Scan(cloud, outside.viewpoint, places, union.grid, planes, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
 
 

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Surfaces that go on behind what hides them are one object; those that end in the open are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pcgraph
+from pcgraph.graph.continuations import continuations, faces_of
+from pcgraph.tree.tree import segmentation_tree
+
+FOCAL = 150.0
+
+
+def seen(fronts, back, shape=(160, 220)):
+    """What a camera at the origin, z forward, sees of rectangles (x0, x1, y0, y1, z) before a wall at depth `back`.
+
+    Points (h, w, 3), metres, NaN where there is none, and which is seen, (h, w), the wall -1.
+    """
+    v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
+    rays = np.stack(((u - shape[1] / 2 + 0.5) / FOCAL, (v - shape[0] / 2 + 0.5) / FOCAL, np.ones(shape)), axis=-1)
+    depth, thing = np.full(shape, back), np.full(shape, -1)
+    for number, (x0, x1, y0, y1, z) in enumerate(fronts):
+        x, y = z * rays[..., 0], z * rays[..., 1]
+        hit = (x0 < x) & (x < x1) & (y0 < y) & (y < y1) & (z < depth)
+        depth[hit], thing[hit] = z, number
+    points = rays * depth[..., None]
+    points[~np.isfinite(depth)] = np.nan
+    return points, thing
+
+
+PILLAR = (-0.1, 0.1, -2.0, 2.0, 1.0)
+BOARDS = [(-0.9, -0.2, -2.0, 2.0, 2.0), (0.2, 0.9, -2.0, 2.0, 2.0)]
+
+
+def objects_of(labels, thing, number):
+    """Objects that hold much of a thing."""
+    names, counts = np.unique(labels[(thing == number) & (labels >= 0)], return_counts=True)
+    return set(names[counts > 0.1 * counts.sum()].tolist())
+
+
+@pytest.mark.parametrize("organised", [True, False])
+def test_a_wall_behind_a_pillar_is_one_object(organised):
+    points, thing = seen([PILLAR], 2.0)
+    if not organised:
+        points, thing = points.reshape(-1, 3), thing.ravel()
+    result = pcgraph.segment(points, viewpoint=(0, 0, 0))
+    assert len(objects_of(result.labels, thing, -1)) == 1
+    assert len(objects_of(result.labels, thing, 0)) == 1
+    assert not objects_of(result.labels, thing, -1) & objects_of(result.labels, thing, 0)
+    without = replace(result.graph, continuations=None)
+    tree = segmentation_tree(result.linkage.merges(without, result.leaves), result.leaves)
+    apart = result.on_points(tree.cut(altitude=result.object_altitude))
+    assert len(objects_of(apart, thing, -1)) == 2
+    assert len(set(result.groups[thing == -1].tolist())) == 1
+
+
+def test_pairs_are_coplanar_and_neither_touch_nor_nearly_do():
+    points, _ = seen([PILLAR], 2.0)
+    result = pcgraph.segment(points)
+    graph, found = result.graph, result.graph.continuations
+    x, _, depth = graph.node_features.centroid.T
+    assert len(found.pairs) > 4
+    assert depth[found.pairs] == pytest.approx(2.0, abs=1e-6)
+    assert (np.prod(np.sign(x[found.pairs]), axis=1) < 0).all()
+    assert found.coplanar.all()
+    assert (found.crossings >= 2).all()
+    assert found.width == pytest.approx(0.4, abs=0.1)  # the shadow of 0.2 m at twice the distance
+    pairs = [tuple(pair) for pair in found.pairs.tolist()]
+    assert pairs == sorted(set(pairs))
+    assert all(i < j for i, j in pairs)
+    assert not set(pairs) & {tuple(pair) for pair in np.concatenate((graph.edges, graph.gaps.edges)).tolist()}
+    assert len(graph.joined) == len(graph.edges) + len(graph.gaps.edges) + len(pairs)
+
+
+def test_a_surface_that_jumps_behind_the_pillar_does_not_go_on():
+    points, thing = seen([PILLAR, (-2.0, 0.0, -2.0, 2.0, 1.8)], 2.0)
+    result = pcgraph.segment(points)
+    assert not len(result.graph.continuations.pairs)
+    assert not objects_of(result.labels, thing, -1) & objects_of(result.labels, thing, 1)
+
+
+@pytest.mark.parametrize("back", [4.0, np.inf])
+def test_boards_in_one_plane_end_in_the_open_though_something_stands_before_a_part_of_the_gap(back):
+    """A pole a third as high as the boards hides their borders along a few lines; the other lines see past them."""
+    fronts = [*BOARDS, (-0.16, 0.16, -0.15, 0.15, 1.0)]
+    points, thing = seen(fronts, back)
+    result = pcgraph.segment(points)
+    assert not objects_of(result.labels, thing, 0) & objects_of(result.labels, thing, 1)
+    x, _, depth = np.moveaxis(result.graph.node_features.centroid[result.graph.continuations.pairs], -1, 0)
+    x = x[depth[:, 0] < 2.1]
+    assert (np.prod(np.sign(x), axis=1) > 0).all()  # a board goes on behind the pole, above and below it
+
+
+def test_boards_whose_gap_is_hidden_all_along_may_be_one():
+    points, thing = seen([*BOARDS, (-0.16, 0.16, -2.0, 2.0, 1.0)], np.inf)
+    result = pcgraph.segment(points)
+    assert objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)
+
+
+def rectangle(origin, first, second, spacing, rng):
+    """Points at random on a parallelogram, `spacing` apart on average."""
+    first, second = np.array(first, float), np.array(second, float)
+    n = int(np.linalg.norm(np.cross(first, second)) / spacing**2)
+    return origin + rng.random((n, 1)) * first + rng.random((n, 1)) * second
+
+
+def room_with_a_cabinet(seed, spacing=0.02):
+    """A floor that was not seen below a cabinet from wall to wall, and walls around, from nowhere in particular."""
+    rng = np.random.default_rng(seed)
+    parts = [
+        rectangle((0, 0, 0), (4, 0, 0), (0, 1.6, 0), spacing, rng),
+        rectangle((0, 2.3, 0), (4, 0, 0), (0, 1.7, 0), spacing, rng),
+        *(rectangle((0, y, 0.15), (4, 0, 0), (0, 0, 0.85), spacing, rng) for y in (1.7, 2.2)),
+        rectangle((0, 1.7, 1.0), (4, 0, 0), (0, 0.5, 0), spacing, rng),
+    ]
+    truth = np.repeat([0, 0, 1, 1, 1], [len(part) for part in parts])
+    points = np.concatenate(parts)
+    return points + rng.normal(0.0, 0.001, points.shape), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_floor_under_a_cabinet_is_one_object_though_nobody_says_from_where_it_was_seen(seed):
+    points, truth = room_with_a_cabinet(seed)
+    result = pcgraph.segment(points)
+    assert len(result.graph.continuations.pairs) > 5
+    assert len(objects_of(result.labels, truth, 0)) == 1
+    assert len(objects_of(result.labels, truth, 1)) == 1
+    assert pcgraph.metrics.weighted_overlap(result.labels, truth) > 0.97
+
+
+def test_order_of_points_changes_nothing():
+    points, _ = room_with_a_cabinet(0)
+    order = np.random.default_rng(1).permutation(len(points))
+    one, other = pcgraph.segment(points), pcgraph.segment(points[order])
+    assert np.array_equal(one.graph.continuations.pairs, other.graph.continuations.pairs)
+    assert np.array_equal(one.labels[order], other.labels)
+
+
+def test_of_many_voxels_some_tell_the_same():
+    """Of more than 30 000 every third is looked at, of more than 100 000 every seventh."""
+    points, truth = room_with_a_cabinet(0, spacing=0.007)
+    for voxel in (0.05, 0.025, 0.012):
+        result = pcgraph.segment(points, voxel_size=voxel, seed_size=0.25, viewpoint=(2.0, -1.0, 6.0))
+        assert len(objects_of(result.labels, truth, 0)) == 1
+        assert len(objects_of(result.labels, truth, 1)) == 1
+    assert result.surface.grid.n_voxels > 100_000
+
+
+def test_no_place_and_a_place_on_a_point_find_what_there_is():
+    points, _ = seen([PILLAR], 2.0)
+    result = pcgraph.segment(points)
+    surface, nodes = result.surface, result.graph.node_features
+    faces = faces_of(result.graph.edges, result.graph.edge_features, result.graph.n_nodes)
+    on_a_point = continuations(surface, nodes, faces, surface.grid.centroids[:1])
+    assert on_a_point.pairs.shape[1] == 2
+    single = pcgraph.segment(np.zeros((1, 3)), viewpoint=(0, 0, 0), voxel_size=0.1)
+    assert single.graph.continuations.pairs.shape == (0, 2)
+
+
+def test_several_viewpoints_and_an_update_look_from_some_of_them():
+    points, thing = seen([PILLAR], 2.0)
+    places = np.zeros_like(points)
+    result = pcgraph.segment(points, viewpoint=places)
+    assert len(objects_of(result.labels, thing, -1)) == 1
+    after = pcgraph.update(result, points + np.array([0.0, 0.001, 0.0]), viewpoint=(0, 0, 0))
+    assert len(objects_of(after.labels, thing, -1)) == 1
