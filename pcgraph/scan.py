@@ -77,7 +77,8 @@ _PRICE_OF_ROUGHNESS = 0.25  # less a quarter of their roughness, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
-_LOOKED_FROM = 3  # places, where the cloud was not seen from one
+_LOOKED_FROM = 3  # places, where the cloud was not seen from one; of viewpoints, from those of the points
+_ASKED_FOR_PLACES = 64  # in so many voxels
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
 
 
@@ -484,8 +485,18 @@ def _outward_planes(
     low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
     place_of_voxel = middle + reach * voxel_means((given - middle) / reach, grid)
-    some = (np.arange(_LOOKED_FROM) + 0.5) / _LOOKED_FROM * grid.n_voxels
-    return Outside(given, place_of_voxel[some.astype(np.int64)], method.planes(grid, place_of_voxel))
+    return Outside(given, _some_viewpoints(given, grid), method.planes(grid, place_of_voxel))
+
+
+def _some_viewpoints(given: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
+    """A few of the points' viewpoints, (n, 3), far from each other, whatever the points' order."""
+    voxels = np.unique(np.linspace(0, grid.n_voxels - 1, _ASKED_FOR_PLACES).astype(np.int64))
+    places = np.unique(np.concatenate([given[grid.order[grid.starts[v] : grid.starts[v + 1]]] for v in voxels]), axis=0)
+    chosen, away = [0], np.full(len(places), np.inf)
+    while len(chosen) < min(_LOOKED_FROM, len(places)):
+        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(away)))
+    return places[chosen]
 
 
 def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:

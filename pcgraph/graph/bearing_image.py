@@ -248,17 +248,17 @@ def _scan(  # type: ignore[no-untyped-def]
     indptr, neighbours = view.squares.neighbourhood
     depth_edges = np.empty((image.size, 2), np.int32)
     hidings = np.empty((image.size, 2), np.int32)
-    hidden, line = np.empty(_MAX_DEPTH, np.int32), np.empty(image.shape[1] + 4, np.int32)
+    hidden, (line, columns) = np.empty(_MAX_DEPTH, np.int32), lines_of(image)
     n_edges = n_hidings = 0
     for row in range(image.shape[0]):
-        first, last = voxels_of(image[row], wraps, line)
+        stop, lap = squares_along(image[row], wraps, line, columns)
         depth = 0
-        for at in range(first, last):
-            before, voxel = line[at], line[at + 1]
-            if supervoxels[before] == supervoxels[voxel]:
+        for at in range(1, stop - 1):
+            before, i = line[at], line[at + 1]
+            if supervoxels[before] == supervoxels[i]:
                 continue
-            comes_out = ranges[before] < ranges[voxel]
-            front, behind, beyond = (before, voxel, line[at + 2]) if comes_out else (voxel, before, line[at - 1])
+            comes_out = ranges[before] < ranges[i]
+            front, behind, beyond = (before, i, line[at + 2]) if comes_out else (i, before, line[at - 1])
             if apart(front, behind, view, reach):
                 depth = 0
                 continue
@@ -271,34 +271,53 @@ def _scan(  # type: ignore[no-untyped-def]
                 neighbours[indptr[front] : indptr[front + 1]] == behind
             ):
                 continue
-            depth_edges[n_edges, 0], depth_edges[n_edges, 1] = front, behind
-            n_edges += 1
+            if at < lap or not wraps:
+                depth_edges[n_edges, 0], depth_edges[n_edges, 1] = front, behind
+                n_edges += 1
             if not comes_out:
                 hidden[depth % _MAX_DEPTH] = behind
                 depth += 1
             elif depth > 0:
                 depth -= 1
                 entered = hidden[depth % _MAX_DEPTH]
-                if ranges[entered] > ranges[front] and supervoxels[entered] != supervoxels[behind]:
+                known = at >= lap or not wraps  # of a panorama's first lap it is not known what is hidden at its start
+                if known and ranges[entered] > ranges[front] and supervoxels[entered] != supervoxels[behind]:
                     hidings[n_hidings, 0], hidings[n_hidings, 1] = entered, behind
                     n_hidings += 1
     return depth_edges[:n_edges].copy(), hidings[:n_hidings].copy()
 
 
 @routine
-def voxels_of(cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32]) -> tuple[int, int]:
-    """First and last place in `line` of the voxels in these cells, each once in a row; -1 is before and after them."""
+def lines_of(image: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Room for what `squares_along` sets."""
+    return np.empty(2 * image.shape[1] + 4, np.int32), np.empty(2 * image.shape[1] + 4, np.int32)
+
+
+@routine
+def squares_along(
+    cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32], columns: NDArray[np.int32]
+) -> tuple[int, int]:
+    """Set the squares in these cells, each once in a row, from ``line[1]`` on, and where they begin; -1 is around them.
+
+    Returns their end and where the second lap starts: of a panorama they are there twice, as lines go round.
+    """
     n = 1
     line[0] = line[1] = -1
-    for cell in cells:
+    for column in range(len(cells)):
+        cell = cells[column]
         if cell >= 0 and cell != line[n]:
             n += line[n] >= 0
-            line[n] = cell
-    if wraps and n > 1:  # go on to the first voxel again
-        line[n + 1] = line[1]
-        n += 1
-    line[n + 1] = -1
-    return 1, n
+            line[n], columns[n] = cell, column
+    n += line[n] >= 0
+    lap = n
+    if wraps and lap > 2:
+        n -= line[n - 1] == line[1]
+        lap = n
+        for at in range(1, lap):
+            line[n], columns[n] = line[at], columns[at] + len(cells)
+            n += 1
+    line[n] = -1
+    return n, lap
 
 
 @routine

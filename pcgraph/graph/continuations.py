@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
-from pcgraph.graph.bearing_image import View, apart, bearing_image, depth_jumps, squares_of, view_from, voxels_of
+from pcgraph.graph.bearing_image import (
+    View,
+    apart,
+    bearing_image,
+    depth_jumps,
+    lines_of,
+    squares_along,
+    squares_of,
+    view_from,
+)
 from pcgraph.graph.contacts import angle_between
 from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
@@ -23,6 +32,7 @@ REACH, LEAST_GAP = 8.0, 3.0
 _SMOOTH_RAD = 0.2  # surfaces at most this far apart in angle
 _SMOOTH_VOXELS = 2.0  # and in height may be one
 _LEAST_CROSSINGS = 2
+_SUPPORT = 2.0  # times as wide as what is hidden is the larger of the faces, at least
 _OPEN = 0.5  # of the lines along which borders are hidden, at most, may find them open
 
 
@@ -89,9 +99,10 @@ def continuations(
 
     Notes
     -----
-    Pairs are coplanar, along two lines at least. Two faces that lie in one plane by chance, as fronts of houses do, end
-    in the open: their borders are theirs, where those of a floor behind a chair are the chair's. So the borders of both
-    faces decide: on the lines from one to the other they lie open at most half as often as they are hidden.
+    Pairs are coplanar, along two lines at least. Two faces that lie in one plane by chance,
+    as fronts of houses do, end in the open: their borders are theirs, where those of a floor behind a chair are the
+    chair's. So the borders of both faces decide: on the lines from one to the other they lie open at most half as often
+    as they are hidden.
 
     Completion behind what hides a surface: Kellman and Shipley 1991; borders: Nakayama et al. 1989.
     """
@@ -107,10 +118,12 @@ def continuations(
     hidden, opened = np.bincount(pair, found.crossings, len(between)), np.zeros(len(between), np.int64)
     both_ways, face = _both_ways(between, int(faces.max()) + 1), faces[squares.supervoxels]
     for view, image in zip(views, images, strict=True):
-        for lines in (image.voxels, np.ascontiguousarray(image.voxels.T)):
-            _count_open(lines, view, face, both_ways, opened)
+        for lines, wraps in ((image.voxels, image.wraps), (np.ascontiguousarray(image.voxels.T), False)):
+            _count_open(lines, wraps, view, face, both_ways, opened)
     one_face = between[:, 0] == between[:, 1]
-    return found.chosen((one_face | (opened <= _OPEN * hidden))[pair])
+    areas = np.bincount(faces[surface.supervoxels], surface.grid.edge_lengths**2)
+    wide = np.sqrt(areas[faces[found.pairs]].max(axis=1)) >= _SUPPORT * found.width
+    return found.chosen(wide & (one_face | (opened <= _OPEN * hidden))[pair])
 
 
 class _Ways(NamedTuple):
@@ -130,34 +143,40 @@ def _both_ways(pairs: NDArray[np.int32], n_faces: int) -> _Ways:
 
 @kernel
 def _count_open(
-    image: NDArray[np.int32], view: View, face: NDArray[np.int32], ways: _Ways, opened: NDArray[np.int64]
+    image: NDArray[np.int32],
+    wraps: bool,
+    view: View,
+    face: NDArray[np.int32],
+    ways: _Ways,
+    opened: NDArray[np.int64],
 ) -> None:
     """Add how often, along the rows of an image, one face of each pair ends in the open on the way to the other.
 
-    A face, `face` says which of each square, ends or begins in the open where something farther, or nothing,
-    lies beside it.
+    A face, `face` says which of each square, ends or begins in the open where something farther, or nothing, or the
+    other face itself lies beside it.
     """
-    n_faces, edges = len(ways.starts) - 1, view.squares.edge_lengths
+    n_faces, widths, around = len(ways.starts) - 1, view.squares.widths, image.shape[1]
     last, ends_open = np.full(n_faces, -1, np.int64), np.zeros(n_faces, np.bool_)
-    line = np.empty(image.shape[1] + 4, np.int32)
+    line, columns = lines_of(image)
+    farthest = around // 2 if wraps else around  # the way from one to the other is no more than half a turn
     for row in range(image.shape[0]):
-        first, stop = voxels_of(image[row], False, line)
-        start = row * image.shape[1]
-        for at in range(first, stop + 1):
+        stop, lap = squares_along(image[row], wraps, line, columns)
+        start = 2 * row * around
+        for at in range(1, stop):
             before, i = line[at - 1], line[at]
-            if i < 0:
-                continue
             here, begins_open = face[i], False
             if before >= 0 and face[before] != here:
-                deeper, edge = view.ranges[i] - view.ranges[before], max(edges[before], edges[i])
+                deeper, width = view.ranges[i] - view.ranges[before], max(widths[before], widths[i])
                 hole = apart(before, i, view, REACH)
-                ends_open[face[before]], begins_open = hole or deeper > edge, hole or -deeper > edge
-            if before < 0 or face[before] != here:
+                ends_open[face[before]], begins_open = hole or deeper > width, hole or -deeper > width
+            column = start + columns[at]
+            if (before < 0 or face[before] != here) and (at >= lap or not wraps):
                 for way in range(ways.starts[here], ways.starts[here + 1]):
                     other = ways.others[way]
-                    if last[other] > max(last[here], start) and (begins_open or ends_open[other]):
-                        opened[ways.pair[way]] += 1
-            last[here] = start + at
+                    beside = before >= 0 and face[before] == other
+                    follows = last[other] > max(last[here], start - 1, column - farthest)
+                    opened[ways.pair[way]] += follows and (begins_open or ends_open[other] or beside)
+            last[here] = column
 
 
 def continuations_of(surface: Surface, nodes: NodeFeatures, hidings: NDArray[np.integer]) -> Continuations:

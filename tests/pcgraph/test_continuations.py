@@ -95,10 +95,13 @@ def test_boards_in_one_plane_end_in_the_open_though_something_stands_before_a_pa
     assert (np.prod(np.sign(x), axis=1) > 0).all()  # a board goes on behind the pole, above and below it
 
 
-def test_boards_whose_gap_is_hidden_all_along_may_be_one():
-    points, thing = seen([*BOARDS, (-0.16, 0.16, -2.0, 2.0, 1.0)], np.inf)
+@pytest.mark.parametrize(("width", "one"), [(1.2, True), (0.35, False)])
+def test_of_boards_whose_gap_is_hidden_all_along_only_wide_ones_are_one(width, one):
+    """Nothing tells them from a wall behind a pillar; narrow ones are more likely things in a row."""
+    boards = [(-0.2 - width, -0.2, -2.0, 2.0, 2.0), (0.2, 0.2 + width, -2.0, 2.0, 2.0)]
+    points, thing = seen([*boards, (-0.16, 0.16, -2.0, 2.0, 1.0)], np.inf)
     result = pcgraph.segment(points)
-    assert objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)
+    assert (objects_of(result.labels, thing, 0) == objects_of(result.labels, thing, 1)) is one
 
 
 def rectangle(origin, first, second, spacing, rng):
@@ -126,7 +129,7 @@ def room_with_a_cabinet(seed, spacing=0.02):
 def test_a_floor_under_a_cabinet_is_one_object_though_nobody_says_from_where_it_was_seen(seed):
     points, truth = room_with_a_cabinet(seed)
     result = pcgraph.segment(points)
-    assert len(result.graph.continuations.pairs) > 5
+    assert len(result.graph.continuations.pairs) > 1
     assert len(objects_of(result.labels, truth, 0)) == 1
     assert len(objects_of(result.labels, truth, 1)) == 1
     assert pcgraph.metrics.weighted_overlap(result.labels, truth) > 0.97
@@ -168,3 +171,36 @@ def test_several_viewpoints_and_an_update_look_from_some_of_them():
     assert len(objects_of(result.labels, thing, -1)) == 1
     after = pcgraph.update(result, points + np.array([0.0, 0.001, 0.0]), viewpoint=(0, 0, 0))
     assert len(objects_of(after.labels, thing, -1)) == 1
+
+
+def test_a_pillar_at_the_seam_of_a_panorama_hides_as_any_other():
+    """The image's seam lies behind the middle of the view; a pillar there was paired with nothing."""
+    n = 720
+    azimuth, elevation = np.meshgrid(np.arange(n) * 2.0 * np.pi / n, np.linspace(-0.4, 0.4, 92))
+    found = []
+    for turn in np.radians([0.0, 90.0, 180.0, 270.0]):
+        angle = azimuth - turn
+        pillar = np.abs(np.mod(angle + np.pi, 2.0 * np.pi) - np.pi) < 0.1
+        wall = 3.0 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))  # a room of 6 m around
+        away = np.where(pillar, 1.5, wall)
+        x, y, z = away * np.cos(azimuth), away * np.sin(azimuth), away * np.tan(elevation)
+        points = np.stack((x, y, z), axis=-1).reshape(-1, 3)
+        result = pcgraph.segment(points, voxel_size=0.05, viewpoint=(0.0, 0.0, 0.0), range_growth=0.0)
+        found.append(len(result.graph.continuations.pairs))
+    assert min(found) > 4, found
+
+
+def test_viewpoints_of_points_are_those_given_and_no_means_of_them():
+    """Two scanners on either side of a wall see each its own pillar before it; between them stands nobody."""
+    rng = np.random.default_rng(0)
+    clouds, viewpoints = [], []
+    for side in (-1.0, 1.0):
+        points = seen([PILLAR], 2.0)[0].reshape(-1, 3)[:, [0, 2, 1]] * [1.0, side, 1.0]  # y is along the view
+        clouds.append(points + np.array([0.0, -2.02 * side, 0.0]) + rng.normal(0.0, 5e-4, points.shape))
+        viewpoints.append(np.tile([0.0, -2.02 * side, 0.0], (len(points), 1)))
+    points, places = np.concatenate(clouds), np.concatenate(viewpoints)
+    result = pcgraph.segment(points, viewpoint=places)
+    y = result.graph.node_features.centroid[result.graph.continuations.pairs, 1]
+    assert (np.abs(y) < 0.1).all()
+    assert (y < 0).any()
+    assert (y > 0).any()
