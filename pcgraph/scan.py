@@ -259,7 +259,7 @@ def update(
     far_off[union.first] = _far_along(before.grid, before.normals)
     planes = settings.method.planes(union.grid, far_off)
     earlier_place = earlier.viewpoint[None] if earlier.viewpoint.ndim == 1 else np.empty((0, 3))
-    places = np.concatenate((outside.places, earlier_place))
+    places = np.unique(np.concatenate((outside.places, earlier_place)), axis=0)
     scan = Scan(cloud, outside.viewpoint, places, union.grid, planes, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
 
