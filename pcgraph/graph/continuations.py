@@ -78,7 +78,7 @@ class Continuations(ShortRepr):
 
 
 def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArray[np.int32]:
-    """Face of each of k supervoxels, (k,) int32: those that touch, one as smooth as the other goes on, are on one."""
+    """Face of each of k supervoxels, (k,) int32: those that touch, and go on smoothly as each other, are on one."""
     smooth = (features.normal_angle <= _SMOOTH_RAD) & (features.step <= features.voxel_edge)
     return connected_components(edges[smooth], k)
 
@@ -99,10 +99,11 @@ def continuations(
 
     Notes
     -----
-    Pairs are coplanar, along two lines at least. Two faces that lie in one plane by chance,
-    as fronts of houses do, end in the open: their borders are theirs, where those of a floor behind a chair are the
-    chair's. So the borders of both faces decide: on the lines from one to the other they lie open at most half as often
-    as they are hidden.
+    Pairs are coplanar, along two lines at least. Two faces that lie in one plane by chance, as fronts of houses do, end
+    in the open: their borders are theirs, where those of a floor behind a chair are the chair's. So the borders of both
+    faces decide: on the lines from one to the other they lie open at most half as often as they are hidden. Where
+    something stands before each gap in a row of equal things, nothing tells; so the larger of the two faces is at least
+    twice as wide, by the root of its area, as what is hidden.
 
     Completion behind what hides a surface: Kellman and Shipley 1991; borders: Nakayama et al. 1989.
     """
@@ -121,8 +122,8 @@ def continuations(
         for lines, wraps in ((image.voxels, image.wraps), (np.ascontiguousarray(image.voxels.T), False)):
             _count_open(lines, wraps, view, face, both_ways, opened)
     one_face = between[:, 0] == between[:, 1]
-    areas = np.bincount(faces[surface.supervoxels], surface.grid.edge_lengths**2)
-    wide = np.sqrt(areas[faces[found.pairs]].max(axis=1)) >= _SUPPORT * found.width
+    areas = np.bincount(faces[surface.supervoxels], np.square(surface.grid.edge_lengths / surface.grid.size))
+    wide = np.sqrt(areas[faces[found.pairs]].max(axis=1)) >= _SUPPORT * found.width / surface.grid.size
     return found.chosen(wide & (one_face | (opened <= _OPEN * hidden))[pair])
 
 
