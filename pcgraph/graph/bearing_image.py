@@ -120,7 +120,7 @@ def bearing_image(view: View) -> BearingImage:
     seen = np.flatnonzero(view.ranges > 0.5 * squares.edge_lengths)  # the sensor's own voxel lies in no direction
     if not len(seen):
         return BearingImage(np.full((1, 1), -1, np.int32))
-    cell = max(float(np.median((squares.widths / view.ranges)[seen])), math.sqrt(4.0 * math.pi / _MAX_CELLS))
+    cell = max(float(np.median(squares.widths[seen] / view.ranges[seen])), math.sqrt(4.0 * math.pi / _MAX_CELLS))
     frame, angles = _frame(view.bearings, seen), np.empty((2, len(seen)))
     in_blocks(_set_angles, len(seen), view.bearings, seen, frame, angles)
     first, last = angles.min(axis=1), angles.max(axis=1)

@@ -204,3 +204,10 @@ def test_viewpoints_of_points_are_those_given_and_no_means_of_them():
     assert (np.abs(y) < 0.1).all()
     assert (y < 0).any()
     assert (y > 0).any()
+
+
+def test_a_voxel_at_the_viewpoint_lies_in_no_direction_and_nothing_is_warned_of():
+    """Voxels as large as a planet: what has no range is not divided by it."""
+    points = np.array([[0.0, 0, 0], [9, 0, 0], [0, 9, 0], [9, 9, 0], [0, 0, 9]]) * 1e9
+    result = pcgraph.segment(points, viewpoint=(0.0, 0.0, 0.0), voxel_size=1e9, range_growth=0.0)
+    assert result.graph.continuations.pairs.shape == (0, 2)
