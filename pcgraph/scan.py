@@ -42,6 +42,7 @@ from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.directions import farthest_first
 from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, occupied_cells, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
@@ -343,10 +344,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: continuations(surface, nodes, faces, scan.places),
     )
     hidden = hidden.without(touching.edges).without(near.edges)
-    joined = np.concatenate((touching.edges, near.edges, hidden.pairs))
-    across = bridges(grid, supervoxels, leaves.counts, joined)
-    told_by_colors = color_evidence(grid, normals)
-    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, across, told_by_colors)
+    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, color_evidence=color_evidence(grid, normals))
+    graph = replace(graph, bridges=bridges(grid, supervoxels, leaves.counts, graph.joined))
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
@@ -492,11 +491,7 @@ def _some_viewpoints(given: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.
     """A few of the points' viewpoints, (n, 3), far from each other, whatever the points' order."""
     voxels = np.unique(np.linspace(0, grid.n_voxels - 1, _ASKED_FOR_PLACES).astype(np.int64))
     places = np.unique(np.concatenate([given[grid.order[grid.starts[v] : grid.starts[v + 1]]] for v in voxels]), axis=0)
-    chosen, away = [0], np.full(len(places), np.inf)
-    while len(chosen) < min(_LOOKED_FROM, len(places)):
-        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(away)))
-    return places[chosen]
+    return places[farthest_first(places, 0, _LOOKED_FROM)]
 
 
 def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:

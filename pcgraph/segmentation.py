@@ -102,8 +102,7 @@ class Segmentation:
         """Group of each point, in the input's shape, negative as in `labels`: what hangs together, such as a table with
         all that stands on it.
 
-        Each holds whole objects, and comes near no other: what contacts, gaps, continuations and objects
-        join.
+        Each holds whole objects, and comes near no other: what contacts, gaps, continuations and objects join.
         """
         k = len(self.objects)
         first = np.unique(self.objects, return_index=True)[1][self.objects]

@@ -157,8 +157,8 @@ def _compile_graph_and_tree() -> None:
     nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
     near = gaps(grid, normals, labels, nodes, touching.edges)
     hidden = continuations(Surface(grid, normals, labels), nodes, labels, np.zeros((1, 3)))
-    across = bridges(grid, labels, leaves.counts, np.concatenate((touching.edges, near.edges)))
-    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden, across)
+    graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden)
+    graph = replace(graph, bridges=bridges(grid, labels, leaves.counts, graph.joined))
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
 
 

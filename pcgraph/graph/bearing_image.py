@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -106,6 +107,11 @@ class BearingImage:
     voxels: NDArray[np.int32]
     wraps: bool = False
 
+    @cached_property
+    def lines(self) -> tuple[tuple[NDArray[np.int32], bool], tuple[NDArray[np.int32], bool]]:
+        """Its rows, and its columns as rows, and whether they wrap."""
+        return (self.voxels, self.wraps), (np.ascontiguousarray(self.voxels.T), False)
+
 
 def bearing_image(view: View) -> BearingImage:
     """Spherical image in which a voxel at median distance fills about one cell.
@@ -167,11 +173,9 @@ def _set_angles(
         along = aside = height = 0.0
         for axis in range(3):
             part = bearings[seen[at], axis]
-            along, aside, height = (
-                along + frame[0, axis] * part,
-                aside + frame[1, axis] * part,
-                height + frame[2, axis] * part,
-            )
+            along += frame[0, axis] * part
+            aside += frame[1, axis] * part
+            height += frame[2, axis] * part
         angles[0, at], angles[1, at] = math.atan2(aside, along), math.asin(min(max(height, -1.0), 1.0))
 
 
@@ -229,8 +233,7 @@ def depth_jumps(view: View, image: BearingImage, reach: float, least_gap: float)
     least_gap : float, voxel edges
         Difference of range above which surfaces are apart.
     """
-    lines = (image.voxels, image.wraps), (np.ascontiguousarray(image.voxels.T), False)
-    found = [_scan(voxels, wraps, view, reach, least_gap) for voxels, wraps in lines]
+    found = [_scan(voxels, wraps, view, reach, least_gap) for voxels, wraps in image.lines]
     edges, hidings = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return Jumps(edges, hidings)
 

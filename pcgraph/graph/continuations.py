@@ -73,7 +73,7 @@ class Continuations(ShortRepr):
 
     def without(self, pairs: NDArray[np.int32]) -> Continuations:
         """Those that are not among these pairs, (m, 2) int32, the smaller first, in ascending order."""
-        keys, others = (both[:, 0].astype(np.int64) << 32 | both[:, 1] for both in (self.pairs, pairs))
+        keys, others = (_keys(*both.T) for both in (self.pairs, pairs))
         return self.chosen(np.searchsorted(others, keys, "left") == np.searchsorted(others, keys, "right"))
 
 
@@ -119,7 +119,7 @@ def continuations(
     hidden, opened = np.bincount(pair, found.crossings, len(between)), np.zeros(len(between), np.int64)
     both_ways, face = _both_ways(between, int(faces.max()) + 1), faces[squares.supervoxels]
     for view, image in zip(views, images, strict=True):
-        for lines, wraps in ((image.voxels, image.wraps), (np.ascontiguousarray(image.voxels.T), False)):
+        for lines, wraps in image.lines:
             _count_open(lines, wraps, view, face, both_ways, opened)
     one_face = between[:, 0] == between[:, 1]
     areas = np.bincount(faces[surface.supervoxels], np.square(surface.grid.edge_lengths / surface.grid.size))
@@ -206,5 +206,10 @@ def _heights(points: NDArray[np.float64], owners: NDArray[np.int32], nodes: Node
 
 def distinct_pairs(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Distinct pairs in ascending order, (q, 2) int32, and the pair of each row."""
-    keys, inverse = np.unique((first.astype(np.int64) << 32) + second, return_inverse=True)
+    keys, inverse = np.unique(_keys(first, second), return_inverse=True)
     return np.stack((keys >> 32, keys & 0xFFFFFFFF), axis=1).astype(np.int32), inverse
+
+
+def _keys(first: NDArray[np.int32], second: NDArray[np.int32]) -> NDArray[np.int64]:
+    """One number per pair, in the order of the pairs."""
+    return (first.astype(np.int64) << 32) + second

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directions all around, and the plane on which most of a cloud lies."""
+"""Directions all around, the plane on which most of a cloud lies, and places far from each other."""
 
 from __future__ import annotations
 
@@ -17,6 +17,16 @@ def densest_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> 
     quarter = len(offsets) // 4
     first = int(np.argmin(offsets[quarter:] - offsets[: len(offsets) - quarter]))
     return normal, float(offsets[first + quarter // 2])
+
+
+def farthest_first(places: NDArray[np.float64], first: int, n: int) -> list[int]:
+    """At most n of some places, (k, 3): one of them, then each time that which lies farthest from those before."""
+    chosen, nearest = [first], np.full(len(places), np.inf)
+    while len(chosen) < min(n, len(places)):
+        ways = places - places[chosen[-1]]
+        nearest = np.minimum(nearest, np.sqrt(np.einsum("ij,ij->i", ways, ways)))
+        chosen.append(int(np.argmax(nearest)))
+    return chosen
 
 
 def sphere_directions(n: int) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
-from pcgraph.voxels.directions import densest_plane, sphere_directions
+from pcgraph.voxels.directions import densest_plane, farthest_first, sphere_directions
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
@@ -585,11 +585,7 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
     some = _columns(coarse.centroids[:: max(1, coarse.n_voxels // _SOME)])
     in_blocks(_count_hits, len(free), places.astype(np.float32), some, hits, smallest=1)
     among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
-    chosen = [among[np.argmax(clearance[among])]]
-    nearest = np.full(len(among), np.inf)
-    while len(chosen) < min(int(_SPREAD * _INSIDE), len(among)):
-        nearest = np.minimum(nearest, _lengths(places[among] - places[chosen[-1]]))
-        chosen.append(among[np.argmax(nearest)])
+    chosen = among[farthest_first(places[among], int(np.argmax(clearance[among])), int(_SPREAD * _INSIDE))]
     order = np.argsort(-clearance, kind="stable")
     rest = order[~np.isin(order, chosen)][: _INSIDE - len(chosen)]
     return places[np.concatenate((chosen, rest))]
