@@ -270,9 +270,9 @@ def _scan(  # type: ignore[no-untyped-def]
                 continue
             if beyond >= 0 and apart(behind, beyond, view, reach):
                 beyond = -1
-            if not _stands_off(front, behind, beyond, view, least_gap * edge) or np.any(
-                neighbours[indptr[front] : indptr[front + 1]] == behind
-            ):
+            first, last = np.int64(indptr[front]), np.int64(indptr[front + 1])
+            touch = np.any(neighbours[first:last] == behind)
+            if touch or not _stands_off(front, behind, beyond, view, least_gap * edge):
                 continue
             if at < lap or not wraps:
                 depth_edges[n_edges, 0], depth_edges[n_edges, 1] = front, behind

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.parallel import kernel, routine
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, Neighbourhood, VoxelGrid
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray
     supervoxels : (v,) int32
         Supervoxel of each voxel.
     """
-    voxel, other, pair, keys = _boundary_voxels(grid.indptr, grid.neighbours, supervoxels)
+    voxel, other, pair, keys = _boundary_voxels(grid.neighbourhood, supervoxels)
     order = np.argsort(keys)
     edge_of_pair = np.empty(len(keys), np.int64)
     edge_of_pair[order] = np.arange(len(keys))
@@ -135,13 +135,12 @@ def _sum_up_sides(
 
 
 @kernel
-def _boundary_voxels(  # type: ignore[no-untyped-def]
-    indptr: NDArray[np.int64], neighbours: NDArray[np.int32], supervoxels: NDArray[np.int32]
-):
+def _boundary_voxels(around: Neighbourhood, supervoxels: NDArray[np.int32]):  # type: ignore[no-untyped-def]
     """Each voxel on a boundary, once per other supervoxel it touches: voxel, other, pair; and the pairs' keys.
 
     Pairs are numbered as they come up; their key is (smaller << 32) + larger.
     """
+    indptr, neighbours = around
     voxel, other = np.empty(len(neighbours), np.int32), np.empty(len(neighbours), np.int32)
     pair = np.empty(len(neighbours), np.int32)
     keys, slots = np.empty(512, np.int64), np.full(2048, -1, np.int32)

@@ -54,15 +54,15 @@ class VoxelGraph(NamedTuple):
     ----------
     features : (v, 9 + d) float64
         Rows (place in the warped space, unit normal, colour, and the features that were given, if any).
-    indptr : (v + 1,) int64
-    neighbours : (e,) int32
+    indptr : (v + 1,) uint64
+    neighbours : (e,) uint32
         The voxels around each; see `pcgraph.voxels.grid.Neighbourhood`.
     metric : Metric
     """
 
     features: NDArray[np.float64]
-    indptr: NDArray[np.int64]
-    neighbours: NDArray[np.int32]
+    indptr: NDArray[np.uint64]
+    neighbours: NDArray[np.uint32]
     metric: Metric
 
 
@@ -80,7 +80,7 @@ def voxel_graph(grid: VoxelGrid, normals: NDArray[np.float64], metric: Metric) -
     if grid.features is not None:
         signal = np.maximum(autocorrelation(grid.features, grid) - _NOISE, 0.0) / (1.0 - _NOISE)
         features[:, 9:] = grid.features * signal
-    return VoxelGraph(features, grid.indptr, grid.neighbours, metric)
+    return VoxelGraph(features, *grid.neighbourhood, metric)
 
 
 @routine
@@ -429,8 +429,12 @@ def _move(
             add_features(features, i, sums, labels[i], -1.0)
             add_features(features, i, sums, chosen[q], 1.0)
             labels[i] = chosen[q]
-            for a in range(indptr[i] - 1, indptr[i + 1]):
-                j = i if a < indptr[i] else neighbours[a]
+            if not queued[i]:
+                queued[i] = True
+                following[used] = i
+                used += 1
+            for a in range(indptr[i], indptr[i + 1]):
+                j = neighbours[a]
                 if not queued[j]:
                     queued[j] = True
                     following[used] = j
@@ -495,7 +499,7 @@ def _largest_pieces(
             if neighbours[a] > i:
                 break
             if labels[neighbours[a]] == labels[i]:
-                other = root_of(links, neighbours[a])
+                other = root_of(links, np.int64(neighbours[a]))
                 links[max(root, other)] = min(root, other)
                 root = min(root, other)
     sizes, largest = np.zeros(n, np.int64), np.full(n_supervoxels, -1, np.int64)

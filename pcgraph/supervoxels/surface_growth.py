@@ -23,7 +23,7 @@ from pcgraph.supervoxels.clustering import (
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.voxels.cells import fetch_batch
 from pcgraph.voxels.evidence import color_evidence
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
+from pcgraph.voxels.grid import MAX_NEIGHBOURS, Neighbourhood, VoxelGrid
 from pcgraph.voxels.surface import LocalPlanes, local_planes
 
 _PLACE_WEIGHT = 0.3  # of a metre along the surface against one off the plane
@@ -113,7 +113,7 @@ def assign_points(
     surface = np.empty((grid.n_voxels, 8))  # a voxel's row fills one line of the cache
     in_blocks(_set_surface, grid.n_voxels, grid.centroids, planes.normals, planes.origins, surface)
     members = PointsOfVoxels(points, grid.order, grid.starts)
-    in_blocks(_assign, grid.n_voxels, members, grid.indptr, grid.neighbours, surface, supervoxels, chosen)
+    in_blocks(_assign, grid.n_voxels, members, grid.neighbourhood, surface, supervoxels, chosen)
     return chosen
 
 
@@ -139,14 +139,14 @@ def _assign(
     start: int,
     stop: int,
     members: PointsOfVoxels,
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
+    around: Neighbourhood,
     surface: NDArray[np.float64],
     supervoxels: NDArray[np.int32],
     chosen: NDArray[np.int32],
 ) -> None:
     """Set each point's supervoxel: of the voxel on whose plane, and near which, it lies; of equals its own voxel's."""
     points, order, starts = members
+    indptr, neighbours = around
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
     near, labels = np.empty((MAX_NEIGHBOURS, 8)), np.empty(MAX_NEIGHBOURS, np.int32)
     places, nearest = np.empty((0, 3)), np.empty(0, np.int32)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pcgraph.hierarchy import AncestorIndex, ancestor_index, lowest_common_ancestor
 from pcgraph.parallel import kernel
 from pcgraph.tree.tree import SegmentationTree
+from pcgraph.voxels.grid import Neighbourhood
 from pcgraph.voxels.surface import Surface
 
 
@@ -38,7 +39,7 @@ def voxel_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float
     if last >= tree.n_leaves:
         raise ValueError(f"expected a surface of the tree's {tree.n_leaves} leaves, got one with supervoxel {last}")
     index = ancestor_index(tree.parents)
-    return _strongest_contacts(index, tree.altitudes, grid.indptr, grid.neighbours, surface.supervoxels)
+    return _strongest_contacts(index, tree.altitudes, grid.neighbourhood, surface.supervoxels)
 
 
 def point_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float64]:
@@ -53,10 +54,10 @@ def point_saliency(tree: SegmentationTree, surface: Surface) -> NDArray[np.float
 def _strongest_contacts(
     index: AncestorIndex,
     altitudes: NDArray[np.float64],
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
+    around: Neighbourhood,
     supervoxels: NDArray[np.int32],
 ) -> NDArray[np.float64]:
+    indptr, neighbours = around
     strength = np.zeros(len(supervoxels))
     for voxel in range(len(supervoxels)):
         own = supervoxels[voxel]

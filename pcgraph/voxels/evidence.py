@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import kernel
-from pcgraph.voxels.grid import VoxelGrid
+from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 
 _SMOOTH, _CREASED = 0.9, 0.5  # cosines between normals, more than and less than
 _TELLING = 1 << 13  # voxels, about
@@ -38,7 +38,7 @@ def edge_evidence(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArray
     autocorrelation of Geary 1954). Every so many voxels tell, some 8000.
     """
     step = -(-grid.n_voxels // _TELLING)
-    sums, pairs = _squared_distances(values, grid.counts, normals, grid.indptr, grid.neighbours, step)
+    sums, pairs = _squared_distances(values, grid.counts, normals, grid.neighbourhood, step)
     some, counts = values[::step], grid.counts[::step]
     mean = np.average(some, axis=0, weights=counts)
     any_two = float((counts @ np.square(some - mean)).sum()) / len(some)
@@ -59,11 +59,11 @@ def _squared_distances(
     values: NDArray[np.float64],
     counts: NDArray[np.int64],
     normals: NDArray[np.float64],
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
+    around: Neighbourhood,
     step: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Weighted sums of squared distances of touching voxels, and their numbers, on smooth surfaces and at creases."""
+    indptr, neighbours = around
     sums, pairs = np.zeros(2), np.zeros(2, np.int64)
     for i in range(0, len(values), step):
         for a in range(indptr[i], indptr[i + 1]):
@@ -88,7 +88,7 @@ def autocorrelation(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.
     1 - C, no less than 0, where C is the mean square difference of touching voxels over twice the variance of all
     (Geary 1954); 0 where all are equal.
     """
-    squares = _sums_of_squares(values, values.mean(axis=0), grid.indptr, grid.neighbours)
+    squares = _sums_of_squares(values, values.mean(axis=0), grid.neighbourhood)
     pairs = max(len(grid.neighbours), 1)
     twice = 2.0 * squares[1] / max(grid.n_voxels - 1, 1)
     ratio = np.divide(squares[0] / pairs, twice, out=np.ones_like(twice), where=twice > 0.0)
@@ -97,9 +97,10 @@ def autocorrelation(values: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.
 
 @kernel
 def _sums_of_squares(
-    values: NDArray[np.float64], means: NDArray[np.float64], indptr: NDArray[np.int64], neighbours: NDArray[np.int32]
+    values: NDArray[np.float64], means: NDArray[np.float64], around: Neighbourhood
 ) -> NDArray[np.float64]:
     """Sums of squared differences of touching voxels, and of squared distances to the mean, (2, d)."""
+    indptr, neighbours = around
     sums = np.zeros((2, values.shape[1]))
     for i in range(len(values)):
         for column in range(values.shape[1]):

@@ -12,7 +12,7 @@ from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.eigen import least_eigenvalue
-from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, VoxelGrid, boundary_voxels, voxels_within
+from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, Neighbourhood, VoxelGrid, boundary_voxels, voxels_within
 
 OUTLIER = -2
 """Label of a point that belongs to nothing."""
@@ -51,7 +51,7 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     nothing = np.zeros(grid.n_voxels, np.bool_)
     n_points = int(grid.counts.sum())
     around = np.empty(grid.n_voxels, np.int64)
-    in_blocks(_count_around, grid.n_voxels, grid.indptr, grid.neighbours, grid.counts, around)
+    in_blocks(_count_around, grid.n_voxels, grid.neighbourhood, grid.counts, around)
     if n_points < _MIN_POINTS:  # only now: the cloud that kernels are warmed up on is small
         return nothing
     points = np.cumsum(np.bincount(around, grid.counts))
@@ -170,12 +170,12 @@ def _least_significant(expected: float) -> int:
 def _count_around(
     start: int,
     stop: int,
-    indptr: NDArray[np.int64],
-    neighbours: NDArray[np.int32],
+    neighbourhood: Neighbourhood,
     counts: NDArray[np.int64],
     around: NDArray[np.int64],
 ) -> None:
     """Set the number of points in each voxel and those around it."""
+    indptr, neighbours = neighbourhood
     for i in range(start, stop):
         around[i] = counts[i]
         for a in range(indptr[i], indptr[i + 1]):
