@@ -148,7 +148,8 @@ def _assign(
     points, order, starts = members
     indptr, neighbours = around
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
-    near, labels = np.empty((MAX_NEIGHBOURS, 8)), np.empty(MAX_NEIGHBOURS, np.int32)
+    near, others = np.empty((MAX_NEIGHBOURS, 8)), np.empty(MAX_NEIGHBOURS + 1, np.uint32)
+    labels = np.empty(MAX_NEIGHBOURS + 1, np.int32)
     places, nearest = np.empty((0, 3)), np.empty(0, np.int32)
     first = start
     while first < stop:
@@ -158,13 +159,12 @@ def _assign(
             nearest = np.empty(len(places), np.int32)
         for v in range(first, last):
             own, n = supervoxels[v], 0
-            for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around
-                i = neighbours[a]
-                if supervoxels[i] != own:
-                    for column in range(7):
-                        near[n, column] = surface[i, column]
-                    labels[n] = supervoxels[i]
-                    n += 1
+            for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around, without a branch, which would
+                others[n], labels[n] = neighbours[a], supervoxels[neighbours[a]]  # often be guessed wrongly
+                n += labels[n] != own
+            for i in range(n):
+                for column in range(7):
+                    near[i, column] = surface[others[i], column]
             own_points, stay = range(starts[v] - begin, starts[v + 1] - begin), n == 0
             for m in own_points:
                 px, py, pz = places[m, 0], places[m, 1], places[m, 2]
