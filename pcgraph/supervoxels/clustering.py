@@ -498,7 +498,7 @@ def _largest_pieces(
         for a in range(indptr[i], indptr[i + 1]):
             if neighbours[a] > i:
                 break
-            if labels[neighbours[a]] == labels[i]:
+            if labels[neighbours[a]] == labels[i] and links[neighbours[a]] != root:
                 other = root_of(links, np.int64(neighbours[a]))
                 links[max(root, other)] = min(root, other)
                 root = min(root, other)

@@ -90,7 +90,7 @@ def plane_normal(scatter: NDArray[np.float64], normal: NDArray[np.float64]) -> f
     determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     angle = np.arccos(min(max(determinant / (2.0 * spread**3), -1.0), 1.0)) / 3.0
     least = 2.0 * spread * np.cos(angle + 2.0 * np.pi / 3.0)
-    middle = -least - 2.0 * spread * np.cos(angle)
+    middle = -0.5 * (least + np.sqrt(max(3.0 * (4.0 * spread * spread - least * least), 0.0)))  # of the quadratic left
     if middle - least < _WIDE_GAP:
         return -1.0
     xx, yy, zz = xx - least, yy - least, zz - least

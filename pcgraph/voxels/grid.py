@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.cells import cell_keys, fetch_batch, gallop, sorted_keys, starts_of_runs
+from pcgraph.voxels.cells import cell_keys, gallop, sorted_keys, starts_of_runs
 from pcgraph.voxels.warp import Warp
 
 # Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
@@ -250,24 +250,23 @@ def _gather(
     cells: NDArray[np.float64],
     warped: NDArray[np.float64],
 ) -> None:
-    """Set the voxel of each point, each voxel's cell, and the mean of its points in units of a voxel."""
-    rows, first = np.empty((0, 3)), start
-    while first < stop:
-        last, rows = fetch_batch(scaled, order, starts, first, stop, rows)
-        begin = starts[first]
-        for v in range(first, last):
-            x = y = z = np.int64(0)
-            m = starts[v] - begin
-            cell_x, cell_y, cell_z = np.floor(rows[m, 0]), np.floor(rows[m, 1]), np.floor(rows[m, 2])
-            cells[v, 0], cells[v, 1], cells[v, 2] = cell_x, cell_y, cell_z
-            for m in range(starts[v] - begin, starts[v + 1] - begin):
-                voxel_of_point[order[begin + m]] = v
-                x += np.int64(np.rint((rows[m, 0] - cell_x) * _STEPS_PER_VOXEL))
-                y += np.int64(np.rint((rows[m, 1] - cell_y) * _STEPS_PER_VOXEL))
-                z += np.int64(np.rint((rows[m, 2] - cell_z) * _STEPS_PER_VOXEL))
-            total = (starts[v + 1] - starts[v]) * _STEPS_PER_VOXEL
-            warped[v, 0], warped[v, 1], warped[v, 2] = cell_x + x / total, cell_y + y / total, cell_z + z / total
-        first = last
+    """Set the voxel of each point, each voxel's cell, and the mean of its points in units of a voxel.
+
+    Sums are of whole numbers, exact as long as a voxel has less than 2**32 points, so that their order does not count.
+    """
+    for v in range(start, stop):
+        x = y = z = 0.0
+        p = order[starts[v]]
+        cell_x, cell_y, cell_z = np.floor(scaled[p, 0]), np.floor(scaled[p, 1]), np.floor(scaled[p, 2])
+        cells[v, 0], cells[v, 1], cells[v, 2] = cell_x, cell_y, cell_z
+        for at in range(starts[v], starts[v + 1]):
+            p = order[at]
+            voxel_of_point[p] = v
+            x += np.rint((scaled[p, 0] - cell_x) * _STEPS_PER_VOXEL)
+            y += np.rint((scaled[p, 1] - cell_y) * _STEPS_PER_VOXEL)
+            z += np.rint((scaled[p, 2] - cell_z) * _STEPS_PER_VOXEL)
+        total = (starts[v + 1] - starts[v]) * _STEPS_PER_VOXEL
+        warped[v, 0], warped[v, 1], warped[v, 2] = cell_x + x / total, cell_y + y / total, cell_z + z / total
 
 
 @kernel
@@ -280,14 +279,14 @@ def _average(
     steps: float,
     means: NDArray[np.float64],
 ) -> None:
-    """Means of vectors by voxel, summed as whole numbers."""
+    """Means of vectors by voxel, summed as whole numbers, as `_gather` does."""
     for v in range(start, stop):
-        x = y = z = np.int64(0)
+        x = y = z = 0.0
         for at in range(starts[v], starts[v + 1]):
             p = order[at]
-            x += np.int64(np.rint(values[p, 0] * steps))
-            y += np.int64(np.rint(values[p, 1] * steps))
-            z += np.int64(np.rint(values[p, 2] * steps))
+            x += np.rint(values[p, 0] * steps)
+            y += np.rint(values[p, 1] * steps)
+            z += np.rint(values[p, 2] * steps)
         total = max(starts[v + 1] - starts[v], 1) * steps
         means[v, 0], means[v, 1], means[v, 2] = x / total, y / total, z / total
 
