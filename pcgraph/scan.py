@@ -335,7 +335,9 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         leaf_of_point = method.supervoxel_of_point(cloud.points, grid, planes, supervoxels)
         return leaf_of_point, _leaves(cloud, surface, leaf_of_point, earlier)
 
-    (leaf_of_point, leaves), touching = side_by_side(with_points, lambda: contacts(grid, normals, supervoxels))
+    (leaf_of_point, leaves), (touching, evidence) = side_by_side(
+        with_points, lambda: (contacts(grid, normals, supervoxels), color_evidence(grid, normals))
+    )
     nodes = node_features(leaves)
     features = edge_features(nodes, touching)
     faces = faces_of(touching.edges, features, len(leaves))
@@ -344,7 +346,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: continuations(surface, nodes, faces, scan.places),
     )
     hidden = hidden.without(touching.edges).without(near.edges)
-    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, color_evidence=color_evidence(grid, normals))
+    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, color_evidence=evidence)
     graph = replace(graph, bridges=bridges(grid, supervoxels, leaves.counts, graph.joined))
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
