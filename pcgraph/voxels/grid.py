@@ -350,13 +350,13 @@ def _walk(
     with_lists: bool,
 ) -> NDArray[np.int32]:
     """The lists, one after the other, if wanted, and how long each is, in `counts`: nine pointers walk the sorted keys,
-    each along one row of three voxels around."""
-    n, found, n_found = len(keys), np.empty((stop - start) * MAX_NEIGHBOURS if with_lists else 0, np.int32), 0
-    pointers = np.empty(9, np.int64)
+    each along one row of three voxels around. They are unsigned for the same reason as `Neighbourhood`."""
+    found, n_found = np.empty((stop - start) * MAX_NEIGHBOURS if with_lists else 0, np.int32), 0
+    pointers, end, one = np.empty(9, np.uint64), np.uint64(len(keys)), np.uint64(1)
     shifts = np.empty(9, np.int64)
     for row in range(9):
         shifts[row] = (row // 3 - 1) * pitch_x + (row % 3 - 1) * pitch_y - 1
-        low, high = 0, n if start < stop else 0  # np.searchsorted takes seconds to compile
+        low, high = 0, len(keys) if start < stop else 0  # np.searchsorted takes seconds to compile
         while low < high:
             middle = (low + high) // 2
             if keys[middle] < keys[start] + shifts[row]:
@@ -369,15 +369,15 @@ def _walk(
         for row in range(9):
             target = keys[i] + shifts[row]
             at = pointers[row]
-            while at < n and keys[at] < target:
-                at += 1
+            while at < end and keys[at] < target:
+                at += one
             pointers[row] = at
-            while at < n and keys[at] <= target + 2:
-                if at != i:
+            while at < end and keys[at] <= target + 2:
+                if at != np.uint64(i):
                     if with_lists:
                         found[n_found + count] = at
                     count += 1
-                at += 1
+                at += one
         counts[i] = count
         n_found += count
     return found[: n_found if with_lists else 0]
