@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.inputs import non_negative
-from pcgraph.parallel import in_blocks, kernel
+from pcgraph.parallel import in_blocks, kernel, side_by_side
 from pcgraph.supervoxels.clustering import (
     EARLY_SWEEPS,
     Metric,
+    VoxelGraph,
     enforce_connectivity,
     expand,
     refine,
@@ -68,11 +69,13 @@ class SurfaceGrowth(SupervoxelMethod):
         self, grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float, initial: NDArray[np.int32]
     ) -> NDArray[np.int32]:
         """Supervoxels by expansion and k-means sweeps along their boundaries."""
-        color = self.color_weight * color_evidence(grid, normals)
-        weights = self.spatial_weight / seed_size, self.normal_weight, color
-        metric = Metric(*weights, two_sided=False, feature=self.feature_weight)
-        voxels = voxel_graph(grid, normals, metric)
-        seeds = seed_voxels(grid, normals, seed_size, two_sided=False)
+
+        def graph() -> VoxelGraph:
+            color = self.color_weight * color_evidence(grid, normals)
+            weights = self.spatial_weight / seed_size, self.normal_weight, color
+            return voxel_graph(grid, normals, Metric(*weights, two_sided=False, feature=self.feature_weight))
+
+        voxels, seeds = side_by_side(graph, lambda: seed_voxels(grid, normals, seed_size, two_sided=False))
         labels = expand(voxels, seeds, EARLY_SWEEPS * seed_size / grid.size, initial)
         refine(voxels, labels, initial >= 0)
         return enforce_connectivity(voxels, labels, initial)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
-from pcgraph.parallel import inlined, kernel
+from pcgraph.parallel import in_blocks, inlined, kernel
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, unite
 from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
@@ -153,21 +153,28 @@ def region_linkage(
     state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, color, 1.0))
     sums = np.stack((costs * weights, weights, weights) if n_bridges else (costs * weights, weights))
     sums[2:, : len(edges) - n_bridges] = 0.0  # what is left are the bridges' weights
-    contracted = ContractedGraph.of(graph.n_nodes, edges, _first_altitudes(state, edges, sums, _SHAPE), sums)
+    set_residuals(state)
+    altitudes = np.empty(len(edges))
+    in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
+    contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
     _merge(state, contracted, _SHAPE)
     merges = contracted.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))
 
 
 @kernel
-def _first_altitudes(
-    state: RegionState, edges: NDArray[np.int32], sums: NDArray[np.float64], shape: _Shape
-) -> NDArray[np.float64]:
-    set_residuals(state)
-    altitudes = np.empty(len(edges))
-    for edge in range(len(edges)):
+def _set_first_altitudes(
+    start: int,
+    stop: int,
+    state: RegionState,
+    edges: NDArray[np.int32],
+    sums: NDArray[np.float64],
+    shape: _Shape,
+    altitudes: NDArray[np.float64],
+) -> None:
+    """Set the altitude of each edge before the first merge."""
+    for edge in range(start, stop):
         altitudes[edge] = _altitude(state, sums, edge, edges[edge, 0], edges[edge, 1], shape)
-    return altitudes
 
 
 @kernel
