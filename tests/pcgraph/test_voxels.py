@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import pcgraph
 from pcgraph.parallel import in_blocks
 from pcgraph.voxels.cells import bounding_box, sorted_keys
-from pcgraph.voxels.eigen import plane_normal, symmetric_eigen
+from pcgraph.voxels.eigen import least_root, plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.surface import local_planes
@@ -46,6 +46,18 @@ def test_closed_form_normal_is_lapacks_or_declined(seed, spread, scale):
     assert least == pytest.approx(exact_values[0], abs=1e-11 * values.sum())
     assert abs(normal @ exact[:, 0]) == pytest.approx(1.0, abs=1e-8)
     assert normal @ normal == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_least_root_is_that_of_the_cosine_formula():
+    """In extended precision where there is one: the formula's own rounding in doubles is twice the polynomial's."""
+    near_ends = np.logspace(-17, -2, 500)
+    ratios = np.concatenate((np.linspace(-1.0, 1.0, 100_001), 1.0 - near_ends, near_ends - 1.0))
+    wide = np.longdouble(1.0)
+    exact = np.cos((np.arccos(wide * ratios) + 4.0 * np.arcsin(wide)) / 3.0)
+    found = np.array([least_root(ratio) for ratio in ratios])
+    assert np.abs(found - exact).max() < 3e-16 + 4.0 * np.finfo(np.longdouble).eps
+    assert least_root(1.0 + 1e-9) == least_root(1.0) == pytest.approx(-0.5, abs=3e-16)
+    assert least_root(-1.0 - 1e-9) == least_root(-1.0) == pytest.approx(-1.0, abs=3e-16)
 
 
 @settings(max_examples=200, deadline=None)
