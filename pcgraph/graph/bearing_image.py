@@ -271,8 +271,8 @@ def _scan(  # type: ignore[no-untyped-def]
             if beyond >= 0 and apart(behind, beyond, view, reach):
                 beyond = -1
             first, last = np.int64(indptr[front]), np.int64(indptr[front + 1])
-            touch = np.any(neighbours[first:last] == behind)
-            if touch or not _stands_off(front, behind, beyond, view, least_gap * edge):
+            stands_off = _stands_off(front, behind, beyond, view, least_gap * edge)
+            if not stands_off or np.any(neighbours[first:last] == behind):
                 continue
             if at < lap or not wraps:
                 depth_edges[n_edges, 0], depth_edges[n_edges, 1] = front, behind

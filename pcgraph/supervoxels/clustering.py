@@ -435,12 +435,9 @@ def _move(
             add_features(features, i, sums, labels[i], -1.0)
             add_features(features, i, sums, chosen[q], 1.0)
             labels[i] = chosen[q]
-            if not queued[i]:
-                queued[i] = True
-                following[used] = i
-                used += 1
-            for a in range(indptr[i], indptr[i + 1]):
-                j = neighbours[a]
+            first = np.int64(indptr[i])
+            for a in range(first - 1, np.int64(indptr[i + 1])):
+                j = i if a < first else np.int64(neighbours[a])
                 if not queued[j]:
                     queued[j] = True
                     following[used] = j

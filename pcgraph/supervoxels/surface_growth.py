@@ -162,8 +162,9 @@ def _assign(
             nearest = np.empty(len(places), np.int32)
         for v in range(first, last):
             own, n = supervoxels[v], 0
-            for a in range(indptr[v], indptr[v + 1]):  # the other surfaces around, without a branch, which would
-                others[n], labels[n] = neighbours[a], supervoxels[neighbours[a]]  # often be guessed wrongly
+            # The other surfaces around, without a branch, which would often be guessed wrongly.
+            for a in range(indptr[v], indptr[v + 1]):
+                others[n], labels[n] = neighbours[a], supervoxels[neighbours[a]]
                 n += labels[n] != own
             for i in range(n):
                 for column in range(7):

@@ -94,11 +94,9 @@ def plane_normal(scatter: NDArray[np.float64], normal: NDArray[np.float64]) -> f
         return -1.0
     xx, yy, zz = scatter[0] / trace - 1.0 / 3.0, scatter[1] / trace - 1.0 / 3.0, scatter[2] / trace - 1.0 / 3.0
     xy, xz, yz = scatter[3] / trace, scatter[4] / trace, scatter[5] / trace
-    spread = np.sqrt((xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    spread, least = _spread_and_least(xx, yy, zz, xy, xz, yz)
     if spread < _WIDE_GAP:
         return -1.0
-    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    least = 2.0 * spread * least_root(determinant / (2.0 * spread**3))
     middle = -0.5 * (least + np.sqrt(max(3.0 * (4.0 * spread * spread - least * least), 0.0)))  # of the quadratic left
     if middle - least < _WIDE_GAP:
         return -1.0
@@ -131,11 +129,17 @@ def least_eigenvalue(xx: float, yy: float, zz: float, xy: float, xz: float, yz: 
         return 0.0
     xx, yy, zz = xx / trace - 1.0 / 3.0, yy / trace - 1.0 / 3.0, zz / trace - 1.0 / 3.0
     xy, xz, yz = xy / trace, xz / trace, yz / trace
+    return max(_spread_and_least(xx, yy, zz, xy, xz, yz)[1] + 1.0 / 3.0, 0.0) * trace
+
+
+@routine
+def _spread_and_least(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
+    """Of a matrix without a trace: the root of a sixth of the sum of its squares, and the least eigenvalue."""
     spread = np.sqrt((xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
     if spread == 0.0:
-        return trace / 3.0
+        return 0.0, 0.0
     determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    return max(2.0 * spread * least_root(determinant / (2.0 * spread**3)) + 1.0 / 3.0, 0.0) * trace
+    return spread, 2.0 * spread * least_root(determinant / (2.0 * spread**3))
 
 
 @kernel

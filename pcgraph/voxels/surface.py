@@ -271,11 +271,9 @@ def local_planes(grid: VoxelGrid, viewpoints: NDArray[np.float64], reach: int) -
     towards = viewpoints - grid.centroids
     windows = fitted_windows(grid, towards)
     best, costs = np.arange(n, dtype=np.int32), _OWN_BONUS * windows.residuals
-    held = windows.residuals
     for _ in range(reach):
-        better = np.empty_like(best)
+        held, better = windows.residuals[best], np.empty_like(best)
         in_blocks(_take_best, n, neighbourhood, grid.centroids, windows, held, best, costs, better)
-        held = np.where(better == best, np.inf, windows.residuals[better])  # all around know the others by now
         best = better
     planes = LocalPlanes(np.empty((n, 3)), np.empty((n, 3)))
     in_blocks(_set_planes, n, best, windows, towards, planes.normals, planes.origins)
