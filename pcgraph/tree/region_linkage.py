@@ -17,6 +17,7 @@ from pcgraph.parallel import in_blocks, inlined, kernel
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, unite
 from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
+from pcgraph.voxels.eigen import plane_normal
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,15 @@ class RegionLinkage(Linkage):
     color : float, voxel edges, >= 0
         Distance that a difference of 1 counts for, in a colour of 0..1, if colours change where surfaces do; less as
         they do not (`AdjacencyGraph.color_evidence`).
+    relief : float, radians, >= 0
+        What a region costs that stands in relief: a window in its wall, a picture on it, a roof above the ground.
 
     Notes
     -----
     Two regions A and B merge at
 
-        (c + c0 + c1 ln(1 + l / l0)) E / (E + e0) (l / (l + l0))^1/2 (w / (b + w))^3/4 (1 + M / (r m))^1/4 m / (m + m0)
+        (c + relief R + c0 + c1 ln(1 + l / l0)) E / (E + e0) (l / (l + l0))^1/2
+            (w / (b + w))^3/4 (1 + M / (r m))^1/4 m / (m + m0)
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
     increase of the squared distances to the regions' best planes and mean colours by the merge, and l = E / b that per
@@ -53,6 +57,15 @@ class RegionLinkage(Linkage):
     the first to go in coarser cuts, bridges (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges
     joins merge above the altitude of objects, at their mean cost times m / (m + 1).
 
+    R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
+    one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
+
+        R = (s b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
+
+    where s is the fraction of the smaller region's contacts that are with the larger one, b <= b1 w, r1 m <= M, d is
+    the distance of the smaller one's mean from the larger one's plane, p the variance of its distances to that plane
+    and q that of the larger one's own, all in voxel edges.
+
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
     """
@@ -61,13 +74,14 @@ class RegionLinkage(Linkage):
     gap: float = 0.15
     bridge: float = 0.1
     color: float = 2.0
+    relief: float = 15.0
 
     default_object_altitude = 0.4
     default_part_altitude = 0.06
 
     def __post_init__(self) -> None:
         check_cost(self.cost)
-        check_numbers(self, "gap", "bridge", "color")
+        check_numbers(self, "gap", "bridge", "color", "relief")
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least altitude first."""
@@ -83,7 +97,8 @@ class RegionLinkage(Linkage):
             edges, costs = np.concatenate((edges, bridges.edges)), np.concatenate((costs, self.bridge * bridges.widths))
             weights = np.concatenate((weights, np.full(len(bridges.edges), _BRIDGE_VOXELS)))
         n_bridges = 0 if bridges is None else len(bridges.edges)
-        return region_linkage(graph, leaves, edges, costs, weights, self.color * graph.color_evidence, n_bridges)
+        color = self.color * graph.color_evidence
+        return region_linkage(graph, leaves, edges, costs, weights, color, n_bridges, self.relief)
 
 
 _STEPS = float(1 << 20)
@@ -92,7 +107,7 @@ _BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact where others join it: 
 
 
 class _Shape(NamedTuple):
-    """Constants of the altitude, as in `RegionLinkage`; the width of a region of mass m is `width` sqrt(m)."""
+    """Constants of the altitude, as in `RegionLinkage`; the width w of a region of mass m is `width` sqrt(m)."""
 
     c0: float
     c1: float
@@ -102,6 +117,11 @@ class _Shape(NamedTuple):
     r: float
     m0: float
     m1: float
+    m2: float
+    b1: float
+    r1: float
+    v0: float
+    d1: float
     objects: float  # altitude of objects, radians
 
 
@@ -114,6 +134,11 @@ _SHAPE = _Shape(
     r=100.0,
     m0=0.1,
     m1=1.0,
+    m2=20.0,
+    b1=3.5,
+    r1=2.0,
+    v0=0.05,
+    d1=2.0,
     objects=RegionLinkage.default_object_altitude,
 )
 
@@ -126,6 +151,7 @@ def region_linkage(
     weights: NDArray[np.float64],
     color: float = 0.0,
     n_bridges: int = 0,
+    relief: float = 0.0,
 ) -> Merges:
     """Merges of regions along edges, the least altitude of `RegionLinkage` first.
 
@@ -143,6 +169,8 @@ def region_linkage(
         What colours count, if there are any.
     n_bridges : int
         So many of the last edges are bridges.
+    relief : float, radians, >= 0
+        What a region costs that stands in relief.
 
     Returns
     -------
@@ -154,10 +182,11 @@ def region_linkage(
     sums = np.stack((costs * weights, weights, weights) if n_bridges else (costs * weights, weights))
     sums[2:, : len(edges) - n_bridges] = 0.0  # what is left are the bridges' weights
     set_residuals(state)
+    perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
     altitudes = np.empty(len(edges))
-    in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
+    in_blocks(_set_first_altitudes, len(edges), state, perimeters, relief, edges, sums, _SHAPE, altitudes)
     contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
-    _merge(state, contracted, _SHAPE)
+    _merge(state, perimeters, relief, contracted, _SHAPE)
     merges = contracted.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))
 
@@ -167,18 +196,24 @@ def _set_first_altitudes(
     start: int,
     stop: int,
     state: RegionState,
+    perimeters: NDArray[np.float64],
+    relief: float,
     edges: NDArray[np.int32],
     sums: NDArray[np.float64],
     shape: _Shape,
     altitudes: NDArray[np.float64],
 ) -> None:
     """Set the altitude of each edge before the first merge."""
+    normal = np.empty(3)
     for edge in range(start, stop):
-        altitudes[edge] = _altitude(state, sums, edge, edges[edge, 0], edges[edge, 1], shape)
+        a, b = edges[edge, 0], edges[edge, 1]
+        altitudes[edge] = _altitude(state, perimeters, relief, sums, edge, a, b, shape, normal)
 
 
 @kernel
-def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
+def _merge(
+    state: RegionState, perimeters: NDArray[np.float64], relief: float, graph: ContractedGraph, shape: _Shape
+) -> None:
     """Merge along the lowest edge until there is none.
 
     After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
@@ -187,42 +222,76 @@ def _merge(state: RegionState, graph: ContractedGraph, shape: _Shape) -> None:
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
     # After how many merges each region changed, and each altitude was computed.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
+    normal = np.empty(3)
     while heap.size[0] > 0:
         edge = heap.order[0]
         a, b = halves[2 * edge].end, halves[2 * edge + 1].end
         if computed[edge] < max(changed[a], changed[b]):
             computed[edge] = graph.done[0]
-            heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
+            heap_update(heap, edge, _altitude(state, perimeters, relief, sums, edge, a, b, shape, normal))
             continue
+        inside = 2.0 * sums[1, edge]
         kept, gone, n_parallel = contract_cheapest(graph)
         unite(state, kept, gone)
+        perimeters[kept] += perimeters[gone] - inside
         changed[kept] = graph.done[0]
         half = clusters[kept].first if clusters[kept].degree <= _MANY else NONE
         while half != NONE:
             edge = half >> 1
             computed[edge] = graph.done[0]
-            heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, shape))
+            other = halves[half ^ 1].end
+            heap_update(heap, edge, _altitude(state, perimeters, relief, sums, edge, kept, other, shape, normal))
             half = halves[half].after
         for edge in graph.parallel[:n_parallel]:
             if computed[edge] < graph.done[0]:  # two became one: both old altitudes say little
                 computed[edge] = graph.done[0]
                 a, b = halves[2 * edge].end, halves[2 * edge + 1].end
-                heap_update(heap, edge, _altitude(state, sums, edge, a, b, shape))
+                heap_update(heap, edge, _altitude(state, perimeters, relief, sums, edge, a, b, shape, normal))
 
 
 @inlined
-def _altitude(state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, shape: _Shape) -> float:
+def _altitude(
+    state: RegionState,
+    perimeters: NDArray[np.float64],
+    relief: float,
+    sums: NDArray[np.float64],
+    edge: int,
+    a: int,
+    b: int,
+    shape: _Shape,
+    normal: NDArray[np.float64],
+) -> float:
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
+    if state.masses[b] < state.masses[a]:
+        a, b = b, a
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
-    smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
+    smaller, larger = state.masses[a], state.masses[b]
     if len(sums) > 2 and sums[2, edge] == sums[1, edge]:  # nothing but bridges
         return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), round(shape.objects * _STEPS) + 1) / _STEPS
     increase = max(energy_increase(state, a, b), 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(smaller)
     shortness = width / (length + width)
+    surrounded = min(sums[1, edge] / perimeters[a], 1.0) * min(length / (shape.b1 * width), 1.0)
+    large = max(1.0 - shape.r1 * smaller / larger, 0.0) * smaller / (smaller + shape.m2)
+    cost += relief * surrounded * surrounded * large * _offset(state, a, b, shape, normal)
     evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
     evidence *= smaller / (smaller + shape.m0)
     return round(evidence * _STEPS) / _STEPS
+
+
+@kernel
+def _offset(state: RegionState, a: int, b: int, shape: _Shape, normal: NDArray[np.float64]) -> float:
+    """How far the first region lies off the second one's plane as a whole, but not far, 0..1; `normal` is scratch."""
+    if plane_normal(state.scatters[b], normal) < 0.0:
+        return 0.0
+    x, y, z = normal
+    scatter, from_, to = state.scatters[a], state.centroids[b], state.centroids[a]
+    distance = x * (to[0] - from_[0]) + y * (to[1] - from_[1]) + z * (to[2] - from_[2])
+    spread = x * x * scatter[0] + y * y * scatter[1] + z * z * scatter[2]
+    spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])
+    square = distance * distance
+    noise = shape.v0 + 4.0 * spread / state.masses[a] + state.residuals[b] / state.masses[b]
+    return 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (shape.d1 * shape.d1)))

@@ -15,13 +15,14 @@ import pcgraph
 from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
 
 
-@pytest.mark.parametrize("times_as_large", [1, 100])
-def test_the_altitude_of_two_regions_is_the_formula(times_as_large):
+@pytest.mark.parametrize(("times_as_large", "weight", "relief"), [(1, 7.0, 15.0), (100, 7.0, 0.0), (5, 60.0, 1000.0)])
+def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief):
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
     grown = leaves.counts * np.array([1, times_as_large])
     leaves = replace(leaves, counts=grown, scatters=leaves.scatters * (grown / leaves.counts)[:, None, None])
-    cost, weight = 0.4, 7.0
-    found = region_linkage(graph, leaves, graph.edges, np.array([cost]), np.array([weight])).altitudes[0]
+    cost = 0.4
+    costs, weights = np.array([cost]), np.array([weight])
+    found = region_linkage(graph, leaves, graph.edges, costs, weights, relief=relief).altitudes[0]
     unit = float(np.median(graph.edge_features.voxel_edge))
     mean = leaves.counts.mean()
 
@@ -34,11 +35,51 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large):
     union = a + b + n[0] * n[1] / n.sum() * np.outer(apart, apart)
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
-    evidence = cost + 0.08 + 0.04 * math.log(1 + scale / 0.1)
+    evidence = cost + relief * _relief(leaves, unit, length, width) + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
     weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
+    assert relief < 1000.0 or relief * _relief(leaves, unit, length, width) > 0.1 * evidence
+
+
+def _relief(leaves, unit, length, width):
+    """R of the formula, of two regions that touch nothing else."""
+    small, large = np.argsort(leaves.counts, kind="stable")
+    m, larger = leaves.counts[[small, large]] / leaves.counts.mean()
+    normal = np.linalg.eigh(leaves.scatters[large])[1][:, 0] / unit
+    square = float(normal @ (leaves.centroids[small] - leaves.centroids[large])) ** 2
+    across = [float(normal @ leaves.covariances[region] @ normal) for region in (small, large)]
+    noise = 4.0 * across[0] + across[1] + 0.05
+    around = min(length / (3.5 * width), 1.0) ** 2 * max(1.0 - 2.0 * m / larger, 0.0) * m / (m + 20.0)
+    return around / (1.0 + (noise / square) ** 8) / (1.0 + square / 4.0)
+
+
+def _wall(height, slope=None):
+    """A wall of 2 m x 1.5 m with a panel on it, or in it, or a hill on it, and which points are the panel's."""
+    x, y = (c.ravel() for c in np.meshgrid(np.arange(0.0, 2.0, 0.01), np.arange(0.0, 1.5, 0.01)))
+    outside = np.maximum(np.abs(x - 1.0) - 0.35, np.abs(y - 0.75) - 0.3)
+    z = height * (outside < 0.0 if slope is None else np.clip(-outside / slope, 0.0, 1.0))
+    z = z + np.random.default_rng(0).normal(0.0, 0.001, len(x))
+    return np.stack((x, y, z), axis=1), (outside < 0.0).astype(int)
+
+
+@pytest.mark.parametrize("height", [0.01, 0.02, 0.03, -0.01, -0.03])
+def test_what_stands_in_relief_is_an_object(height):
+    """A step of half a voxel to less than two, which normals of voxels don't show."""
+    points, truth = _wall(height)
+    found = pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0))
+    assert 0.5 < abs(height) / found.voxel_size < 2.0
+    assert found.labels.max() == 1
+    assert pcgraph.metrics.segmentation_covering(found.labels, truth) > 0.97
+    without = pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0), linkage=RegionLinkage(relief=0.0))
+    assert without.labels.max() == 0
+
+
+@pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.1, 0.2), (0.1, 0.3)])
+def test_a_gentle_hill_is_no_object(height, slope):
+    points, _ = _wall(height, slope)
+    assert pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0)).labels.max() == 0
 
 
 @pytest.mark.parametrize("kind", ["random", "chain", "star"])
@@ -73,6 +114,8 @@ def test_concavity_parts_what_convexity_joins():
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="gap"):
         RegionLinkage(gap=-1.0)
+    with pytest.raises(ValueError, match="relief"):
+        RegionLinkage(relief=np.nan)
     with pytest.raises(ValueError, match="BoundaryCost"):
         RegionLinkage(cost=3)
 
