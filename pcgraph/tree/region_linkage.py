@@ -182,9 +182,9 @@ def region_linkage(
     sums = np.stack((costs * weights, weights, weights) if n_bridges else (costs * weights, weights))
     sums[2:, : len(edges) - n_bridges] = 0.0  # what is left are the bridges' weights
     set_residuals(state)
-    perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
     altitudes = np.empty(len(edges))
-    in_blocks(_set_first_altitudes, len(edges), state, perimeters, relief, edges, sums, _SHAPE, altitudes)
+    in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
+    perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
     contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
     _merge(state, perimeters, relief, contracted, _SHAPE)
     merges = contracted.merges()
@@ -196,18 +196,14 @@ def _set_first_altitudes(
     start: int,
     stop: int,
     state: RegionState,
-    perimeters: NDArray[np.float64],
-    relief: float,
     edges: NDArray[np.int32],
     sums: NDArray[np.float64],
     shape: _Shape,
     altitudes: NDArray[np.float64],
 ) -> None:
-    """Set the altitude of each edge before the first merge."""
-    normal = np.empty(3)
+    """Set the altitude of each edge before the first merge, without relief."""
     for edge in range(start, stop):
-        a, b = edges[edge, 0], edges[edge, 1]
-        altitudes[edge] = _altitude(state, perimeters, relief, sums, edge, a, b, shape, normal)
+        altitudes[edge] = _altitude(state, sums, edge, edges[edge, 0], edges[edge, 1], 0.0, shape)
 
 
 @kernel
@@ -217,18 +213,23 @@ def _merge(
     """Merge along the lowest edge until there is none.
 
     After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
-    hardly changes, an edge gets it when it comes up.
+    hardly changes, an edge gets it when it comes up. Then, too, it is seen whether relief raises it.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
-    # After how many merges each region changed, and each altitude was computed.
+    # After how many merges each region changed, each altitude was computed, and relief was last added to it.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
-    normal = np.empty(3)
+    raised, normal = np.full(len(heap.edges), -1), np.empty(3)
     while heap.size[0] > 0:
         edge = heap.order[0]
         a, b = halves[2 * edge].end, halves[2 * edge + 1].end
         if computed[edge] < max(changed[a], changed[b]):
             computed[edge] = graph.done[0]
-            heap_update(heap, edge, _altitude(state, perimeters, relief, sums, edge, a, b, shape, normal))
+            heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, shape))
+            continue
+        if raised[edge] < computed[edge]:
+            raised[edge] = computed[edge]
+            stands_out = relief * _relief(state, perimeters, sums[1, edge], a, b, shape, normal)
+            heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
             continue
         inside = 2.0 * sums[1, edge]
         kept, gone, n_parallel = contract_cheapest(graph)
@@ -239,43 +240,29 @@ def _merge(
         while half != NONE:
             edge = half >> 1
             computed[edge] = graph.done[0]
-            other = halves[half ^ 1].end
-            heap_update(heap, edge, _altitude(state, perimeters, relief, sums, edge, kept, other, shape, normal))
+            heap_update(heap, edge, _altitude(state, sums, edge, kept, halves[half ^ 1].end, 0.0, shape))
             half = halves[half].after
         for edge in graph.parallel[:n_parallel]:
             if computed[edge] < graph.done[0]:  # two became one: both old altitudes say little
                 computed[edge] = graph.done[0]
                 a, b = halves[2 * edge].end, halves[2 * edge + 1].end
-                heap_update(heap, edge, _altitude(state, perimeters, relief, sums, edge, a, b, shape, normal))
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, shape))
 
 
 @inlined
 def _altitude(
-    state: RegionState,
-    perimeters: NDArray[np.float64],
-    relief: float,
-    sums: NDArray[np.float64],
-    edge: int,
-    a: int,
-    b: int,
-    shape: _Shape,
-    normal: NDArray[np.float64],
+    state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, stands_out: float, shape: _Shape
 ) -> float:
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
-    if state.masses[b] < state.masses[a]:
-        a, b = b, a
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
-    smaller, larger = state.masses[a], state.masses[b]
+    smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
     if len(sums) > 2 and sums[2, edge] == sums[1, edge]:  # nothing but bridges
         return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), round(shape.objects * _STEPS) + 1) / _STEPS
     increase = max(energy_increase(state, a, b), 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(smaller)
     shortness = width / (length + width)
-    surrounded = min(sums[1, edge] / perimeters[a], 1.0) * min(length / (shape.b1 * width), 1.0)
-    large = max(1.0 - shape.r1 * smaller / larger, 0.0) * smaller / (smaller + shape.m2)
-    cost += relief * surrounded * surrounded * large * _offset(state, a, b, shape, normal)
-    evidence = cost + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
+    evidence = cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
     evidence *= smaller / (smaller + shape.m0)
@@ -283,15 +270,29 @@ def _altitude(
 
 
 @kernel
-def _offset(state: RegionState, a: int, b: int, shape: _Shape, normal: NDArray[np.float64]) -> float:
-    """How far the first region lies off the second one's plane as a whole, but not far, 0..1; `normal` is scratch."""
-    if plane_normal(state.scatters[b], normal) < 0.0:
+def _relief(
+    state: RegionState,
+    perimeters: NDArray[np.float64],
+    contact: float,
+    a: int,
+    b: int,
+    shape: _Shape,
+    normal: NDArray[np.float64],
+) -> float:
+    """How much the smaller of two regions stands in relief, 0..1: R of `RegionLinkage`; `normal` is scratch."""
+    if state.masses[b] < state.masses[a]:
+        a, b = b, a
+    smaller, larger = state.masses[a], state.masses[b]
+    if shape.r1 * smaller >= larger or plane_normal(state.scatters[b], normal) < 0.0:
         return 0.0
+    width = shape.width * math.sqrt(smaller)
+    within = min(contact / perimeters[a], 1.0) * min(0.5 * contact / (shape.b1 * width), 1.0)
     x, y, z = normal
-    scatter, from_, to = state.scatters[a], state.centroids[b], state.centroids[a]
-    distance = x * (to[0] - from_[0]) + y * (to[1] - from_[1]) + z * (to[2] - from_[2])
+    scatter, inner, outer = state.scatters[a], state.centroids[a], state.centroids[b]
+    distance = x * (inner[0] - outer[0]) + y * (inner[1] - outer[1]) + z * (inner[2] - outer[2])
     spread = x * x * scatter[0] + y * y * scatter[1] + z * z * scatter[2]
     spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])
     square = distance * distance
-    noise = shape.v0 + 4.0 * spread / state.masses[a] + state.residuals[b] / state.masses[b]
-    return 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (shape.d1 * shape.d1)))
+    noise = shape.v0 + 4.0 * spread / smaller + state.residuals[b] / larger
+    off = 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (shape.d1 * shape.d1)))
+    return within * within * (1.0 - shape.r1 * smaller / larger) * smaller / (smaller + shape.m2) * off
