@@ -137,7 +137,7 @@ _SHAPE = _Shape(
     m2=20.0,
     b1=3.5,
     r1=2.0,
-    v0=0.05,
+    v0=0.075,
     d1=2.0,
     objects=RegionLinkage.default_object_altitude,
 )

@@ -50,7 +50,7 @@ def _relief(leaves, unit, length, width):
     normal = np.linalg.eigh(leaves.scatters[large])[1][:, 0] / unit
     square = float(normal @ (leaves.centroids[small] - leaves.centroids[large])) ** 2
     across = [float(normal @ leaves.covariances[region] @ normal) for region in (small, large)]
-    noise = 4.0 * across[0] + across[1] + 0.05
+    noise = 4.0 * across[0] + across[1] + 0.075
     around = min(length / (3.5 * width), 1.0) ** 2 * max(1.0 - 2.0 * m / larger, 0.0) * m / (m + 20.0)
     return around / (1.0 + (noise / square) ** 8) / (1.0 + square / 4.0)
 
