@@ -62,9 +62,9 @@ class RegionLinkage(Linkage):
 
         R = (s b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
 
-    where s is the fraction of the smaller region's contacts that are with the larger one, b <= b1 w, r1 m <= M, d is
+    where s is the fraction of the smaller region's contacts that are with the larger one, and b counts up to b1 w; d is
     the distance of the smaller one's mean from the larger one's plane, p the variance of its distances to that plane
-    and q that of the larger one's own, all in voxel edges.
+    and q that of the larger one's own, in voxel edges. R is 0 where the larger one is not r1 times as large.
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -294,5 +294,7 @@ def _relief(
     spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])
     square = distance * distance
     noise = shape.v0 + 4.0 * spread / smaller + state.residuals[b] / larger
+    if square < 0.1 * noise:
+        return 0.0  # it would be less than 1e-8
     off = 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (shape.d1 * shape.d1)))
     return within * within * (1.0 - shape.r1 * smaller / larger) * smaller / (smaller + shape.m2) * off
