@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
-from pcgraph.parallel import in_blocks, inlined, kernel
+from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, unite
 from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
@@ -216,9 +216,9 @@ def _merge(
     hardly changes, an edge gets it when it comes up. Then, too, it is seen whether relief raises it.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
-    # After how many merges each region changed, each altitude was computed, and relief was last added to it.
+    # After how many merges each region changed, each altitude was computed, and it was last asked for relief.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
-    raised, normal = np.full(len(heap.edges), -1), np.empty(3)
+    asked, normal = np.full(len(heap.edges), -1), np.empty(3)
     while heap.size[0] > 0:
         edge = heap.order[0]
         a, b = halves[2 * edge].end, halves[2 * edge + 1].end
@@ -226,11 +226,12 @@ def _merge(
             computed[edge] = graph.done[0]
             heap_update(heap, edge, _altitude(state, sums, edge, a, b, 0.0, shape))
             continue
-        if raised[edge] < computed[edge]:
-            raised[edge] = computed[edge]
+        if asked[edge] < computed[edge]:
+            asked[edge] = computed[edge]
             stands_out = relief * _relief(state, perimeters, sums[1, edge], a, b, shape, normal)
-            heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
-            continue
+            if stands_out > 0.0:
+                heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
+                continue
         inside = 2.0 * sums[1, edge]
         kept, gone, n_parallel = contract_cheapest(graph)
         unite(state, kept, gone)
@@ -269,7 +270,7 @@ def _altitude(
     return round(evidence * _STEPS) / _STEPS
 
 
-@kernel
+@routine
 def _relief(
     state: RegionState,
     perimeters: NDArray[np.float64],
