@@ -17,11 +17,13 @@ from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.evidence import autocorrelation
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
+from pcgraph.voxels.warp import Slant, warped_normal
 
 EARLY_SWEEPS = 1.8
 """Times seed size over voxel size: sweeps in which PCL's supervoxels take voxels from each other."""
 _REFINEMENTS = 2
 _NOISE = 0.1  # autocorrelation of a column that says nothing, at most
+_STEP, _PARALLEL = 1.0, 0.7  # voxel edges between two surfaces in one cell, and the cosine of their normals, at least
 _FEW = 32  # a smaller part of the voxels, touched in a sweep, is not worth a look at all of them
 
 
@@ -29,7 +31,9 @@ _FEW = 32  # a smaller part of the voxels, touched in a sweep, is not worth a lo
 
 
 class Metric(NamedTuple):
-    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + feature |f - f'|, with |n . n'| where `two_sided`.
+    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane |n' . (x - x')| + feature |f - f'|.
+
+    Primed is the supervoxel; with |n . n'| where `two_sided`.
 
     Attributes
     ----------
@@ -37,6 +41,7 @@ class Metric(NamedTuple):
     normal, color : float
     two_sided : bool
         Whether opposite normals are the same.
+    plane : float, 1 / metres, or None
     feature : float or None
         None where no features were given.
     """
@@ -45,6 +50,7 @@ class Metric(NamedTuple):
     normal: float
     color: float
     two_sided: bool
+    plane: float | None = None
     feature: float | None = None
 
 
@@ -59,12 +65,15 @@ class VoxelGraph(NamedTuple):
     neighbours : (e,) uint32
         The voxels around each; see `pcgraph.voxels.grid.Neighbourhood`.
     metric : Metric
+    slant : Slant
+        Of the warp.
     """
 
     features: NDArray[np.float64]
     indptr: NDArray[np.uint64]
     neighbours: NDArray[np.uint32]
     metric: Metric
+    slant: Slant
 
 
 def voxel_graph(grid: VoxelGrid, normals: NDArray[np.float64], metric: Metric) -> VoxelGraph:
@@ -81,12 +90,12 @@ def voxel_graph(grid: VoxelGrid, normals: NDArray[np.float64], metric: Metric) -
     if grid.features is not None:
         signal = np.maximum(autocorrelation(grid.features, grid) - _NOISE, 0.0) / (1.0 - _NOISE)
         features[:, 9:] = grid.features * signal
-    return VoxelGraph(features, *grid.neighbourhood, metric)
+    return VoxelGraph(features, *grid.neighbourhood, metric, grid.warp.slant)
 
 
 @routine
 def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], s: int, metric: Metric) -> float:
-    """Distance D of voxel i to supervoxel s, given rows of `VoxelGraph.features`."""
+    """Distance D of voxel i to supervoxel s, given rows of `VoxelGraph.features` and of `set_means`."""
     x, y, z = features[i, 0] - means[s, 0], features[i, 1] - means[s, 1], features[i, 2] - means[s, 2]
     cosine = features[i, 3] * means[s, 3] + features[i, 4] * means[s, 4] + features[i, 5] * means[s, 5]
     r, g, b = features[i, 6] - means[s, 6], features[i, 7] - means[s, 7], features[i, 8] - means[s, 8]
@@ -94,7 +103,16 @@ def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], 
         cosine = abs(cosine)
     away, tint = np.sqrt(x * x + y * y + z * z), np.sqrt(r * r + g * g + b * b)
     total = metric.spatial * away + metric.normal * (1.0 - cosine) + metric.color * tint
-    return total + _contrast(features, i, means, s, metric.feature)
+    return total + _off_plane(x, y, z, means, s, metric.plane) + _contrast(features, i, means, s, metric.feature)
+
+
+@routine
+def _off_plane(x: float, y: float, z: float, means: NDArray[np.float64], s: int, weight: float | None) -> float:
+    """What lies off the plane of supervoxel s, from its mean place."""
+    if weight is None:
+        return 0.0
+    across = means.shape[1] - 3
+    return weight * abs(x * means[s, across] + y * means[s, across + 1] + z * means[s, across + 2])
 
 
 @routine
@@ -132,15 +150,21 @@ def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64
 
 
 @routine
-def set_means(sums: NDArray[np.float64], means: NDArray[np.float64]) -> None:
-    """Set `means`, (k, 9 + d), to the supervoxels' mean rows, normals at unit length; rows of empty ones stay."""
+def set_means(sums: NDArray[np.float64], means: NDArray[np.float64], slant: Slant) -> None:
+    """Set `means`, (k, 9 + d + 3), to the supervoxels' mean rows and warped normals; rows of empty ones stay.
+
+    Normals have unit length; warped ones are as of `pcgraph.voxels.warp.Slant`.
+    """
+    across = sums.shape[1] - 1
     for s in range(len(sums)):
         if sums[s, 9] > 0.0:
             length = max(np.sqrt(sums[s, 3] ** 2 + sums[s, 4] ** 2 + sums[s, 5] ** 2), 1e-12)
             for column in range(9):
                 means[s, column] = sums[s, column] / (length if 3 <= column < 6 else sums[s, 9])
-            for column in range(9, means.shape[1]):
+            for column in range(9, across):
                 means[s, column] = sums[s, column + 1] / sums[s, 9]
+            place, normal = (means[s, 0], means[s, 1], means[s, 2]), (means[s, 3], means[s, 4], means[s, 5])
+            means[s, across], means[s, across + 1], means[s, across + 2] = warped_normal(slant, *place, *normal)
 
 
 # --- where supervoxels start ---
@@ -150,8 +174,8 @@ def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float,
     """Voxels from which supervoxels expand, (k,) int32, ascending; perhaps none.
 
     In each seed cell with enough voxels for a surface, it is the voxel nearest to the mean of the cell's voxels,
-    of equals the first. Unless `two_sided`, voxels of the cell that face away from it count as another surface,
-    with a seed of its own if they are enough.
+    of equals the first. Unless `two_sided`, voxels of the cell that face away from it, or lie on a parallel surface a
+    voxel edge off its plane, count as another surface, with a seed of its own if they are enough.
 
     Parameters
     ----------
@@ -172,19 +196,22 @@ def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float,
     starts = starts_of_runs(ordered)
     ratio = seed_size / grid.size  # a cell counts if it holds a tenth of a plane, or half of a line
     enough = min(0.1 * ratio * ratio, 0.5 * ratio)
-    return np.sort(_seeds_of_cells(grid.warped, normals, order, starts, enough, two_sided))
+    cells = order, starts, enough
+    return np.sort(_seeds_of_cells(grid.warped, normals, grid.warp.slant, _STEP * grid.size, *cells, two_sided))
 
 
 @kernel
 def _seeds_of_cells(
     places: NDArray[np.float64],
     normals: NDArray[np.float64],
+    slant: Slant,
+    step: float,
     order: NDArray[np.int64],
     starts: NDArray[np.int64],
     enough: float,
     two_sided: bool,
 ) -> NDArray[np.int32]:
-    """One seed per cell, or two where surfaces face away from each other."""
+    """One seed per cell, or two where surfaces face away from each other or lie a step apart."""
     seeds = np.empty(2 * (len(starts) - 1), np.int32)
     used = 0
     for cell in range(len(starts) - 1):
@@ -196,19 +223,34 @@ def _seeds_of_cells(
         used += 1
         if two_sided:
             continue
-        turned = 0
-        for at in range(len(members)):  # those that face away come to the front of the list
+        others = 0
+        for at in range(len(members)):  # those of another surface come to the front of the list
             i = members[at]
-            facing = 0.0
-            for axis in range(3):
-                facing += normals[i, axis] * normals[seed, axis]
-            if facing < 0.0:
-                members[turned], members[at] = i, members[turned]
-                turned += 1
-        if turned > 0 and turned >= enough:
-            seeds[used] = _nearest_to_mean(places, members[:turned])
+            if _on_another_surface(places, normals, slant, step, i, seed):
+                members[others], members[at] = i, members[others]
+                others += 1
+        if others > 0 and others >= enough:
+            seeds[used] = _nearest_to_mean(places, members[:others])
             used += 1
     return seeds[:used]
+
+
+@inlined
+def _on_another_surface(
+    places: NDArray[np.float64], normals: NDArray[np.float64], slant: Slant, step: float, i: int, seed: int
+) -> bool:
+    """Whether voxel i faces away from a seed, or lies on a surface in parallel to the seed's, a step off its plane."""
+    cosine = normals[i, 0] * normals[seed, 0] + normals[i, 1] * normals[seed, 1] + normals[i, 2] * normals[seed, 2]
+    off = min(_off(places, normals, slant, seed, i), _off(places, normals, slant, i, seed))
+    return cosine < 0.0 or (cosine > _PARALLEL and off > step)
+
+
+@inlined
+def _off(places: NDArray[np.float64], normals: NDArray[np.float64], slant: Slant, i: int, other: int) -> float:
+    """Distance of another voxel from the plane of voxel i, in the warped space."""
+    x, y, z = places[i, 0], places[i, 1], places[i, 2]
+    a, b, c = warped_normal(slant, x, y, z, normals[i, 0], normals[i, 1], normals[i, 2])
+    return abs(a * (places[other, 0] - x) + b * (places[other, 1] - y) + c * (places[other, 2] - z))
 
 
 @routine
@@ -269,10 +311,10 @@ def _expand(
 
     Early sweeps may also take a voxel from a supervoxel that is farther from it.
     """
-    features, indptr, neighbours, metric = voxels
+    features, indptr, neighbours, metric, slant = voxels
     n = len(features)
     claim, best = np.full(n, -1, np.int32), np.full(n, np.inf)
-    sums, means = sum_features(features, labels, n_labels), np.zeros((n_labels, features.shape[1]))
+    sums, means = sum_features(features, labels, n_labels), np.zeros((n_labels, features.shape[1] + 3))
     frontier, touched = np.empty(n, np.int32), np.empty(n, np.int32)
     n_frontier, sweep = 0, 0
     for i in range(n):
@@ -281,7 +323,7 @@ def _expand(
             frontier[n_frontier] = i
             n_frontier += 1
     while n_frontier > 0:
-        set_means(sums, means)
+        set_means(sums, means, slant)
         n_touched = 0
         for f in range(n_frontier):
             i = frontier[f]
@@ -362,7 +404,7 @@ def _boundary(  # type: ignore[no-untyped-def]
     voxels: VoxelGraph, labels: NDArray[np.int32], fixed: NDArray[np.bool_], n_labels: int
 ):
     """Voxels that are not fixed and touch another supervoxel, ascending; and sums and means of all supervoxels."""
-    features, indptr, neighbours, _ = voxels
+    features, indptr, neighbours, _, slant = voxels
     found = np.empty(len(labels), np.int32)
     used = 0
     for i in range(len(labels)):
@@ -373,8 +415,8 @@ def _boundary(  # type: ignore[no-untyped-def]
                 found[used] = i
                 used += 1
                 break
-    sums, means = sum_features(features, labels, n_labels), np.empty((n_labels, features.shape[1]))
-    set_means(sums, means)
+    sums, means = sum_features(features, labels, n_labels), np.empty((n_labels, features.shape[1] + 3))
+    set_means(sums, means, slant)
     return found[:used], sums, means
 
 
@@ -389,7 +431,7 @@ def _choose(
     chosen: NDArray[np.int32],
 ) -> None:
     """Set the nearest of the supervoxels around each active voxel; of equals its own, else the smaller number."""
-    features, indptr, neighbours, metric = voxels
+    features, indptr, neighbours, metric, _ = voxels
     around = np.empty(MAX_NEIGHBOURS + 1, np.int32)
     for q in range(start, stop):
         i = active[q]
@@ -426,7 +468,7 @@ def _move(
 
     Fixed voxels count as queued.
     """
-    features, indptr, neighbours, _ = voxels
+    features, indptr, neighbours, _, slant = voxels
     following = np.empty(len(labels), np.int32)
     used = 0
     for q in range(len(active)):
@@ -444,7 +486,7 @@ def _move(
                     used += 1
     for q in range(used):
         queued[following[q]] = False
-    set_means(sums, means)
+    set_means(sums, means, slant)
     return following[:used]
 
 
@@ -525,9 +567,9 @@ def _adopt(
     n_supervoxels: int,
 ) -> None:
     """Give every voxel without a label, ring by ring, the nearest label around it."""
-    features, indptr, neighbours, metric = voxels
-    means = np.zeros((n_supervoxels, features.shape[1]))
-    set_means(sum_features(features, labels, n_supervoxels), means)
+    features, indptr, neighbours, metric, slant = voxels
+    means = np.zeros((n_supervoxels, features.shape[1] + 3))
+    set_means(sum_features(features, labels, n_supervoxels), means, slant)
     waiting, adopted = np.empty(len(labels), np.int32), np.empty(len(labels), np.int32)
     n_waiting = 0
     for i in range(len(labels)):

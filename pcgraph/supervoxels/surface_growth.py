@@ -40,14 +40,19 @@ class SurfaceGrowth(SupervoxelMethod):
         What counts in the distance of a voxel to a supervoxel: colours in 0..1, metres over the seed size, and one
         minus the cosine of normals; w_c, w_s and w_n of Papon et al. 2013, equation 7. Colours count so much if they
         change where surfaces do; noise and patterns count for nothing (`pcgraph.voxels.evidence.edge_evidence`).
+    plane_weight : float, >= 0
+        The same for the distance of a voxel from the plane through the supervoxel's mean, in voxel edges. It parts
+        surfaces that are parallel, a step of a voxel or two from each other, of which normals do not tell.
     feature_weight : float, >= 0
         The same for the features given to `pcgraph.segment`, in robust spreads: what one spread counts, if touching
         voxels are alike in it; noise counts for nothing (`pcgraph.voxels.evidence.autocorrelation`).
 
     Notes
     -----
-    Expansion, seeds and distance are those of VCCS (Papon et al. 2013) with four changes. Normals do not round off
-    edges (see `local_planes`). Their cosine keeps its sign, so the two faces of a thin plate stay apart. After the
+    Expansion, seeds and distance are those of VCCS (Papon et al. 2013) with five changes. Normals do not round off
+    edges (see `local_planes`). Their cosine keeps its sign, so the two faces of a thin plate stay apart. What lies off a
+    supervoxel's plane is farther from it than what lies as far off along it (the distance to a proxy's plane of
+    Cohen-Steiner et al. 2004), and two surfaces in one seed cell have a seed each. After the
     expansion a few k-means sweeps refine the boundaries. At last each point of a voxel on a boundary goes to the
     surface, its voxel's or one that touches it, on whose plane it lies.
     """
@@ -55,6 +60,7 @@ class SurfaceGrowth(SupervoxelMethod):
     color_weight: float = 1.0
     spatial_weight: float = 0.2
     normal_weight: float = 1.0
+    plane_weight: float = 0.35
     feature_weight: float = 0.1
 
     def __post_init__(self) -> None:
@@ -73,7 +79,8 @@ class SurfaceGrowth(SupervoxelMethod):
         def graph() -> VoxelGraph:
             color = self.color_weight * color_evidence(grid, normals)
             weights = self.spatial_weight / seed_size, self.normal_weight, color
-            return voxel_graph(grid, normals, Metric(*weights, two_sided=False, feature=self.feature_weight))
+            metric = Metric(*weights, two_sided=False, plane=self.plane_weight / grid.size, feature=self.feature_weight)
+            return voxel_graph(grid, normals, metric)
 
         voxels, seeds = side_by_side(graph, lambda: seed_voxels(grid, normals, seed_size, two_sided=False))
         labels = expand(voxels, seeds, EARLY_SWEEPS * seed_size / grid.size, initial)

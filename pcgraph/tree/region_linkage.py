@@ -36,7 +36,7 @@ class RegionLinkage(Linkage):
         Distance that a difference of 1 counts for, in a colour of 0..1, if colours change where surfaces do; less as
         they do not (`AdjacencyGraph.color_evidence`).
     relief : float, radians, >= 0
-        What a region costs that stands in relief: a window in its wall, a picture on it, a roof above the ground.
+        What a region costs that stands in relief: a door on its wall, a picture, a roof above the ground.
 
     Notes
     -----
@@ -58,13 +58,16 @@ class RegionLinkage(Linkage):
     joins merge above the altitude of objects, at their mean cost times m / (m + 1).
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
-    one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
+    one's plane, on its outer side, by little, but as a whole. Normals of voxels do not show such a step: it is as high
+    as a voxel or two.
 
-        R = (s b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
+        R = (s^2 b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
 
     where s is the fraction of the smaller region's contacts that are with the larger one, and b counts up to b1 w; d is
     the distance of the smaller one's mean from the larger one's plane, p the variance of its distances to that plane
-    and q that of the larger one's own, in voxel edges. R is 0 where the larger one is not r1 times as large.
+    and q that of the larger one's own, in voxel edges. R is 0 where the larger one is not r1 times as large, and where
+    the smaller one lies behind it: as with concavity, what stands out of a surface is another thing, and what is sunk
+    into it, as panes in a wall, is not.
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -125,6 +128,21 @@ class _Shape(NamedTuple):
     objects: float  # altitude of objects, radians
 
 
+class _Outlines(NamedTuple):
+    """What relief asks of n regions beside their moments, while they merge.
+
+    Attributes
+    ----------
+    perimeters : (n,) float64
+        Contacts with all others, in voxels of both sides.
+    outward : (n, 3) float64
+        Sums of their supervoxels' normals, by mass.
+    """
+
+    perimeters: NDArray[np.float64]
+    outward: NDArray[np.float64]
+
+
 _SHAPE = _Shape(
     c0=0.08,
     c1=0.04,
@@ -134,11 +152,11 @@ _SHAPE = _Shape(
     r=100.0,
     m0=0.1,
     m1=1.0,
-    m2=20.0,
+    m2=10.0,
     b1=3.5,
     r1=2.0,
     v0=0.075,
-    d1=2.0,
+    d1=3.0,
     objects=RegionLinkage.default_object_altitude,
 )
 
@@ -185,8 +203,9 @@ def region_linkage(
     altitudes = np.empty(len(edges))
     in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
     perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
+    outlines = _Outlines(perimeters.astype(np.float64), state.masses[:, None] * graph.node_features.normal)
     contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
-    _merge(state, perimeters, relief, contracted, _SHAPE)
+    _merge(state, outlines, relief, contracted, _SHAPE)
     merges = contracted.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))
 
@@ -207,15 +226,14 @@ def _set_first_altitudes(
 
 
 @kernel
-def _merge(
-    state: RegionState, perimeters: NDArray[np.float64], relief: float, graph: ContractedGraph, shape: _Shape
-) -> None:
+def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: ContractedGraph, shape: _Shape) -> None:
     """Merge along the lowest edge until there is none.
 
     After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
     hardly changes, an edge gets it when it comes up. Then, too, it is seen whether relief raises it.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
+    perimeters, outward = outlines
     # After how many merges each region changed, each altitude was computed, and it was last asked for relief.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
     asked, normal = np.full(len(heap.edges), -1), np.empty(3)
@@ -228,7 +246,7 @@ def _merge(
             continue
         if asked[edge] < computed[edge]:
             asked[edge] = computed[edge]
-            stands_out = relief * _relief(state, perimeters, sums[1, edge], a, b, shape, normal)
+            stands_out = relief * _relief(state, outlines, sums[1, edge], a, b, shape, normal)
             if stands_out > 0.0:
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
                 continue
@@ -236,6 +254,8 @@ def _merge(
         kept, gone, n_parallel = contract_cheapest(graph)
         unite(state, kept, gone)
         perimeters[kept] += perimeters[gone] - inside
+        for axis in range(3):
+            outward[kept, axis] += outward[gone, axis]
         changed[kept] = graph.done[0]
         half = clusters[kept].first if clusters[kept].degree <= _MANY else NONE
         while half != NONE:
@@ -273,7 +293,7 @@ def _altitude(
 @routine
 def _relief(
     state: RegionState,
-    perimeters: NDArray[np.float64],
+    outlines: _Outlines,
     contact: float,
     a: int,
     b: int,
@@ -287,12 +307,15 @@ def _relief(
     if shape.r1 * smaller >= larger or plane_normal(state.scatters[b], normal) < 0.0:
         return 0.0
     width = shape.width * math.sqrt(smaller)
-    within = min(contact / perimeters[a], 1.0) * min(0.5 * contact / (shape.b1 * width), 1.0)
+    share = min(contact / outlines.perimeters[a], 1.0)
+    within = share * share * min(0.5 * contact / (shape.b1 * width), 1.0)
     x, y, z = normal
     scatter, inner, outer = state.scatters[a], state.centroids[a], state.centroids[b]
     distance = x * (inner[0] - outer[0]) + y * (inner[1] - outer[1]) + z * (inner[2] - outer[2])
     spread = x * x * scatter[0] + y * y * scatter[1] + z * z * scatter[2]
     spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])
+    if distance * (x * outlines.outward[b, 0] + y * outlines.outward[b, 1] + z * outlines.outward[b, 2]) <= 0.0:
+        return 0.0  # it lies behind
     square = distance * distance
     noise = shape.v0 + 4.0 * spread / smaller + state.residuals[b] / larger
     if square < 0.1 * noise:

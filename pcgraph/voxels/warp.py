@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,22 @@ from pcgraph.parallel import in_blocks, kernel, routine
 
 _SOME = 2048  # values
 _MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
+
+
+class Slant(NamedTuple):
+    """How normals lie in the warped space: a plane's n becomes m = n + ray (n . r) r + depth (n_x x + n_y y) e_z.
+
+    x, y are the warped place, r its direction, e_z the z axis. Then a step dX in the warped space leaves the plane by
+    m . dX, in metres of the warped space: scale(p) m = J^-T n, J being the derivative of `Warp.forward` at p.
+
+    Attributes
+    ----------
+    ray : float
+    depth : float, 1 / metres
+    """
+
+    ray: float = 0.0
+    depth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +61,11 @@ class Warp:
     def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Metres in space per metre of the warped space at each point, (n,) float64."""
         return np.ones(len(points))
+
+    @property
+    def slant(self) -> Slant:
+        """How normals lie in the warped space."""
+        return Slant()
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +115,11 @@ class CameraWarp(Warp):
         """Depth over reference depth, (n,) float64."""
         return (points[:, 2] - self.viewpoint[2]) / self.reference_depth
 
+    @property
+    def slant(self) -> Slant:
+        """A step along z moves along the ray of the pixel."""
+        return Slant(depth=1.0 / self.reference_depth)
+
 
 @dataclass(frozen=True, eq=False)
 class RangeWarp(Warp):
@@ -134,6 +160,11 @@ class RangeWarp(Warp):
         """(r / r0)^growth, (n,) float64."""
         return (_ranges(points, self.viewpoint) / self.reference_range) ** self.growth
 
+    @property
+    def slant(self) -> Slant:
+        """A step along the ray is shorter than one across it."""
+        return Slant(ray=self.growth / (1.0 - self.growth))
+
 
 def _median(values: NDArray[np.float64]) -> float:
     """Median of values, (n,), of many in a third of the time: only those near it, as some tell, are put in order."""
@@ -159,6 +190,18 @@ def _ray(points: NDArray[np.float64], p: int, viewpoint: NDArray[np.float64]) ->
     """From a viewpoint to point p: x, y, z, and the range, at least `_MIN_LENGTH`."""
     x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
     return x, y, z, max(math.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
+
+
+@routine
+def warped_normal(
+    slant: Slant, x: float, y: float, z: float, a: float, b: float, c: float
+) -> tuple[float, float, float]:
+    """The normal (a, b, c) in the warped space at the warped place (x, y, z); see `Slant`."""
+    if slant.ray > 0.0:
+        square = max(x * x + y * y + z * z, _MIN_LENGTH)
+        along = slant.ray * (a * x + b * y + c * z) / square
+        return a + along * x, b + along * y, c + along * z
+    return a, b, c + slant.depth * (a * x + b * y)
 
 
 @kernel

@@ -15,11 +15,16 @@ import pcgraph
 from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize(("times_as_large", "weight", "relief"), [(1, 7.0, 15.0), (100, 7.0, 0.0), (5, 60.0, 1000.0)])
-def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief):
+def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, side):
+    """With the smaller region before the larger one, or behind it."""
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
     grown = leaves.counts * np.array([1, times_as_large])
     leaves = replace(leaves, counts=grown, scatters=leaves.scatters * (grown / leaves.counts)[:, None, None])
+    graph = replace(
+        graph, node_features=replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
+    )
     cost = 0.4
     costs, weights = np.array([cost]), np.array([weight])
     found = region_linkage(graph, leaves, graph.edges, costs, weights, relief=relief).altitudes[0]
@@ -35,12 +40,20 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     union = a + b + n[0] * n[1] / n.sum() * np.outer(apart, apart)
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
-    evidence = cost + relief * _relief(leaves, unit, length, width) + 0.08 + 0.04 * math.log(1 + scale / 0.1)
+    stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 else 0.0
+    evidence = cost + stands_out + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
     weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
-    assert relief < 1000.0 or relief * _relief(leaves, unit, length, width) > 0.1 * evidence
+    assert relief < 1000.0 or side < 0.0 or stands_out > 0.1 * evidence
+
+
+def _normals_towards_the_smaller(leaves, side):
+    small, large = np.argsort(leaves.counts, kind="stable")
+    normal = np.linalg.eigh(leaves.scatters[large])[1][:, 0]
+    towards = side * np.sign(normal @ (leaves.centroids[small] - leaves.centroids[large])) * normal
+    return np.stack((towards, towards))
 
 
 def _relief(leaves, unit, length, width):
@@ -51,8 +64,8 @@ def _relief(leaves, unit, length, width):
     square = float(normal @ (leaves.centroids[small] - leaves.centroids[large])) ** 2
     across = [float(normal @ leaves.covariances[region] @ normal) for region in (small, large)]
     noise = 4.0 * across[0] + across[1] + 0.075
-    around = min(length / (3.5 * width), 1.0) ** 2 * max(1.0 - 2.0 * m / larger, 0.0) * m / (m + 20.0)
-    return around / (1.0 + (noise / square) ** 8) / (1.0 + square / 4.0)
+    around = min(length / (3.5 * width), 1.0) ** 2 * max(1.0 - 2.0 * m / larger, 0.0) * m / (m + 10.0)
+    return around / (1.0 + (noise / square) ** 8) / (1.0 + square / 9.0)
 
 
 def _wall(height, slope=None):
@@ -64,16 +77,23 @@ def _wall(height, slope=None):
     return np.stack((x, y, z), axis=1), (outside < 0.0).astype(int)
 
 
-@pytest.mark.parametrize("height", [0.01, 0.02, 0.03, -0.01, -0.03])
+@pytest.mark.parametrize("height", [0.01, 0.02, 0.03])
 def test_what_stands_in_relief_is_an_object(height):
     """A step of half a voxel to less than two, which normals of voxels don't show."""
     points, truth = _wall(height)
     found = pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0))
-    assert 0.5 < abs(height) / found.voxel_size < 2.0
+    assert 0.5 < height / found.voxel_size < 2.0
     assert found.labels.max() == 1
     assert pcgraph.metrics.segmentation_covering(found.labels, truth) > 0.97
     without = pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0), linkage=RegionLinkage(relief=0.0))
     assert without.labels.max() == 0
+
+
+@pytest.mark.parametrize("height", [-0.01, -0.02, -0.03])
+def test_what_is_sunk_into_a_surface_is_not(height):
+    points, _ = _wall(height)
+    assert pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0)).labels.max() == 0
+    assert pcgraph.segment(points, viewpoint=(1.0, 0.75, -3.0)).labels.max() == 1  # from behind it stands out
 
 
 @pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.1, 0.2), (0.1, 0.3)])

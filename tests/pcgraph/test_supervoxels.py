@@ -49,6 +49,23 @@ def test_both_faces_of_a_thin_plate_are_one_to_vccs_and_two_to_surface_growth():
         assert bool(of_front & of_back) is mixed
 
 
+@pytest.mark.parametrize("growth", [{}, {"range_growth": 0.5}, {"camera": True}], ids=["even", "range", "camera"])
+def test_a_step_between_parallel_surfaces_parts_supervoxels_though_no_normal_shows_it(growth):
+    """A board a voxel and a half before a wall, off the axis of the sensor."""
+    wall = patch((0.2, 0.1, 2.0), (0.8, 0, 0.3), (0, 0.8, 0))
+    board = (abs(wall[:, 0] - 0.58) < 0.18) & (abs(wall[:, 1] - 0.52) < 0.18)
+    forward = np.array([0.3, 0.0, -0.8]) / np.hypot(0.3, 0.8)
+    points = wall + 1.5 * 3 * SPACING * board[:, None] * forward
+    points += np.random.default_rng(0).normal(0.0, 0.1 * SPACING, points.shape)
+    settings = {"voxel_size": 3 * SPACING, "seed_size": 15 * SPACING, "viewpoint": (0.0, 0.0, 0.0), **growth}
+    errors = [
+        undersegmentation_error(pcgraph.segment(points, **settings, method=method).supervoxels, board.astype(int))
+        for method in (pcgraph.SurfaceGrowth(), pcgraph.SurfaceGrowth(plane_weight=0.0))
+    ]
+    assert errors[0] < 0.001
+    assert errors[1] > 0.02
+
+
 def test_colour_weight_makes_supervoxels_keep_to_colours():
     points = patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0))
     truth = ((points[:, 0] * 1.7 + points[:, 1]) % 0.37 > 0.15).astype(int)

@@ -21,7 +21,7 @@ from pcgraph.voxels.eigen import least_root, plane_normal, symmetric_eigen
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.surface import local_planes
-from pcgraph.voxels.warp import Warp, choose_warp
+from pcgraph.voxels.warp import Warp, choose_warp, warped_normal
 
 
 def six(matrix):
@@ -210,6 +210,17 @@ def test_voxels_of_an_image_do_not_depend_on_what_flies_before_it() -> None:
 def test_supervoxels_are_smaller_on_smooth_surfaces(noise: float, edges: float) -> None:
     result = pcgraph.segment(three_faces(noise))
     assert result.seed_size / result.voxel_size == pytest.approx(edges, rel=0.05)
+
+
+@pytest.mark.parametrize("growth", [{"camera": False}, {"camera": True}, {"camera": False, "range_growth": 0.7}])
+def test_a_warped_normal_tells_how_far_a_step_in_the_warped_space_leaves_the_plane(growth):
+    random = np.random.default_rng(0)
+    points, normals, steps = random.uniform(1.0, 6.0, (50, 3)), *random.standard_normal((2, 50, 3))
+    warp = choose_warp(points, np.array([0.1, 0.3, -2.0]), **growth)
+    step = warp.forward(points + 1e-5 * steps) - warp.forward(points - 1e-5 * steps)
+    warped = [warped_normal.py_func(warp.slant, *x, *n) for x, n in zip(warp.forward(points), normals, strict=True)]
+    off = warp.scale(points) * np.einsum("ij,ij->i", warped, step)
+    np.testing.assert_allclose(off, 2e-5 * np.einsum("ij,ij->i", normals, steps), rtol=1e-6, atol=1e-11)
 
 
 def test_spacing_of_many_random_points_is_that_of_a_tree_over_all():
