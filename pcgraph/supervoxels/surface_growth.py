@@ -50,11 +50,11 @@ class SurfaceGrowth(SupervoxelMethod):
     Notes
     -----
     Expansion, seeds and distance are those of VCCS (Papon et al. 2013) with five changes. Normals do not round off
-    edges (see `local_planes`). Their cosine keeps its sign, so the two faces of a thin plate stay apart. What lies off a
-    supervoxel's plane is farther from it than what lies as far off along it (the distance to a proxy's plane of
-    Cohen-Steiner et al. 2004), and two surfaces in one seed cell have a seed each. After the
-    expansion a few k-means sweeps refine the boundaries. At last each point of a voxel on a boundary goes to the
-    surface, its voxel's or one that touches it, on whose plane it lies.
+    edges (see `local_planes`). Their cosine keeps its sign, so the two faces of a thin plate stay apart. What lies off
+    a supervoxel's plane is farther from it than what lies along it (distance to a proxy's plane, Cohen-Steiner et al.
+    2004), and two parallel surfaces in one seed cell have a seed each. After the expansion a few k-means sweeps refine
+    the boundaries. At last each point of a voxel on a boundary goes to the surface, its voxel's or one that touches it,
+    on whose plane it lies.
     """
 
     color_weight: float = 1.0
