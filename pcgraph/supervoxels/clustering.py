@@ -31,9 +31,9 @@ _FEW = 32  # a smaller part of the voxels, touched in a sweep, is not worth a lo
 
 
 class Metric(NamedTuple):
-    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane |n' . (x - x')| + feature |f - f'|.
+    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane h^2 / (h + slack) + feature |f - f'|.
 
-    Primed is the supervoxel; with |n . n'| where `two_sided`.
+    Primed is the supervoxel, and h = |n' . (x - x')|; with |n . n'| where `two_sided`.
 
     Attributes
     ----------
@@ -42,6 +42,8 @@ class Metric(NamedTuple):
     two_sided : bool
         Whether opposite normals are the same.
     plane : float, 1 / metres, or None
+    slack : float, metres, > 0
+        Distances off the plane below it are noise, and hardly count.
     feature : float or None
         None where no features were given.
     """
@@ -51,6 +53,7 @@ class Metric(NamedTuple):
     color: float
     two_sided: bool
     plane: float | None = None
+    slack: float = 1.0
     feature: float | None = None
 
 
@@ -103,16 +106,20 @@ def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], 
         cosine = abs(cosine)
     away, tint = np.sqrt(x * x + y * y + z * z), np.sqrt(r * r + g * g + b * b)
     total = metric.spatial * away + metric.normal * (1.0 - cosine) + metric.color * tint
-    return total + _off_plane(x, y, z, means, s, metric.plane) + _contrast(features, i, means, s, metric.feature)
+    total += _off_plane(x, y, z, means, s, metric.plane, metric.slack)
+    return total + _contrast(features, i, means, s, metric.feature)
 
 
 @routine
-def _off_plane(x: float, y: float, z: float, means: NDArray[np.float64], s: int, weight: float | None) -> float:
-    """What lies off the plane of supervoxel s, from its mean place."""
-    if weight is None:
+def _off_plane(
+    x: float, y: float, z: float, means: NDArray[np.float64], s: int, weight: float | None, slack: float
+) -> float:
+    """What it counts that something lies off the plane of supervoxel s, (x, y, z) from its mean place."""
+    if weight is None:  # known to the compiler
         return 0.0
     across = means.shape[1] - 3
-    return weight * abs(x * means[s, across] + y * means[s, across + 1] + z * means[s, across + 2])
+    off = abs(x * means[s, across] + y * means[s, across + 1] + z * means[s, across + 2])
+    return weight * off * off / (off + slack)
 
 
 @routine
@@ -163,8 +170,9 @@ def set_means(sums: NDArray[np.float64], means: NDArray[np.float64], slant: Slan
                 means[s, column] = sums[s, column] / (length if 3 <= column < 6 else sums[s, 9])
             for column in range(9, across):
                 means[s, column] = sums[s, column + 1] / sums[s, 9]
-            place, normal = (means[s, 0], means[s, 1], means[s, 2]), (means[s, 3], means[s, 4], means[s, 5])
-            means[s, across], means[s, across + 1], means[s, across + 2] = warped_normal(slant, *place, *normal)
+            x, y, z = means[s, 0], means[s, 1], means[s, 2]
+            x, y, z = warped_normal(slant, x, y, z, means[s, 3], means[s, 4], means[s, 5])
+            means[s, across], means[s, across + 1], means[s, across + 2] = x, y, z
 
 
 # --- where supervoxels start ---
@@ -241,8 +249,9 @@ def _on_another_surface(
 ) -> bool:
     """Whether voxel i faces away from a seed, or lies on a surface in parallel to the seed's, a step off its plane."""
     cosine = normals[i, 0] * normals[seed, 0] + normals[i, 1] * normals[seed, 1] + normals[i, 2] * normals[seed, 2]
-    off = min(_off(places, normals, slant, seed, i), _off(places, normals, slant, i, seed))
-    return cosine < 0.0 or (cosine > _PARALLEL and off > step)
+    if cosine < _PARALLEL:
+        return cosine < 0.0
+    return _off(places, normals, slant, seed, i) > step and _off(places, normals, slant, i, seed) > step
 
 
 @inlined

@@ -27,6 +27,7 @@ from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, Neighbourhood, VoxelGrid
 from pcgraph.voxels.surface import LocalPlanes, local_planes
 
+_SLACK = 0.5  # voxel edges off a supervoxel's plane that noise may be
 _PLACE_WEIGHT = 0.3  # of a metre along the surface against one off the plane
 
 
@@ -41,8 +42,9 @@ class SurfaceGrowth(SupervoxelMethod):
         minus the cosine of normals; w_c, w_s and w_n of Papon et al. 2013, equation 7. Colours count so much if they
         change where surfaces do; noise and patterns count for nothing (`pcgraph.voxels.evidence.edge_evidence`).
     plane_weight : float, >= 0
-        The same for the distance of a voxel from the plane through the supervoxel's mean, in voxel edges. It parts
-        surfaces that are parallel, a step of a voxel or two from each other, of which normals do not tell.
+        The same for h^2 / (h + 0.5), h being the distance of a voxel from the plane through the supervoxel's mean, in
+        voxel edges: little for noise, nearly h for a step. It parts surfaces that are parallel, a voxel or two from
+        each other, of which normals do not tell.
     feature_weight : float, >= 0
         The same for the features given to `pcgraph.segment`, in robust spreads: what one spread counts, if touching
         voxels are alike in it; noise counts for nothing (`pcgraph.voxels.evidence.autocorrelation`).
@@ -60,7 +62,7 @@ class SurfaceGrowth(SupervoxelMethod):
     color_weight: float = 1.0
     spatial_weight: float = 0.2
     normal_weight: float = 1.0
-    plane_weight: float = 0.35
+    plane_weight: float = 0.45
     feature_weight: float = 0.1
 
     def __post_init__(self) -> None:
@@ -79,7 +81,8 @@ class SurfaceGrowth(SupervoxelMethod):
         def graph() -> VoxelGraph:
             color = self.color_weight * color_evidence(grid, normals)
             weights = self.spatial_weight / seed_size, self.normal_weight, color
-            metric = Metric(*weights, two_sided=False, plane=self.plane_weight / grid.size, feature=self.feature_weight)
+            plane, slack = self.plane_weight / grid.size, _SLACK * grid.size
+            metric = Metric(*weights, two_sided=False, plane=plane, slack=slack, feature=self.feature_weight)
             return voxel_graph(grid, normals, metric)
 
         voxels, seeds = side_by_side(graph, lambda: seed_voxels(grid, normals, seed_size, two_sided=False))

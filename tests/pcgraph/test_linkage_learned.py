@@ -20,25 +20,37 @@ from pcgraph.tree.learned import EdgeModel, LearnedLinkage, edge_evidence, leaf_
 MODEL = EdgeModel(("concavity", "step_voxels"), (0.2, 1.0), (0.5, 2.0), (1.5, 0.25), -0.5, 0.4)
 
 
-@pytest.fixture(scope="module")
-def stack():
+VIEWPOINT = np.array([0.8, -1.0, 3.0])
+
+
+def _box_on_a_plane(shift=0.0):
     """Another scene than `boxes`: one large box on a plane, and its truth."""
     plane = patch((0, 0, 0), (1.6, 0, 0), (0, 1.2, 0))
     on_top = box(0.5, 0.4, 0.4)
     hidden = (abs(plane[:, 0] - 0.7) < 0.2) & (plane[:, 1] > 0.4) & (plane[:, 1] < 1.0)
-    points = np.vstack((plane[~hidden], on_top))
+    points = np.vstack((plane[~hidden], on_top)) + shift
     truth = np.repeat([0, 1], [int((~hidden).sum()), len(on_top)])
-    return pcgraph.segment(points, viewpoint=(0.8, -1.0, 3.0)), truth
+    return pcgraph.segment(points, viewpoint=VIEWPOINT + shift), truth
 
 
-def test_fitted_on_one_scene_it_finds_the_objects_of_another(boxes, stack):
-    result, truth = stack
-    linkage = LearnedLinkage.fit([result], [truth])
+@pytest.fixture(scope="module")
+def stack():
+    return _box_on_a_plane()
+
+
+def test_fitted_on_one_scene_it_finds_the_objects_of_another(boxes):
+    """Of some twenty boundaries now and then too little is learned: what counts is the median of draws of voxels."""
     points, objects, _ = boxes
-    found = pcgraph.segment(points, viewpoint=(0.8, -1.0, 3.0), linkage=linkage)
-    assert pcgraph.metrics.weighted_overlap(found.labels, objects) > 0.95
-    assert 0.0 < linkage.default_part_altitude < linkage.default_object_altitude < 1.0
-    assert found.tree.altitudes[np.isfinite(found.tree.altitudes)].max() <= 1.0
+    overlaps = []
+    for shift in (0.0, 0.011, 0.023, 0.037, 0.041, 0.053, 0.067):
+        result, truth = _box_on_a_plane(shift)
+        linkage = LearnedLinkage.fit([result], [truth])
+        found = pcgraph.segment(points + shift, viewpoint=VIEWPOINT + shift, linkage=linkage)
+        overlaps.append(pcgraph.metrics.weighted_overlap(found.labels, objects))
+        assert 0.0 < linkage.default_part_altitude < linkage.default_object_altitude < 1.0
+        assert found.tree.altitudes[np.isfinite(found.tree.altitudes)].max() <= 1.0
+    assert np.median(overlaps) > 0.98
+    assert np.mean(overlaps) > 0.9
 
 
 def test_it_is_scikit_learns_regression(stack):
