@@ -31,9 +31,10 @@ _FEW = 32  # a smaller part of the voxels, touched in a sweep, is not worth a lo
 
 
 class Metric(NamedTuple):
-    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane h^2 / (h + slack) + feature |f - f'|.
+    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane rho(n' . (x - x')) + feature |f - f'|.
 
-    Primed is the supervoxel, and h = |n' . (x - x')|; with |n . n'| where `two_sided`.
+    Primed is the supervoxel, and rho is Huber's: half the square up to `slack`, and linear beyond; with |n . n'| where
+    `two_sided`.
 
     Attributes
     ----------
@@ -41,9 +42,8 @@ class Metric(NamedTuple):
     normal, color : float
     two_sided : bool
         Whether opposite normals are the same.
-    plane : float, 1 / metres, or None
-    slack : float, metres, > 0
-        Distances off the plane below it are noise, and hardly count.
+    plane : float, 1 / square metres, or None
+    slack : float, metres
     feature : float or None
         None where no features were given.
     """
@@ -53,7 +53,7 @@ class Metric(NamedTuple):
     color: float
     two_sided: bool
     plane: float | None = None
-    slack: float = 1.0
+    slack: float = 0.0
     feature: float | None = None
 
 
@@ -119,7 +119,8 @@ def _off_plane(
         return 0.0
     across = means.shape[1] - 3
     off = abs(x * means[s, across] + y * means[s, across + 1] + z * means[s, across + 2])
-    return weight * off * off / (off + slack)
+    noise = min(off, slack)
+    return weight * noise * (off - 0.5 * noise)
 
 
 @routine

@@ -42,9 +42,9 @@ class SurfaceGrowth(SupervoxelMethod):
         minus the cosine of normals; w_c, w_s and w_n of Papon et al. 2013, equation 7. Colours count so much if they
         change where surfaces do; noise and patterns count for nothing (`pcgraph.voxels.evidence.edge_evidence`).
     plane_weight : float, >= 0
-        The same for h^2 / (h + 0.5), h being the distance of a voxel from the plane through the supervoxel's mean, in
-        voxel edges: little for noise, nearly h for a step. It parts surfaces that are parallel, a voxel or two from
-        each other, of which normals do not tell.
+        The same for the distance h of a voxel from the plane through the supervoxel's mean, in voxel edges, by Huber's
+        loss: h^2 up to half an edge, which noise may be, and h - 1/4 beyond. It parts surfaces that are parallel, a
+        voxel or two from each other, of which normals do not tell.
     feature_weight : float, >= 0
         The same for the features given to `pcgraph.segment`, in robust spreads: what one spread counts, if touching
         voxels are alike in it; noise counts for nothing (`pcgraph.voxels.evidence.autocorrelation`).
@@ -62,7 +62,7 @@ class SurfaceGrowth(SupervoxelMethod):
     color_weight: float = 1.0
     spatial_weight: float = 0.2
     normal_weight: float = 1.0
-    plane_weight: float = 0.45
+    plane_weight: float = 0.4
     feature_weight: float = 0.1
 
     def __post_init__(self) -> None:
@@ -81,7 +81,8 @@ class SurfaceGrowth(SupervoxelMethod):
         def graph() -> VoxelGraph:
             color = self.color_weight * color_evidence(grid, normals)
             weights = self.spatial_weight / seed_size, self.normal_weight, color
-            plane, slack = self.plane_weight / grid.size, _SLACK * grid.size
+            slack = _SLACK * grid.size
+            plane = self.plane_weight / grid.size / slack
             metric = Metric(*weights, two_sided=False, plane=plane, slack=slack, feature=self.feature_weight)
             return voxel_graph(grid, normals, metric)
 
