@@ -185,7 +185,9 @@ def segment(
     outside = _outward_planes(grid, settings.method, law, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
     result = segment_scan(
-        Scan(cloud, outside.viewpoint, outside.places, grid, outside.planes, initial_labels, seed), None, settings
+        Scan(cloud, outside.viewpoint, outside.places, outside.known, grid, outside.planes, initial_labels, seed),
+        None,
+        settings,
     )
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
@@ -261,7 +263,8 @@ def update(
     planes = settings.method.planes(union.grid, far_off)
     earlier_place = earlier.viewpoint[None] if earlier.viewpoint.ndim == 1 else np.empty((0, 3))
     places = np.unique(np.concatenate((outside.places, earlier_place)), axis=0)
-    scan = Scan(cloud, outside.viewpoint, places, union.grid, planes, labels, earlier.seed_size)
+    known = outside.known and earlier.graph.sides_known
+    scan = Scan(cloud, outside.viewpoint, places, known, union.grid, planes, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
 
 
@@ -275,6 +278,8 @@ class Scan:
     viewpoint : (3,) or (n, 3) float64, metres
     places : (p, 3) float64, metres
         From which continuations are looked for.
+    sides_known : bool
+        Whether it is known from where all that has been seen was seen.
     grid : VoxelGrid of v voxels
         All that has been seen; its `voxel_of_point` speaks of these points.
     planes : LocalPlanes of v voxels
@@ -287,6 +292,7 @@ class Scan:
     cloud: CleanCloud
     viewpoint: NDArray[np.float64]
     places: NDArray[np.float64]
+    sides_known: bool
     grid: VoxelGrid
     planes: LocalPlanes
     initial_labels: NDArray[np.int32]
@@ -346,7 +352,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: continuations(surface, nodes, faces, scan.places),
     )
     hidden = hidden.without(touching.edges).without(near.edges)
-    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, color_evidence=evidence)
+    known = scan.sides_known or cloud.normals is not None
+    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=known)
     graph = replace(graph, bridges=bridges(grid, supervoxels, leaves.counts, graph.joined))
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
@@ -451,11 +458,14 @@ class Outside(NamedTuple):
         One for all n points or one for each.
     places : (p, 3) float64, metres
         The viewpoint, or some of them, or where none is known, some of the places from which the outside is seen.
+    known : bool
+        Whether the viewpoint was given, or told by the spacing.
     planes : LocalPlanes
     """
 
     viewpoint: NDArray[np.float64]
     places: NDArray[np.float64]
+    known: bool
     planes: LocalPlanes
 
 
@@ -477,16 +487,17 @@ def _outward_planes(
             planes, telling = method.planes(grid, told), None
         axis = None if law is None or told is None else law.axis
         sides = visible_sides(grid, planes.normals, told, telling, axis)
-        return Outside(sides.places[0], sides.places[:_LOOKED_FROM], replace(planes, normals=sides.normals))
+        planes = replace(planes, normals=sides.normals)
+        return Outside(sides.places[0], sides.places[:_LOOKED_FROM], told is not None, planes)
     if given.ndim == 1:
         planes = method.planes(grid, given)
         if law is not None and law.axis is not None:
             planes = replace(planes, normals=sides_towards(grid, planes.normals, given, law.axis))
-        return Outside(given, given[None], planes)
+        return Outside(given, given[None], True, planes)
     low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
     place_of_voxel = middle + reach * voxel_means((given - middle) / reach, grid)
-    return Outside(given, _some_viewpoints(given, grid), method.planes(grid, place_of_voxel))
+    return Outside(given, _some_viewpoints(given, grid), True, method.planes(grid, place_of_voxel))
 
 
 def _some_viewpoints(given: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:

@@ -130,6 +130,9 @@ class AdjacencyGraph(ShortRepr):
         Ways from specks to what is around them. They are no edges either.
     color_evidence : float, 0..1
         How far colours change where surfaces do (`pcgraph.voxels.evidence.edge_evidence`): what they are worth.
+    sides_known : bool
+        Whether normals point to where the cloud is known to have been seen from, or were given. Else the outside was
+        found from what is visible, and which side of a bare sheet that is, is a guess.
     """
 
     edges: NDArray[np.int32]
@@ -139,6 +142,7 @@ class AdjacencyGraph(ShortRepr):
     continuations: Continuations | None = None
     bridges: Bridges | None = None
     color_evidence: float = 1.0
+    sides_known: bool = False
 
     def _counts(self) -> str:
         return f"{self.n_nodes} nodes, {len(self.edges)} edges"

@@ -58,8 +58,7 @@ class RegionLinkage(Linkage):
     joins merge above the altitude of objects, at their mean cost times m / (m + 1).
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
-    one's plane, on its outer side, by little, but as a whole. Normals of voxels do not show such a step: it is as high
-    as a voxel or two.
+    one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
 
         R = (s^2 b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
 
@@ -67,7 +66,8 @@ class RegionLinkage(Linkage):
     the distance of the smaller one's mean from the larger one's plane, p the variance of its distances to that plane
     and q that of the larger one's own, in voxel edges. R is 0 where the larger one is not r1 times as large, and where
     the smaller one lies behind it: as with concavity, what stands out of a surface is another thing, and what is sunk
-    into it, as panes in a wall, is not.
+    into it, as panes in a wall, is not. Where it is not known from where the cloud was seen, either side counts, as
+    which is the outer one of a bare sheet is a guess.
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -136,7 +136,7 @@ class _Outlines(NamedTuple):
     perimeters : (n,) float64
         Contacts with all others, in voxels of both sides.
     outward : (n, 3) float64
-        Sums of their supervoxels' normals, by mass.
+        Sums of their supervoxels' normals, by mass; zero if it is not known from where they were seen.
     """
 
     perimeters: NDArray[np.float64]
@@ -203,7 +203,8 @@ def region_linkage(
     altitudes = np.empty(len(edges))
     in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
     perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
-    outlines = _Outlines(perimeters.astype(np.float64), state.masses[:, None] * graph.node_features.normal)
+    outward = (state.masses[:, None] if graph.sides_known else 0.0) * graph.node_features.normal
+    outlines = _Outlines(perimeters.astype(np.float64), outward)
     contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
     _merge(state, outlines, relief, contracted, _SHAPE)
     merges = contracted.merges()
@@ -314,7 +315,7 @@ def _relief(
     distance = x * (inner[0] - outer[0]) + y * (inner[1] - outer[1]) + z * (inner[2] - outer[2])
     spread = x * x * scatter[0] + y * y * scatter[1] + z * z * scatter[2]
     spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])
-    if distance * (x * outlines.outward[b, 0] + y * outlines.outward[b, 1] + z * outlines.outward[b, 2]) <= 0.0:
+    if distance * (x * outlines.outward[b, 0] + y * outlines.outward[b, 1] + z * outlines.outward[b, 2]) < 0.0:
         return 0.0  # it lies behind
     square = distance * distance
     noise = shape.v0 + 4.0 * spread / smaller + state.residuals[b] / larger

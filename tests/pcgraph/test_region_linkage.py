@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 from clouds import two_boxes_on_a_plane
 from graphs import random_graph
+from scipy.spatial.transform import Rotation
 
 import pcgraph
 from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(("known", "side"), [(True, 1.0), (True, -1.0), (False, 1.0), (False, -1.0)])
 @pytest.mark.parametrize(("times_as_large", "weight", "relief"), [(1, 7.0, 15.0), (100, 7.0, 0.0), (5, 60.0, 1000.0)])
-def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, side):
-    """With the smaller region before the larger one, or behind it."""
+def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, known, side):
+    """With the smaller region before the larger one, or behind it, if that is known."""
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
     grown = leaves.counts * np.array([1, times_as_large])
     leaves = replace(leaves, counts=grown, scatters=leaves.scatters * (grown / leaves.counts)[:, None, None])
-    graph = replace(
-        graph, node_features=replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
-    )
+    nodes = replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
+    graph = replace(graph, node_features=nodes, sides_known=known)
     cost = 0.4
     costs, weights = np.array([cost]), np.array([weight])
     found = region_linkage(graph, leaves, graph.edges, costs, weights, relief=relief).altitudes[0]
@@ -40,13 +40,13 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     union = a + b + n[0] * n[1] / n.sum() * np.outer(apart, apart)
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
-    stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 else 0.0
+    stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 or not known else 0.0
     evidence = cost + stands_out + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
     weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
-    assert relief < 1000.0 or side < 0.0 or stands_out > 0.1 * evidence
+    assert relief < 1000.0 or (known and side < 0.0) or stands_out > 0.1 * evidence
 
 
 def _normals_towards_the_smaller(leaves, side):
@@ -94,6 +94,15 @@ def test_what_is_sunk_into_a_surface_is_not(height):
     points, _ = _wall(height)
     assert pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0)).labels.max() == 0
     assert pcgraph.segment(points, viewpoint=(1.0, 0.75, -3.0)).labels.max() == 1  # from behind it stands out
+
+
+@pytest.mark.parametrize("turn", [0.0, 90.0, 180.0, 270.0])
+def test_turning_a_sheet_seen_from_who_knows_where_changes_no_object(turn):
+    """Which of its sides is the outer one, nothing tells."""
+    points, truth = _wall(0.02)
+    found = pcgraph.segment(points @ Rotation.from_euler("x", turn, degrees=True).as_matrix().T)
+    assert not found.graph.sides_known
+    assert pcgraph.metrics.segmentation_covering(found.labels, truth) > 0.97
 
 
 @pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.1, 0.2), (0.1, 0.3)])
