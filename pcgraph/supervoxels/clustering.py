@@ -31,10 +31,10 @@ _FEW = 32  # a smaller part of the voxels, touched in a sweep, is not worth a lo
 
 
 class Metric(NamedTuple):
-    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane rho(n' . (x - x')) + feature |f - f'|.
+    """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane rho(per_slack h) + feature |f - f'|.
 
-    Primed is the supervoxel, and rho is Huber's: half the square up to `slack`, and linear beyond; with |n . n'| where
-    `two_sided`.
+    Primed is the supervoxel, h = |n' . (x - x')|, and rho is Huber's loss: rho(t) = t^2 / 2 up to 1, t - 1/2 beyond; with
+    |n . n'| where `two_sided`.
 
     Attributes
     ----------
@@ -42,8 +42,8 @@ class Metric(NamedTuple):
     normal, color : float
     two_sided : bool
         Whether opposite normals are the same.
-    plane : float, 1 / square metres, or None
-    slack : float, metres
+    plane : float or None
+    per_slack : float, 1 / metres
     feature : float or None
         None where no features were given.
     """
@@ -53,7 +53,7 @@ class Metric(NamedTuple):
     color: float
     two_sided: bool
     plane: float | None = None
-    slack: float = 0.0
+    per_slack: float = 0.0
     feature: float | None = None
 
 
@@ -106,20 +106,20 @@ def distance(features: NDArray[np.float64], i: int, means: NDArray[np.float64], 
         cosine = abs(cosine)
     away, tint = np.sqrt(x * x + y * y + z * z), np.sqrt(r * r + g * g + b * b)
     total = metric.spatial * away + metric.normal * (1.0 - cosine) + metric.color * tint
-    total += _off_plane(x, y, z, means, s, metric.plane, metric.slack)
+    total += _off_plane(x, y, z, means, s, metric.plane, metric.per_slack)
     return total + _contrast(features, i, means, s, metric.feature)
 
 
 @routine
 def _off_plane(
-    x: float, y: float, z: float, means: NDArray[np.float64], s: int, weight: float | None, slack: float
+    x: float, y: float, z: float, means: NDArray[np.float64], s: int, weight: float | None, per_slack: float
 ) -> float:
     """What it counts that something lies off the plane of supervoxel s, (x, y, z) from its mean place."""
     if weight is None:  # known to the compiler
         return 0.0
     across = means.shape[1] - 3
-    off = abs(x * means[s, across] + y * means[s, across + 1] + z * means[s, across + 2])
-    noise = min(off, slack)
+    off = per_slack * abs(x * means[s, across] + y * means[s, across + 1] + z * means[s, across + 2])
+    noise = min(off, 1.0)
     return weight * noise * (off - 0.5 * noise)
 
 

@@ -81,9 +81,8 @@ class SurfaceGrowth(SupervoxelMethod):
         def graph() -> VoxelGraph:
             color = self.color_weight * color_evidence(grid, normals)
             weights = self.spatial_weight / seed_size, self.normal_weight, color
-            slack = _SLACK * grid.size
-            plane = self.plane_weight / grid.size / slack
-            metric = Metric(*weights, two_sided=False, plane=plane, slack=slack, feature=self.feature_weight)
+            plane, per_slack = _SLACK * self.plane_weight, 1.0 / (_SLACK * grid.size)
+            metric = Metric(*weights, False, plane, per_slack, self.feature_weight)
             return voxel_graph(grid, normals, metric)
 
         voxels, seeds = side_by_side(graph, lambda: seed_voxels(grid, normals, seed_size, two_sided=False))

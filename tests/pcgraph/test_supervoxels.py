@@ -66,6 +66,15 @@ def test_a_step_between_parallel_surfaces_parts_supervoxels_though_no_normal_sho
     assert errors[1] > 0.02
 
 
+@pytest.mark.parametrize("power", [-500, -100, 300])
+def test_no_unit_of_length_changes_a_supervoxel(power):
+    points, _, viewpoint = two_boxes_on_a_plane()
+    expected = pcgraph.segment(points, viewpoint=viewpoint)
+    found = pcgraph.segment(points * 2.0**power, viewpoint=np.array(viewpoint) * 2.0**power)
+    assert (found.supervoxels == expected.supervoxels).all()
+    assert (found.labels == expected.labels).all()
+
+
 def test_colour_weight_makes_supervoxels_keep_to_colours():
     points = patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0))
     truth = ((points[:, 0] * 1.7 + points[:, 1]) % 0.37 > 0.15).astype(int)
