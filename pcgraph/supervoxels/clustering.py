@@ -33,8 +33,8 @@ _FEW = 32  # a smaller part of the voxels, touched in a sweep, is not worth a lo
 class Metric(NamedTuple):
     """D = normal (1 - n . n') + color |c - c'| + spatial |x - x'| + plane rho(per_slack h) + feature |f - f'|.
 
-    Primed is the supervoxel, h = |n' . (x - x')|, and rho is Huber's loss: rho(t) = t^2 / 2 up to 1, t - 1/2 beyond; with
-    |n . n'| where `two_sided`.
+    Primed is the supervoxel, h = |n' . (x - x')|, and rho is Huber's loss, rho(t) = t^2 / 2 up to 1, t - 1/2 beyond.
+    Where `two_sided`, |n . n'| counts.
 
     Attributes
     ----------
