@@ -184,11 +184,9 @@ def segment(
         warn_of_viewpoint(place, grid)
     outside = _outward_planes(grid, settings.method, law, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
-    result = segment_scan(
-        Scan(cloud, outside.viewpoint, outside.places, outside.known, grid, outside.planes, initial_labels, seed),
-        None,
-        settings,
-    )
+    known = outside.known or cloud.normals is not None
+    scan = Scan(cloud, outside.viewpoint, outside.places, known, grid, outside.planes, initial_labels, seed)
+    result = segment_scan(scan, None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
 
@@ -263,7 +261,7 @@ def update(
     planes = settings.method.planes(union.grid, far_off)
     earlier_place = earlier.viewpoint[None] if earlier.viewpoint.ndim == 1 else np.empty((0, 3))
     places = np.unique(np.concatenate((outside.places, earlier_place)), axis=0)
-    known = outside.known and earlier.graph.sides_known
+    known = earlier.graph.sides_known and (outside.known or cloud.normals is not None)
     scan = Scan(cloud, outside.viewpoint, places, known, union.grid, planes, labels, earlier.seed_size)
     return segment_scan(scan, earlier, settings)
 
@@ -279,7 +277,7 @@ class Scan:
     places : (p, 3) float64, metres
         From which continuations are looked for.
     sides_known : bool
-        Whether it is known from where all that has been seen was seen.
+        As of `AdjacencyGraph`, for all that has been seen.
     grid : VoxelGrid of v voxels
         All that has been seen; its `voxel_of_point` speaks of these points.
     planes : LocalPlanes of v voxels
@@ -352,8 +350,9 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: continuations(surface, nodes, faces, scan.places),
     )
     hidden = hidden.without(touching.edges).without(near.edges)
-    known = scan.sides_known or cloud.normals is not None
-    graph = AdjacencyGraph(touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=known)
+    graph = AdjacencyGraph(
+        touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=scan.sides_known
+    )
     graph = replace(graph, bridges=bridges(grid, supervoxels, leaves.counts, graph.joined))
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)

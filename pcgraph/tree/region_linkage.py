@@ -128,21 +128,6 @@ class _Shape(NamedTuple):
     objects: float  # altitude of objects, radians
 
 
-class _Outlines(NamedTuple):
-    """What relief asks of n regions beside their moments, while they merge.
-
-    Attributes
-    ----------
-    perimeters : (n,) float64
-        Contacts with all others, in voxels of both sides.
-    outward : (n, 3) float64
-        Sums of their supervoxels' normals, by mass; zero if it is not known from where they were seen.
-    """
-
-    perimeters: NDArray[np.float64]
-    outward: NDArray[np.float64]
-
-
 _SHAPE = _Shape(
     c0=0.08,
     c1=0.04,
@@ -159,6 +144,21 @@ _SHAPE = _Shape(
     d1=3.0,
     objects=RegionLinkage.default_object_altitude,
 )
+
+
+class _Outlines(NamedTuple):
+    """What relief asks of n regions beside their moments, while they merge.
+
+    Attributes
+    ----------
+    perimeters : (n,) float64
+        Contacts with all others, in voxels of both sides.
+    outward : (n, 3) float64
+        Sums of their supervoxels' normals, by mass; zero if it is not known from where they were seen.
+    """
+
+    perimeters: NDArray[np.float64]
+    outward: NDArray[np.float64]
 
 
 def region_linkage(

@@ -38,6 +38,20 @@ def test_nodes_face_where_given_normals_point():
     assert (np.sign(nodes.normal[:, 1]) == np.sign(0.1 - nodes.centroid[:, 1])).all()
 
 
+def test_sides_are_known_where_all_scans_tell_them():
+    points, seen_from = plate()
+    normals = np.sign(seen_from - points) * (0.0, 1.0, 0.0)
+    told, by_normals, bare = (
+        pcgraph.segment(points, **given) for given in ({"viewpoint": seen_from}, {"normals": normals}, {})
+    )
+    assert [result.graph.sides_known for result in (told, by_normals, bare)] == [True, True, False]
+    after = [
+        pcgraph.update(first, points + 1.0, normals=normals).graph.sides_known for first in (told, by_normals, bare)
+    ]
+    assert after == [True, True, False]
+    assert not pcgraph.update(told, points + 1.0).graph.sides_known
+
+
 def test_an_image_takes_a_viewpoint_per_pixel():
     points, seen_from = (array[:5184].reshape(72, 72, 3) for array in plate())
     result = pcgraph.segment(points, viewpoint=seen_from)
