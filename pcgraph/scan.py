@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.bounding_planes import bounding_planes
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.continuations import continuations, faces_of
@@ -349,6 +350,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: gaps(grid, normals, supervoxels, nodes, touching.edges),
         lambda: continuations(surface, nodes, faces, scan.places),
     )
+    hidden = hidden.with_others(bounding_planes(surface, nodes, faces))
     hidden = hidden.without(touching.edges).without(near.edges)
     graph = AdjacencyGraph(
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=scan.sides_known

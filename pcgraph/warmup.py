@@ -29,6 +29,7 @@ from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
 from pcgraph.graph.adjacency import AdjacencyGraph
+from pcgraph.graph.bounding_planes import bounding_planes
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
@@ -156,7 +157,10 @@ def _compile_graph_and_tree() -> None:
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
     near = gaps(grid, normals, labels, nodes, touching.edges)
-    hidden = continuations(Surface(grid, normals, labels), nodes, labels, np.zeros((1, 3)))
+    surface = Surface(grid, normals, labels)
+    hidden = continuations(surface, nodes, labels, np.zeros((1, 3))).with_others(
+        bounding_planes(surface, nodes, labels)
+    )
     graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden)
     graph = replace(graph, bridges=bridges(grid, labels, leaves.counts, graph.joined))
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)

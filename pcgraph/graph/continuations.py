@@ -45,7 +45,7 @@ class Continuations(ShortRepr):
     pairs : (r, 2) int32
         Supervoxels i < j, rows in ascending order, once each.
     crossings : (r,) int64
-        Lines of the bearing image along which that happens.
+        Lines of the bearing image along which that happens, or pairs of voxels that face each other.
     width : (r,) float64, metres
         Mean distance across what hides the surface between.
     angle : (r,) float64, radians, 0..pi
@@ -56,7 +56,7 @@ class Continuations(ShortRepr):
         Distance of mean colours; 0 if the cloud has none.
     coplanar : (r,) bool
         Whether the two could be one flat surface: angle of at most 0.2 rad, and offset of at most two voxels or a
-        tenth of the width.
+        tenth of the width; or they lie on one bounding plane (`pcgraph.graph.bounding_planes.bounding_planes`).
     """
 
     pairs: NDArray[np.int32]
@@ -70,6 +70,14 @@ class Continuations(ShortRepr):
     def chosen(self, some: NDArray[np.bool_]) -> Continuations:
         """Some of the rows."""
         return Continuations(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
+
+    def with_others(self, others: Continuations) -> Continuations:
+        """These rows and those of others whose pairs are not among them."""
+        columns = self.__dataclass_fields__
+        others = others.without(self.pairs)
+        both = Continuations(*(np.concatenate((getattr(self, name), getattr(others, name))) for name in columns))
+        order = np.argsort(_keys(*both.pairs.T), kind="stable")
+        return Continuations(*(getattr(both, name)[order] for name in columns))
 
     def without(self, pairs: NDArray[np.int32]) -> Continuations:
         """Those that are not among these pairs, (m, 2) int32, the smaller first, in ascending order."""
