@@ -54,8 +54,9 @@ class RegionLinkage(Linkage):
     thing is whole before it joins what it stands on; and a valley counts most between two large surfaces that meet
     along a line short for their size. Contacts are touching voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at
     none continuations behind what hides a surface (`pcgraph.graph.continuations.continuations`) and of planes that
-    bound the scene (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts, bridges (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges
-    joins merge above the altitude of objects, at their mean cost times m / (m + 1).
+    bound the scene (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser
+    cuts, bridges (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude
+    of objects, at their mean cost times m / (m + 1).
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
     one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
