@@ -46,17 +46,19 @@ class RegionLinkage(Linkage):
             (w / (b + w))^3/4 (1 + M / (r m))^1/4 m / (m + m0)
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
-    increase of the squared distances to the regions' best planes and mean colours by the merge, and l = E / b that per
-    length b of the contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean
-    supervoxel; w is the width of the smaller region; m and M are the masses of the smaller and the larger one. So what
-    lies on one plane and has one colour merges first, whatever its normals; a small piece merges early, as its contact
-    says little, and a handful of points at once, but a piece later with a surface a hundred times as large, so that a
-    thing is whole before it joins what it stands on; and a valley counts most between two large surfaces that meet
-    along a line short for their size. Contacts are touching voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at
-    none continuations behind what hides a surface (`pcgraph.graph.continuations.continuations`) and of planes that
-    bound the scene (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser
-    cuts, bridges (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude
-    of objects, at their mean cost times m / (m + 1).
+    increase of the squared distances to the regions' best planes and mean colours by the merge, at least e1 m (q - q0)
+    with q the mean square distance of the larger one from its own plane, and l = E / b that per length b of the
+    contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean supervoxel; w is the
+    width of the smaller region; m and M are the masses of the smaller and the larger one. So what lies on one plane and
+    has one colour merges first, whatever its normals, unless the larger one is so uneven, as hills are, that its plane
+    says nothing; a small piece merges early, as its contact says little, and a handful of points at once, but a piece
+    later with a surface a hundred times as large, so that a thing is whole before it joins what it stands on; and a
+    valley counts most between two large surfaces that meet along a line short for their size. Contacts are touching
+    voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at none continuations behind what hides a surface
+    (`pcgraph.graph.continuations.continuations`) and of planes that bound the scene
+    (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts, bridges
+    (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of objects,
+    at their mean cost times m / (m + 1).
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
     one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
@@ -116,6 +118,8 @@ class _Shape(NamedTuple):
     c0: float
     c1: float
     e0: float
+    e1: float
+    q0: float
     l0: float
     width: float
     r: float
@@ -133,6 +137,8 @@ _SHAPE = _Shape(
     c0=0.08,
     c1=0.04,
     e0=1.0,
+    e1=0.3,
+    q0=2.0,
     l0=0.1,
     width=7.7,
     r=100.0,
@@ -281,7 +287,8 @@ def _altitude(
     smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
     if len(sums) > 2 and sums[2, edge] == sums[1, edge]:  # nothing but bridges
         return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), round(shape.objects * _STEPS) + 1) / _STEPS
-    increase = max(energy_increase(state, a, b), 0.0)
+    uneven = state.residuals[a if state.masses[a] == larger else b] / larger - shape.q0
+    increase = max(energy_increase(state, a, b), shape.e1 * smaller * uneven, 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(smaller)
     shortness = width / (length + width)

@@ -17,18 +17,22 @@ from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
 
 
 @pytest.mark.parametrize(("known", "side"), [(True, 1.0), (True, -1.0), (False, 1.0), (False, -1.0)])
-@pytest.mark.parametrize(("times_as_large", "weight", "relief"), [(1, 7.0, 15.0), (100, 7.0, 0.0), (5, 60.0, 1000.0)])
-def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, known, side):
-    """With the smaller region before the larger one, or behind it, if that is known."""
+@pytest.mark.parametrize(
+    ("times_as_large", "weight", "relief", "uneven"),
+    [(1, 7.0, 15.0, 0.0), (100, 7.0, 0.0, 0.0), (100, 7.0, 0.0, 50.0), (5, 60.0, 1000.0, 0.0)],
+)
+def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, uneven, known, side):
+    """With the smaller region before the larger one, or behind it, if that is known; and that one flat, or uneven."""
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
     grown = leaves.counts * np.array([1, times_as_large])
     leaves = replace(leaves, counts=grown, scatters=leaves.scatters * (grown / leaves.counts)[:, None, None])
+    unit = float(np.median(graph.edge_features.voxel_edge))
+    leaves.scatters[grown.argmax()] += uneven * unit**2 * grown.max() * np.eye(3)
     nodes = replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
     graph = replace(graph, node_features=nodes, sides_known=known)
     cost = 0.4
     costs, weights = np.array([cost]), np.array([weight])
     found = region_linkage(graph, leaves, graph.edges, costs, weights, relief=relief).altitudes[0]
-    unit = float(np.median(graph.edge_features.voxel_edge))
     mean = leaves.counts.mean()
 
     def residual(scatter):
@@ -39,6 +43,9 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     apart = leaves.centroids[0] - leaves.centroids[1]
     union = a + b + n[0] * n[1] / n.sum() * np.outer(apart, apart)
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
+    least = 0.3 * n.min() / mean * (residual(leaves.scatters[n.argmax()]) / (n.max() / mean) - 2.0)
+    assert (least > increase) == (uneven > 0.0)
+    increase = max(increase, least)
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
     stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 or not known else 0.0
     evidence = cost + stands_out + 0.08 + 0.04 * math.log(1 + scale / 0.1)
@@ -103,6 +110,26 @@ def test_turning_a_sheet_seen_from_who_knows_where_changes_no_object(turn):
     found = pcgraph.segment(points @ Rotation.from_euler("x", turn, degrees=True).as_matrix().T)
     assert not found.graph.sides_known
     assert pcgraph.metrics.segmentation_covering(found.labels, truth) > 0.97
+
+
+def test_a_thing_in_a_hollow_of_rolling_ground_is_no_less_one_than_on_a_hill():
+    """The plane of the ground runs through what stands in the hollow."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0.0, 40.0, (2, 80_000))
+    ground = np.stack((x, y, np.sin(x * np.pi / 10.0) + rng.normal(0.0, 0.01, len(x))), axis=1)
+    clouds, things = [ground], 0
+    for middle_x in (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0):
+        for middle_y in (10.0, 20.0, 30.0):
+            bale = rng.normal(size=(120, 3))
+            bale = bale / np.linalg.norm(bale, axis=1, keepdims=True) * 0.6
+            height = np.sin(middle_x * np.pi / 10.0)
+            bale = bale[bale[:, 2] > -0.3] + [middle_x, middle_y, height + 0.4]
+            clouds.append(bale)
+            things += 1
+    points, truth = np.concatenate(clouds), np.repeat(np.arange(things + 1), [len(cloud) for cloud in clouds])
+    labels = pcgraph.segment(points).labels
+    alone = [truth[labels == np.bincount(labels[truth == thing] + 1).argmax() - 1] for thing in range(1, things + 1)]
+    assert sum(np.mean(found > 0) > 0.9 for found in alone) == things
 
 
 @pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.1, 0.2), (0.1, 0.3)])
