@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounding planes: floors, ceilings and walls, whose pieces are one, though nothing shows how they go on."""
+"""Bounding planes: floors, ceilings and walls, whose pieces are one where something stands before the gap."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, cKDTree
 
 from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures, node_features
-from pcgraph.graph.continuations import Continuations, continuations_of
-from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.graph.continuations import Continuations, continuations_of, distinct_pairs
+from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.surface import Surface
 
 _LEAST_VOXELS = 40  # of a piece, some two supervoxels
@@ -23,17 +24,22 @@ _BEHIND, _BEFORE = 0.005, 0.2  # of all voxels lie so, at most and at least
 _PARALLEL, _OFFSET = 0.98, 1.0  # cosine, and voxel edges, between two pieces of one plane, at least and at most
 _GAP = 0.75  # times the width of the larger one lies between them, at most
 _FACING = 2.0  # times as far apart as where they are nearest are borders that face each other, at most
-_BETWEEN = 1.5  # times as long as the way between two pieces is one over a point between them, at most
+_HIDDEN = 0.5  # of the ways between such borders lead past something before the plane, at least,
+_HEIGHT = 2.0  # that lies no more times as high as the way is long,
+_ALONG = 0.5  # and along the plane, by the cosine between normals, at least
 _AROUND = 8  # voxels of its own piece that a voxel amid it has around it
+_NEAR = 8  # supervoxels before a gap that are looked at
 
 
 def bounding_planes(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> Continuations:
     """Supervoxels on the borders that pieces of one bounding plane turn to each other.
 
     A plane bounds the scene if nothing lies behind it, and much before it: the floor of a room, its ceiling, its outer
-    walls, a street. What is missing of it is hidden, or was not scanned: through a hole something would be seen. So its
-    pieces are one, whether or not something is seen to hide the rest, if what lies between them is at most three
-    quarters as wide as the larger one, by the root of its area, which grows as they join.
+    walls, a street. Two pieces of it are one if what is missing between them is hidden: something lies before most of
+    the gap, as the top of a desk above a floor does, and nothing shows behind it. From where it was hidden need not be
+    known, as it has to be for other continuations. What parts rooms, a partition, lies across the plane, not along it;
+    and what faces as the pieces do and is larger is what they are set in, as doors and windows are in a wall. Between
+    them lies at most three quarters of the width of the larger one, by the root of its area, which grows as they join.
 
     Parameters
     ----------
@@ -45,17 +51,28 @@ def bounding_planes(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int
     Returns
     -------
     Continuations
-        All coplanar, as their pieces are, whatever their own normals. Crossings are pairs of voxels on the borders,
-        each the other's nearest. What lies so near that gaps join it (`pcgraph.graph.gaps.gaps`) is left to these.
+        All coplanar, as their pieces are, whatever their own normals. Crossings are ways across the gap, edges of the
+        Delaunay triangulation of all borders on the plane. What lies so near that gaps join it
+        (`pcgraph.graph.gaps.gaps`) is left to these.
     """
-    pieces = _bounding_pieces(surface, nodes, faces)
-    pairs = _coplanar_pairs(pieces.planes.centroid, pieces.planes.normal, pieces.planes.covariance, pieces.edges)
-    borders = _borders(surface, pieces.of_supervoxel, pairs)
-    hidings = np.concatenate((np.empty((0, 2), np.int64), *_ways(pieces, pairs, borders, nodes)))
+    scene = _scene(surface, nodes)
+    pieces = _bounding_pieces(scene, nodes, faces)
+    ways = [_hidden_ways(surface, scene, pieces, some) for some in _on_one_plane(pieces)]
+    hidings = np.concatenate((np.empty((0, 2), np.int64), *ways))
     ends = surface.grid.warped[hidings]
     far = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > surface.grid.warp.max_gap * surface.grid.size
     found = continuations_of(surface, nodes, hidings[far])
     return replace(found, coplanar=np.ones(len(found.pairs), np.bool_))
+
+
+class _Scene(NamedTuple):
+    """The k supervoxels: places, outer normals, number of voxels, their mean edge length, and areas."""
+
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    voxels: NDArray[np.int64]
+    edges: NDArray[np.float64]
+    areas: NDArray[np.float64]
 
 
 class _Pieces(NamedTuple):
@@ -78,39 +95,34 @@ class _Pieces(NamedTuple):
     of_supervoxel: NDArray[np.int64]
 
 
-class _Border(NamedTuple):
-    """Voxels at the border of a piece, their places and a tree of these."""
-
-    voxels: NDArray[np.int64]
-    places: NDArray[np.float64]
-    tree: cKDTree
-
-
-def _bounding_pieces(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> _Pieces:
-    """Faces that are large and flat and bound the scene."""
+def _scene(surface: Surface, nodes: NodeFeatures) -> _Scene:
     k = len(nodes.size)
     voxels = np.bincount(surface.supervoxels, minlength=k)
     edges = np.bincount(surface.supervoxels, surface.grid.edge_lengths, k) / voxels
-    large = np.bincount(faces, voxels) >= _LEAST_VOXELS
+    return _Scene(nodes.centroid, nodes.normal, voxels, edges, voxels * edges * edges)
+
+
+def _bounding_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32]) -> _Pieces:
+    """Faces that are large and flat and bound the scene."""
+    large = np.bincount(faces, scene.voxels) >= _LEAST_VOXELS
     on, n = np.flatnonzero(large[faces]), int(large.sum())
     face = (np.cumsum(large) - 1)[faces[on]]
-    parts = Moments(voxels[on], nodes.centroid[on], voxels[on, None, None] * nodes.covariance[on], None)
-    parts = replace(parts, normals=nodes.normal[on])  # outwards
-    moments = grouped_moments(parts, face, n)
+    voxels = scene.voxels[on]
+    parts = Moments(voxels, nodes.centroid[on], voxels[:, None, None] * nodes.covariance[on], None)
+    moments = grouped_moments(replace(parts, normals=nodes.normal[on]), face, n)
     planes = node_features(moments)
-    mean_edges = np.bincount(face, voxels[on] * edges[on], n) / planes.size
-    flat = np.flatnonzero(planes.residual <= _FLAT * mean_edges)
+    edges = np.bincount(face, voxels * scene.edges[on], n) / planes.size
+    flat = np.flatnonzero(planes.residual <= _FLAT * edges)
     bounding = np.empty(len(flat), np.bool_)
-    scattered = np.random.default_rng(0).permutation(k)  # so that it is soon seen that a plane bounds nothing
-    scene = nodes.centroid[scattered], _BEYOND * edges[scattered], voxels[scattered]
-    in_blocks(_bound, len(flat), planes.centroid[flat], planes.normal[flat], *scene, bounding)
+    scattered = np.random.default_rng(0).permutation(len(faces))  # soon it is seen that a plane bounds nothing
+    others = scene.places[scattered], _BEYOND * scene.edges[scattered], scene.voxels[scattered]
+    in_blocks(_bound, len(flat), planes.centroid[flat], planes.normal[flat], *others, bounding)
     kept = flat[bounding]
-    number = np.full(n, -1)
+    number, areas = np.full(n, -1), np.bincount(face, scene.areas[on], n).astype(np.float64)
     number[kept] = np.arange(len(kept))
-    of_supervoxel = np.full(k, -1)
+    of_supervoxel = np.full(len(faces), -1)
     of_supervoxel[on] = number[face]
-    areas = np.bincount(face, (voxels * edges * edges)[on], n)[kept].astype(np.float64)
-    return _Pieces(node_features(moments[kept]), mean_edges[kept], areas, of_supervoxel)
+    return _Pieces(node_features(moments[kept]), edges[kept], areas[kept], of_supervoxel)
 
 
 @kernel
@@ -139,113 +151,134 @@ def _bound(
         found[plane] = behind <= _BEHIND * total and before >= _BEFORE * total
 
 
-@kernel
-def _coplanar_pairs(
-    centroids: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    edges: NDArray[np.float64],
-) -> NDArray[np.int64]:
-    """Pairs of pieces that lie on one plane, (q, 2), the smaller number first, ascending."""
-    n = len(edges)
-    partners, firsts = np.empty(n, np.int64), np.empty(0, np.int64)
-    seconds = firsts
-    for a in range(n):
-        found = 0
-        for b in range(a + 1, n):
-            cosine = 0.0
-            for axis in range(3):
-                cosine += normals[a, axis] * normals[b, axis]
-            if cosine < _PARALLEL:
-                continue
-            off = _square_off(centroids, normals, covariances, a, b)
-            off = max(off, _square_off(centroids, normals, covariances, b, a))
-            if off <= (_OFFSET * max(edges[a], edges[b])) ** 2:
-                partners[found] = b
-                found += 1
-        firsts, seconds = np.append(firsts, np.full(found, a)), np.append(seconds, partners[:found])
-    return np.stack((firsts, seconds), axis=1)
+def _on_one_plane(pieces: _Pieces) -> Iterator[NDArray[np.int64]]:
+    """Pieces, two or more, that lie on the plane of the largest of them."""
+    planes, left = pieces.planes, np.argsort(-pieces.areas, kind="stable")
+    while len(left) > 1:
+        first = left[0]
+        cosine = np.einsum("ij,j->i", planes.normal[left], planes.normal[first])
+        off = np.maximum(_offset(planes, left, first), _offset(planes, first, left))
+        on_it = (cosine >= _PARALLEL) & (off <= _OFFSET * np.maximum(pieces.edges[left], pieces.edges[first]))
+        on_it[0] = True
+        if on_it.sum() > 1:
+            yield left[on_it]
+        left = left[~on_it]
 
 
-@routine
-def _square_off(
-    centroids: NDArray[np.float64], normals: NDArray[np.float64], covariances: NDArray[np.float64], a: int, b: int
-) -> float:
-    """Mean square distance of piece a to the plane of piece b."""
-    shift = square = 0.0
-    for i in range(3):
-        shift += (centroids[a, i] - centroids[b, i]) * normals[b, i]
-        for j in range(3):
-            square += normals[b, i] * covariances[a, i, j] * normals[b, j]
-    return square + shift * shift
+def _offset(planes: NodeFeatures, ones: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Root mean square distances of the ones' voxels to the others' planes, metres."""
+    normals = planes.normal[others]
+    shift = ((planes.centroid[ones] - planes.centroid[others]) * normals).sum(axis=-1)
+    spread = np.einsum("...i,...ij,...j->...", normals, planes.covariance[ones], normals)
+    return np.sqrt(shift * shift + np.maximum(spread, 0.0))
 
 
-def _borders(surface: Surface, of_supervoxel: NDArray[np.int64], pairs: NDArray[np.int64]) -> dict[int, _Border]:
-    """The border of each piece in a pair: voxels with fewer than eight of the same piece around them."""
-    if not len(pairs):
-        return {}
-    grid, piece = surface.grid, of_supervoxel[surface.supervoxels]
-    voxels = np.flatnonzero(np.isin(piece, pairs))
+def _border(surface: Surface, piece: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Voxels of some pieces, given the piece of each, with fewer than eight of the same piece around them."""
+    grid, voxels = surface.grid, np.flatnonzero(np.isin(piece, some))
     degrees = np.diff(grid.indptr)[voxels]
     row = np.repeat(np.arange(len(voxels)), degrees)
     at = np.arange(len(row)) + np.repeat(grid.indptr[voxels] - np.cumsum(degrees) + degrees, degrees)
     around = np.bincount(row, piece[grid.neighbours[at]] == piece[voxels[row]], len(voxels))
-    voxels = voxels[around < _AROUND]
-    voxels = voxels[np.argsort(piece[voxels], kind="stable")]
-    numbers, starts = np.unique(piece[voxels], return_index=True)
-    borders = {}
-    for number, some in zip(numbers.tolist(), np.split(voxels, starts[1:]), strict=True):
-        borders[number] = _Border(some, grid.centroids[some], cKDTree(grid.centroids[some]))
-    return borders
+    return voxels[around < _AROUND]
 
 
-def _ways(
-    pieces: _Pieces, pairs: NDArray[np.int64], borders: dict[int, _Border], nodes: NodeFeatures
-) -> list[NDArray[np.int64]]:
-    """Voxels on borders that face each other, (c, 2), of each pair of pieces that joins what was not yet one."""
-    box = np.empty((2, len(pieces.edges), 3))
-    for piece, border in borders.items():
-        box[:, piece] = border.places.min(axis=0), border.places.max(axis=0)
-    (low_a, low_b), (high_a, high_b) = box[:, pairs.T]
-    apart = np.linalg.norm(np.maximum(np.maximum(low_a - high_b, low_b - high_a), 0.0), axis=1)
-    whole, areas = np.arange(len(pieces.edges)), pieces.areas.copy()
-    facing: dict[int, tuple[float, NDArray[np.int64]]] = {}
-    ways, order, joined = [], np.argsort(apart, kind="stable"), True
-    while joined:  # as what is one grows, wider gaps are bridged
+def _hidden_ways(surface: Surface, scene: _Scene, pieces: _Pieces, some: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Voxels at both ends of the ways across gaps, (c, 2), between pieces of one plane that are one."""
+    piece = pieces.of_supervoxel[surface.supervoxels]
+    border = _border(surface, piece, some)
+    places, piece = surface.grid.centroids[border], piece[border]
+    frame = _Frame.of(pieces.planes.centroid[some[0]], pieces.planes.normal[some[0]])
+    triangles = Delaunay(frame.feet(places), qhull_options="QJ").simplices
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
+    lengths = np.linalg.norm(places[ends[:, 1]] - places[ends[:, 0]], axis=1)
+    pairs, pair = distinct_pairs(*np.sort(piece[ends], axis=1).T)
+    widths = np.full(len(pairs), np.inf)
+    np.minimum.at(widths, pair, lengths)
+    facing = lengths <= _FACING * widths[pair]
+    ends, lengths, pair = ends[facing], lengths[facing], pair[facing]
+    middles, larger = frame.feet(places[ends].mean(axis=1)), pieces.areas[pairs].max(axis=1)[pair]
+    hidden = np.bincount(pair, _is_hidden(scene, frame, middles, lengths, larger), len(pairs))
+    opened = np.bincount(pair, _is_open(scene, frame, middles, lengths), len(pairs))
+    may_join = (hidden >= _HIDDEN * np.bincount(pair, minlength=len(pairs))) & (opened == 0)
+    return border[ends[_joining(pairs, widths, may_join, pieces.areas)[pair]]]
+
+
+class _Frame(NamedTuple):
+    """A plane: a place on it, its unit normal, and two directions along it, (3, 2)."""
+
+    origin: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    axes: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, origin: NDArray[np.float64], normal: NDArray[np.float64]) -> _Frame:
+        first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+        first /= np.linalg.norm(first)
+        return cls(origin, normal, np.stack((first, np.cross(normal, first)), axis=1))
+
+    def heights(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distances of places, (n, 3), to the plane, (n,)."""
+        return np.einsum("ij,j->i", places - self.origin, self.normal)
+
+    def feet(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where on the plane the places lie, (n, 2)."""
+        return np.einsum("ij,jk->ik", places - self.origin, self.axes)
+
+
+def _is_hidden(
+    scene: _Scene,
+    frame: _Frame,
+    middles: NDArray[np.float64],
+    lengths: NDArray[np.float64],
+    larger: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Whether something lies before the middle of each way, (c,), and not what the pieces are set in.
+
+    That is: what faces as they do, and takes more of a plane parallel to theirs than the larger one of them theirs.
+    """
+    heights, cosines = frame.heights(scene.places), np.einsum("ij,j->i", scene.normals, frame.normal)
+    before = np.flatnonzero((heights > scene.edges) & (np.abs(cosines) >= _ALONG))
+    if not len(before):
+        return np.zeros(len(middles), np.bool_)
+    parallel = np.flatnonzero(cosines >= _PARALLEL)
+    parallel = parallel[np.argsort(heights[parallel], kind="stable")]
+    areas = np.concatenate((np.zeros(1), np.cumsum(scene.areas[parallel])))
+    low, high = (areas[np.searchsorted(heights[parallel], heights + off)] for off in (-scene.edges, scene.edges))
+    sets_in = np.where(cosines >= _PARALLEL, high - low, 0.0)
+    distance, nearest = cKDTree(frame.feet(scene.places[before])).query(
+        middles, k=np.arange(1, min(_NEAR, len(before)) + 1)
+    )
+    nearest, ways = before[nearest], lengths[:, None]
+    over = distance <= np.maximum(0.5 * ways, _BEYOND * scene.edges[nearest])
+    hides = over & (heights[nearest] > _BEYOND * scene.edges[nearest]) & (heights[nearest] <= _HEIGHT * ways)
+    return hides.any(axis=1) & ~(over & (sets_in[nearest] > larger[:, None])).any(axis=1)
+
+
+def _is_open(
+    scene: _Scene, frame: _Frame, middles: NDArray[np.float64], lengths: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether something shows behind the plane at the middle of each way, (c,)."""
+    behind = scene.places[frame.heights(scene.places) < -_BEYOND * scene.edges]
+    if not len(behind):
+        return np.zeros(len(middles), np.bool_)
+    return cKDTree(frame.feet(behind)).query(middles)[0] <= 0.5 * lengths
+
+
+def _joining(
+    pairs: NDArray[np.int32], widths: NDArray[np.float64], may_join: NDArray[np.bool_], areas: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Which pairs join pieces that are not one yet: as what is one grows, wider gaps are bridged."""
+    whole, areas = np.arange(len(areas)), areas.copy()
+    joins, order, joined = np.zeros(len(pairs), np.bool_), np.argsort(widths, kind="stable"), True
+    order = order[may_join[order]]
+    while joined:
         joined, order = False, order[whole[pairs[order, 0]] != whole[pairs[order, 1]]]
         for pair in order.tolist():
             a, b = whole[pairs[pair]]
-            reach = _GAP * np.sqrt(max(areas[a], areas[b]))
-            if a == b or apart[pair] > reach:
-                continue
-            one, other = (borders[piece] for piece in pairs[pair].tolist())
-            if pair not in facing:
-                facing[pair] = _facing(one, other)
-            width, between = facing[pair]
-            if width > reach:
-                continue
-            if any(_shows_behind(pieces, piece, nodes, one, other, width) for piece in pairs[pair]):
-                apart[pair] = np.inf
-                continue
-            ways.append(between)
-            areas[a] += areas[b]
-            whole[whole == b] = a
-            joined = True
-    return ways
-
-
-def _facing(one: _Border, other: _Border) -> tuple[float, NDArray[np.int64]]:
-    """How far apart two borders are, metres, and their voxels that are each the other's nearest, (c, 2)."""
-    distance, nearest = other.tree.query(one.places)
-    _, back = one.tree.query(other.places)
-    facing = (back[nearest] == np.arange(len(nearest))) & (distance <= _FACING * distance.min())
-    return float(distance.min()), np.stack((one.voxels[facing], other.voxels[nearest[facing]]), axis=1)
-
-
-def _shows_behind(pieces: _Pieces, piece: int, nodes: NodeFeatures, one: _Border, other: _Border, width: float) -> bool:
-    """Whether a supervoxel behind the plane of a piece is seen between two, through what would be a hole."""
-    normal = pieces.planes.normal[piece]
-    heights = (nodes.centroid - pieces.planes.centroid[piece]) @ normal
-    behind = heights < -_BEYOND * pieces.edges[piece]
-    feet = nodes.centroid[behind] - heights[behind, None] * normal
-    return bool(len(feet)) and bool((one.tree.query(feet)[0] + other.tree.query(feet)[0] <= _BETWEEN * width).any())
+            if a != b and widths[pair] <= _GAP * np.sqrt(max(areas[a], areas[b])):
+                joins[pair] = joined = True
+                areas[a] += areas[b]
+                whole[whole == b] = a
+    return joins
