@@ -28,6 +28,7 @@ _HIDDEN = 0.5  # of the ways between such borders lead past something before the
 _HEIGHT = 2.0  # that lies no more times as high as the way is long,
 _ALONG = 0.5  # and along the plane, by the cosine between normals, at least
 _AROUND = 8  # voxels of its own piece that a voxel amid it has around it
+_LEAST_FOR_TRIANGLES = 4  # voxels
 _NEAR = 8  # supervoxels before a gap that are looked at
 
 
@@ -188,8 +189,11 @@ def _hidden_ways(surface: Surface, scene: _Scene, pieces: _Pieces, some: NDArray
     piece = pieces.of_supervoxel[surface.supervoxels]
     border = _border(surface, piece, some)
     places, piece = surface.grid.centroids[border], piece[border]
-    frame = _Frame.of(pieces.planes.centroid[some[0]], pieces.planes.normal[some[0]])
-    triangles = Delaunay(frame.feet(places), qhull_options="QJ").simplices
+    plane = _Plane.of(pieces.planes.centroid[some[0]], pieces.planes.normal[some[0]])
+    if len(border) < _LEAST_FOR_TRIANGLES:
+        return np.empty((0, 2), np.int64)
+    feet = plane.feet(places) / pieces.edges[some[0]]  # no unit is too small
+    triangles = Delaunay(feet, qhull_options="QJ").simplices  # joggled, as places on a lattice or a line are no error
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
     lengths = np.linalg.norm(places[ends[:, 1]] - places[ends[:, 0]], axis=1)
@@ -198,14 +202,14 @@ def _hidden_ways(surface: Surface, scene: _Scene, pieces: _Pieces, some: NDArray
     np.minimum.at(widths, pair, lengths)
     facing = lengths <= _FACING * widths[pair]
     ends, lengths, pair = ends[facing], lengths[facing], pair[facing]
-    middles, larger = frame.feet(places[ends].mean(axis=1)), pieces.areas[pairs].max(axis=1)[pair]
-    hidden = np.bincount(pair, _is_hidden(scene, frame, middles, lengths, larger), len(pairs))
-    opened = np.bincount(pair, _is_open(scene, frame, middles, lengths), len(pairs))
+    middles, larger = plane.feet(places[ends].mean(axis=1)), pieces.areas[pairs].max(axis=1)[pair]
+    hidden = np.bincount(pair, _is_hidden(scene, plane, middles, lengths, larger), len(pairs))
+    opened = np.bincount(pair, _is_open(scene, plane, middles, lengths), len(pairs))
     may_join = (hidden >= _HIDDEN * np.bincount(pair, minlength=len(pairs))) & (opened == 0)
     return border[ends[_joining(pairs, widths, may_join, pieces.areas)[pair]]]
 
 
-class _Frame(NamedTuple):
+class _Plane(NamedTuple):
     """A plane: a place on it, its unit normal, and two directions along it, (3, 2)."""
 
     origin: NDArray[np.float64]
@@ -213,7 +217,7 @@ class _Frame(NamedTuple):
     axes: NDArray[np.float64]
 
     @classmethod
-    def of(cls, origin: NDArray[np.float64], normal: NDArray[np.float64]) -> _Frame:
+    def of(cls, origin: NDArray[np.float64], normal: NDArray[np.float64]) -> _Plane:
         first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
         first /= np.linalg.norm(first)
         return cls(origin, normal, np.stack((first, np.cross(normal, first)), axis=1))
@@ -229,7 +233,7 @@ class _Frame(NamedTuple):
 
 def _is_hidden(
     scene: _Scene,
-    frame: _Frame,
+    plane: _Plane,
     middles: NDArray[np.float64],
     lengths: NDArray[np.float64],
     larger: NDArray[np.float64],
@@ -238,7 +242,7 @@ def _is_hidden(
 
     That is: what faces as they do, and takes more of a plane parallel to theirs than the larger one of them theirs.
     """
-    heights, cosines = frame.heights(scene.places), np.einsum("ij,j->i", scene.normals, frame.normal)
+    heights, cosines = plane.heights(scene.places), np.einsum("ij,j->i", scene.normals, plane.normal)
     before = np.flatnonzero((heights > scene.edges) & (np.abs(cosines) >= _ALONG))
     if not len(before):
         return np.zeros(len(middles), np.bool_)
@@ -247,7 +251,7 @@ def _is_hidden(
     areas = np.concatenate((np.zeros(1), np.cumsum(scene.areas[parallel])))
     low, high = (areas[np.searchsorted(heights[parallel], heights + off)] for off in (-scene.edges, scene.edges))
     sets_in = np.where(cosines >= _PARALLEL, high - low, 0.0)
-    distance, nearest = cKDTree(frame.feet(scene.places[before])).query(
+    distance, nearest = cKDTree(plane.feet(scene.places[before])).query(
         middles, k=np.arange(1, min(_NEAR, len(before)) + 1)
     )
     nearest, ways = before[nearest], lengths[:, None]
@@ -257,13 +261,13 @@ def _is_hidden(
 
 
 def _is_open(
-    scene: _Scene, frame: _Frame, middles: NDArray[np.float64], lengths: NDArray[np.float64]
+    scene: _Scene, plane: _Plane, middles: NDArray[np.float64], lengths: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Whether something shows behind the plane at the middle of each way, (c,)."""
-    behind = scene.places[frame.heights(scene.places) < -_BEYOND * scene.edges]
+    behind = scene.places[plane.heights(scene.places) < -_BEYOND * scene.edges]
     if not len(behind):
         return np.zeros(len(middles), np.bool_)
-    return cKDTree(frame.feet(behind)).query(middles)[0] <= 0.5 * lengths
+    return cKDTree(plane.feet(behind)).query(middles)[0] <= 0.5 * lengths
 
 
 def _joining(
