@@ -40,13 +40,17 @@ _NEARLY_EDGE_ON, _SEEN_WELL = 0.1, 0.2  # cosines between normals and rays, less
 _NEARLY_LEVEL, _LEVEL_INDEED, _FEW_LEVEL = 0.9, 0.97, 20  # cosines to the axis, and to what is level; voxels
 _TOLD = 40.0  # votes of the viewpoint for one of the places
 _CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
+_BOTH_SIDES = 0.2  # cosine under which places closed in see either side of a partition, at least
+_FINER = 1, 2, 4  # times as many cells and places, if some are closed in, until one agreement shows
+_SHOWS_MOST = 0.9  # of the surface
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
 _LEVEL = 0.996  # cosine between a plane's normal and z: 5 degrees
 _MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
-_VIEWS = 12  # places that the voxels themselves are looked at from
+_VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at from; and more, each of which
+_NEWS = 0.005  # of all cells is seen by first
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
 _SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # along x, y and z, times these, add up to a multiple of seven or three
 _SMOOTHING = 4  # rounds of votes by the voxels around
@@ -139,7 +143,7 @@ def visible_sides(
     votes, (looked_at, stretch) = _TOLD * told, standing_for_all(grid)
     centres, widths = (grid.centroids[looked_at] - middle) / reach, stretch * grid.edge_lengths[looked_at] / reach
     sides = normals[looked_at]
-    seen, towards = seen_from(places, centres, widths, sides), np.empty((len(centres), 3))
+    seen, towards = seen_from(places, centres, widths, sides, widths / stretch), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
     smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
@@ -251,6 +255,7 @@ def seen_from(
     centres: NDArray[np.float64],
     widths: NDArray[np.float64],
     normals: NDArray[np.float64],
+    depths: NDArray[np.float64] | None = None,
 ) -> NDArray[np.bool_]:
     """Whether each of n squares is visible from each of k places, (k, n) bool: none is in front by more than its depth.
 
@@ -268,7 +273,8 @@ def seen_from(
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
-    squares = _Squares(_columns(centres), _columns(normals), widths.astype(np.float32))
+    depths = widths if depths is None else depths
+    squares = _Squares(_columns(centres), _columns(normals), widths.astype(np.float32), depths.astype(np.float32))
     in_blocks(_look, len(places), places.astype(np.float32), bins, squares, seen, smallest=1)
     return seen
 
@@ -279,6 +285,7 @@ class _Squares(NamedTuple):
     centres: NDArray[np.float32]
     normals: NDArray[np.float32]
     widths: NDArray[np.float32]
+    depths: NDArray[np.float32]
 
 
 def _columns(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -305,13 +312,25 @@ def _lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> TellingPlaces:
-    """The places that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`."""
+    """The places that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
+
+    Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells.
+    """
+    for finer in _FINER:
+        telling, shows_most = _telling_places(grid, viewpoint, finer)
+        if shows_most:
+            break
+    return telling
+
+
+def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, finer: int) -> tuple[TellingPlaces, bool]:
+    """The places, with so many times as many cells, and whether more of them would hardly show more."""
     middle, reach = _unit_frame(grid, grid.centroids)
     origin = -middle / reach
     viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
-    coarse = _coarse(grid, middle, reach)
+    coarse = _coarse(grid, middle, reach, finer * _CELLS)
     low, high = bounding_box(coarse.centroids)
-    inside = _free_places(coarse, low, high)
+    inside = _free_places(coarse, low, high, finer)
     outside = (low + high) / 2.0 + _DISTANCE * _lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
@@ -334,10 +353,23 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
     closed = np.zeros(len(places))
     hits = closed[_OUTSIDE : _OUTSIDE + len(inside)]
     in_blocks(_count_hits, len(inside), inside.astype(np.float32), _columns(coarse.centroids), hits, smallest=1)
-    found = _agreements(sides, _starts(sides, outside, likely))
-    weights = _most_telling(found, sides, coarse, closed, likely, bool(from_viewpoint))
+    voting = _without_partitions(sides, sides[closed >= _CLOSED])
+    found = _agreements(voting, _starts(voting, outside, likely))
+    weights, shown = _most_telling(found, sides, coarse, closed, likely, bool(from_viewpoint))
     chosen = _spread_choice(seen, weights)
-    return TellingPlaces(places[chosen], weights[chosen])
+    shows_most = shown >= _SHOWS_MOST or not (closed >= _CLOSED).any() or coarse.n_voxels > grid.n_voxels // 2
+    return TellingPlaces(places[chosen], weights[chosen]), shows_most
+
+
+def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The sides that places see, (k, n), but of partitions: cells of which those in rooms see both.
+
+    A cell is thicker than a partition, so that the rooms on either side of it would contradict each other.
+    """
+    if not len(of_rooms):
+        return sides
+    front, back = np.maximum(of_rooms, 0.0).max(axis=0), np.maximum(-of_rooms, 0.0).max(axis=0)
+    return np.where(np.minimum(front, back) > _BOTH_SIDES, np.float32(0.0), sides)
 
 
 def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -485,8 +517,8 @@ def _most_telling(
     closed: NDArray[np.float64],
     likely: NDArray[np.bool_],
     likely_is_told: bool,
-) -> NDArray[np.float64]:
-    """Weights of the places, (k,) float64, in the agreement that shows most of the surface.
+) -> tuple[NDArray[np.float64], float]:
+    """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
 
     A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
     one of places closed in, as in a room: of that all but narrow gaps is seen from within.
@@ -495,8 +527,8 @@ def _most_telling(
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
     is_closed = any(float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0 for s in different)
     likely_counts = _FROM_VIEWPOINT if likely_is_told else _BEFORE
-    shown = np.empty(len(different))
-    in_blocks(_show, len(different), different, sides, found, coarse.neighbourhood, is_closed, shown, smallest=1)
+    shown, around = np.empty(len(different)), coarse.neighbourhood
+    in_blocks(_show, len(different), different, sides, found, around, is_closed, shown, smallest=1)
     most, best = -np.inf, found.weights[0]
     for s, fraction in zip(different, shown, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
@@ -507,7 +539,7 @@ def _most_telling(
             score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
-    return best.astype(np.float64)
+    return best.astype(np.float64), float(shown.max())
 
 
 @kernel
@@ -531,7 +563,8 @@ def _show(
         for k in range(n_places):
             if weights[k] > 0.0:
                 for i in range(n):
-                    of_cells[i] += weights[k] * max(sides[k, i] * outward[i], nothing)
+                    value = sides[k, i] * outward[i] if outward[i] != nothing else abs(sides[k, i])
+                    of_cells[i] += weights[k] * max(value, nothing)
         total = 0.0
         for i in range(n):
             most = of_cells[i]
@@ -543,38 +576,46 @@ def _show(
 
 
 def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Some of the places, by weight and by how much each sees, (k, n) bool, that those before see seldom or never."""
+    """Some of the places, by weight and by how much each sees, (k, n) bool, that those before see seldom or never.
+
+    So each of many rooms has one.
+    """
     places = np.flatnonzero(weights > 0.0)
     left, sees = weights[places], seen[places].astype(np.float32)
     interest = np.ones(seen.shape[1], np.float32)
     chosen: list[int] = []
-    while len(chosen) < _VIEWS and left.any():
+    while len(chosen) < _MOST_VIEWS and left.any():
         best = int(np.argmax(left * np.einsum("kn,n->k", sees, interest)))
+        if len(chosen) >= _VIEWS and (sees[best] @ (interest == 1.0)) < _NEWS * len(interest):
+            break
         chosen.append(best)
         interest[sees[best] > 0.0] *= np.float32(0.25)
         left[best] = 0.0
     return places[chosen]
 
 
-def _coarse(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> VoxelGrid:
+def _coarse(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: int = _CELLS) -> VoxelGrid:
     """Voxels in larger ones, as few as still show their shape, in the frame of `_unit_frame`; the outermost surfaces
     amid a layer of them."""
     centres, width = (grid.centroids - middle) / reach, float(np.median(grid.edge_lengths)) / reach
-    size = width * max(1.0, math.sqrt(len(centres) / (1.5 * _CELLS)))  # as many as a surface would have
+    size = width * max(1.0, math.sqrt(len(centres) / (1.5 * cells)))  # as many as a surface would have
     low = bounding_box(centres)[0]
     while True:
         shift = 0.5 * size - low
         coarse = voxel_grid(centres + shift, None, size, Warp())
-        if coarse.n_voxels <= 2 * _CELLS:
+        if coarse.n_voxels <= 2 * cells:
             return replace(coarse, centroids=coarse.centroids - shift)
         size *= 1.4
 
 
-def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places within the bounding box, the farthest off all surfaces first, (k, 3)."""
+def _free_places(
+    coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64], finer: int
+) -> NDArray[np.float64]:
+    """Places within the bounding box, the farthest off all surfaces first, (k, 3); so many times as many as usual."""
     from scipy.spatial import cKDTree
 
-    steps = (np.arange(_LATTICE) + 0.5) / _LATTICE
+    n, lattice_side = finer * _INSIDE, round(_LATTICE * finer ** (1.0 / 3.0))
+    steps = (np.arange(lattice_side) + 0.5) / lattice_side
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     places = low + lattice * (high - low)
     clearance = cKDTree(coarse.centroids).query(places)[0] / coarse.size
@@ -585,9 +626,9 @@ def _free_places(coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.f
     some = _columns(coarse.centroids[:: max(1, coarse.n_voxels // _SOME)])
     in_blocks(_count_hits, len(free), places.astype(np.float32), some, hits, smallest=1)
     among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
-    chosen = among[farthest_first(places[among], int(np.argmax(clearance[among])), int(_SPREAD * _INSIDE))]
+    chosen = among[farthest_first(places[among], int(np.argmax(clearance[among])), int(_SPREAD * n))]
     order = np.argsort(-clearance, kind="stable")
-    rest = order[~np.isin(order, chosen)][: _INSIDE - len(chosen)]
+    rest = order[~np.isin(order, chosen)][: n - len(chosen)]
     return places[np.concatenate((chosen, rest))]
 
 
@@ -724,7 +765,7 @@ def _look(
 @routine
 def _view(place: NDArray[np.float32], bins: int, squares: _Squares, views: _Views) -> None:
     """Set how squares look from a place, on a map of bins x bins. One at the place has range 0 and is not seen."""
-    centres, normals, widths = squares
+    centres, normals, widths, depths = squares
     px, py, pz = place
     nothing, one, halves, bin_size = np.float32(0.0), np.float32(1.0), np.float32(0.5 * bins), np.float32(2.0 / bins)
     margin, widest = np.float32(0.6), np.float32(24.0)
@@ -744,7 +785,7 @@ def _view(place: NDArray[np.float32], bins: int, squares: _Squares, views: _View
         slope = across / depth
         views.slopes[i] = bin_width * (slope if across < _STEEPEST * depth else _STEEPEST)
         views.ranges[i] = distance
-        limit = distance - widths[i] - np.float32(0.5) * bin_width
+        limit = distance - depths[i] - np.float32(0.5) * bin_width
         views.limits[i] = limit if distance > nothing else _FAR
 
 
@@ -760,7 +801,7 @@ def _on_one_surface(i: int, j: int, squares: _Squares) -> bool:
         off += way * normals[axis, i]
         off_other += way * normals[axis, j]
     reach = _SLANTED * width
-    return bool(abs(cosine) >= _SAME and max(abs(off), abs(off_other)) < width and square < reach * reach)
+    return bool(abs(cosine) >= _SAME and max(abs(off), abs(off_other)) < squares.depths[i] and square < reach * reach)
 
 
 @kernel
