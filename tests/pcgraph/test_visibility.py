@@ -410,3 +410,56 @@ def test_a_scan_whose_frame_lies_on_the_ground_is_seen_from_above_it():
     ground = np.abs(normals[:, 2]) > 0.7
     assert ground.mean() > 0.4
     assert (normals[ground, 2] > 0).mean() > 0.97
+
+
+def _rooms(nx, ny, doors, seed=0, wall=0.12):
+    """Points on the surfaces of rooms of 4 m x 3 m x 2.5 m side by side, 3.5 cm apart, and the way into the room."""
+    rng = np.random.default_rng(seed)
+    points, inwards = [], []
+
+    def sheet(corner, first, second, inward, door=False):
+        lengths = np.linalg.norm(first), np.linalg.norm(second)
+        along, up = rng.random((2, int(800 * lengths[0] * lengths[1])))
+        kept = ~(door & (np.abs(along * lengths[0] - 2.0) < 0.45) & (up * lengths[1] < 2.0))
+        points.append(corner + along[kept, None] * first + up[kept, None] * second)
+        inwards.append(np.broadcast_to(inward, points[-1].shape))
+
+    x, y, z = np.diag([4.0, 3.0, 2.5])
+    for i, j in np.ndindex(nx, ny):
+        corner = np.array([i * (4.0 + wall), j * (3.0 + wall), 0.0])
+        sheet(corner, x, y, z)
+        sheet(corner + z, x, y, -z)
+        sheet(corner, x, z, y, doors and j > 0)
+        sheet(corner + y, x, z, -y, doors and j < ny - 1)
+        sheet(corner, y, z, x)
+        sheet(corner + x, y, z, -x)
+    cloud = np.concatenate(points)
+    return cloud + rng.normal(0.0, 0.003, cloud.shape), np.concatenate(inwards)
+
+
+@pytest.mark.parametrize(
+    ("nx", "ny", "doors"), [(2, 1, False), (2, 2, False), (3, 2, True), (4, 3, True), (5, 4, False)]
+)
+def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
+    """Places in one room saw its partitions from the other side than those next door, and the outside won."""
+    points, inwards = _rooms(nx, ny, doors)
+    result = pcgraph.segment(points)
+    normals = result.surface.normals[result.surface.grid.voxel_of_point]
+    facing = np.einsum("ij,ij->i", normals, inwards) > 0.0
+    level = inwards[:, 2] != 0.0
+    assert np.mean(facing[level]) > 0.97
+    assert np.mean(facing) > 0.75  # of two sheets 12 cm apart, two voxels, one may take the other's side
+
+
+def test_a_thin_wall_hides_what_is_behind_it_also_where_some_voxels_stand_for_many():
+    """A square that stands for its neighbours is as wide as all of them, but no deeper than one."""
+    steps = np.arange(-2.0, 2.0, 0.05)
+    y, z = (side.ravel() for side in np.meshgrid(steps, steps))
+    near, far = (np.stack((np.full_like(y, x), y, z), axis=1) for x in (2.0, 2.12))
+    places = np.concatenate((near, far))
+    widths = np.full(len(places), 0.05 * np.sqrt(7.0))
+    normals = np.tile([1.0, 0.0, 0.0], (len(places), 1))
+    seen = seen_from(np.zeros((1, 3)), places, widths, normals, np.full(len(places), 0.05))[0]
+    assert seen[: len(near)].all()
+    assert not seen[len(near) :].any()
+    assert seen_from(np.zeros((1, 3)), places, widths, normals)[0].all()
