@@ -143,7 +143,7 @@ def visible_sides(
     votes, (looked_at, stretch) = _TOLD * told, standing_for_all(grid)
     centres, widths = (grid.centroids[looked_at] - middle) / reach, stretch * grid.edge_lengths[looked_at] / reach
     sides = normals[looked_at]
-    seen, towards = seen_from(places, centres, widths, sides, widths / stretch), np.empty((len(centres), 3))
+    seen, towards = seen_from(places, centres, widths, sides, stretch), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
     smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
@@ -255,7 +255,7 @@ def seen_from(
     centres: NDArray[np.float64],
     widths: NDArray[np.float64],
     normals: NDArray[np.float64],
-    depths: NDArray[np.float64] | None = None,
+    stretch: float = 1.0,
 ) -> NDArray[np.bool_]:
     """Whether each of n squares is visible from each of k places, (k, n) bool: none is in front by more than its depth.
 
@@ -273,8 +273,7 @@ def seen_from(
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
-    depths = widths if depths is None else depths
-    squares = _Squares(_columns(centres), _columns(normals), widths.astype(np.float32), depths.astype(np.float32))
+    squares = _Squares(_columns(centres), _columns(normals), widths.astype(np.float32), np.float32(1.0 / stretch))
     in_blocks(_look, len(places), places.astype(np.float32), bins, squares, seen, smallest=1)
     return seen
 
@@ -285,7 +284,7 @@ class _Squares(NamedTuple):
     centres: NDArray[np.float32]
     normals: NDArray[np.float32]
     widths: NDArray[np.float32]
-    depths: NDArray[np.float32]
+    depth: np.float32
 
 
 def _columns(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -726,6 +725,7 @@ def _look(
     A bin holds the range, whose bits as a float32 sort as it does, above the number of the square that has it.
     """
     n, nothing, half_bin = squares.centres.shape[1], np.float32(0.0), np.float32(0.5)
+    depth = squares.depth
     at, doubtful = np.empty(n, np.int64), np.empty(n + 1, np.int64)
     views = _Views(
         np.empty(n, np.float32),
@@ -759,13 +759,13 @@ def _look(
             doubtful[n_doubtful] = i
             n_doubtful += (too_far > nothing) & (too_far < _SLANTED * squares.widths[i])
         for i in doubtful[:n_doubtful]:
-            seen[k, i] = _on_one_surface(i, nearest[at[i]] & _NUMBER, squares)
+            seen[k, i] = _on_one_surface(i, nearest[at[i]] & _NUMBER, squares, depth)
 
 
 @routine
 def _view(place: NDArray[np.float32], bins: int, squares: _Squares, views: _Views) -> None:
     """Set how squares look from a place, on a map of bins x bins. One at the place has range 0 and is not seen."""
-    centres, normals, widths, depths = squares
+    centres, normals, widths, depth_of_width = squares
     px, py, pz = place
     nothing, one, halves, bin_size = np.float32(0.0), np.float32(1.0), np.float32(0.5 * bins), np.float32(2.0 / bins)
     margin, widest = np.float32(0.6), np.float32(24.0)
@@ -778,19 +778,22 @@ def _view(place: NDArray[np.float32], bins: int, squares: _Squares, views: _View
         distance = math.sqrt(square)
         bin_width = bin_size * total  # across the direction, at least, as of the square
         half = margin * widths[i] / bin_width
-        views.halves[i] = half if half < widest else widest
+        half = half if half < widest else widest
+        views.halves[i] = half
         depth = abs(x * normals[0, i] + y * normals[1, i] + z * normals[2, i])
         across = square - depth * depth
         across = math.sqrt(across if across > nothing else nothing)
         slope = across / depth
-        views.slopes[i] = bin_width * (slope if across < _STEEPEST * depth else _STEEPEST)
+        slope = bin_width * (slope if across < _STEEPEST * depth else _STEEPEST)
+        views.slopes[i] = slope
         views.ranges[i] = distance
-        limit = distance - depths[i] - np.float32(0.5) * bin_width
+        deep = depth_of_width * widths[i] + slope * half  # from edge to edge
+        limit = distance - (deep if deep < widths[i] else widths[i]) - np.float32(0.5) * bin_width
         views.limits[i] = limit if distance > nothing else _FAR
 
 
 @routine
-def _on_one_surface(i: int, j: int, squares: _Squares) -> bool:
+def _on_one_surface(i: int, j: int, squares: _Squares, depth: np.float32) -> bool:
     """Whether two squares lie on each other's planes and near: at a slant one may seem to hide the other."""
     centres, normals, width = squares.centres, squares.normals, squares.widths[i]
     cosine = off = off_other = square = np.float32(0.0)
@@ -800,8 +803,8 @@ def _on_one_surface(i: int, j: int, squares: _Squares) -> bool:
         cosine += normals[axis, i] * normals[axis, j]
         off += way * normals[axis, i]
         off_other += way * normals[axis, j]
-    reach = _SLANTED * width
-    return bool(abs(cosine) >= _SAME and max(abs(off), abs(off_other)) < squares.depths[i] and square < reach * reach)
+    reach, flat = _SLANTED * width, depth * width
+    return bool(abs(cosine) >= _SAME and max(abs(off), abs(off_other)) < flat and square < reach * reach)
 
 
 @kernel
