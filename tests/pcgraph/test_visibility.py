@@ -461,6 +461,5 @@ def test_a_thin_wall_hides_what_is_behind_it_also_where_some_voxels_stand_for_ma
     normals = np.tile([1.0, 0.0, 0.0], (len(places), 1))
     seen = seen_from(np.zeros((1, 3)), places, widths, normals, np.sqrt(7.0))[0]
     assert seen[: len(near)].all()
-    assert not seen[len(near) :][np.abs(far[:, 1:]).max(axis=1) < 1.0].any()
-    assert np.mean(seen[len(near) :]) < 0.1
+    assert np.mean(seen[len(near) :]) < 0.05
     assert seen_from(np.zeros((1, 3)), places, widths, normals)[0].all()
