@@ -21,6 +21,7 @@ _LEAST_VOXELS = 40  # of a piece, some two supervoxels
 _FLAT = 0.7  # voxel edges, root mean square of its distances to its plane, at most
 _BEYOND = 2.5  # voxel edges off a plane lies what is behind it, or before it
 _BEHIND, _BEFORE = 0.005, 0.2  # of all voxels lie so, at most and at least
+_ENOUGH = 20_000  # supervoxels tell that
 _PARALLEL, _OFFSET = 0.98, 1.0  # cosine, and voxel edges, between two pieces of one plane, at least and at most
 _GAP = 0.75  # times the width of the larger one lies between them, at most
 _FACING = 2.0  # times as far apart as where they are nearest are borders that face each other, at most
@@ -58,7 +59,9 @@ def bounding_planes(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int
     """
     scene = _scene(surface, nodes)
     pieces = _bounding_pieces(scene, nodes, faces)
-    ways = [_hidden_ways(surface, scene, pieces, some) for some in _on_one_plane(pieces)]
+    planes = list(_on_one_plane(pieces))
+    borders = _borders(surface, pieces.of_supervoxel, planes)
+    ways = [_hidden_ways(surface, scene, pieces, some[0], border) for some, border in zip(planes, borders, strict=True)]
     hidings = np.concatenate((np.empty((0, 2), np.int64), *ways))
     ends = surface.grid.warped[hidings]
     far = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > surface.grid.warp.max_gap * surface.grid.size
@@ -115,7 +118,7 @@ def _bounding_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32
     edges = np.bincount(face, voxels * scene.edges[on], n) / planes.size
     flat = np.flatnonzero(planes.residual <= _FLAT * edges)
     bounding = np.empty(len(flat), np.bool_)
-    scattered = np.random.default_rng(0).permutation(len(faces))  # soon it is seen that a plane bounds nothing
+    scattered = np.random.default_rng(0).permutation(len(faces))[:_ENOUGH]  # soon seen if a plane bounds nothing
     others = scene.places[scattered], _BEYOND * scene.edges[scattered], scene.voxels[scattered]
     in_blocks(_bound, len(flat), planes.centroid[flat], planes.normal[flat], *others, bounding)
     kept = flat[bounding]
@@ -174,25 +177,40 @@ def _offset(planes: NodeFeatures, ones: NDArray[np.int64], others: NDArray[np.in
     return np.sqrt(shift * shift + np.maximum(spread, 0.0))
 
 
-def _border(surface: Surface, piece: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Voxels of some pieces, given the piece of each, with fewer than eight of the same piece around them."""
-    grid, voxels = surface.grid, np.flatnonzero(np.isin(piece, some))
+def _borders(
+    surface: Surface, of_supervoxel: NDArray[np.int64], planes: list[NDArray[np.int64]]
+) -> list[NDArray[np.int64]]:
+    """Voxels of the pieces on each plane that have fewer than eight of the same piece around them."""
+    if not planes:
+        return []
+    grid, on = surface.grid, np.full(int(of_supervoxel.max()) + 2, -1)  # the last is of what lies on no piece
+    for number, some in enumerate(planes):
+        on[some] = number
+    piece = of_supervoxel[surface.supervoxels]
+    voxels = np.flatnonzero(on[piece] >= 0)
     degrees = np.diff(grid.indptr)[voxels]
     row = np.repeat(np.arange(len(voxels)), degrees)
     at = np.arange(len(row)) + np.repeat(grid.indptr[voxels] - np.cumsum(degrees) + degrees, degrees)
     around = np.bincount(row, piece[grid.neighbours[at]] == piece[voxels[row]], len(voxels))
-    return voxels[around < _AROUND]
+    voxels = voxels[around < _AROUND]
+    order = np.argsort(on[piece[voxels]], kind="stable")
+    counts = np.bincount(on[piece[voxels]], minlength=len(planes))
+    return np.split(voxels[order], np.cumsum(counts)[:-1])
 
 
-def _hidden_ways(surface: Surface, scene: _Scene, pieces: _Pieces, some: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Voxels at both ends of the ways across gaps, (c, 2), between pieces of one plane that are one."""
-    piece = pieces.of_supervoxel[surface.supervoxels]
-    border = _border(surface, piece, some)
-    places, piece = surface.grid.centroids[border], piece[border]
-    plane = _Plane.of(pieces.planes.centroid[some[0]], pieces.planes.normal[some[0]])
+def _hidden_ways(
+    surface: Surface, scene: _Scene, pieces: _Pieces, first: np.int64, border: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Voxels at both ends of the ways across gaps, (c, 2), between pieces of one plane that are one.
+
+    Of the pieces the first says where the plane lies.
+    """
+    piece = pieces.of_supervoxel[surface.supervoxels[border]]
+    places = surface.grid.centroids[border]
+    plane = _Plane.of(pieces.planes.centroid[first], pieces.planes.normal[first])
     if len(border) < _LEAST_FOR_TRIANGLES:
         return np.empty((0, 2), np.int64)
-    feet = plane.feet(places) / pieces.edges[some[0]]  # no unit is too small
+    feet = plane.feet(places) / pieces.edges[first]  # no unit is too small
     triangles = Delaunay(feet, qhull_options="QJ").simplices  # joggled, as places on a lattice or a line are no error
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
@@ -249,15 +267,15 @@ def _is_hidden(
     parallel = np.flatnonzero(cosines >= _PARALLEL)
     parallel = parallel[np.argsort(heights[parallel], kind="stable")]
     areas = np.concatenate((np.zeros(1), np.cumsum(scene.areas[parallel])))
-    low, high = (areas[np.searchsorted(heights[parallel], heights + off)] for off in (-scene.edges, scene.edges))
-    sets_in = np.where(cosines >= _PARALLEL, high - low, 0.0)
-    distance, nearest = cKDTree(plane.feet(scene.places[before])).query(
-        middles, k=np.arange(1, min(_NEAR, len(before)) + 1)
-    )
-    nearest, ways = before[nearest], lengths[:, None]
+    bands = heights[before] + np.array([[-1.0], [1.0]]) * scene.edges[before]
+    low, high = areas[np.searchsorted(heights[parallel], bands)]
+    sets_in = np.where(cosines[before] >= _PARALLEL, high - low, 0.0)
+    some = np.arange(1, min(_NEAR, len(before)) + 1)
+    distance, number = cKDTree(plane.feet(scene.places[before])).query(middles, k=some)
+    nearest, ways = before[number], lengths[:, None]
     over = distance <= np.maximum(0.5 * ways, _BEYOND * scene.edges[nearest])
     hides = over & (heights[nearest] > _BEYOND * scene.edges[nearest]) & (heights[nearest] <= _HEIGHT * ways)
-    return hides.any(axis=1) & ~(over & (sets_in[nearest] > larger[:, None])).any(axis=1)
+    return hides.any(axis=1) & ~(over & (sets_in[number] > larger[:, None])).any(axis=1)
 
 
 def _is_open(
