@@ -267,6 +267,8 @@ def seen_from(
     widths : (n,) float64
     normals : (n, 3) float64
         Towards either side. A square that is seen at a slant hides little of what lies beside it on the same surface.
+    stretch : float, >= 1
+        Widths over depths: squares that stand for others beside them are wider, but no deeper.
     """
     seen = np.empty((len(places), len(centres)), np.bool_)
     some = slice(None, None, max(1, len(centres) // 200))  # to know how fine a map it takes
@@ -279,7 +281,10 @@ def seen_from(
 
 
 class _Squares(NamedTuple):
-    """Squares that stand for a surface, in columns, as loops take them in lanes: (3, n) float32, and widths, (n,)."""
+    """Squares that stand for a surface, in columns, as loops take them in lanes: (3, n) float32, and widths, (n,).
+
+    They are so many times as deep as wide.
+    """
 
     centres: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -552,7 +557,10 @@ def _show(
     is_closed: bool,
     shown: NDArray[np.float64],
 ) -> None:
-    """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in."""
+    """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in.
+
+    Of partitions, on which no place has a vote, either side counts.
+    """
     n_places, n = sides.shape
     of_cells, nothing = np.empty(n, np.float32), np.float32(0.0)
     for d in range(start, stop):
