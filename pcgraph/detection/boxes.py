@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull
 from pcgraph.features.nodes import unit_vector
 from pcgraph.features.primitives import finite_vectors
 from pcgraph.short_repr import ShortRepr
+from pcgraph.voxels.directions import plane_basis
 
 FLAT = 1e-7
 """Width over length below which points lie on a line (or, a dimension up, in a plane): Qhull needs more than that."""
@@ -142,21 +143,6 @@ def some_points(points: ArrayLike) -> NDArray[np.float64]:
     if not len(places):
         raise ValueError("expected at least one point, got none")
     return places
-
-
-def plane_basis(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Two unit vectors, rows of (2, 3), that form a right-handed frame with a unit normal as the third."""
-    helper = np.zeros(3)
-    helper[int(np.abs(normal).argmin())] = 1.0
-    first = _cross(helper, normal)
-    first /= np.linalg.norm(first)
-    return np.stack((first, _cross(normal, first)))
-
-
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cross product of two vectors, (3,); `np.cross` takes ten times as long for one."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _facets(hull: ConvexHull) -> NDArray[np.float64]:

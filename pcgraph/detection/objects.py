@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from pcgraph.detection.boxes import OrientedBox, inside_outline, outline, plane_basis, standing_box, tight_box
+from pcgraph.detection.boxes import OrientedBox, inside_outline, outline, standing_box, tight_box
 from pcgraph.detection.plane_detection import Planes, find_planes, members, voxel_edges
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.inputs import non_negative
 from pcgraph.segmentation import Segmentation
 from pcgraph.short_repr import ShortRepr
+from pcgraph.voxels.directions import plane_basis
 
 MIN_HEIGHT = 3.0
 """Voxel edges: least height of an object unless given. What is lower is mostly the support's noise and sag."""

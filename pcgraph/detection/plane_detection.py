@@ -9,7 +9,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.detection.boxes import outline, plane_basis, smallest_rectangle
+from pcgraph.detection.boxes import outline, smallest_rectangle
 from pcgraph.detection.region_growing import (
     PlanarPatches,
     coplanar_regions,
@@ -21,6 +21,7 @@ from pcgraph.features.nodes import node_features, unit_vector
 from pcgraph.inputs import positive
 from pcgraph.segmentation import Segmentation
 from pcgraph.short_repr import ShortRepr
+from pcgraph.voxels.directions import plane_basis
 
 ROLE_ANGLE = np.radians(20.0)
 """Within this of level or upright: ramps and roofs are steeper, a camera held by hand knows `up` to some degrees."""

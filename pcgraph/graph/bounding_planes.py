@@ -15,6 +15,7 @@ from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures, node_features
 from pcgraph.graph.continuations import Continuations, continuations_of, distinct_pairs
 from pcgraph.parallel import in_blocks, kernel
+from pcgraph.voxels.directions import plane_basis
 from pcgraph.voxels.surface import Surface
 
 _LEAST_VOXELS = 40  # of a piece, some two supervoxels
@@ -207,7 +208,8 @@ def _hidden_ways(
     """
     piece = pieces.of_supervoxel[surface.supervoxels[border]]
     places = surface.grid.centroids[border]
-    plane = _Plane.of(pieces.planes.centroid[first], pieces.planes.normal[first])
+    normal = pieces.planes.normal[first]
+    plane = _Plane(pieces.planes.centroid[first], normal, plane_basis(normal))
     if len(border) < _LEAST_FOR_TRIANGLES:
         return np.empty((0, 2), np.int64)
     feet = plane.feet(places) / pieces.edges[first]  # no unit is too small
@@ -221,24 +223,19 @@ def _hidden_ways(
     facing = lengths <= _FACING * widths[pair]
     ends, lengths, pair = ends[facing], lengths[facing], pair[facing]
     middles, larger = plane.feet(places[ends].mean(axis=1)), pieces.areas[pairs].max(axis=1)[pair]
-    hidden = np.bincount(pair, _is_hidden(scene, plane, middles, lengths, larger), len(pairs))
-    opened = np.bincount(pair, _is_open(scene, plane, middles, lengths), len(pairs))
+    heights = plane.heights(scene.places)
+    hidden = np.bincount(pair, _is_hidden(scene, plane, heights, middles, lengths, larger), len(pairs))
+    opened = np.bincount(pair, _is_open(scene, plane, heights, middles, lengths), len(pairs))
     may_join = (hidden >= _HIDDEN * np.bincount(pair, minlength=len(pairs))) & (opened == 0)
     return border[ends[_joining(pairs, widths, may_join, pieces.areas)[pair]]]
 
 
 class _Plane(NamedTuple):
-    """A plane: a place on it, its unit normal, and two directions along it, (3, 2)."""
+    """A plane: a place on it, its unit normal, and two directions along it, (2, 3)."""
 
     origin: NDArray[np.float64]
     normal: NDArray[np.float64]
     axes: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, origin: NDArray[np.float64], normal: NDArray[np.float64]) -> _Plane:
-        first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-        first /= np.linalg.norm(first)
-        return cls(origin, normal, np.stack((first, np.cross(normal, first)), axis=1))
 
     def heights(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distances of places, (n, 3), to the plane, (n,)."""
@@ -246,12 +243,13 @@ class _Plane(NamedTuple):
 
     def feet(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where on the plane the places lie, (n, 2)."""
-        return np.einsum("ij,jk->ik", places - self.origin, self.axes)
+        return np.einsum("ij,kj->ik", places - self.origin, self.axes)
 
 
 def _is_hidden(
     scene: _Scene,
     plane: _Plane,
+    heights: NDArray[np.float64],
     middles: NDArray[np.float64],
     lengths: NDArray[np.float64],
     larger: NDArray[np.float64],
@@ -260,7 +258,7 @@ def _is_hidden(
 
     That is: what faces as they do, and takes more of a plane parallel to theirs than the larger one of them theirs.
     """
-    heights, cosines = plane.heights(scene.places), np.einsum("ij,j->i", scene.normals, plane.normal)
+    cosines = np.einsum("ij,j->i", scene.normals, plane.normal)
     before = np.flatnonzero((heights > scene.edges) & (np.abs(cosines) >= _ALONG))
     if not len(before):
         return np.zeros(len(middles), np.bool_)
@@ -279,10 +277,14 @@ def _is_hidden(
 
 
 def _is_open(
-    scene: _Scene, plane: _Plane, middles: NDArray[np.float64], lengths: NDArray[np.float64]
+    scene: _Scene,
+    plane: _Plane,
+    heights: NDArray[np.float64],
+    middles: NDArray[np.float64],
+    lengths: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Whether something shows behind the plane at the middle of each way, (c,)."""
-    behind = scene.places[plane.heights(scene.places) < -_BEYOND * scene.edges]
+    behind = scene.places[heights < -_BEYOND * scene.edges]
     if not len(behind):
         return np.zeros(len(middles), np.bool_)
     return cKDTree(plane.feet(behind)).query(middles)[0] <= 0.5 * lengths

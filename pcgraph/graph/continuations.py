@@ -45,7 +45,7 @@ class Continuations(ShortRepr):
     pairs : (r, 2) int32
         Supervoxels i < j, rows in ascending order, once each.
     crossings : (r,) int64
-        Lines of the bearing image along which that happens, or pairs of voxels that face each other.
+        Lines of the bearing image along which that happens, or ways across a gap in a bounding plane.
     width : (r,) float64, metres
         Mean distance across what hides the surface between.
     angle : (r,) float64, radians, 0..pi

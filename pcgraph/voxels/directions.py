@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directions all around, the plane on which most of a cloud lies, and places far from each other."""
+"""Directions all around and along a plane, the plane on which most of a cloud lies, and places far from each other."""
 
 from __future__ import annotations
 
@@ -36,3 +36,18 @@ def sphere_directions(n: int) -> NDArray[np.float64]:
     angle = np.pi * (3.0 - np.sqrt(5.0)) * number
     across = np.sqrt(1.0 - z * z)
     return np.stack((across * np.cos(angle), across * np.sin(angle), z), axis=1)
+
+
+def plane_basis(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two unit vectors, rows of (2, 3), that form a right-handed frame with a unit normal as the third."""
+    helper = np.zeros(3)
+    helper[int(np.abs(normal).argmin())] = 1.0
+    first = _cross(helper, normal)
+    first /= np.linalg.norm(first)
+    return np.stack((first, _cross(normal, first)))
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cross product of two vectors, (3,); `np.cross` takes ten times as long for one."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

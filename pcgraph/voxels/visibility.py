@@ -357,11 +357,12 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     closed = np.zeros(len(places))
     hits = closed[_OUTSIDE : _OUTSIDE + len(inside)]
     in_blocks(_count_hits, len(inside), inside.astype(np.float32), _columns(coarse.centroids), hits, smallest=1)
-    voting = _without_partitions(sides, sides[closed >= _CLOSED])
+    in_rooms = closed >= _CLOSED
+    voting = _without_partitions(sides, sides[in_rooms])
     found = _agreements(voting, _starts(voting, outside, likely))
     weights, shown = _most_telling(found, sides, coarse, closed, likely, bool(from_viewpoint))
     chosen = _spread_choice(seen, weights)
-    shows_most = shown >= _SHOWS_MOST or not (closed >= _CLOSED).any() or coarse.n_voxels > grid.n_voxels // 2
+    shows_most = shown >= _SHOWS_MOST or not in_rooms.any() or coarse.n_voxels > grid.n_voxels // 2
     return TellingPlaces(places[chosen], weights[chosen]), shows_most
 
 
@@ -733,7 +734,7 @@ def _look(
     A bin holds the range, whose bits as a float32 sort as it does, above the number of the square that has it.
     """
     n, nothing, half_bin = squares.centres.shape[1], np.float32(0.0), np.float32(0.5)
-    depth = squares.depth
+    depth = squares.depth  # read here: a field read where squares are compared costs that loop half its time again
     at, doubtful = np.empty(n, np.int64), np.empty(n + 1, np.int64)
     views = _Views(
         np.empty(n, np.float32),

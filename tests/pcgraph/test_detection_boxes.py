@@ -13,11 +13,11 @@ from pcgraph.detection.boxes import (
     OrientedBox,
     inside_outline,
     outline,
-    plane_basis,
     smallest_rectangle,
     standing_box,
     tight_box,
 )
+from pcgraph.voxels.directions import plane_basis
 
 
 def test_box_knows_its_corners_and_what_it_holds():
