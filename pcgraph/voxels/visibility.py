@@ -43,6 +43,7 @@ _CLOSED = 0.96  # of all directions hit by something, from places inside: all wa
 _BOTH_SIDES = 0.2  # cosine under which places closed in see either side of a partition, at least
 _FINER = 1, 2, 4  # times as many cells and places, if some are closed in, until one agreement shows
 _SHOWS_MOST = 0.85  # of the surface
+_AS_MUCH = 0.004  # of it by which an agreement shows less than another, and yet as much
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
@@ -525,6 +526,7 @@ def _most_telling(
 ) -> tuple[NDArray[np.float64], float]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
 
+    Crevices between things are crests from behind, which are seen the better: what little that is decides nothing.
     A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
     one of places closed in, as in a room: of that all but narrow gaps is seen from within.
     """
@@ -534,17 +536,17 @@ def _most_telling(
     likely_counts = _FROM_VIEWPOINT if likely_is_told else _BEFORE
     shown, around = np.empty(len(different)), coarse.neighbourhood
     in_blocks(_show, len(different), different, sides, found, around, is_closed, shown, smallest=1)
-    most, best = -np.inf, found.weights[0]
+    most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
     for s, fraction in zip(different, shown, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
-        score = float(fraction)
+        score = min(float(fraction), most_shown - _AS_MUCH)
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
         score += _DECIDED * float(decided[visible > 0.0].mean())
         for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, likely_counts)):
             score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
-    return best.astype(np.float64), float(shown.max())
+    return best.astype(np.float64), most_shown
 
 
 @kernel

@@ -243,6 +243,20 @@ def thinned(points, edge):
     return points[np.unique(np.floor(points / edge), axis=0, return_index=True)[1]]
 
 
+@pytest.mark.parametrize("seed", [0, 6])
+def test_crevices_seen_better_from_behind_do_not_turn_a_heap_inside_out(seed):
+    rng = np.random.default_rng(seed)
+    row, column = np.mgrid[-4:5, -4:5].reshape(2, -1)
+    balls = np.stack((1.7 * (row + 0.5 * (column % 2)), 1.5 * column), axis=1)
+    places = rng.uniform(-5.0, 5.0, (40_000, 2))
+    squared = np.square(places[:, None] - balls).sum(axis=2).min(axis=1)
+    places, squared = places[squared < 0.98], squared[squared < 0.98]
+    heap = np.column_stack((places, np.sqrt(1.0 - squared) - 0.02 * np.square(places).sum(axis=1)))
+    turn = Rotation.random(random_state=seed).as_matrix()
+    found = pcgraph.segment((heap + rng.normal(0.0, 0.01, heap.shape)) @ turn.T)
+    assert np.mean(found.surface.normals @ turn[:, 2] > 0.0) > 0.99
+
+
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.5), (0.04, -0.03, 2.0)])
 def test_a_pool_is_seen_from_above(turn):
     """All that is not on its largest plane lies below that, as things do under a table turned over."""
