@@ -86,12 +86,16 @@ class Gaps(ShortRepr):
         Least distance between centroids of their voxels.
     weights : (g,) float64
         What the gap counts as a contact, in voxels: e^(1 - width) for each that faces the other side.
+    of_one_scan : bool
+        Whether voxels grow with the distance from where all was seen: with the spacing of its points, so that a gap
+        says more than among scans of which one leaves gaps where another is dense.
     """
 
     edges: NDArray[np.int32]
     edge_features: EdgeFeatures
     widths: NDArray[np.float64]
     weights: NDArray[np.float64]
+    of_one_scan: bool
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
 from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.parallel import in_blocks, kernel
-from pcgraph.voxels.grid import VoxelGrid, boundary_voxels, voxels_within
+from pcgraph.voxels.grid import VoxelGrid, at_ends, boundary_voxels, voxels_within
 
 
 def gaps(
@@ -38,10 +39,12 @@ def gaps(
 
     Notes
     -----
-    Only voxels with fewer than eight around them are looked at: those at the ends of surfaces.
+    Only voxels at the ends of surfaces are looked at: those with fewer than eight around them and, beside the largest
+    component, those in strips. A row of points that lies on a border between cells has voxels on either side, and two
+    such rows up to eleven around each: a scan whose rows lie far apart is hundreds of such strips.
     """
     k = np.int64(len(nodes.size))
-    boundary = np.flatnonzero(boundary_voxels(grid))
+    boundary = _ends_of_surfaces(grid, supervoxels, touching, int(k))
     near = voxels_within(grid, boundary, grid.warp.max_gap, boundary, later=True)
     source: NDArray[np.int64] = np.repeat(boundary, np.diff(near.indptr))
     target = near.neighbours
@@ -68,7 +71,23 @@ def gaps(
     shortest = np.full(len(edges), np.inf)
     np.minimum.at(shortest, edge, width)
     weights = np.bincount(edge, np.exp(1.0 - width), len(edges)).astype(np.float64)
-    return Gaps(edges, edge_features(nodes, facing), shortest, weights)
+    return Gaps(edges, edge_features(nodes, facing), shortest, weights, grid.warp.of_one_scan)
+
+
+def _ends_of_surfaces(
+    grid: VoxelGrid, supervoxels: NDArray[np.int32], touching: NDArray[np.int32], k: int
+) -> NDArray[np.int64]:
+    """Voxels at the ends of surfaces, ascending; of the largest component, if that is most of all, those with few
+    around them alone, as there is no time to look at others."""
+    ends = boundary_voxels(grid)
+    components = connected_components(touching, k)[supervoxels]
+    sizes = np.bincount(components)
+    looked_at = ~ends
+    if 2 * sizes.max() > len(components):
+        looked_at &= components != sizes.argmax()
+    others = np.flatnonzero(looked_at)
+    ends[others] = at_ends(grid, others)
+    return np.flatnonzero(ends)
 
 
 @kernel

@@ -29,7 +29,7 @@ class RegionLinkage(Linkage):
     cost : BoundaryCost
         Cost of an edge, radians.
     gap : float, radians per voxel edge, >= 0
-        What a gap costs beyond one voxel edge.
+        What a gap in one scan costs beyond one voxel edge; a third of that in other clouds (`Gaps.of_one_scan`).
     bridge : float, radians per voxel edge, >= 0
         What a bridge from a speck costs.
     color : float, voxel edges, >= 0
@@ -94,7 +94,8 @@ class RegionLinkage(Linkage):
         edges, costs = graph.joined, self.cost(graph.edge_features)
         weights = graph.edge_features.contact_voxels.astype(np.float64)
         if (gaps := graph.gaps) is not None:
-            costs = np.concatenate((costs, self.cost(gaps.edge_features) + self.gap * (gaps.widths - 1.0)))
+            price = self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap
+            costs = np.concatenate((costs, self.cost(gaps.edge_features) + price * (gaps.widths - 1.0)))
             weights = np.concatenate((weights, gaps.weights))
         if (hidden := graph.continuations) is not None:
             costs = np.concatenate((costs, np.zeros(len(hidden.pairs))))
@@ -109,6 +110,7 @@ class RegionLinkage(Linkage):
 
 _STEPS = float(1 << 20)
 _MANY = 40  # edges of a region
+_OF_SEVERAL = 1.0 / 3.0  # of the price of a gap, where scans lie over each other
 _BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact where others join it: one on each side
 
 

@@ -26,6 +26,7 @@ _STRETCH = 1024  # cells in a row of which the cells around are counted,
 _COUNTED = 1 << 16  # and of how many they are, about
 _END = np.iinfo(np.int64).max
 _AMID = 8  # voxels around one amid a surface
+_OF_SURFACE = 6  # of eight places beside one, seen from the front of a surface that is as steep as may be
 
 
 class VoxelLists(NamedTuple):
@@ -389,6 +390,40 @@ def _walk(
 def boundary_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     """Whether each voxel lies where a surface ends, with fewer than eight around it, (v,) bool."""
     return np.diff(grid.indptr) < _AMID
+
+
+def at_ends(grid: VoxelGrid, voxels: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each of m voxels lies where a surface ends, though that be two voxels thick, (m,) bool.
+
+    Seen along no axis are six of the eight places beside it taken, as they are on each surface seen from its front.
+    """
+    ends = np.empty(len(voxels), np.bool_)
+    in_blocks(_find_ends, len(voxels), voxels, grid.cells, grid.neighbourhood, ends)
+    return ends
+
+
+@kernel
+def _find_ends(
+    start: int,
+    stop: int,
+    voxels: NDArray[np.int64],
+    cells: NDArray[np.float64],
+    around: Neighbourhood,
+    ends: NDArray[np.bool_],
+) -> None:
+    taken = np.empty((3, 3, 3), np.bool_)  # seen along each axis
+    for m in range(start, stop):
+        i = voxels[m]
+        taken[:] = False
+        for a in range(around.indptr[i], around.indptr[i + 1]):
+            j = around.neighbours[a]
+            x, y, z = cells[j, 0] - cells[i, 0], cells[j, 1] - cells[i, 1], cells[j, 2] - cells[i, 2]
+            right, ahead, above = int(x) + 1, int(y) + 1, int(z) + 1
+            taken[0, ahead, above] = taken[1, right, above] = taken[2, right, ahead] = True
+        ends[m] = True
+        for axis in range(3):
+            taken[axis, 1, 1] = False
+            ends[m] = ends[m] and taken[axis].sum() < _OF_SURFACE
 
 
 def voxels_within(

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -39,6 +41,33 @@ def test_rows_of_a_scan_from_one_place_merge_across_wider_gaps():
     settings = {"voxel_size": 0.08, "viewpoint": (0.0, 0.0, 0.0)}
     assert pcgraph.segment(ground, range_growth=0.5, **settings).labels.max() == 0
     assert pcgraph.segment(ground, range_growth=0.0, **settings).labels.max() + 1 == len(rings)
+
+
+def test_rows_on_borders_between_cells_merge():
+    """Each row lies in two by two cells: with up to eleven voxels around one, yet at the end of a surface."""
+    rng = np.random.default_rng(0)
+    along, row = np.meshgrid(np.arange(0.0, 2.0, VOXEL / 32), np.arange(12) * 3 * VOXEL)
+    ground = np.stack((along.ravel(), row.ravel(), np.zeros(row.size)), axis=1)
+    ground[:, 1:] += rng.normal(0.0, VOXEL / 12, (len(ground), 2))
+    settings = {"voxel_size": VOXEL, "viewpoint": (1.0, 1.0, 5.0), "range_growth": 0.0}
+    result = pcgraph.segment(ground, **settings)
+    assert np.median(np.diff(result.surface.grid.indptr)) > 8
+    assert len(np.unique(result.graph.gaps.edges)) == result.tree.n_leaves
+    assert result.labels.max() == 0
+
+
+def test_a_gap_costs_more_in_one_scan():
+    points = np.concatenate((sheet(0.0, 1.0), sheet(1.0 + VOXEL, 2.0, VOXEL)))
+    settings = {"voxel_size": VOXEL, "seed_size": 6 * VOXEL, "viewpoint": (1.0, 0.5, 5.0)}
+    several = pcgraph.segment(points, range_growth=0.0, **settings)
+    one = dataclasses.replace(several.graph, gaps=dataclasses.replace(several.graph.gaps, of_one_scan=True))
+    assert not several.graph.gaps.of_one_scan
+    altitudes = [
+        pcgraph.RegionLinkage(gap=gap).merges(graph, several.leaves).altitudes.max()
+        for graph, gap in ((several.graph, 0.15), (one, 0.15), (several.graph, 0.45))
+    ]
+    assert altitudes[0] < altitudes[1] == pytest.approx(altitudes[2], abs=1e-5)
+    assert pcgraph.segment(points, range_growth=0.5, **settings).graph.gaps.of_one_scan
 
 
 def test_a_linkage_of_contacts_alone_merges_across_no_gap():
