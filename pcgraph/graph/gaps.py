@@ -79,14 +79,14 @@ def _ends_of_surfaces(
 ) -> NDArray[np.int64]:
     """Voxels at the ends of surfaces, ascending; of the largest component, if that is most of all, those with few
     around them alone, as there is no time to look at others."""
-    ends = boundary_voxels(grid)
-    components = connected_components(touching, k)[supervoxels]
-    sizes = np.bincount(components)
-    looked_at = ~ends
-    if 2 * sizes.max() > len(components):
-        looked_at &= components != sizes.argmax()
-    others = np.flatnonzero(looked_at)
-    ends[others] = at_ends(grid, others)
+    ends, of_nodes = boundary_voxels(grid), connected_components(touching, k)
+    if of_nodes.any():
+        components = of_nodes[supervoxels]
+        sizes, looked_at = np.bincount(components), ~ends
+        if 2 * sizes.max() > len(components):
+            looked_at &= components != sizes.argmax()
+        others = np.flatnonzero(looked_at)
+        ends[others] = at_ends(grid, others)
     return np.flatnonzero(ends)
 
 
