@@ -50,7 +50,14 @@ from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_v
 from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface, roughness
-from pcgraph.voxels.visibility import likelier_place, sides_towards, telling_places, visible_fraction, visible_sides
+from pcgraph.voxels.visibility import (
+    likelier_place,
+    sides_towards,
+    sides_towards_each,
+    telling_places,
+    visible_fraction,
+    visible_sides,
+)
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
@@ -498,7 +505,9 @@ def _outward_planes(
     low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
     place_of_voxel = middle + reach * voxel_means((given - middle) / reach, grid)
-    return Outside(given, _some_viewpoints(given, grid), True, method.planes(grid, place_of_voxel))
+    planes = method.planes(grid, place_of_voxel)
+    planes = replace(planes, normals=sides_towards_each(grid, planes.normals, place_of_voxel))
+    return Outside(given, _some_viewpoints(given, grid), True, planes)
 
 
 def _some_viewpoints(given: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:

@@ -147,13 +147,8 @@ def visible_sides(
     seen, towards = seen_from(places, centres, widths, sides, stretch), np.empty((len(centres), 3))
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
-    smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
-    in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
-    for _ in range(_SMOOTHING):
-        in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
-        votes, smoothed = smoothed, votes
     seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
-    return VisibleSides(seen_from_places, _turned(normals, votes))
+    return VisibleSides(seen_from_places, _turned_together(grid, normals, votes))
 
 
 def standing_for_all(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
@@ -177,6 +172,18 @@ def sides_towards(
     """
     reach = _unit_frame(grid, grid.centroids)[1]
     return _turned(normals, _cosines(grid, normals, place, axis, reach))
+
+
+def sides_towards_each(
+    grid: VoxelGrid, normals: NDArray[np.float64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Unit normals, (v, 3) float64, towards the place from which each voxel was seen, (v, 3).
+
+    What was seen edge-on, as ground far from a tripod, faces as the voxels around that were seen better do: normals that
+    are a degree off turned a thirtieth of it upside down.
+    """
+    ways = (places - grid.centroids) / _unit_frame(grid, places)[1]
+    return _turned_together(grid, normals, np.einsum("ij,ij->i", normals, ways) / _lengths(ways))
 
 
 def _cosines(
@@ -223,6 +230,16 @@ def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray
     turned = np.empty_like(normals)
     in_blocks(_turn, len(normals), normals, votes, turned)
     return turned
+
+
+def _turned_together(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same by votes that voxels on one surface have given each other."""
+    smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
+    in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
+    for _ in range(_SMOOTHING):
+        in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
+        votes, smoothed = smoothed, votes
+    return _turned(normals, votes)
 
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:

@@ -243,6 +243,14 @@ def thinned(points, edge):
     return points[np.unique(np.floor(points / edge), axis=0, return_index=True)[1]]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_ground_seen_edge_on_from_viewpoints_of_its_points_faces_up(seed):
+    rng = np.random.default_rng(seed)
+    ground = np.stack((rng.uniform(10, 30, 60_000), rng.uniform(-10, 10, 60_000), rng.normal(0, 0.02, 60_000)), axis=1)
+    places = np.where(rng.random((len(ground), 1)) < 0.5, (0.0, 0.0, 0.8), (0.0, 5.0, 0.8))
+    assert np.mean(pcgraph.segment(ground, viewpoint=places).surface.normals[:, 2] > 0.0) > 0.95
+
+
 @pytest.mark.parametrize("seed", [0, 6])
 def test_crevices_seen_better_from_behind_do_not_turn_a_heap_inside_out(seed):
     rng = np.random.default_rng(seed)
