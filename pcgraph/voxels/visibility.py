@@ -179,8 +179,8 @@ def sides_towards_each(
 ) -> NDArray[np.float64]:
     """Unit normals, (v, 3) float64, towards the place from which each voxel was seen, (v, 3).
 
-    What was seen edge-on, as ground far from a tripod, faces as the voxels around that were seen better do: normals that
-    are a degree off turned a thirtieth of it upside down.
+    What was seen edge-on, as ground far from a tripod, faces as the voxels around that were seen better do: normals
+    that are a degree off turned a thirtieth of it upside down.
     """
     ways = (places - grid.centroids) / _unit_frame(grid, places)[1]
     return _turned_together(grid, normals, np.einsum("ij,ij->i", normals, ways) / _lengths(ways))
