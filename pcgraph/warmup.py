@@ -38,7 +38,7 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels import visibility
-from pcgraph.voxels.grid import VoxelGrid, voxel_grid
+from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.sampling import some_blocks
 from pcgraph.voxels.spacing import median_spacing
@@ -115,6 +115,7 @@ def compile_voxels() -> None:
     median_spacing(points)
     spacing_law(points)
     outlier_voxels(grid)
+    at_ends(grid, np.zeros(1, np.int64))
     visible_fraction(grid, np.zeros(3))
     method = SurfaceGrowth()
     planes = method.planes(grid, np.zeros(3))

@@ -182,7 +182,8 @@ def sides_towards_each(
     What was seen edge-on, as ground far from a tripod, faces as the voxels around that were seen better do: normals
     that are a degree off turned a thirtieth of it upside down.
     """
-    ways = (places - grid.centroids) / _unit_frame(grid, places)[1]
+    ways = places - grid.centroids
+    ways /= max(float(np.abs(ways).max()), np.finfo(np.float64).tiny)
     return _turned_together(grid, normals, np.einsum("ij,ij->i", normals, ways) / _lengths(ways))
 
 
@@ -233,7 +234,7 @@ def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray
 
 
 def _turned_together(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same by votes that voxels on one surface have given each other."""
+    """The same by the votes of each voxel and of those around it on one surface."""
     smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
     in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
     for _ in range(_SMOOTHING):
