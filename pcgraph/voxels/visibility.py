@@ -148,7 +148,7 @@ def visible_sides(
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
     seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
-    return VisibleSides(seen_from_places, _turned_together(grid, normals, votes))
+    return VisibleSides(seen_from_places, _turned(normals, _votes_along(grid, normals, votes)))
 
 
 def standing_for_all(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
@@ -179,12 +179,14 @@ def sides_towards_each(
 ) -> NDArray[np.float64]:
     """Unit normals, (v, 3) float64, towards the place from which each voxel was seen, (v, 3).
 
-    What was seen edge-on, as ground far from a tripod, faces as the voxels around that were seen better do: normals
-    that are a degree off turned a thirtieth of it upside down.
+    What was seen edge-on, as ground far from a tripod, faces as the voxels around on one surface do: normals that are
+    a degree off turned a thirtieth of it upside down. What was seen well keeps its side, as those of a thin wall do.
     """
     ways = places - grid.centroids
     ways /= max(float(np.abs(ways).max()), np.finfo(np.float64).tiny)
-    return _turned_together(grid, normals, np.einsum("ij,ij->i", normals, ways) / _lengths(ways))
+    cosines = np.einsum("ij,ij->i", normals, ways) / _lengths(ways)
+    edge_on = np.abs(cosines) < _SEEN_WELL
+    return _turned(normals, np.where(edge_on, _votes_along(grid, normals, cosines), cosines))
 
 
 def _cosines(
@@ -233,14 +235,14 @@ def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray
     return turned
 
 
-def _turned_together(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same by the votes of each voxel and of those around it on one surface."""
-    smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
+def _votes_along(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Votes for the side of each voxel's normal, (v,), with those of the voxels around on one surface."""
+    votes, smoothed, alike = votes.copy(), np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
     in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
     for _ in range(_SMOOTHING):
         in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
         votes, smoothed = smoothed, votes
-    return _turned(normals, votes)
+    return votes
 
 
 def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
