@@ -108,11 +108,11 @@ def main() -> None:
     if of_chosen:
         within = sum(loss >= -0.01 for loss in of_chosen)
         print(f"\ndefault against the chosen: {within} of {len(of_chosen)} scores within 0.01, least {min(of_chosen)}")
-    print(json.dumps(report | {
+    worst_losses = {
         "worst_loss": losses[worst] if worst else None,
-        "worst_domain": worst,
         "worst_loss_of_chosen": min(of_chosen, default=None),
-    }))  # fmt: skip
+    }
+    print(json.dumps(report | worst_losses | {"worst_domain": worst}))
 
 
 def _chosen(every: list[Domain], names: str | None, quick: bool) -> list[Domain]:
@@ -153,11 +153,11 @@ def _measure(domain: Domain, samples: list[Sample], *, with_best: bool) -> tuple
     print(f"\n{domain.name}: {len(samples)} x {sizes} points; counts: {', '.join(domain.scores)}; cuts of {number}")
     print(" " * 14 + "".join(f"{name:>8s}" for name in (*COLUMNS, *COUNTS)))
     default = [_segmented(domain, sample)[0] for sample in samples]
-    _show("default", _mean(default))
     rows: dict[str, Any] = {"default": _mean(default), "best": None, "chosen": None, "baselines": {}}
+    _show("default", rows["default"])
     plain = [_segmented(domain, sample, linkage=pcgraph.MumfordShahLinkage())[0] for sample in samples]
     rows["mumford_shah"] = _mean(plain)
-    _show("Mumford-Shah", _mean(plain))
+    _show("Mumford-Shah", rows["mumford_shah"])
     others: list[list[Row]] = []
     for name, baseline in BASELINES.items():
         found = list(baseline(domain, samples))

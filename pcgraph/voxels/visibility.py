@@ -148,7 +148,7 @@ def visible_sides(
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
     seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
-    return VisibleSides(seen_from_places, _turned(normals, _votes_along(grid, normals, votes)))
+    return VisibleSides(seen_from_places, _turned(normals, _smoothed_votes(grid, normals, votes)))
 
 
 def standing_for_all(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
@@ -186,7 +186,7 @@ def sides_towards_each(
     ways /= max(float(np.abs(ways).max()), np.finfo(np.float64).tiny)
     cosines = np.einsum("ij,ij->i", normals, ways) / _lengths(ways)
     edge_on = np.abs(cosines) < _SEEN_WELL
-    return _turned(normals, np.where(edge_on, _votes_along(grid, normals, cosines), cosines))
+    return _turned(normals, np.where(edge_on, _smoothed_votes(grid, normals, cosines.copy()), cosines))
 
 
 def _cosines(
@@ -235,9 +235,9 @@ def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray
     return turned
 
 
-def _votes_along(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Votes for the side of each voxel's normal, (v,), with those of the voxels around on one surface."""
-    votes, smoothed, alike = votes.copy(), np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
+def _smoothed_votes(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Votes for the side of each voxel's normal, (v,), overwritten, with those of the voxels around on one surface."""
+    smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
     in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
     for _ in range(_SMOOTHING):
         in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
