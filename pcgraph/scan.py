@@ -483,10 +483,13 @@ def _outward_planes(
     """From where the cloud was seen, and the plane of each voxel, its normal on the outer side.
 
     A viewpoint that was given counts before one that the spacing tells. Voxels of points that were seen from several
-    places take the mean of those.
+    places take the mean of those. Of what lies alone or in a row, on no plane, the normal is the one nearest to that
+    viewpoint; where there are many or none, to the vertical: what was seen from nearby has neighbours, and the ground
+    far from a tripod, seen edge-on, has none.
     """
+    upwards = np.array([0.0, 0.0, 1.0])
     if given is None:
-        told, upwards = None if law is None else _told_place(law, grid), np.array([0.0, 0.0, 1.0])
+        told = None if law is None else _told_place(law, grid)
         if told is None:
             planes, telling = side_by_side(
                 lambda: method.planes(grid, _far_along(grid, upwards)), lambda: telling_places(grid)
@@ -505,7 +508,7 @@ def _outward_planes(
     low, high = bounding_box(given)
     middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
     place_of_voxel = middle + reach * voxel_means((given - middle) / reach, grid)
-    planes = method.planes(grid, place_of_voxel)
+    planes = method.planes(grid, _far_along(grid, upwards))
     planes = replace(planes, normals=sides_towards_each(grid, planes.normals, place_of_voxel))
     return Outside(given, _some_viewpoints(given, grid), True, planes)
 

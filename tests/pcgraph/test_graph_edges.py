@@ -107,6 +107,15 @@ def test_boundary_strength_by_hand():
     assert only_steps(both) == pytest.approx(1.0 - 2.0**-8)
 
 
+@pytest.mark.parametrize("name", ["convexity", "contact_convexity"])
+def test_a_valley_costs_its_angle_and_less_as_it_closes(name):
+    angles = np.array([0.0, 0.5, 0.75 * np.pi, 0.9 * np.pi, np.pi])
+    assert BoundaryCost()(some_edges(**{name: -angles})) == pytest.approx(
+        0.5 * np.array([0.0, 0.5, 0.75 * np.pi, 0.3 * np.pi, 0.0]), abs=1e-6
+    )
+    assert BoundaryCost()(some_edges(**{name: angles})) == pytest.approx(0.015 * angles, abs=1e-6)
+
+
 unit = st.floats(0.0, 1.0)
 
 

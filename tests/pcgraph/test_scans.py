@@ -30,6 +30,29 @@ def test_one_viewpoint_per_point_turns_each_normal_to_its_own():
     assert (np.sign(nodes.normal[:, 1]) == np.sign(nodes.centroid[:, 1] - 0.1)).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_leaf_seen_from_both_sides_is_one_object(seed):
+    """Each voxel faces where it was seen from, so neighbours on one sheet face opposite ways."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0.0, 1.0, (2, 20_000))
+    leaf = np.stack((x, y, 0.15 * x**2 + rng.normal(0.0, 0.001, len(x))), axis=1)
+    seen_from = np.where(rng.random((len(leaf), 1)) < 0.5, (0.5, 0.5, 2.0), (0.5, 0.5, -2.0))
+    assert pcgraph.segment(leaf, viewpoint=seen_from).labels.max() == 0
+
+
+def test_rows_of_points_on_ground_do_not_face_their_tripod():
+    """Far rings are rows, and what is seen edge-on has few points: the way to the tripod says least of its normal."""
+    rng = np.random.default_rng(0)
+    near = rng.uniform(-3.0, 3.0, (90_000, 2))
+    rows = np.stack(np.meshgrid(np.arange(10.0, 30.0, 2.0), np.arange(-10.0, 10.0, 0.03)), axis=-1).reshape(-1, 2)
+    ground = np.pad(np.concatenate((near, rows)), ((0, 0), (0, 1)))
+    places = np.where(rng.random((len(ground), 1)) < 0.5, (0.0, 0.0, 1.5), (0.0, 5.0, 1.5))
+    surface = pcgraph.segment(ground, viewpoint=places, voxel_size=0.05).surface
+    far = surface.grid.centroids[:, 0] > 5.0
+    assert far.sum() > 3000
+    assert (surface.normals[far, 2] > 0.99).all()
+
+
 def test_nodes_face_where_given_normals_point():
     points, _ = plate()
     inwards = np.zeros_like(points)
