@@ -42,8 +42,8 @@ class RegionLinkage(Linkage):
     -----
     Two regions A and B merge at
 
-        (c + relief R + c0 + c1 ln(1 + l / l0)) E / (E + e0) (l / (l + l0))^1/2
-            (w / (b + w))^3/4 (1 + M / (r m))^1/4 m / (m + m0)
+        ((c + relief R + c0 + c1 ln(1 + l / l0)) s + max(c - c2, 0) max(s0 - s, 0) u)
+            E / (E + e0) (l / (l + l0))^1/2 (1 + M / (r m))^1/4 m / (m + m0),    s = (w / (b + w))^3/4
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
     increase of the squared distances to the regions' best planes and mean colours by the merge, at least e1 m (q - q0)
@@ -53,12 +53,15 @@ class RegionLinkage(Linkage):
     has one colour merges first, whatever its normals, unless the larger one is so uneven, as hills are, that its plane
     says nothing; a small piece merges early, as its contact says little, and a handful of points at once, but a piece
     later with a surface a hundred times as large, so that a thing is whole before it joins what it stands on; and a
-    valley counts most between two large surfaces that meet along a line short for their size. Contacts are touching
-    voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at none continuations behind what hides a surface
-    (`pcgraph.graph.continuations.continuations`) and of planes that bound the scene
-    (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts, bridges
-    (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of objects,
-    at their mean cost times m / (m + 1).
+    valley counts most between two large surfaces that meet along a line short for their size. What is steep of it
+    counts half at least, s0, however long the line, so that a heap is told from the ground; but only as far as the
+    surfaces beside it are smooth, so that the crown of a tree is not parted at its clefts: u is the mean over the
+    contacts of 1 / (1 + (v / v1)^2), where v is the circular variance of the rougher supervoxel's normals, 1 less the
+    length of their mean. Contacts are touching voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at none
+    continuations behind what hides a surface (`pcgraph.graph.continuations.continuations`) and of planes that bound
+    the scene (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts,
+    bridges (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of
+    objects, at their mean cost times m / (m + 1).
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
     one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
@@ -119,6 +122,9 @@ class _Shape(NamedTuple):
 
     c0: float
     c1: float
+    c2: float
+    s0: float
+    v1: float
     e0: float
     e1: float
     q0: float
@@ -138,6 +144,9 @@ class _Shape(NamedTuple):
 _SHAPE = _Shape(
     c0=0.08,
     c1=0.04,
+    c2=0.35,
+    s0=0.5,
+    v1=0.03,
     e0=1.0,
     e1=0.3,
     q0=2.0,
@@ -206,8 +215,8 @@ def region_linkage(
         first edge merges first.
     """
     state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, color, 1.0))
-    sums = np.stack((costs * weights, weights, weights) if n_bridges else (costs * weights, weights))
-    sums[2:, : len(edges) - n_bridges] = 0.0  # what is left are the bridges' weights
+    sums = np.stack((costs * weights, weights, _smoothness(leaves, edges) * weights, weights)[: 4 if n_bridges else 3])
+    sums[3:, : len(edges) - n_bridges] = 0.0  # what is left are the bridges' weights
     set_residuals(state)
     altitudes = np.empty(len(edges))
     in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
@@ -218,6 +227,15 @@ def region_linkage(
     _merge(state, outlines, relief, contracted, _SHAPE)
     merges = contracted.merges()
     return Merges(merges.pairs, np.maximum.accumulate(merges.altitudes))
+
+
+def _smoothness(leaves: Moments, edges: NDArray[np.int32]) -> NDArray[np.float64]:
+    """How smooth the rougher region at each edge is, (m,) float64, 0..1: u of `RegionLinkage`, in whole steps."""
+    if leaves.normals is None:
+        return np.ones(len(edges))
+    spread = 1.0 - np.sqrt(np.einsum("ij,ij->i", leaves.normals, leaves.normals))
+    rougher = np.maximum(spread[edges[:, 0]], spread[edges[:, 1]])
+    return np.rint(_STEPS / (1.0 + np.square(rougher / _SHAPE.v1))) / _STEPS
 
 
 @kernel
@@ -287,17 +305,18 @@ def _altitude(
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
     smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
-    if len(sums) > 2 and sums[2, edge] == sums[1, edge]:  # nothing but bridges
+    if len(sums) > 3 and sums[3, edge] == sums[1, edge]:  # nothing but bridges
         return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), round(shape.objects * _STEPS) + 1) / _STEPS
     uneven = state.residuals[a if state.masses[a] == larger else b] / larger - shape.q0
     increase = max(energy_increase(state, a, b), shape.e1 * smaller * uneven, 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(smaller)
     shortness = width / (length + width)
-    evidence = cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)
+    shortness = math.sqrt(shortness * math.sqrt(shortness))
+    evidence = (cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)) * shortness
+    evidence += max(cost - shape.c2, 0.0) * max(shape.s0 - shortness, 0.0) * sums[2, edge] / sums[1, edge]
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
-    evidence *= math.sqrt(shortness * math.sqrt(shortness * (1.0 + larger / (shape.r * smaller))))
-    evidence *= smaller / (smaller + shape.m0)
+    evidence *= math.sqrt(math.sqrt(1.0 + larger / (shape.r * smaller))) * smaller / (smaller + shape.m0)
     return round(evidence * _STEPS) / _STEPS
 
 

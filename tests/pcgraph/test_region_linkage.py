@@ -18,11 +18,19 @@ from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
 
 @pytest.mark.parametrize(("known", "side"), [(True, 1.0), (True, -1.0), (False, 1.0), (False, -1.0)])
 @pytest.mark.parametrize(
-    ("times_as_large", "weight", "relief", "uneven"),
-    [(1, 7.0, 15.0, 0.0), (100, 7.0, 0.0, 0.0), (100, 7.0, 0.0, 50.0), (5, 60.0, 1000.0, 0.0)],
+    ("times_as_large", "weight", "relief", "uneven", "cost"),
+    [
+        (1, 7.0, 15.0, 0.0, 0.4),
+        (100, 7.0, 0.0, 0.0, 0.4),
+        (100, 7.0, 0.0, 50.0, 0.4),
+        (5, 60.0, 1000.0, 0.0, 0.3),
+        (5, 60.0, 1000.0, 0.0, 1.2),
+    ],
 )
-def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, uneven, known, side):
-    """With the smaller region before the larger one, or behind it, if that is known; and that one flat, or uneven."""
+def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, uneven, cost, known, side):
+    """With the smaller region before the larger one, or behind it, if that is known; and that one flat, or uneven; a
+    contact short or long for their size, and a valley flat or steep.
+    """
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
     grown = leaves.counts * np.array([1, times_as_large])
     leaves = replace(leaves, counts=grown, scatters=leaves.scatters * (grown / leaves.counts)[:, None, None])
@@ -30,7 +38,7 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     leaves.scatters[grown.argmax()] += uneven * unit**2 * grown.max() * np.eye(3)
     nodes = replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
     graph = replace(graph, node_features=nodes, sides_known=known)
-    cost = 0.4
+    leaves = replace(leaves, normals=nodes.normal * [[1.0], [0.95]])
     costs, weights = np.array([cost]), np.array([weight])
     found = region_linkage(graph, leaves, graph.edges, costs, weights, relief=relief).altitudes[0]
     mean = leaves.counts.mean()
@@ -49,7 +57,11 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
     stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 or not known else 0.0
     evidence = cost + stands_out + 0.08 + 0.04 * math.log(1 + scale / 0.1)
-    weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1)) * (width / (length + width)) ** 0.75
+    shortness = (width / (length + width)) ** 0.75
+    steep = max(cost - 0.35, 0.0) * max(0.5 - shortness, 0.0) / (1.0 + (0.05 / 0.03) ** 2)
+    assert cost < 1.0 or steep > 0.05
+    evidence = evidence * shortness + steep
+    weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1))
     weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
     assert found > 1e-3
@@ -130,6 +142,18 @@ def test_a_thing_in_a_hollow_of_rolling_ground_is_no_less_one_than_on_a_hill():
     labels = pcgraph.segment(points).labels
     alone = [truth[labels == np.bincount(labels[truth == thing] + 1).argmax() - 1] for thing in range(1, things + 1)]
     assert sum(np.mean(found > 0) > 0.9 for found in alone) == things
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steep_heaps_are_objects_however_long_the_line_around_them(seed):
+    rng = np.random.default_rng(seed)
+    places, radii = rng.uniform(0.0, 30.0, (60_000, 2)), np.array([3.0, 4.0, 5.0, 6.0])
+    middles = np.array([(8.0, 8.0), (22.0, 8.0), (8.0, 22.0), (22.0, 22.0)])
+    off = np.linalg.norm(places[:, None] - middles, axis=2)
+    heights = np.tan(np.radians(48.0)) * np.maximum(radii - off, 0.0)
+    points = np.column_stack((places, heights.max(axis=1) + rng.normal(0.0, 0.03, len(places))))
+    truth = np.where(heights.max(axis=1) > 0.0, heights.argmax(axis=1) + 1, 0)
+    assert pcgraph.metrics.segmentation_covering(pcgraph.segment(points).labels, truth) > 0.97
 
 
 @pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.1, 0.2), (0.1, 0.3)])
