@@ -144,7 +144,7 @@ class _Shape(NamedTuple):
 _SHAPE = _Shape(
     c0=0.08,
     c1=0.04,
-    c2=0.35,
+    c2=0.45,
     s0=0.5,
     v1=0.03,
     e0=1.0,

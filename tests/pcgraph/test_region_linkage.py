@@ -58,7 +58,7 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 or not known else 0.0
     evidence = cost + stands_out + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     shortness = (width / (length + width)) ** 0.75
-    steep = max(cost - 0.35, 0.0) * max(0.5 - shortness, 0.0) / (1.0 + (0.05 / 0.03) ** 2)
+    steep = max(cost - 0.45, 0.0) * max(0.5 - shortness, 0.0) / (1.0 + (0.05 / 0.03) ** 2)
     assert cost < 1.0 or steep > 0.05
     evidence = evidence * shortness + steep
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1))
