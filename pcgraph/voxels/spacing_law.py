@@ -408,7 +408,7 @@ def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDAr
 
 def _mirrored(place: NDArray[np.float64], readings: _Readings) -> NDArray[np.float64]:
     """A place, (3,), on the other side of the plane on which most lies."""
-    normal, offset = densest_plane(readings.places, readings.normals)
+    normal, offset, _ = densest_plane(readings.places, readings.normals)
     return place - 2.0 * (place @ normal - offset) * normal
 
 

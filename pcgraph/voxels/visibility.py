@@ -45,10 +45,15 @@ _FINER = 1, 2, 4  # times as many cells and places, if some are closed in, until
 _SHOWS_MOST = 0.85  # of the surface
 _AS_MUCH = 0.004  # of it by which an agreement shows less than another, and yet as much
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
+_ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
 _OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
 _LEVEL = 0.996  # cosine between a plane's normal and z: 5 degrees
+_BEARS, _OF_GROUND = 0.1, 0.25  # of the cells lie on a plane that bears something, and on one that is the ground
+_ANYTHING = 0.02  # of the cells lies off the ground at least, and of those, under it at most
+_NEARLY_EVERYTHING = 0.02, 0.98  # quantiles
+_WITHIN_GROUND = 0.6  # of the ground's area is at most that of all that stands on it
 _MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at from; and more, each of which
 _NEWS = 0.005  # of all cells is seen by first
@@ -128,7 +133,8 @@ def visible_sides(
     two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
     sides, then how much of what is seen from outside has its outside there, and how much of what is seen from those of
     these places before the plane that bears most, as the ground or a table does, on which things stand (above it, if it
-    is level); or from the origin, if that lies there and all before it, as before a camera that looks along z. The
+    is level); or from the origin, if that lies there and all before it, as before a camera that looks along z. Where a
+    level plane reaches beyond all that stands on it, that it is seen from above counts more than what is shown. The
     voxels then take the mean direction to the places that see them, those that none sees, and of many voxels most, from
     the voxels around.
 
@@ -264,7 +270,7 @@ def likelier_place(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[n
     if max(visible, other_is) <= _MUCH_MORE * min(visible, other_is):
         middle, reach = _unit_frame(grid, grid.centroids)
         coarse = _coarse(grid, middle, reach)
-        upwards, offset = _support(coarse, _either_normals(coarse))
+        upwards, offset, _ = _support(coarse, _either_normals(coarse))
         before = [bool((one - middle) / reach @ upwards >= offset) for one in (place, other)]
         if before[0] != before[1]:
             return place if before[0] else other
@@ -360,7 +366,7 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
     normals = _either_normals(coarse)
-    upwards, offset = _support(coarse, normals)
+    upwards, offset, is_ground = _support(coarse, normals)
     from_viewpoint = [] if viewpoint is None else [viewpoint]
     if viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids):
         from_viewpoint = [origin]
@@ -381,7 +387,8 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     in_rooms = closed >= _CLOSED
     voting = _without_partitions(sides, sides[in_rooms])
     found = _agreements(voting, _starts(voting, outside, likely))
-    weights, shown = _most_telling(found, sides, coarse, closed, likely, bool(from_viewpoint))
+    likely_counts = _FROM_VIEWPOINT if from_viewpoint else _ABOVE_GROUND if is_ground else _BEFORE
+    weights, shown = _most_telling(found, sides, coarse, closed, likely, likely_counts)
     chosen = _spread_choice(seen, weights)
     shows_most = shown >= _SHOWS_MOST or not in_rooms.any() or coarse.n_voxels > grid.n_voxels // 2
     return TellingPlaces(places[chosen], weights[chosen]), shows_most
@@ -416,19 +423,45 @@ def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: ND
     return starts[starts.any(axis=1)]
 
 
-def _support(coarse: VoxelGrid, normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """The plane that bears most: its unit normal, (3,), to where nearly all the rest stands, and offset along it.
+class _Support(NamedTuple):
+    """The plane that bears most: the ground, a table, or a wall behind things.
 
-    It is the ground, a table, or a wall behind things. Where the rest lies on both sides, the normal is z, and nothing
-    lies behind the plane.
+    Attributes
+    ----------
+    upwards : (3,) float64, unit
+        Its normal, to where nearly all the rest stands; or z, where that lies on both sides of each plane.
+    offset : float
+        Of the plane along it; -inf where there is none.
+    is_ground : bool
+        Whether it is level, and reaches beyond all that stands on it, or lies in a hollow of it.
     """
-    normal, offset = densest_plane(coarse.centroids, normals)
-    beyond = np.einsum("ij,j->i", coarse.centroids, normal) - offset
-    beyond = beyond[np.abs(beyond) > _OFF_PLANE * coarse.size]
-    before, behind = beyond[beyond > 0.0].sum(), -beyond[beyond < 0.0].sum()
-    if max(before, behind) <= _NEARLY_ALL * (before + behind):
-        return np.array([0.0, 0.0, 1.0]), -np.inf
-    return (normal, offset) if before > behind else (-normal, -offset)
+
+    upwards: NDArray[np.float64]
+    offset: float
+    is_ground: bool
+
+
+def _support(coarse: VoxelGrid, normals: NDArray[np.float64]) -> _Support:
+    """The plane on which most cells lie, if nearly all the rest is on one side of it."""
+    normal, offset, fraction = densest_plane(coarse.centroids, normals)
+    heights = np.einsum("ij,j->i", coarse.centroids, normal) - offset
+    is_rest = np.abs(heights) > _OFF_PLANE * coarse.size
+    above, below = heights[is_rest & (heights > 0.0)].sum(), -heights[is_rest & (heights < 0.0)].sum()
+    if fraction < _BEARS or max(above, below) <= _NEARLY_ALL * (above + below):
+        return _Support(np.array([0.0, 0.0, 1.0]), -np.inf, False)
+    if above < below:
+        normal, offset, heights = -normal, -offset, -heights
+    is_ground = abs(normal[2]) >= _LEVEL and fraction >= _OF_GROUND
+    if is_ground and np.mean(is_rest) >= _ANYTHING and np.mean(heights[is_rest] < 0.0) <= _ANYTHING:
+        areas = [_level_area(coarse.centroids[some]) for some in (is_rest, ~is_rest)]
+        return _Support(normal, offset, areas[0] < _WITHIN_GROUND * areas[1])
+    return _Support(normal, offset, False)
+
+
+def _level_area(places: NDArray[np.float64]) -> float:
+    """Area of the rectangle along x and y that holds nearly all places."""
+    low, high = np.quantile(places[:, :2], _NEARLY_EVERYTHING, axis=0)
+    return float(np.prod(high - low))
 
 
 def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bool:
@@ -542,7 +575,7 @@ def _most_telling(
     coarse: VoxelGrid,
     closed: NDArray[np.float64],
     likely: NDArray[np.bool_],
-    likely_is_told: bool,
+    likely_counts: float,
 ) -> tuple[NDArray[np.float64], float]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
 
@@ -553,7 +586,6 @@ def _most_telling(
     visible = np.abs(sides).sum(axis=1)
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
     is_closed = any(float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0 for s in different)
-    likely_counts = _FROM_VIEWPOINT if likely_is_told else _BEFORE
     shown, around = np.empty(len(different)), coarse.neighbourhood
     in_blocks(_show, len(different), different, sides, found, around, is_closed, shown, smallest=1)
     most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcgraph
+from pcgraph.voxels.directions import densest_plane
 from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.visibility import seen_from
 
@@ -263,6 +264,57 @@ def test_crevices_seen_better_from_behind_do_not_turn_a_heap_inside_out(seed):
     turn = Rotation.random(random_state=seed).as_matrix()
     found = pcgraph.segment((heap + rng.normal(0.0, 0.01, heap.shape)) @ turn.T)
     assert np.mean(found.surface.normals @ turn[:, 2] > 0.0) > 0.99
+
+
+def ranges_with_ball(ranges, rays, middle, radius):
+    """Ranges along rays from the origin, where a ball stands in the way."""
+    along = rays @ middle
+    inside = along**2 - middle @ middle + radius**2
+    return np.where(inside > 0.0, np.minimum(ranges, along - np.sqrt(np.maximum(inside, 0.0))), ranges)
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_fruit_in_a_crate_on_a_table_is_seen_from_above(seed):
+    """From below more is visible, through where crate and fruit hide the table."""
+    rng, eye = np.random.default_rng(seed), np.array([0.1, -0.3, 1.2])
+    ahead = -eye / np.linalg.norm(eye)
+    right = np.cross(ahead, (0.0, 0.0, 1.0)) / np.linalg.norm(np.cross(ahead, (0.0, 0.0, 1.0)))
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 560), np.linspace(-0.4, 0.4, 440))
+    rays = (ahead + u[..., None] * right + v[..., None] * np.cross(right, ahead)).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    ranges = -eye[2] / rays[:, 2]
+    on_table = (np.abs((eye + ranges[:, None] * rays)[:, :2]) < (0.6, 0.5)).all(axis=1)
+    ranges = np.where(on_table, ranges, np.inf)
+    for low, high in (
+        ((-0.31, -0.21, 0.0), (-0.3, 0.21, 0.2)),
+        ((0.3, -0.21, 0.0), (0.31, 0.21, 0.2)),
+        ((-0.31, -0.21, 0.0), (0.31, -0.2, 0.2)),
+        ((-0.31, 0.2, 0.0), (0.31, 0.21, 0.2)),
+        ((-0.3, -0.2, 0.0), (0.3, 0.2, 0.01)),
+    ):
+        ranges = ranges_with_box(ranges, rays, low - eye, high - eye)
+    rows = np.stack(np.meshgrid(np.arange(-0.25, 0.26, 0.08), np.arange(-0.15, 0.16, 0.08)), axis=-1).reshape(-1, 2)
+    for layer in range(2):
+        for x, y in rows + rng.uniform(-0.01, 0.01, rows.shape) + 0.04 * layer:
+            if abs(x) < 0.26 and abs(y) < 0.16 and (layer == 0 or rng.random() > 0.3):
+                ranges = ranges_with_ball(ranges, rays, np.array([x, y, 0.05 + 0.065 * layer]) - eye, 0.04)
+    points = eye + rays * (ranges + rng.normal(0.0, 0.0006, len(ranges)))[:, None]
+    points = points[np.isfinite(ranges)]
+    assert fraction_facing(points, pcgraph.segment(points), eye) > 0.9
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1, 0.7])
+def test_the_densest_plane_is_a_table_whatever_stands_on_it(tilt):
+    """Of what stands on it most has one direction, too, and turns the commonest of all aside."""
+    table = faces((-0.6, -0.5, -0.1), (0.6, 0.5, 0.0), 0.02, "+z")
+    lean = Rotation.from_rotvec((0.8, 0.0, 0.0)).as_matrix()
+    boards = joined(*(faces((-0.3, y, 0.0), (0.3, y + 0.3, 0.4 + y), 0.01, "+z") for y in (-0.3, 0.0)))
+    points, normals = turned(joined(table, tuple(column @ lean.T for column in boards)), (0.0, tilt, 0.0))
+    upwards = Rotation.from_rotvec((0.0, tilt, 0.0)).as_matrix()[:, 2]
+    plane = densest_plane(points, normals)
+    assert abs(plane.normal @ upwards) > 0.9999
+    assert plane.offset == pytest.approx(0.0, abs=0.01)
+    assert plane.fraction == pytest.approx(len(table[0]) / len(points))
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.5), (0.04, -0.03, 2.0)])
