@@ -314,7 +314,8 @@ def _altitude(
     shortness = width / (length + width)
     shortness = math.sqrt(shortness * math.sqrt(shortness))
     evidence = (cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)) * shortness
-    evidence += max(cost - shape.c2, 0.0) * max(shape.s0 - shortness, 0.0) * sums[2, edge] / sums[1, edge]
+    if cost > shape.c2 and shortness < shape.s0:
+        evidence += (cost - shape.c2) * (shape.s0 - shortness) * sums[2, edge] / sums[1, edge]
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(math.sqrt(1.0 + larger / (shape.r * smaller))) * smaller / (smaller + shape.m0)
     return round(evidence * _STEPS) / _STEPS

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _STARTS = 8  # normals from which planes are looked for
-_ALIKE = 0.95  # cosine between normals on one plane, and more
+_ALIKE, _SAME = 0.95, 0.99  # cosine between normals on one plane, and of those looked from once, and more
 _BAND = 0.02  # of the diagonal of the places' bounding box, within which those on one plane lie
 
 
@@ -39,9 +39,13 @@ def densest_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> 
     """
     some = normals[np.linspace(0, len(normals) - 1, _STARTS).astype(np.int64)]
     band = _BAND * float(np.linalg.norm(places.max(axis=0) - places.min(axis=0)))
-    best = DensestPlane(np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
+    best, tried = DensestPlane(np.array([0.0, 0.0, 1.0]), 0.0, 0.0), np.zeros((0, 3))
     for start in (_commonest(normals), *some):
-        normal = _commonest(normals[_alike(normals, start)]) if _alike(normals, start).any() else start
+        if _alike(tried, start, _SAME).any():
+            continue
+        near = _alike(normals, start)
+        normal = _commonest(normals[near]) if near.any() else start
+        tried = np.concatenate((tried, start[None], normal[None]))
         offsets = np.sort(np.einsum("ij,j->i", places[_alike(normals, normal)], normal))
         if not len(offsets):
             continue
@@ -53,8 +57,8 @@ def densest_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> 
     return best
 
 
-def _alike(normals: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.abs(np.einsum("ij,j->i", normals, normal)) > _ALIKE
+def _alike(normals: NDArray[np.float64], normal: NDArray[np.float64], least: float = _ALIKE) -> NDArray[np.bool_]:
+    return np.abs(np.einsum("ij,j->i", normals, normal)) > least
 
 
 def _commonest(normals: NDArray[np.float64]) -> NDArray[np.float64]:
