@@ -451,11 +451,14 @@ def _support(coarse: VoxelGrid, normals: NDArray[np.float64]) -> _Support:
         return _Support(np.array([0.0, 0.0, 1.0]), -np.inf, False)
     if above < below:
         normal, offset, heights = -normal, -offset, -heights
-    is_ground = abs(normal[2]) >= _LEVEL and fraction >= _OF_GROUND
-    if is_ground and np.mean(is_rest) >= _ANYTHING and np.mean(heights[is_rest] < 0.0) <= _ANYTHING:
-        areas = [_level_area(coarse.centroids[some]) for some in (is_rest, ~is_rest)]
-        return _Support(normal, offset, areas[0] < _WITHIN_GROUND * areas[1])
-    return _Support(normal, offset, False)
+    is_ground = (
+        abs(normal[2]) >= _LEVEL
+        and fraction >= _OF_GROUND
+        and np.mean(is_rest) >= _ANYTHING
+        and np.mean(heights[is_rest] < 0.0) <= _ANYTHING
+        and _level_area(coarse.centroids[is_rest]) < _WITHIN_GROUND * _level_area(coarse.centroids[~is_rest])
+    )
+    return _Support(normal, offset, bool(is_ground))
 
 
 def _level_area(places: NDArray[np.float64]) -> float:
