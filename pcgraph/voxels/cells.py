@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 
 _MAX_KEY = float(1 << 62)
-_DIGIT = 8  # bits
+_DIGIT, _DIGIT_OF_FEW = 12, 8  # bits, at most, as more digits take more rounds, and their tables time to fill;
+_FEW = 1 << 14  # of so many numbers and fewer
 _BITS = 63  # of a number that is not negative
 _AT_ONCE = 1024  # points, about
 _POINTS_OF_BLOCK = 1 << 16  # that are looked through in less time than it takes to start a thread
@@ -77,7 +78,8 @@ def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
     place_bits, key_bits = len(keys).bit_length(), int(keys.max()).bit_length()
     low_bits = _BITS - place_bits
     if key_bits <= low_bits:
-        return _sort_by_digits(keys, place_bits, max(-(-key_bits // _DIGIT), 1))
+        n_digits = max(-(-key_bits // (_DIGIT if len(keys) > _FEW else _DIGIT_OF_FEW)), 1)
+        return _sort_by_digits(keys, place_bits, n_digits, max(-(-key_bits // n_digits), 1))
     order = sorted_keys(keys & ((1 << low_bits) - 1))[1]
     order = order[sorted_keys(keys[order] >> low_bits)[1]]
     return keys[order], order
@@ -131,21 +133,21 @@ def fetch_batch(
 
 @kernel
 def _sort_by_digits(
-    keys: NDArray[np.int64], place_bits: int, n_digits: int
+    keys: NDArray[np.int64], place_bits: int, n_digits: int, digit_bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5).
 
     A key and its place, of so many bits, are moved as one number.
     """
-    n, mask = len(keys), (1 << _DIGIT) - 1
-    starts = np.zeros((n_digits, 1 << _DIGIT), np.int64)
+    n, mask = len(keys), (1 << digit_bits) - 1
+    starts = np.zeros((n_digits, 1 << digit_bits), np.int64)
     ordered, room = np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
         ordered[i] = keys[i] << place_bits | i
         for digit in range(n_digits):
-            starts[digit, (keys[i] >> (digit * _DIGIT)) & mask] += 1
+            starts[digit, (keys[i] >> (digit * digit_bits)) & mask] += 1
     for digit in range(n_digits):
-        start, shift = starts[digit], place_bits + digit * _DIGIT
+        start, shift = starts[digit], place_bits + digit * digit_bits
         if start.max() == n:
             continue  # all have the same
         total = 0

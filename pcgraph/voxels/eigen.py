@@ -127,8 +127,9 @@ def least_eigenvalue(xx: float, yy: float, zz: float, xy: float, xz: float, yz: 
     trace = xx + yy + zz
     if not trace > 0.0:
         return 0.0
-    xx, yy, zz = xx / trace - 1.0 / 3.0, yy / trace - 1.0 / 3.0, zz / trace - 1.0 / 3.0
-    xy, xz, yz = xy / trace, xz / trace, yz / trace
+    scale = 1.0 / trace
+    xx, yy, zz = xx * scale - 1.0 / 3.0, yy * scale - 1.0 / 3.0, zz * scale - 1.0 / 3.0
+    xy, xz, yz = xy * scale, xz * scale, yz * scale
     return max(_spread_and_least(xx, yy, zz, xy, xz, yz)[1] + 1.0 / 3.0, 0.0) * trace
 
 

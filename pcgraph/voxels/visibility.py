@@ -57,8 +57,7 @@ _WITHIN_GROUND = 0.6  # of the ground's area is at most that of all that stands 
 _MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at from; and more, each of which
 _NEWS = 0.005  # of all cells is seen by first
-_MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at, those whose whole steps
-_SPREAD_OUT = np.array([1.0, 2.0, 4.0])  # along x, y and z, times these, add up to a multiple of seven or three
+_MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
 _SMOOTHING = 4  # rounds of votes by the voxels around
 _SAME = np.float32(0.8)  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
@@ -162,8 +161,18 @@ def standing_for_all(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
     step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
     if step == 1.0:
         return np.arange(grid.n_voxels), 1.0
-    steps = np.einsum("ij,j->i", grid.cells, _SPREAD_OUT)  # a product of matrices would start threads of its own
-    return np.flatnonzero(steps == step * np.rint(steps / step)), math.sqrt(step)
+    return np.concatenate(in_blocks(_in_step, grid.n_voxels, grid.cells, step)), math.sqrt(step)
+
+
+@kernel
+def _in_step(start: int, stop: int, cells: NDArray[np.float64], step: float) -> NDArray[np.int64]:
+    """Which of some cells lie a whole number of steps out along (1, 2, 4): for 3 and 7, spread evenly on any plane."""
+    found, n = np.empty(stop - start + 1, np.int64), 0
+    for i in range(start, stop):
+        steps = (cells[i, 0] + 2.0 * cells[i, 1] + 4.0 * cells[i, 2]) / step
+        found[n] = i
+        n += steps == np.rint(steps)
+    return found[:n]
 
 
 def sides_towards(
@@ -662,7 +671,9 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
 def _coarse(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: int = _CELLS) -> VoxelGrid:
     """Voxels in larger ones, as few as still show their shape, in the frame of `_unit_frame`; the outermost surfaces
     amid a layer of them."""
-    centres, width = (grid.centroids - middle) / reach, float(np.median(grid.edge_lengths)) / reach
+    edges = grid.edge_lengths
+    width = float(edges[0] if edges.min() == edges.max() else np.median(edges)) / reach
+    centres = (grid.centroids - middle) / reach
     size = width * max(1.0, math.sqrt(len(centres) / (1.5 * cells)))  # as many as a surface would have
     low = bounding_box(centres)[0]
     while True:
