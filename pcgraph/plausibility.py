@@ -52,13 +52,13 @@ def warn_of_rounding(given: ArrayLike, cloud: CleanCloud, spacing: float | None)
 
 
 def warn_of_duplicates(cloud: CleanCloud, spacing: float) -> None:
-    """Warn where points lie so close together that they are likely to be copies of each other."""
+    """Warn where points lie so close together, for the extent of all, that they are likely to be copies."""
     low, high = cloud.bounds
     extent = float((high - low).max())
     if 0.0 < spacing < _LEAST_SPACING * extent:
         _warn(
             f"expected points apart from each other, but most have another within {spacing:.2g} m in a cloud of "
-            f"{extent:.3g} m, as copies of a scan do; give voxel_size, or leave copies out"
+            f"{extent:.3g} m, as copies of a scan do, or parts far off; leave copies out, or give voxel_size"
         )
 
 

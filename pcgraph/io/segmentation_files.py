@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
@@ -63,7 +63,7 @@ def _sealed(content: bytes, place: int) -> bytes:
 
 def write_segmentation(
     path: str | PathLike[str],
-    cloud: Cloud,
+    cloud: Cloud | ArrayLike,
     segmentation: Segmentation,
     labels: NDArray[np.int32] | None = None,
 ) -> None:
@@ -77,7 +77,7 @@ def write_segmentation(
         no integers of 64 bits, so those become doubles. ``.npz``: everything, in the input's shape: ``format``,
         ``labels``, ``supervoxels``; ``edges`` and ``edge_<feature>``; ``node_<feature>``; ``tree_parents``,
         ``tree_altitudes``; ``voxel_size``, ``seed_size``, ``viewpoint``; ``column_<name>``, the further columns.
-    cloud : Cloud
+    cloud : Cloud, or points (n, 3) or (h, w, 3)
         What was segmented. A column of a name that the result itself has, such as ``supervoxels``, is left out.
     segmentation : Segmentation
     labels : the points' leading shape, int32, optional
@@ -88,20 +88,30 @@ def write_segmentation(
     CloudWriteError
         Another extension, or the place cannot be written; or a column is not of the points' shape, not of numbers, or
         has a name that is not one word.
+    ValueError
+        Points or labels are not of the shape of what was segmented.
     """
     path = Path(path)
     write_file(path, encode_segmentation(path.name, cloud, segmentation, labels), CloudWriteError)
 
 
 def encode_segmentation(
-    name: str, cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32] | None = None
+    name: str, cloud: Cloud | ArrayLike, segmentation: Segmentation, labels: NDArray[np.int32] | None = None
 ) -> bytes:
     """What `write_segmentation` writes to a file of such a name."""
+    cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(cloud))
+    labels = segmentation.labels if labels is None else np.asarray(labels)
+    shape = segmentation.labels.shape
+    if np.shape(cloud.points) != (*shape, 3):
+        expected = f"the points that were segmented, of shape {(*shape, 3)}"
+        raise ValueError(f"expected {expected}, got {np.shape(cloud.points)}; give the cloud of this segmentation")
+    if labels.shape != shape:
+        raise ValueError(f"expected a label for each point, of shape {shape}, got {labels.shape}")
     encoders = {".ply": _ply, ".npz": _npz}
     encode = encoders.get(Path(name).suffix.lower())
     if encode is None:
         raise CloudWriteError(f"expected an output file ending in {' or '.join(encoders)}, got {name!r}")
-    return encode(cloud, segmentation, segmentation.labels if labels is None else labels)
+    return encode(cloud, segmentation, labels)
 
 
 def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:

@@ -138,6 +138,19 @@ def test_open3d_files_are_read_and_ours_read_back(tmp_path):
     assert np.asarray(o3d.io.read_point_cloud(str(tmp_path / "out.ply")).points) == pytest.approx(points)
 
 
+@pytest.mark.parametrize("name", ["a.ply", "a.npz"])
+def test_results_go_with_their_own_points(tmp_path, boxes, name):
+    points, _, result = boxes
+    pcgraph.write_segmentation(tmp_path / name, points, result)
+    assert (tmp_path / name).exists()
+    for other in (points[:10], np.concatenate((points, points)), pcgraph.Cloud(points[1:])):
+        with pytest.raises(ValueError, match="expected the points that were segmented"):
+            pcgraph.write_segmentation(tmp_path / f"wrong_{name}", other, result)
+    with pytest.raises(ValueError, match="expected a label for each point"):
+        pcgraph.write_segmentation(tmp_path / f"wrong_{name}", points, result, result.labels[1:])
+    assert not (tmp_path / f"wrong_{name}").exists()
+
+
 def test_results_come_back(tmp_path, boxes):
     points, _, result = boxes
     cloud = pcgraph.Cloud(points)
