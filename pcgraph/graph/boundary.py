@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _COST_STEPS = float(1 << 20)
 _AS_IT_CLOSES = 3.0  # what a valley of nearly no width costs, per radian of its width
+_WITH_ROOM = 3.0  # what it costs more per voxel edge between its sides,
+_NO_ROOM = 0.7  # beyond so many, which noise may be
 
 
 @dataclass(frozen=True)
@@ -23,8 +25,8 @@ class BoundaryCost:
     """Cost of merging over an edge, in radians of concavity.
 
     cost = (1 - contact) V(convexity) + contact V(contact_convexity) + step min(step / voxel edge,
-    step_limit), where V(angle) is min(a, 3 (pi - a)) of an edge that is concave by a, and `convex` times the angle of a
-    convex one.
+    step_limit), where V(angle) is min(a, 3 (pi - a) + 3 max(h - 0.7, 0)) of an edge that is concave by a, with h the
+    step in voxel edges up to the limit, and `convex` times the angle of a convex one.
 
     Attributes
     ----------
@@ -47,7 +49,8 @@ class BoundaryCost:
     Convexity as evidence for objects: LCCP, Stein et al. 2014. As a mean over the contact instead of a yes or
     no per edge, one noisy normal cannot open or close a boundary. Hardly anything looks into a valley narrower than
     45 degrees: where normals differ by more than 135, a sheet was seen from both sides, or one of them is turned
-    round, and the sign of the angle says less the nearer that is to pi.
+    round, and the sign of the angle says less the nearer that is to pi; unless there is room between the sides, as
+    between the ground and what stands just above it.
     """
 
     contact: float = 0.5
@@ -67,13 +70,14 @@ class BoundaryCost:
         ----------
         features : EdgeFeatures of m edges
         """
-        bend = (1.0 - self.contact) * self._valley(features.convexity)
-        bend += self.contact * self._valley(features.contact_convexity)
         offset = np.minimum(features.step / features.voxel_edge, self.step_limit)
+        room = _WITH_ROOM * np.maximum(offset - _NO_ROOM, 0.0)
+        bend = (1.0 - self.contact) * self._valley(features.convexity, room)
+        bend += self.contact * self._valley(features.contact_convexity, room)
         return np.rint((bend + self.step * offset) * _COST_STEPS) / _COST_STEPS
 
-    def _valley(self, convexity: NDArray[np.float64]) -> NDArray[np.float64]:
-        valley = np.minimum(-convexity, _AS_IT_CLOSES * np.maximum(np.pi + convexity, 0.0))
+    def _valley(self, convexity: NDArray[np.float64], room: NDArray[np.float64]) -> NDArray[np.float64]:
+        valley = np.minimum(-convexity, _AS_IT_CLOSES * np.maximum(np.pi + convexity, 0.0) + room)
         return np.where(convexity < 0.0, valley, self.convex * convexity)
 
 

@@ -111,21 +111,23 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
     taken out, is regressed on log range. Places all around and within the cloud are tried, then moved by ever smaller
     steps; readings far off the line, such as noise, are left out.
     """
-    found = _readings(points, _READINGS if viewpoint is not None else 2 * _READINGS)
+    found = _readings(points, 2 * _READINGS)
     if len(found.logs) < _MIN_READINGS:
         return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0)
     low, high = bounding_box(found.places)
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
     found = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
     every, own, mirrored = found.some(slice(None, _READINGS)), viewpoint, None
+    spread_out = found.some(_between_points_and_surface(found))
     if viewpoint is None:
-        spread_out = found.some(_between_points_and_surface(found))
         place, mirrored = _most_telling_places(spread_out)
         near_line = spread_out.some(_on_line(spread_out, place))
         place = _searched(near_line.some(slice(None, None, 2)), place[None], np.array([_SHORT_STEP]), 8)[0][0]
     else:
         place = (viewpoint - middle) / reach
-    kept = _on_line(every, place)
+    kept, halved = _on_line(every, place), every
+    if viewpoint is not None:  # the pole of its scanner is where it is, and readings there many
+        halved = spread_out.some(_on_line(spread_out, place))
     line = _regressions(every.some(kept), place[None])
     if viewpoint is None:
         origin = -middle / reach
@@ -137,7 +139,7 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         exponent=float(line.exponents[0]),
         explained=float(line.explained[0]),
         by_range=float(line.by_range[0]),
-        in_halves=_least_exponent(every, place, float(line.exponents[0])),
+        in_halves=_least_exponent(halved, place, float(line.exponents[0])),
         mirrored=None if mirrored is None else middle + reach * mirrored,
     )
 

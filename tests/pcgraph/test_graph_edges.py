@@ -116,6 +116,16 @@ def test_a_valley_costs_its_angle_and_less_as_it_closes(name):
     assert BoundaryCost()(some_edges(**{name: angles})) == pytest.approx(0.015 * angles, abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["convexity", "contact_convexity"])
+def test_a_valley_with_room_between_its_sides_costs_its_angle(name):
+    closed = {name: np.full(4, -np.pi)}
+    steps = np.array([0.0, 0.7, 1.7, 3.0])  # voxels of 1 cm
+    of_steps = BoundaryCost()(some_edges(step=0.01 * steps))
+    assert BoundaryCost()(some_edges(step=0.01 * steps, **closed)) - of_steps == pytest.approx(
+        0.5 * np.array([0.0, 0.0, 3.0, np.pi]), abs=1e-6
+    )
+
+
 unit = st.floats(0.0, 1.0)
 
 

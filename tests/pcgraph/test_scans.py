@@ -40,6 +40,25 @@ def test_a_leaf_seen_from_both_sides_is_one_object(seed):
     assert pcgraph.segment(leaf, viewpoint=seen_from).labels.max() == 0
 
 
+def test_a_body_just_above_the_ground_is_not_the_ground():
+    """Its underside and the ground face each other, two voxels apart, and touch in places."""
+    rng = np.random.default_rng(0)
+    ground = np.stack((*rng.uniform(0.0, 10.0, (2, 40_000)), rng.normal(0.0, 0.01, 40_000)), axis=1)
+    faces, normals = [], []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            face = rng.uniform((3.0, 4.0, 0.15), (7.2, 5.8, 1.35), (3000, 3))
+            face[:, axis] = (7.2, 5.8, 1.35)[axis] if side > 0 else (3.0, 4.0, 0.15)[axis]
+            faces.append(face + rng.normal(0.0, 0.01, (3000, 1)) * np.eye(3)[axis])
+            normals.append(np.tile(side * np.eye(3)[axis], (3000, 1)))
+    given = np.concatenate((np.tile((0.0, 0.0, 1.0), (len(ground), 1)), *normals))
+    for voxel_size in (0.065, 0.07, 0.075):
+        result = pcgraph.segment(np.concatenate((ground, *faces)), normals=given, voxel_size=voxel_size)
+        largest = np.bincount(result.labels[len(ground) :]).argmax()
+        assert (result.labels[len(ground) :] == largest).mean() > 0.95
+        assert (result.labels[: len(ground)] == largest).mean() < 0.01
+
+
 def test_rows_of_points_on_ground_do_not_face_their_tripod():
     """Far rings are rows, and what is seen edge-on has few points: the way to the tripod says least of its normal."""
     rng = np.random.default_rng(0)

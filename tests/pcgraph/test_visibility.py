@@ -399,6 +399,18 @@ def test_a_scanners_pole_does_not_mislead():
     assert from_within >= 7  # it was two, where spacing was read as points lie alone
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_scanners_pole_says_nothing_against_its_own_place(seed):
+    """Told where the scanner stood, spacing below it grows with range by no power; elsewhere it does."""
+    points, place = scanned_furniture(seed, (4.2, 0.8, 1.5), (5.0, 4.0, 2.6), highest=80, n_boxes=3)
+    assert spacing_law(points).holds
+    assert spacing_law(points, place).holds
+    told, found = pcgraph.segment(points, viewpoint=place), pcgraph.segment(points)
+    assert told.surface.grid.warp.of_one_scan
+    assert found.surface.grid.warp.of_one_scan
+    assert told.labels.max() <= found.labels.max() + 2
+
+
 def rings_ahead(seed):
     """Ground, a wall and boxes in the 90 degrees before a 64-beam LiDAR 1.7 m above the ground, 2 cm of range noise."""
     rng = np.random.default_rng(seed)
