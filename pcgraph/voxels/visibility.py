@@ -59,6 +59,10 @@ _VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at 
 _NEWS = 0.005  # of all cells is seen by first
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
 _SMOOTHING = 4  # rounds of votes by the voxels around
+_CLEAR = 0.3  # votes for a side that need no others, where all voxels are looked at
+_PATCH, _CREASE = 10, 0.5  # voxels of a patch, at least, and the cosine between normals at its edges, at most
+_OFF_PATCH = 0.7  # edge lengths between planes of touching voxels: so many, and they are two surfaces
+_HARDLY, _MOSTLY = 0.05, 0.3  # what votes that are not clear count beside edges; and how much more must agree than not
 _SAME = np.float32(0.8)  # cosine between normals on one surface, and more
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
@@ -135,7 +139,8 @@ def visible_sides(
     is level); or from the origin, if that lies there and all before it, as before a camera that looks along z. Where a
     level plane reaches beyond all that stands on it, that it is seen from above counts more than what is shown. The
     voxels then take the mean direction to the places that see them, those that none sees, and of many voxels most, from
-    the voxels around.
+    the voxels around. A surface that no place sees well, as an underside or the back of a cabinet near a wall, takes
+    its side from what it meets at its edges: what lies behind one of two faces has the other behind itself.
 
     Visibility of points without a surface: Katz et al. 2007, here by a depth buffer, as voxels have a size.
     """
@@ -153,7 +158,9 @@ def visible_sides(
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
     seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
-    return VisibleSides(seen_from_places, _turned(normals, _smoothed_votes(grid, normals, votes)))
+    votes = _smoothed_votes(grid, normals, votes)
+    _carry_over(grid.neighbourhood, grid.centroids, grid.edge_lengths, normals, votes, _CLEAR / stretch**2)
+    return VisibleSides(seen_from_places, _turned(normals, votes))
 
 
 def standing_for_all(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
@@ -940,6 +947,70 @@ def _look_around(
                 towards[i, 0] += scale * x
                 towards[i, 1] += scale * y
                 towards[i, 2] += scale * z
+
+
+@kernel
+def _carry_over(
+    around: Neighbourhood,
+    centroids: NDArray[np.float64],
+    edge_lengths: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    votes: NDArray[np.float64],
+    clear: float,
+) -> None:
+    """Set votes of patches that have no clear ones by what they meet at their edges, if most of that agrees.
+
+    A patch is voxels on one surface. What it meets has clear votes, or got them in an earlier round.
+    """
+    indptr, neighbours = around
+    known, visited = np.abs(votes) >= clear, np.empty(len(votes), np.bool_)
+    patch, way = np.empty(len(votes), np.int64), np.empty(len(votes))  # 1 or -1 along the first one's normal
+    changed = True
+    while changed:
+        changed, visited[:] = False, known
+        for first in range(len(votes)):
+            if visited[first]:
+                continue
+            patch[0], way[first], visited[first] = first, 1.0, True
+            done, size, total, own, said = 0, 1, 0.0, 0.0, 0.0
+            while done < size:
+                i = patch[done]
+                done += 1
+                own += way[i] * votes[i]
+                for a in range(indptr[i], indptr[i + 1]):
+                    j = np.int64(neighbours[a])
+                    alike, is_one = _alike_sides(i, j, centroids, normals, edge_lengths[i])
+                    if known[j]:
+                        total += way[i] * alike if votes[j] > 0.0 else -way[i] * alike
+                        said += abs(alike)
+                    elif is_one and not visited[j]:
+                        patch[size], way[j], visited[j] = j, way[i] * alike, True
+                        size += 1
+            own *= _HARDLY / clear
+            if size >= _PATCH and said > 0.0 and abs(total + own) >= _MOSTLY * (said + abs(own)):
+                changed, side = True, clear if total + own > 0.0 else -clear
+                for i in patch[:size]:
+                    known[i], votes[i] = True, side * way[i]
+
+
+@routine
+def _alike_sides(
+    i: int, j: int, centroids: NDArray[np.float64], normals: NDArray[np.float64], edge: float
+) -> tuple[float, bool]:
+    """Whether the outer side of two touching voxels is that of both normals (or of neither), 1, or of one of them, -1,
+    the nearer to 0 the less it is sure; and whether they are on one surface."""
+    cosine = ahead_of_i = ahead_of_j = 0.0
+    for axis in range(3):
+        way = centroids[j, axis] - centroids[i, axis]
+        cosine += normals[i, axis] * normals[j, axis]
+        ahead_of_i += way * normals[i, axis]
+        ahead_of_j -= way * normals[j, axis]
+    least, most = min(abs(ahead_of_i), abs(ahead_of_j)) / edge, max(abs(ahead_of_i), abs(ahead_of_j)) / edge
+    if abs(cosine) > _SAME and most <= _OFF_PATCH:
+        return 1.0 if cosine > 0.0 else -1.0, True
+    if abs(cosine) < _CREASE:
+        return min(least, 1.0) * (1.0 if ahead_of_i * ahead_of_j > 0.0 else -1.0), False
+    return 0.0, False
 
 
 @kernel

@@ -399,6 +399,41 @@ def test_a_scanners_pole_does_not_mislead():
     assert from_within >= 7  # it was two, where spacing was read as points lie alone
 
 
+@pytest.mark.parametrize("place", [(3.8, 2.7), (0.6, 2.7), (3.4, 0.6)])
+@pytest.mark.parametrize("size", [(0.6, 0.6, 1.9), (1.0, 0.6, 0.75)])
+def test_a_cabinet_near_the_walls_of_a_closed_room_faces_them(place, size):
+    """No place sees its back but edge-on: its edges tell."""
+    rng, low = np.random.default_rng(0), np.array([*place, 0.0])
+    walls, inwards = faces((0, 0, 0), (5, 4, 2.6), 0.018)
+    cabinet, outwards = faces(low, low + size, 0.018, "-x +x -y +y +z")
+    points = np.concatenate((walls, cabinet))
+    points += rng.normal(0.0, 0.002, points.shape)
+    result = pcgraph.segment(points)
+    normals = result.surface.normals[result.surface.grid.voxel_of_point]
+    assert (np.einsum("ij,ij->i", normals, np.concatenate((-inwards, outwards))) > 0.0).mean() > 0.99
+    of_cabinet = result.labels[len(walls) :]
+    assert (of_cabinet == np.bincount(of_cabinet).argmax()).mean() > 0.95
+
+
+@pytest.mark.parametrize("height", [0.15, 0.3])
+def test_an_underside_faces_the_ground_and_goes_with_its_body(height):
+    rng = np.random.default_rng(0)
+    ground = np.stack((*rng.uniform(0.0, 20.0, (2, 160_000)), np.zeros(160_000)), axis=1)
+    bodies, normals = zip(
+        *(faces((x, y, height), (x + 4.2, y + 1.8, height + 1.2), 0.05) for x, y in ((3, 3), (10, 3), (3, 10))),
+        strict=True,
+    )
+    points = np.concatenate((ground, *bodies))
+    points += rng.normal(0.0, 0.01, points.shape)
+    result = pcgraph.segment(points)
+    facing = result.surface.normals[result.surface.grid.voxel_of_point][len(ground) :]
+    assert (np.einsum("ij,ij->i", facing, np.concatenate(normals)) > 0.0).mean() > 0.98
+    for body in np.split(result.labels[len(ground) :], 3):
+        largest = np.bincount(body).argmax()
+        assert (body == largest).mean() > 0.9
+        assert (result.labels == largest).sum() < 1.1 * len(body)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_scanners_pole_says_nothing_against_its_own_place(seed):
     """Told where the scanner stood, spacing below it grows with range by no power; elsewhere it does."""
