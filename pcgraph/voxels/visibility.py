@@ -979,11 +979,13 @@ def _carry_over(
                 own += way[i] * votes[i]
                 for a in range(indptr[i], indptr[i + 1]):
                     j = np.int64(neighbours[a])
+                    if visited[j] and not known[j]:
+                        continue
                     alike, is_one = _alike_sides(i, j, centroids, normals, edge_lengths[i])
                     if known[j]:
                         total += way[i] * alike if votes[j] > 0.0 else -way[i] * alike
                         said += abs(alike)
-                    elif is_one and not visited[j]:
+                    elif is_one:
                         patch[size], way[j], visited[j] = j, way[i] * alike, True
                         size += 1
             own *= _HARDLY / clear
