@@ -1011,7 +1011,7 @@ def _alike_sides(
     if abs(cosine) > _SAME and most <= _OFF_PATCH:
         return 1.0 if cosine > 0.0 else -1.0, True
     if abs(cosine) < _CREASE:
-        return min(least, 1.0) * (1.0 if ahead_of_i * ahead_of_j > 0.0 else -1.0), False
+        return min(least, 1.0) * (1.0 if (ahead_of_i > 0.0) == (ahead_of_j > 0.0) else -1.0), False
     return 0.0, False
 
 
