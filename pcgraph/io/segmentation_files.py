@@ -127,6 +127,7 @@ def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
 def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) -> bytes:
     finite = np.isfinite(cloud.points.reshape(-1, 3)).all(axis=1)
     points = cloud.points.reshape(-1, 3)[finite]
+    points = _for_ply("points", points.astype(np.result_type(points, np.float32), copy=False))
     kept = labels.reshape(-1)[finite]
     colors = label_colors(kept)
     columns: dict[str, NDArray[np.generic]] = {name: points[:, i] for i, name in enumerate("xyz")}

@@ -151,6 +151,16 @@ def test_results_go_with_their_own_points(tmp_path, boxes, name):
     assert not (tmp_path / f"wrong_{name}").exists()
 
 
+@pytest.mark.parametrize("dtype", ["u1", "i4", "i8", "f2", "f4", "f8", "f16"])
+def test_results_go_with_points_of_any_dtype_that_is_segmented(tmp_path, dtype):
+    points = np.random.default_rng(0).integers(0, 100, (2000, 3)).astype(dtype)
+    for cloud in (points, points.tolist()):
+        pcgraph.write_segmentation(tmp_path / "a.ply", cloud, pcgraph.segment(cloud))
+        read = pcgraph.read_cloud(tmp_path / "a.ply")
+        assert read.points.dtype.kind == "f"
+        assert np.array_equal(read.points, points)
+
+
 def test_results_come_back(tmp_path, boxes):
     points, _, result = boxes
     cloud = pcgraph.Cloud(points)
