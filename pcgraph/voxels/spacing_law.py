@@ -123,11 +123,11 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         place, mirrored = _most_telling_places(spread_out)
         near_line = spread_out.some(_on_line(spread_out, place))
         place = _searched(near_line.some(slice(None, None, 2)), place[None], np.array([_SHORT_STEP]), 8)[0][0]
+        halved = every
     else:
         place = (viewpoint - middle) / reach
-    kept, halved = _on_line(every, place), every
-    if viewpoint is not None:  # the pole of its scanner is where it is, and readings there many
-        halved = spread_out.some(_on_line(spread_out, place))
+        halved = spread_out.some(_on_line(spread_out, place))  # without its scanner's pole, where readings are many
+    kept = _on_line(every, place)
     line = _regressions(every.some(kept), place[None])
     if viewpoint is None:
         origin = -middle / reach
