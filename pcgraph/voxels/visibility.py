@@ -962,7 +962,6 @@ def _carry_over(
 
     A patch is voxels on one surface. What it meets has clear votes, or got them in an earlier round.
     """
-    indptr, neighbours = around
     known, visited = np.abs(votes) >= clear, np.empty(len(votes), np.bool_)
     patch, way = np.empty(len(votes), np.int64), np.empty(len(votes))  # 1 or -1 along the first one's normal
     changed = True
@@ -972,27 +971,38 @@ def _carry_over(
             if visited[first]:
                 continue
             patch[0], way[first], visited[first] = first, 1.0, True
-            done, size, total, own, said = 0, 1, 0.0, 0.0, 0.0
-            while done < size:
-                i = patch[done]
-                done += 1
+            size, total, said = _walk_patch(around, centroids, edge_lengths, normals, votes, known, visited, patch, way)
+            own = 0.0
+            for i in patch[:size]:
                 own += way[i] * votes[i]
-                for a in range(indptr[i], indptr[i + 1]):
-                    j = np.int64(neighbours[a])
-                    if visited[j] and not known[j]:
-                        continue
-                    alike, is_one = _alike_sides(i, j, centroids, normals, edge_lengths[i])
-                    if known[j]:
-                        total += way[i] * alike if votes[j] > 0.0 else -way[i] * alike
-                        said += abs(alike)
-                    elif is_one:
-                        patch[size], way[j], visited[j] = j, way[i] * alike, True
-                        size += 1
             own *= _HARDLY / clear
             if size >= _PATCH and said > 0.0 and abs(total + own) >= _MOSTLY * (said + abs(own)):
                 changed, side = True, clear if total + own > 0.0 else -clear
                 for i in patch[:size]:
                     known[i], votes[i] = True, side * way[i]
+
+
+@routine
+def _walk_patch(around, centroids, edge_lengths, normals, votes, known, visited, patch, way):  # type: ignore[no-untyped-def]
+    """Set `patch`, which holds its first voxel, and `way` of all of it; its size, what it meets, summed for the side of
+    the first one's normal, and how sure that is in sum."""
+    indptr, neighbours = around
+    done, size, total, said = 0, 1, 0.0, 0.0
+    while done < size:
+        i = patch[done]
+        done += 1
+        for a in range(indptr[i], indptr[i + 1]):
+            j = np.int64(neighbours[a])
+            if visited[j] and not known[j]:
+                continue
+            alike, is_one = _alike_sides(i, j, centroids, normals, edge_lengths[i])
+            if known[j]:
+                total += way[i] * alike if votes[j] > 0.0 else -way[i] * alike
+                said += abs(alike)
+            elif is_one:
+                patch[size], way[j], visited[j] = j, way[i] * alike, True
+                size += 1
+    return size, total, said
 
 
 @routine
