@@ -34,7 +34,8 @@ TYPICAL_SPP = 24
 """Of light paths per pixel, if their number is not given: 16 to 64, by the surface."""
 PATHS_PER_CORE_S = 1.1e6
 """Camera paths per second and core: tabletop and matte scenes, 5 segments, LLVM."""
-PATHS_PER_GPU_S = 1e8
+PATHS_PER_GPU_S = 5e7
+"""Camera paths per second: tabletop scene, from 5 to 50 million paths, an H100, which has no ray-tracing cores."""
 PHOTON_S = 3e-6
 PASS_S, START_S = 1.0, 4.0
 """Seconds to compile a pass, and to import, load the scene and write the report."""
