@@ -65,7 +65,7 @@ def write_segmentation(
     path: str | PathLike[str],
     cloud: Cloud | ArrayLike,
     segmentation: Segmentation,
-    labels: NDArray[np.int32] | None = None,
+    labels: ArrayLike | None = None,
 ) -> None:
     """Write a segmentation, the whole file or none; an older file of that name is replaced.
 
@@ -80,7 +80,7 @@ def write_segmentation(
     cloud : Cloud, or points (n, 3) or (h, w, 3)
         What was segmented. A column of a name that the result itself has, such as ``supervoxels``, is left out.
     segmentation : Segmentation
-    labels : the points' leading shape, int32, optional
+    labels : the points' leading shape, whole numbers within 32 bits, optional
         Labels to write instead of the default cut.
 
     Raises
@@ -89,18 +89,18 @@ def write_segmentation(
         Another extension, or the place cannot be written; or a column is not of the points' shape, not of numbers, or
         has a name that is not one word.
     ValueError
-        Points or labels are not of the shape of what was segmented.
+        Points or labels are not of the shape of what was segmented, or labels no whole numbers within 32 bits.
     """
     path = Path(path)
     write_file(path, encode_segmentation(path.name, cloud, segmentation, labels), CloudWriteError)
 
 
 def encode_segmentation(
-    name: str, cloud: Cloud | ArrayLike, segmentation: Segmentation, labels: NDArray[np.int32] | None = None
+    name: str, cloud: Cloud | ArrayLike, segmentation: Segmentation, labels: ArrayLike | None = None
 ) -> bytes:
     """What `write_segmentation` writes to a file of such a name."""
     cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(cloud))
-    labels = segmentation.labels if labels is None else np.asarray(labels)
+    labels = segmentation.labels if labels is None else _whole_labels(labels)
     shape = segmentation.labels.shape
     if np.shape(cloud.points) != (*shape, 3):
         expected = f"the points that were segmented, of shape {(*shape, 3)}"
@@ -112,6 +112,16 @@ def encode_segmentation(
     if encode is None:
         raise CloudWriteError(f"expected an output file ending in {' or '.join(encoders)}, got {name!r}")
     return encode(cloud, segmentation, labels)
+
+
+def _whole_labels(labels: ArrayLike) -> NDArray[np.int32]:
+    """Labels as files hold them."""
+    given, limits = np.asarray(labels), np.iinfo(np.int32)
+    if given.dtype.kind not in "iub":
+        raise ValueError(f"expected labels as whole numbers, got {given.dtype}")
+    if given.size and not (limits.min <= given.min() and given.max() <= limits.max):
+        raise ValueError(f"expected labels of 32 bits, got {given.min()} to {given.max()}; number them anew")
+    return given.astype(np.int32)
 
 
 def label_colors(labels: NDArray[np.int32]) -> NDArray[np.uint8]:

@@ -20,7 +20,7 @@ _TRIES = 64
 _NEIGHBOUR = 8
 _MANY_BESIDE = 512  # points in 27 cells, at most, that are looked at
 _FEW_CUT_OFF = 0.05  # of the points have more beside them
-_NEARLY_ALL = 0.95  # of the points (in one place: the others are outliers)
+_NEARLY_ALL = 0.95  # of the points: the others are outliers
 _ROWS_OF_CELLS = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))  # the near ones first
 _NO_SPACING_M = 0.01
 _IN_ROWS = 1280  # points of which it is asked whether they lie in a row
@@ -71,10 +71,17 @@ def spacing_and_rows(points: NDArray[np.float64], warp: Warp | None = None) -> t
         _, cells, held = np.unique(
             np.floor((crowd - low) / (100.0 * spacing)), axis=0, return_index=True, return_counts=True
         )
-        of_cells = _read(crowd[np.sort(cells)])[0]
-        if of_cells > 1000.0 * spacing and held.max() < _NEARLY_ALL * len(crowd):
+        full = _fullest(held)
+        of_cells = _read(crowd[np.sort(cells[full])])[0]
+        if of_cells > 1000.0 * spacing and len(full) > 1:
             return of_cells, rows
     return spacing, rows
+
+
+def _fullest(held: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The fewest of some cells, given how many points each holds, that hold nearly all: not those of points far off."""
+    order = np.argsort(-held, kind="stable")
+    return order[: int(np.searchsorted(np.cumsum(held[order]), _NEARLY_ALL * held.sum())) + 1]
 
 
 def _read(crowd: NDArray[np.float64]) -> tuple[float, Rows]:

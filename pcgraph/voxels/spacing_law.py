@@ -39,6 +39,7 @@ _MIN_EXPONENT = 0.5
 _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
 _MIN_EXPONENT_OF_HALF = 0.3
+_ENDS, _MIN_OF_MOST = 0.1, 0.7  # of the readings, nearest and farthest; exponent of the others, of that of all
 _ALIKE = 0.02  # explained variance: what explains less than this more is no better
 _OWN_ORIGIN = 0.05  # explained variance by which another place must beat the frame's origin
 _MIN_COSINE = 0.1  # between a surface and the rays that meet it: at less a beam's spacing is that along its rows
@@ -64,6 +65,9 @@ class SpacingLaw(ShortRepr):
     in_halves : float
         The lesser of the exponents in the near and in the far half of the readings, where ranges differ enough to tell;
         else `exponent`. About 0 where a fine scan of a thing lies within a coarse one of its surroundings.
+    in_most : float
+        The exponent among the readings without those nearest and farthest, a tenth each, of a place that was found;
+        else `exponent`. Less where little lies far off and less densely, as a house seen from a window.
     mirrored : (3,) float64, metres, or None
         A place on the other side of what is nearly one plane, if spacing does not tell which of the two it was.
     axis : (3,) float64, or None
@@ -75,6 +79,7 @@ class SpacingLaw(ShortRepr):
     explained: float
     by_range: float
     in_halves: float
+    in_most: float
     mirrored: NDArray[np.float64] | None = None
     axis: NDArray[np.float64] | None = None
 
@@ -82,7 +87,8 @@ class SpacingLaw(ShortRepr):
     def holds(self) -> bool:
         """Whether the law says more than chance would, near and far; or does not gainsay what rings told."""
         least = _MIN_EXPLAINED if self.axis is None else _MIN_ON_RINGS
-        return self._tells(least) and self.in_halves >= _MIN_EXPONENT_OF_HALF
+        grows_everywhere = self.in_halves >= _MIN_EXPONENT_OF_HALF and self.in_most >= _MIN_OF_MOST * self.exponent
+        return self._tells(least) and grows_everywhere
 
     @property
     def tells_place(self) -> bool:
@@ -113,7 +119,7 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
     """
     found = _readings(points, 2 * _READINGS)
     if len(found.logs) < _MIN_READINGS:
-        return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0)
+        return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
     low, high = bounding_box(found.places)
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
     found = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
@@ -134,12 +140,14 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         line_of_origin = _regressions(every.some(kept), origin[None])
         if line_of_origin.explained[0] >= line.explained[0] - _OWN_ORIGIN:
             place, line, own, mirrored = origin, line_of_origin, np.zeros(3), None
+    exponent = float(line.exponents[0])
     return SpacingLaw(
         viewpoint=middle + reach * place if own is None else own,
-        exponent=float(line.exponents[0]),
+        exponent=exponent,
         explained=float(line.explained[0]),
         by_range=float(line.by_range[0]),
-        in_halves=_least_exponent(halved, place, float(line.exponents[0])),
+        in_halves=_least_exponent(halved, place, exponent),
+        in_most=_exponent_of_most(every, place) if viewpoint is None else exponent,
         mirrored=None if mirrored is None else middle + reach * mirrored,
     )
 
@@ -375,6 +383,14 @@ def _least_exponent(readings: _Readings, viewpoint: NDArray[np.float64], exponen
         rise = float(np.median(y[far]) - np.median(y[near]))
         slopes.append(rise / max(float(np.median(x[far]) - np.median(x[near])), _TINY))
     return min(slopes)
+
+
+def _exponent_of_most(readings: _Readings, viewpoint: NDArray[np.float64]) -> float:
+    """The exponent among the readings of middling range."""
+    x = _on_law(readings, viewpoint[None])[0][0]
+    low, high = np.quantile(x, (_ENDS, 1.0 - _ENDS))
+    most = readings.some((x >= low) & (x <= high))
+    return float(_regressions(most, viewpoint[None]).exponents[0])
 
 
 def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:

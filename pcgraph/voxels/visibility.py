@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
@@ -30,9 +31,11 @@ _LATTICE = 12  # along each side
 _CLEARANCE = 2.0  # cells between a free place and the next surface
 _SOME = 1500  # cells are looked for in all directions from a place, about
 _AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
+_BLOCKS, _PARTS, _OF_PART = 16, 3, 0.05  # along the box of all, by which parts are told; parts; of the cells in each
+_NEARLY_WHOLE, _SMALL = (0.05, 0.95), 0.5  # quantiles of a part's cells; and how long their box is, of that of all
 _SPREAD = 0.75  # of the free places lie far from each other, the others far from surfaces
 _ROUNDS = 12  # of agreement between places and orientations
-_HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, and from
+_HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, in rooms,
 _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
@@ -42,7 +45,8 @@ _TOLD = 40.0  # votes of the viewpoint for one of the places
 _CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
 _BOTH_SIDES = 0.2  # cosine under which places closed in see either side of a partition, at least
 _FINER = 1, 2, 4  # times as many cells and places, if some are closed in, until one agreement shows
-_SHOWS_MOST = 0.85  # of the surface
+_SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; where rooms are low
+_FEW, _LAYERS, _LOW = 16, 1.7, 8.0  # places in rooms; cells over each other on average, and in height: rooms too low
 _AS_MUCH = 0.004  # of it by which an agreement shows less than another, and yet as much
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
 _ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
@@ -98,10 +102,24 @@ class TellingPlaces(NamedTuple):
     places : (k, 3) float64, in half extents of the voxels' centroids from the middle of their bounding box
     weights : (k,) float64, 0..1
         How much each counts.
+    parts : (k,) int64
+        The part of the cloud whose outside each is asked about; one place may be there for several.
+    cells : (c, 3) float64
+        Places of coarse cells, in the same frame.
+    part_of_cell : (c,) int64
     """
 
     places: NDArray[np.float64]
     weights: NDArray[np.float64]
+    parts: NDArray[np.int64]
+    cells: NDArray[np.float64]
+    part_of_cell: NDArray[np.int64]
+
+    def part_of(self, centres: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The part of each of n places in the same frame, (n,)."""
+        from scipy.spatial import cKDTree
+
+        return self.part_of_cell[cKDTree(self.cells).query(centres)[1]]
 
 
 def visible_sides(
@@ -150,11 +168,14 @@ def visible_sides(
         told = _cosines(grid, normals, viewpoint, axis, reach)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
             return VisibleSides(viewpoint[None], _turned(normals, told))
-    places, weights = telling_places(grid, viewpoint) if telling is None else telling
+    telling = telling_places(grid, viewpoint) if telling is None else telling
+    places, weights = telling.places, telling.weights
     votes, (looked_at, stretch) = _TOLD * told, standing_for_all(grid)
     centres, widths = (grid.centroids[looked_at] - middle) / reach, stretch * grid.edge_lengths[looked_at] / reach
     sides = normals[looked_at]
     seen, towards = seen_from(places, centres, widths, sides, stretch), np.empty((len(centres), 3))
+    if telling.part_of_cell.any():
+        seen &= telling.parts[:, None] == telling.part_of(centres)
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / _lengths(towards)
     seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
@@ -361,7 +382,8 @@ def _lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> TellingPlaces:
     """The places that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
 
-    Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells.
+    Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
+    and where floors and ceilings lie near to each other for cells of that size, so that hardly a place is in a room.
     """
     for finer in _FINER:
         telling, shows_most = _telling_places(grid, viewpoint, finer)
@@ -377,7 +399,9 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
     coarse = _coarse(grid, middle, reach, finer * _CELLS)
     low, high = bounding_box(coarse.centroids)
-    inside = _free_places(coarse, low, high, finer)
+    part_of_cell, boxes = _parts(coarse.centroids, low, high)
+    boxes = [(low, high), *boxes]
+    inside = np.concatenate([_free_places(coarse, *box, max(finer // len(boxes), 1)) for box in boxes])
     outside = (low + high) / 2.0 + _DISTANCE * _lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
@@ -402,12 +426,73 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     in_blocks(_count_hits, len(inside), inside.astype(np.float32), _columns(coarse.centroids), hits, smallest=1)
     in_rooms = closed >= _CLOSED
     voting = _without_partitions(sides, sides[in_rooms])
-    found = _agreements(voting, _starts(voting, outside, likely))
+    starts = _starts(voting, outside, likely, in_rooms)
+    of_place, of_part = _looks_at_parts(seen, part_of_cell)
+    if of_part.any():
+        asked = of_part[:, None] == part_of_cell
+        seen, sides, voting = (np.where(asked, every[of_place], every.dtype.type(0)) for every in (seen, sides, voting))
+    found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
     likely_counts = _FROM_VIEWPOINT if from_viewpoint else _ABOVE_GROUND if is_ground else _BEFORE
-    weights, shown = _most_telling(found, sides, coarse, closed, likely, likely_counts)
+    looks = _Looks(sides, of_place < _OUTSIDE, likely[of_place], closed[of_place], of_part, part_of_cell)
+    weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts)
     chosen = _spread_choice(seen, weights)
-    shows_most = shown >= _SHOWS_MOST or not in_rooms.any() or coarse.n_voxels > grid.n_voxels // 2
-    return TellingPlaces(places[chosen], weights[chosen]), shows_most
+    if _is_layered(
+        coarse
+    ):  # rooms too low to have many places show little at first, and the outside of all of them much
+        shows_most = np.count_nonzero(in_rooms) >= _FEW and shown >= _SHOWS_NEARLY_ALL
+    else:
+        shows_most = shown >= _SHOWS_MOST or not in_rooms.any()
+    shows_most = shows_most or coarse.n_voxels > grid.n_voxels // 2
+    telling = TellingPlaces(places[of_place[chosen]], weights[chosen], of_part[chosen], coarse.centroids, part_of_cell)
+    return telling, shows_most
+
+
+class _Looks(NamedTuple):
+    """Looks of k places at n cells, or at those of one part.
+
+    Attributes
+    ----------
+    sides : (k, n) float32
+        Signed cosines, 0 hidden.
+    from_outside, likely : (k,) bool
+        Whether they are those of places around the cloud, and of places before what bears things or of the viewpoint.
+    closed : (k,) float64
+        Fraction of the directions in which a place has something.
+    of_part : (k,) int64
+        The part at which each is.
+    part_of_cell : (n,) int64
+    """
+
+    sides: NDArray[np.float32]
+    from_outside: NDArray[np.bool_]
+    likely: NDArray[np.bool_]
+    closed: NDArray[np.float64]
+    of_part: NDArray[np.int64]
+    part_of_cell: NDArray[np.int64]
+
+
+def _looks_at_parts(
+    seen: NDArray[np.bool_], part_of_cell: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the place, of k that see cells, (k, n), and of the part, for each look at a part of which it sees some.
+
+    Parts are asked about one by one, as a place before a house sees its front from the right side and the room
+    opposite, into which its sensor looked through a window, from the wrong one.
+    """
+    n_parts = int(part_of_cell.max()) + 1
+    if n_parts == 1:
+        return np.arange(len(seen)), np.zeros(len(seen), np.int64)
+    sees_some = np.stack([seen[:, part_of_cell == part].any(axis=1) for part in range(n_parts)])
+    of_part, of_place = np.nonzero(sees_some)
+    return of_place, of_part
+
+
+def _is_layered(coarse: VoxelGrid) -> bool:
+    """Whether floors and ceilings may lie one over another across the thinnest side, too near for a place between."""
+    low, high = bounding_box(coarse.centroids)
+    thin = int(np.argmin(high - low))
+    columns = np.unique(np.rint(np.delete(coarse.cells, thin, axis=1)), axis=0)
+    return bool(coarse.n_voxels >= _LAYERS * len(columns) and (high - low)[thin] < _LOW * coarse.size)
 
 
 def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -421,16 +506,19 @@ def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32
     return np.where(np.minimum(front, back) > _BOTH_SIDES, np.float32(0.0), sides)
 
 
-def _starts(sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _starts(
+    sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
+) -> NDArray[np.float32]:
     """Weights of the places, (s, k), from which agreement may start: first opinions as different as there are."""
-    starts = np.zeros((_HALVES + 3 + _LEADERS, len(sides)), np.float32)
+    starts = np.zeros((_HALVES + 4 + _LEADERS, len(sides)), np.float32)
     starts[:_HALVES, :_OUTSIDE] = sphere_directions(_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
     starts[_HALVES, :_OUTSIDE] = 1.0
     starts[_HALVES + 1, _OUTSIDE:] = 1.0
     starts[_HALVES + 2] = likely
+    starts[_HALVES + 3] = in_rooms
     unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
     news = np.empty(len(sides), np.float32)
-    for start in starts[_HALVES + 3 :]:
+    for start in starts[_HALVES + 4 :]:
         in_blocks(_tell_news, len(sides), sides, unseen, news, smallest=1)
         leader = int(np.argmax(news))
         start[leader] = 1.0
@@ -589,31 +677,29 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
 
 
 def _most_telling(
-    found: _Agreements,
-    sides: NDArray[np.float32],
-    coarse: VoxelGrid,
-    closed: NDArray[np.float64],
-    likely: NDArray[np.bool_],
-    likely_counts: float,
+    found: _Agreements, looks: _Looks, around: Neighbourhood, likely_counts: float
 ) -> tuple[NDArray[np.float64], float]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
 
     Crevices between things are crests from behind, which are seen the better: what little that is decides nothing.
     A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
-    one of places closed in, as in a room: of that all but narrow gaps is seen from within.
+    one of places closed in, as in a room: of that part all but narrow gaps is seen from within.
     """
-    visible = np.abs(sides).sum(axis=1)
+    visible = np.abs(looks.sides).sum(axis=1)
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
-    is_closed = any(float(found.weights[s] @ closed) >= _CLOSED * float(found.weights[s].sum()) > 0 for s in different)
-    shown, around = np.empty(len(different)), coarse.neighbourhood
-    in_blocks(_show, len(different), different, sides, found, around, is_closed, shown, smallest=1)
+    counts = found.weights[different].astype(np.float64)
+    of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
+    every, closed = counts @ of_parts, counts @ (of_parts * looks.closed[:, None])
+    is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
+    shown = np.empty(len(different))
+    in_blocks(_show, len(different), different, looks.sides, found, around, is_closed, shown, smallest=1)
     most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
     for s, fraction in zip(different, shown, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
         score = min(float(fraction), most_shown - _AS_MUCH)
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
         score += _DECIDED * float(decided[visible > 0.0].mean())
-        for some, counts in ((slice(_OUTSIDE), _OUTSIDE_IN), (likely, likely_counts)):
+        for some, counts in ((looks.from_outside, _OUTSIDE_IN), (looks.likely, likely_counts)):
             score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
@@ -628,7 +714,7 @@ def _show(
     sides: NDArray[np.float32],
     found: _Agreements,
     around: Neighbourhood,
-    is_closed: bool,
+    is_closed: NDArray[np.bool_],
     shown: NDArray[np.float64],
 ) -> None:
     """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in.
@@ -649,7 +735,7 @@ def _show(
         total = 0.0
         for i in range(n):
             most = of_cells[i]
-            if not is_closed:
+            if not is_closed[i]:
                 for a in range(around.indptr[i], around.indptr[i + 1]):
                     most = max(most, of_cells[around.neighbours[a]])
             total += min(most / _WELL_SEEN, 1.0)
@@ -689,6 +775,33 @@ def _coarse(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: i
         if coarse.n_voxels <= 2 * cells:
             return replace(coarse, centroids=coarse.centroids - shift)
         size *= 1.4
+
+
+def _parts(
+    centres: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
+    """Parts of a cloud that are far from each other, the number of each cell's, (n,), the largest first, which has what
+    belongs to none; and boxes in which nearly all of them lies, where the box of all is twice as long.
+
+    A room of whose surroundings little was seen through its windows, or scans of places far apart.
+    """
+    part_of_cell, length = np.zeros(len(centres), np.int64), float((high - low).max())
+    boxes: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    if not length > 0.0:
+        return part_of_cell, boxes
+    blocks = voxel_grid(centres - low, None, length / _BLOCKS, Warp())
+    source = np.repeat(np.arange(blocks.n_voxels), np.diff(blocks.indptr))
+    touching = np.stack((source, blocks.neighbours.astype(np.int64)), axis=1)
+    piece = connected_components(touching, blocks.n_voxels)[blocks.voxel_of_point]
+    counts = np.bincount(piece)
+    for part, number in enumerate(np.argsort(-counts, kind="stable")[:_PARTS]):
+        if counts[number] < _OF_PART * len(centres):
+            break
+        part_of_cell[piece == number] = part
+        lowest, highest = np.quantile(centres[piece == number], _NEARLY_WHOLE, axis=0)
+        if (highest - lowest).max() < _SMALL * length:
+            boxes.append((lowest, highest))
+    return part_of_cell, boxes
 
 
 def _free_places(

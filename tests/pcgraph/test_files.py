@@ -151,6 +151,23 @@ def test_results_go_with_their_own_points(tmp_path, boxes, name):
     assert not (tmp_path / f"wrong_{name}").exists()
 
 
+@pytest.mark.parametrize("suffix", ["ply", "npz"])
+def test_labels_of_ones_own_are_whole_numbers_of_any_type(tmp_path, suffix):
+    """Those that `np.where` or `np.unique` give ended in a KeyError, and NaN became a label."""
+    points = np.random.default_rng(0).random((2000, 3))
+    result, file = pcgraph.segment(points), tmp_path / f"own.{suffix}"
+    for dtype in ("?", "u1", "i8", "u8", ">i4"):
+        own = (np.arange(2000) % 2).astype(dtype)
+        for labels in (own, own.tolist()):
+            pcgraph.write_segmentation(file, points, result, labels)
+    written = pcgraph.read_cloud(file).labels if suffix == "ply" else np.load(file)["labels"]
+    assert written.dtype == np.int32
+    assert np.array_equal(written, np.arange(2000) % 2)
+    for wrong, told in ((np.full(2000, np.nan), "whole numbers, got float64"), (np.full(2000, 1 << 40), "32 bits")):
+        with pytest.raises(ValueError, match=told):
+            pcgraph.write_segmentation(file, points, result, wrong)
+
+
 @pytest.mark.parametrize("dtype", ["u1", "i4", "i8", "f2", "f4", "f8", "f16"])
 def test_results_go_with_points_of_any_dtype_that_is_segmented(tmp_path, dtype):
     points = np.random.default_rng(0).integers(0, 100, (2000, 3)).astype(dtype)

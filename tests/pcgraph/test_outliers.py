@@ -20,6 +20,20 @@ def clean():
     return points, truth, viewpoint, pcgraph.segment(points, viewpoint=viewpoint)
 
 
+@pytest.mark.parametrize(("number", "reach"), [(30, 150.0), (60, 60.0), (300, 30.0)])
+def test_a_few_points_far_off_do_not_say_how_large_voxels_are(clean, number, reach):
+    """Cells of a handful of strays were most of all cells, and their spacing that of the cloud: voxels of 40 m."""
+    points, truth, _, before = clean
+    rng = np.random.default_rng(number)
+    ways = rng.normal(size=(number, 3))
+    ways *= reach * rng.uniform(0.3, 1.0, (number, 1)) / np.linalg.norm(ways, axis=1, keepdims=True)
+    result = pcgraph.segment(np.concatenate((points, points.mean(axis=0) + ways)))
+    assert result.voxel_size == pytest.approx(before.voxel_size, rel=0.1)
+    assert result.outliers[len(points) :].all()
+    covering = pcgraph.metrics.segmentation_covering(result.labels[: len(points)], truth)
+    assert covering > pcgraph.metrics.segmentation_covering(before.labels, truth) - 0.02
+
+
 @pytest.mark.parametrize("fraction", [0.1, 0.5])
 def test_noise_through_the_volume_is_no_object(clean, fraction):
     points, truth, viewpoint, before = clean

@@ -559,10 +559,14 @@ def _rooms(nx, ny, doors, seed=0, wall=0.12):
 
 
 @pytest.mark.parametrize(
-    ("nx", "ny", "doors"), [(2, 1, False), (2, 2, False), (3, 2, True), (4, 3, True), (5, 4, False)]
+    ("nx", "ny", "doors"),
+    [(2, 1, False), (2, 2, False), (3, 2, True), (4, 3, True), (5, 4, False), (9, 6, True)],
 )
 def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
-    """Places in one room saw its partitions from the other side than those next door, and the outside won."""
+    """Places in one room saw its partitions from the other side than those next door, and the outside won.
+
+    Of many rooms the coarse cells were so large that there was no place between floor and ceiling.
+    """
     points, inwards = _rooms(nx, ny, doors)
     result = pcgraph.segment(points)
     normals = result.surface.normals[result.surface.grid.voxel_of_point]
@@ -570,6 +574,25 @@ def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
     level = inwards[:, 2] != 0.0
     assert np.mean(facing[level]) > 0.97
     assert np.mean(facing) > 0.75  # of two sheets 12 cm apart, two voxels, one may take the other's side
+
+
+@pytest.mark.filterwarnings("ignore:expected far fewer objects")  # the house falls apart
+@pytest.mark.parametrize(("away", "seed"), [(10.0, 0), (20.0, 1), (30.0, 2), (50.0, 3)])
+def test_a_room_from_whose_window_a_house_was_seen_is_seen_from_within(away, seed):
+    """A lattice of places over all had few in the room, and the house was taken to be seen from them all."""
+    rng = np.random.default_rng(seed)
+    points, inwards = joined((ROOM[0], -ROOM[1]), THING)
+    in_window = (points[:, 0] == 4.0) & (np.abs(points[:, 1] - 1.5) < 1.0) & (np.abs(points[:, 2] - 1.5) < 0.6)
+    points, inwards = points[~in_window], inwards[~in_window]
+    window = np.stack((np.full(6000, 4.0), rng.uniform(0.5, 2.5, 6000), rng.uniform(0.9, 2.1, 6000)), axis=1)
+    sensor = np.array([[1.0, 0.8, 1.5], [3.0, 2.2, 1.6]])[rng.integers(0, 2, 6000)]
+    front = sensor + (window - sensor) * ((4.0 + away - sensor[:, 0]) / (4.0 - sensor[:, 0]))[:, None]
+    front = front[(front[:, 2] > 0.0) & (front[:, 2] < 15.0)]
+    front = front[np.unique(np.floor(front / 0.06), axis=0, return_index=True)[1]]
+    cloud = np.concatenate((points + rng.normal(0.0, 0.003, points.shape), front))
+    result = pcgraph.segment(cloud)
+    cosines = np.einsum("ij,ij->i", result.surface.normals[result.surface.grid.voxel_of_point][: len(points)], inwards)
+    assert np.mean(cosines[np.abs(cosines) > 0.7] > 0.0) > 0.95
 
 
 def test_a_thin_wall_hides_what_is_behind_it_also_where_some_voxels_stand_for_many():
