@@ -573,9 +573,11 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]
     """The grid, or one of voxels larger by half powers of two, enough to join what falls apart.
 
     What is no surface at any size, as a line, stays. So does the grid where half of it is joined and larger voxels
-    hardly join more, as they do not far rings of a sweep.
+    hardly join more, as they do not far rings of a sweep. Where less than half of one scan is joined at first, as of a
+    sweep of few beams, half is enough, unless larger voxels join much more.
     """
-    cells, size, joined_at_first = [grid.cells, grid.cells], grid.size, _joined(degrees)
+    cells, size, joined, joined_at_first = [grid.cells, grid.cells], grid.size, 0.0, _joined(degrees)
+    few_beams, best = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size
     for step in range(1, _ENLARGEMENTS + 1):
         size *= math.sqrt(2.0)
         if size > largest:
@@ -585,12 +587,16 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]
         larger, degrees = occupied_cells(scaled, size)
         if len(larger) < _MIN_VOXELS:
             break
-        cells, joined = [cells[1], larger], _joined(degrees)
-        if joined >= _MIN_JOINED:
-            if joined_at_first >= _HALF_JOINED and joined - joined_at_first < _MIN_GAIN * step:
+        cells, before, joined = [cells[1], larger], joined, _joined(degrees)
+        if few_beams and joined >= _HALF_JOINED:
+            if before >= _HALF_JOINED and joined - before < _MIN_GAIN:
                 break
-            return voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
-    return grid
+            best = size
+        if joined >= _MIN_JOINED:
+            if joined_at_first < _HALF_JOINED or joined - joined_at_first >= _MIN_GAIN * step:
+                best = size
+            break
+    return grid if best == grid.size else voxel_grid(cloud.points, cloud.colors, best, grid.warp, cloud.features)
 
 
 def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]) -> VoxelGrid:

@@ -282,3 +282,43 @@ def test_an_update_leaves_the_planes_as_they_are_fitted(halves):
     given = np.zeros_like(right)  # zero means: none
     again = pcgraph.update(first, right, None, given, viewpoint)
     assert np.array_equal(again.supervoxels, second.supervoxels)
+
+
+def sweep_of_a_lot(beams, lowest, highest, cars, seed):
+    """Points of a turning scanner 1.8 m above a lot with two buildings, a wall and cars, and on which car each lies."""
+    rng = np.random.default_rng(seed)
+    things = [(14.0, 20.0, 0.3, 12.0, 8.0, 5.0), (-30.0, 5.0, 1.0, 10.0, 10.0, 6.0), (0.0, -28.0, 0.0, 30.0, 1.0, 2.0)]
+    for i in range(cars):
+        angle, away = 2.4 * i + rng.uniform(-0.3, 0.3), 6.0 + 2.0 * i
+        things.append((away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 3.0), 4.4, 1.8, 1.5))
+    angles = np.meshgrid(np.radians(np.arange(0.0, 360.0, 0.2)), np.radians(np.linspace(lowest, highest, beams)))
+    azimuth, elevation = (angle.ravel() for angle in angles)
+    level = np.cos(elevation)
+    rays = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
+    with np.errstate(divide="ignore"):
+        ranges = np.where(rays[:, 2] < 0.0, -1.8 / rays[:, 2], np.inf)
+        car = np.full(len(rays), -1)
+        for number, (x, y, yaw, *size) in enumerate(things):
+            turn = np.array([[np.cos(yaw), np.sin(yaw), 0.0], [-np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+            place, ways, half = turn @ np.array((-x, -y, 1.8 - size[2] / 2.0)), rays @ turn.T, np.array(size) / 2.0
+            ends = np.stack(((-half - place) / ways, (half - place) / ways))
+            near, far = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
+            hit = (near < far) & (near > 0.0) & (near < ranges)
+            ranges[hit], car[hit] = near[hit], number - 3 if number >= 3 else -1
+    seen = ranges < 80.0
+    return rays[seen] * (ranges[seen] + rng.normal(0.0, 0.02, seen.sum()))[:, None], car[seen]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("beams", "lowest", "highest"), [(16, -15.0, 15.0), (32, -30.67, 10.67)])
+def test_cars_in_a_sweep_of_few_beams_are_objects(beams, lowest, highest, seed):
+    """Less than half of the voxels touched five others: they stayed, and cars fell apart, or grew to 0.8 m."""
+    points, car = sweep_of_a_lot(beams, lowest, highest, 10, seed)
+    labels = pcgraph.segment(points).labels
+    overlaps = []
+    for number in range(10):
+        own = car == number
+        found, counts = np.unique(labels[own], return_counts=True)
+        best = labels == found[counts.argmax()]
+        overlaps.append((own & best).sum() / (own | best).sum())
+    assert np.mean(overlaps) > 0.65
