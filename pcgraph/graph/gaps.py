@@ -23,8 +23,8 @@ def gaps(
 ) -> Gaps:
     """Pairs of supervoxels that do not touch, but whose boundary voxels come near each other.
 
-    Near is three voxel edges, or eight where voxels grow with range from a scanner, whose rows lie far apart
-    (`pcgraph.voxels.warp.Warp.max_gap`).
+    Near is three voxel edges, or six where voxels grow with range from a scanner, whose rows lie far apart
+    (`pcgraph.voxels.warp.Warp.max_gap`); with more, cars that are parked side by side are one thing.
 
     Parameters
     ----------

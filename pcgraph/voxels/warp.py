@@ -138,7 +138,7 @@ class RangeWarp(Warp):
     """
 
     # A scanner's rows lie farther apart than the points along them.
-    max_gap: ClassVar[float] = 8.0
+    max_gap: ClassVar[float] = 6.0
     of_one_scan: ClassVar[bool] = True
 
     viewpoint: NDArray[np.float64]

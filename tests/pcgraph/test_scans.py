@@ -284,13 +284,11 @@ def test_an_update_leaves_the_planes_as_they_are_fitted(halves):
     assert np.array_equal(again.supervoxels, second.supervoxels)
 
 
-def sweep_of_a_lot(beams, lowest, highest, cars, seed):
-    """Points of a turning scanner 1.8 m above a lot with two buildings, a wall and cars, and on which car each lies."""
-    rng = np.random.default_rng(seed)
+def sweep_of_a_lot(beams, lowest, highest, cars, rng):
+    """Points of a turning scanner 1.8 m above a lot with two buildings, a wall and cars, given the middle and the yaw
+    of each, and on which car each point lies."""
     things = [(14.0, 20.0, 0.3, 12.0, 8.0, 5.0), (-30.0, 5.0, 1.0, 10.0, 10.0, 6.0), (0.0, -28.0, 0.0, 30.0, 1.0, 2.0)]
-    for i in range(cars):
-        angle, away = 2.4 * i + rng.uniform(-0.3, 0.3), 6.0 + 2.0 * i
-        things.append((away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 3.0), 4.4, 1.8, 1.5))
+    things += [(*car, 4.4, 1.8, 1.5) for car in cars]
     angles = np.meshgrid(np.radians(np.arange(0.0, 360.0, 0.2)), np.radians(np.linspace(lowest, highest, beams)))
     azimuth, elevation = (angle.ravel() for angle in angles)
     level = np.cos(elevation)
@@ -309,16 +307,33 @@ def sweep_of_a_lot(beams, lowest, highest, cars, seed):
     return rays[seen] * (ranges[seen] + rng.normal(0.0, 0.02, seen.sum()))[:, None], car[seen]
 
 
+def overlaps(labels, car):
+    """Intersection over union of each car and the label that has most of it."""
+    found = []
+    for number in range(car.max() + 1):
+        own = car == number
+        of_own, counts = np.unique(labels[own], return_counts=True)
+        best = labels == of_own[counts.argmax()]
+        found.append((own & best).sum() / (own | best).sum())
+    return found
+
+
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("beams", "lowest", "highest"), [(16, -15.0, 15.0), (32, -30.67, 10.67)])
 def test_cars_in_a_sweep_of_few_beams_are_objects(beams, lowest, highest, seed):
     """Less than half of the voxels touched five others: they stayed, and cars fell apart, or grew to 0.8 m."""
-    points, car = sweep_of_a_lot(beams, lowest, highest, 10, seed)
-    labels = pcgraph.segment(points).labels
-    overlaps = []
-    for number in range(10):
-        own = car == number
-        found, counts = np.unique(labels[own], return_counts=True)
-        best = labels == found[counts.argmax()]
-        overlaps.append((own & best).sum() / (own | best).sum())
-    assert np.mean(overlaps) > 0.65
+    rng, cars = np.random.default_rng(seed), []
+    for i in range(10):
+        angle, away = 2.4 * i + rng.uniform(-0.3, 0.3), 6.0 + 2.0 * i
+        cars.append((away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 3.0)))
+    points, car = sweep_of_a_lot(beams, lowest, highest, cars, rng)
+    assert np.mean(overlaps(pcgraph.segment(points).labels, car)) > 0.65
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cars_parked_side_by_side_are_objects(seed):
+    """Over gaps of eight voxel edges two or three were one."""
+    rng = np.random.default_rng(seed)
+    cars = [(3.0 * i - 7.5, 8.0 + rng.normal(0.0, 0.15), np.pi / 2.0 + rng.normal(0.0, 0.03)) for i in range(6)]
+    points, car = sweep_of_a_lot(128, -25.0, 15.0, cars, rng)
+    assert min(overlaps(pcgraph.segment(points).labels, car)) > 0.85
