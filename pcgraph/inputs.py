@@ -20,6 +20,8 @@ from pcgraph.voxels.cells import bounding_box
 
 _SMALLEST = 1e-250
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow
+_SAME_PLACE = 0.02  # of the median range: viewpoints no farther from each other are one
+_SOME_RANGES = 1 << 12
 
 
 Points = ArrayLike | Cloud | PathLike[str]
@@ -209,7 +211,7 @@ def clean_cloud(
 def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64] | None:
     """The viewpoint, (3,) or (n, 3) float64, metres: as given, the origin of an organised cloud, or None.
 
-    The same place for each point is one viewpoint.
+    Nearly the same place for each point is one viewpoint, as of a sweep whose scanner moved a little.
     """
     if viewpoint is not None:
         given = _numbers("viewpoint", viewpoint).astype(np.float64)
@@ -220,9 +222,18 @@ def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[n
                 f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
                 f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
             )
-        one = position.ndim == 2 and len(position) > 0 and bool((position == position[0]).all())
-        return position[0] if one else position
+        return position if position.ndim == 1 or not len(position) else _one_place(position, cloud.points)
     return np.zeros(3) if len(cloud.shape) == 2 else None
+
+
+def _one_place(places: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The middle of places, (n, 3), that are one for what lies as far off as most points, (n, 3); else the places."""
+    low, high = bounding_box(places)
+    if (low == high).all():
+        return places[0]
+    middle = low + (high - low) / 2.0
+    ranges = np.linalg.norm(points[:: len(points) // _SOME_RANGES + 1] - middle, axis=1)
+    return middle if (high - low).max() <= _SAME_PLACE * np.median(ranges) else places
 
 
 def _excerpt(values: NDArray[np.float64]) -> str:
@@ -256,6 +267,8 @@ def fraction(name: str, value: float) -> float:
 
 def _number(value: float) -> float:
     """The value as float; NaN if it is no number."""
+    if isinstance(value, (str, bytes, bool, np.bool_)):
+        return float("nan")
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -293,10 +306,15 @@ def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.i
         shades *= 1.0 / 255.0
         return shades
     if array.dtype.kind != "f":
-        raise ValueError(f"expected colors as uint8 (0..255) or float (0..1), got {array.dtype}")
+        raise ValueError(
+            f"expected colors as uint8 (0..255) or float (0..1), got {array.dtype}; divide by the largest there can be"
+        )
     shades = array.astype(np.float64, order="C")
     if not ((shades >= 0.0) & (shades <= 1.0)).all():
-        raise ValueError("expected float colors within 0..1 at finite points; divide by 255 or pass uint8")
+        raise ValueError(
+            f"expected float colors within 0..1 at finite points, got {shades.min():g} to {shades.max():g}; "
+            "divide by the largest there can be"
+        )
     return shades
 
 

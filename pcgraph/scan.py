@@ -120,10 +120,11 @@ def segment(
     normals : same shape, float, optional
         Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
     viewpoint : (3,) or points' shape float, metres, the points' frame, optional
-        Where the sensor stood, for all points or for each; estimated normals point to its side, and convexity
-        depends on that. Default: the origin for organised clouds. A list of points whose spacing grows with range
-        from one place (`pcgraph.voxels.spacing_law`) was seen from there; of any other, the outside is found from what
-        is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
+        Where the sensor stood, for all points or for each (which is one for all, if no two are farther apart than a
+        fiftieth of the range); estimated normals point to its side, and convexity depends on that. Default: the origin
+        for organised clouds. A list of points whose spacing grows with range from one place
+        (`pcgraph.voxels.spacing_law`) was seen from there; of any other, the outside is found from what is visible from
+        free places (`pcgraph.voxels.visibility.visible_sides`).
     features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
         What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
@@ -169,7 +170,8 @@ def segment(
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
     points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
-    settings = Settings.of(method or SurfaceGrowth(), linkage or RegionLinkage(), object_altitude)
+    method = SurfaceGrowth() if method is None else method
+    settings = Settings.of(method, RegionLinkage() if linkage is None else linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals, features)
     place = clean_viewpoint(viewpoint, cloud)
     compile_in_two_processes()
@@ -250,15 +252,19 @@ def update(
     points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
     if object_altitude is None and linkage is None:
         object_altitude = earlier.object_altitude
-    settings = Settings.of(method or earlier.method, linkage or earlier.linkage, object_altitude)
+    method = earlier.method if method is None else method
+    settings = Settings.of(method, earlier.linkage if linkage is None else linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals, features, earlier.feature_scaling)
     place = clean_viewpoint(viewpoint, cloud)
     compile_in_two_processes()
+    warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp, cloud.features)
     lonely = (outlier_voxels(seen) | detached_voxels(seen)) & ~is_near(seen, before.grid)
     cloud, seen, place = _without(lonely, cloud, seen, place)
+    if place is not None and place.ndim == 1 and viewpoint is not None:
+        warn_of_viewpoint(place, seen)
     union = grid_union(before.grid, seen)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
@@ -271,7 +277,9 @@ def update(
     places = np.unique(np.concatenate((outside.places, earlier_place)), axis=0)
     known = earlier.graph.sides_known and (outside.known or cloud.normals is not None)
     scan = Scan(cloud, outside.viewpoint, places, known, union.grid, planes, labels, earlier.seed_size)
-    return segment_scan(scan, earlier, settings)
+    result = segment_scan(scan, earlier, settings)
+    warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, union.grid.size)
+    return result
 
 
 @dataclass(frozen=True)

@@ -133,3 +133,17 @@ def test_a_name_in_place_of_a_linkage_or_method_is_told_which_there_are():
         pcgraph.segment(np.ones((3, 3)), linkage=3)
     with pytest.raises(ValueError, match=r"pcgraph\.Vccs\(\), got 'Vcs'; did you mean pcgraph\.Vccs\(\)"):
         pcgraph.segment(np.ones((3, 3)), method="Vcs")
+
+
+@pytest.mark.parametrize("wrong", ["0.2", True, b"1"])
+def test_sizes_are_numbers(wrong):
+    with pytest.raises(ValueError, match="expected a finite voxel_size"):
+        pcgraph.segment(POINTS, voxel_size=wrong)
+
+
+@pytest.mark.parametrize("argument", ["method", "linkage"])
+def test_what_is_no_method_or_linkage_is_refused_whatever_it_is(argument):
+    """0 and the empty text were taken for the default."""
+    for wrong in (0, "", False, "lccp"):
+        with pytest.raises(ValueError, match=f"expected a {argument} such as"):
+            pcgraph.segment(POINTS, **{argument: wrong})

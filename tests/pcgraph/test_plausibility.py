@@ -72,3 +72,12 @@ def test_noise_alone_is_warned_of():
     noise = np.random.default_rng(0).random((20000, 3))
     with pytest.warns(CloudWarning, match="expected points on surfaces, but they fill a volume"):
         pcgraph.segment(noise)
+
+
+def test_what_cannot_be_right_of_a_further_scan_is_noticed(one):
+    """`update` said nothing of what `segment` warns of."""
+    with pytest.warns(CloudWarning, match="expected a viewpoint that sees the cloud"):
+        pcgraph.update(one, POINTS, viewpoint=(0.8, 0.6, -1e-3))
+    far = (POINTS + np.array((5e5, 5e6, 0.0))).astype(np.float32)
+    with pytest.warns(CloudWarning, match="comes in steps of"):
+        pcgraph.update(one, far, viewpoint=VIEWPOINT)

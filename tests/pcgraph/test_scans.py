@@ -337,3 +337,17 @@ def test_cars_parked_side_by_side_are_objects(seed):
     cars = [(3.0 * i - 7.5, 8.0 + rng.normal(0.0, 0.15), np.pi / 2.0 + rng.normal(0.0, 0.03)) for i in range(6)]
     points, car = sweep_of_a_lot(128, -25.0, 15.0, cars, rng)
     assert min(overlaps(pcgraph.segment(points).labels, car)) > 0.85
+
+
+def test_viewpoints_that_hardly_differ_are_one():
+    """A micrometre of drift took the growth with range away, and there were three times as many objects."""
+    rng = np.random.default_rng(0)
+    cars = [(8.0 * np.cos(i), 8.0 * np.sin(i), i) for i in range(6)]
+    points, _ = sweep_of_a_lot(64, -25.0, 15.0, cars, rng)
+    drifting = rng.normal(0.0, 1e-6, points.shape)
+    one, each = pcgraph.segment(points, viewpoint=np.zeros(3)), pcgraph.segment(points, viewpoint=drifting)
+    assert each.viewpoint == pytest.approx(np.zeros(3), abs=1e-5)
+    assert each.surface.grid.warp.of_one_scan
+    assert each.labels.max() == pytest.approx(one.labels.max(), rel=0.1)
+    apart = np.where(np.arange(len(points))[:, None] % 2 == 0, (3.0, 0.0, 0.0), (-3.0, 0.0, 0.0))
+    assert pcgraph.segment(points, viewpoint=apart).viewpoint.ndim == 2
