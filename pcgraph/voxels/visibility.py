@@ -491,7 +491,8 @@ def _is_layered(coarse: VoxelGrid) -> bool:
     """Whether floors and ceilings may lie one over another across the thinnest side, too near for a place between."""
     low, high = bounding_box(coarse.centroids)
     thin = int(np.argmin(high - low))
-    columns = np.unique(np.rint(np.delete(coarse.cells, thin, axis=1)), axis=0)
+    across, along = np.delete(coarse.cells, thin, axis=1).T
+    columns = np.unique(across * (float(np.ptp(along)) + 1.0) + along)
     return bool(coarse.n_voxels >= _LAYERS * len(columns) and (high - low)[thin] < _LOW * coarse.size)
 
 
