@@ -50,11 +50,11 @@ from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_v
 from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface, roughness
+from pcgraph.voxels.telling_places import telling_places
 from pcgraph.voxels.visibility import (
     likelier_place,
     sides_towards,
     sides_towards_each,
-    telling_places,
     visible_fraction,
     visible_sides,
 )

@@ -37,7 +37,7 @@ from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
-from pcgraph.voxels import visibility
+from pcgraph.voxels import telling_places
 from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.sampling import some_blocks
@@ -121,7 +121,7 @@ def compile_voxels() -> None:
     planes = method.planes(grid, np.zeros(3))
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
     method.supervoxel_of_point(points, grid, planes, supervoxels)
-    visibility._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
+    telling_places._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
 
 
 def compile_the_rest() -> None:

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcgraph
+from pcgraph.voxels.depth_buffer import seen_from
 from pcgraph.voxels.directions import densest_plane
 from pcgraph.voxels.spacing_law import spacing_law
-from pcgraph.voxels.visibility import seen_from
 
 
 def faces(low, high, spacing, sides="-x +x -y +y -z +z"):

@@ -1,0 +1,552 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places from which the outside of a cloud is seen: those that agree, of many around and within it.
+
+A scanner stood where nothing was, and what it measured it saw from there. So places around and within the cloud are
+tried: those from which much of it is visible, always from the same side, tell which side that is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.disjoint_sets import connected_components
+from pcgraph.parallel import in_blocks, kernel, summing_routine
+from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, seen_from
+from pcgraph.voxels.directions import densest_plane, farthest_first, sphere_directions
+from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
+from pcgraph.voxels.surface import fitted_windows
+from pcgraph.voxels.warp import Warp
+
+_CELLS = 5000  # of the coarse grid on which places are compared, about
+_OUTSIDE = 42  # places around the cloud, and
+_DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
+_INSIDE = 64  # free places within the bounding box, of a lattice of
+_LATTICE = 12  # along each side
+_CLEARANCE = 2.0  # cells between a free place and the next surface
+_SOME = 1500  # cells are looked for in all directions from a place, about
+_AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
+_BLOCKS, _PARTS, _OF_PART = 16, 3, 0.05  # along the box of all, by which parts are told; parts; of the cells in each
+_NEARLY_WHOLE, _SMALL = (0.05, 0.95), 0.5  # quantiles of a part's cells; and how long their box is, of that of all
+_SPREAD = 0.75  # of the free places lie far from each other, the others far from surfaces
+_ROUNDS = 12  # of agreement between places and orientations
+_HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, in rooms,
+_LEADERS = 6  # single places
+_WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
+_CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
+_BOTH_SIDES = 0.2  # cosine under which places closed in see either side of a partition, at least
+_FINER = 1, 2, 4  # times as many cells and places, if some are closed in, until one agreement shows
+_SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; where rooms are low
+_FEW, _LAYERS, _LOW = 16, 1.7, 8.0  # places in rooms; cells over each other on average, and in height: rooms too low
+_AS_MUCH = 0.004  # of it by which an agreement shows less than another, and yet as much
+_DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
+_ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
+_WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
+_NARROW = 0.2  # and beyond which it sees a tenth of all, at least
+_OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
+_LEVEL = 0.996  # cosine between a plane's normal and z: 5 degrees
+_BEARS, _OF_GROUND = 0.1, 0.25  # of the cells lie on a plane that bears something, and on one that is the ground
+_ANYTHING = 0.02  # of the cells lies off the ground at least, and of those, under it at most
+_NEARLY_EVERYTHING = 0.02, 0.98  # quantiles
+_WITHIN_GROUND = 0.6  # of the ground's area is at most that of all that stands on it
+_VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at from; and more, each of which
+_NEWS = 0.005  # of all cells is seen by first
+_TINY = 1e-12
+
+
+class TellingPlaces(NamedTuple):
+    """Places from which the outside is seen, the most telling first.
+
+    Attributes
+    ----------
+    places : (k, 3) float64, in half extents of the voxels' centroids from the middle of their bounding box
+    weights : (k,) float64, 0..1
+        How much each counts.
+    parts : (k,) int64
+        The part of the cloud whose outside each is asked about; one place may be there for several.
+    cells : (c, 3) float64
+        Places of coarse cells, in the same frame.
+    part_of_cell : (c,) int64
+    """
+
+    places: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    parts: NDArray[np.int64]
+    cells: NDArray[np.float64]
+    part_of_cell: NDArray[np.int64]
+
+    def part_of(self, centres: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The part of each of n places in the same frame, (n,)."""
+        from scipy.spatial import cKDTree
+
+        return self.part_of_cell[cKDTree(self.cells).query(centres)[1]]
+
+
+def unit_frame(grid: VoxelGrid, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Middle, (3,), and half extent of places, a voxel edge at least: lengths there are of the order of 1."""
+    low, high = bounding_box(places)
+    return (low + high) / 2.0, max(float((high - low).max()) / 2.0, float(grid.edge_lengths.min()))
+
+
+def either_normals(grid: VoxelGrid) -> NDArray[np.float64]:
+    """Unit normals of the surface at each voxel, (v, 3), towards either side."""
+    upwards = np.zeros((grid.n_voxels, 3))
+    upwards[:, 2] = 1.0
+    return fitted_windows(grid, upwards).normals
+
+
+def lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths of rows, (n,), of the order of 1; of zeros nearly nothing."""
+    return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
+
+
+def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> TellingPlaces:
+    """The places that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
+
+    Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
+    and where floors and ceilings lie near to each other for cells of that size, so that hardly a place is in a room.
+    """
+    for finer in _FINER:
+        telling, shows_most = _telling_places(grid, viewpoint, finer)
+        if shows_most:
+            break
+    return telling
+
+
+def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, finer: int) -> tuple[TellingPlaces, bool]:
+    """The places, with so many times as many cells, and whether more of them would hardly show more."""
+    middle, reach = unit_frame(grid, grid.centroids)
+    origin = -middle / reach
+    viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
+    coarse = coarse_grid(grid, middle, reach, finer * _CELLS)
+    low, high = bounding_box(coarse.centroids)
+    part_of_cell, boxes = _parts(coarse.centroids, low, high)
+    boxes = [(low, high), *boxes]
+    inside = np.concatenate([_free_places(coarse, *box, max(finer // len(boxes), 1)) for box in boxes])
+    outside = (low + high) / 2.0 + _DISTANCE * lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
+    if not (high > low).any():
+        outside = low + sphere_directions(_OUTSIDE)
+    normals = either_normals(coarse)
+    upwards, offset, is_ground = bearing_plane(coarse, normals)
+    from_viewpoint = [] if viewpoint is None else [viewpoint]
+    if viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids):
+        from_viewpoint = [origin]
+    elif upwards[2] < -_LEVEL:  # no accident: the frame stands upright, and things lie in a pit
+        upwards = -upwards
+    places = np.concatenate((outside, inside, *(place[None] for place in from_viewpoint)))
+    likely = np.zeros(len(places), np.bool_)
+    if from_viewpoint:
+        likely[-1] = True
+    else:
+        likely[:_OUTSIDE] = sphere_directions(_OUTSIDE) @ upwards > 0.0
+    seen = seen_from(places, coarse.centroids, coarse.edge_lengths, normals)
+    sides = facing_cosines(places, coarse.centroids, normals, seen)
+    closed = np.zeros(len(places))
+    closed[_OUTSIDE : _OUTSIDE + len(inside)] = hit_fractions(inside, coarse.centroids)
+    in_rooms = closed >= _CLOSED
+    voting = _without_partitions(sides, sides[in_rooms])
+    starts = _starts(voting, outside, likely, in_rooms)
+    of_place, of_part = _looks_at_parts(seen, part_of_cell)
+    if of_part.any():
+        asked = of_part[:, None] == part_of_cell
+        seen, sides, voting = (np.where(asked, every[of_place], every.dtype.type(0)) for every in (seen, sides, voting))
+    found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
+    likely_counts = _FROM_VIEWPOINT if from_viewpoint else _ABOVE_GROUND if is_ground else _BEFORE
+    looks = _Looks(sides, of_place < _OUTSIDE, likely[of_place], closed[of_place], of_part, part_of_cell)
+    weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts)
+    chosen = _spread_choice(seen, weights)
+    if _is_layered(
+        coarse
+    ):  # rooms too low to have many places show little at first, and the outside of all of them much
+        shows_most = np.count_nonzero(in_rooms) >= _FEW and shown >= _SHOWS_NEARLY_ALL
+    else:
+        shows_most = shown >= _SHOWS_MOST or not in_rooms.any()
+    shows_most = shows_most or coarse.n_voxels > grid.n_voxels // 2
+    telling = TellingPlaces(places[of_place[chosen]], weights[chosen], of_part[chosen], coarse.centroids, part_of_cell)
+    return telling, shows_most
+
+
+class _Looks(NamedTuple):
+    """Looks of k places at n cells, or at those of one part.
+
+    Attributes
+    ----------
+    sides : (k, n) float32
+        Signed cosines, 0 hidden.
+    from_outside, likely : (k,) bool
+        Whether they are those of places around the cloud, and of places before what bears things or of the viewpoint.
+    closed : (k,) float64
+        Fraction of the directions in which a place has something.
+    of_part : (k,) int64
+        The part at which each is.
+    part_of_cell : (n,) int64
+    """
+
+    sides: NDArray[np.float32]
+    from_outside: NDArray[np.bool_]
+    likely: NDArray[np.bool_]
+    closed: NDArray[np.float64]
+    of_part: NDArray[np.int64]
+    part_of_cell: NDArray[np.int64]
+
+
+def _looks_at_parts(
+    seen: NDArray[np.bool_], part_of_cell: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of the place, of k that see cells, (k, n), and of the part, for each look at a part of which it sees some.
+
+    Parts are asked about one by one, as a place before a house sees its front from the right side and the room
+    opposite, into which its sensor looked through a window, from the wrong one.
+    """
+    n_parts = int(part_of_cell.max()) + 1
+    if n_parts == 1:
+        return np.arange(len(seen)), np.zeros(len(seen), np.int64)
+    sees_some = np.stack([seen[:, part_of_cell == part].any(axis=1) for part in range(n_parts)])
+    of_part, of_place = np.nonzero(sees_some)
+    return of_place, of_part
+
+
+def _is_layered(coarse: VoxelGrid) -> bool:
+    """Whether floors and ceilings may lie one over another across the thinnest side, too near for a place between."""
+    low, high = bounding_box(coarse.centroids)
+    thin = int(np.argmin(high - low))
+    across, along = np.delete(coarse.cells, thin, axis=1).T
+    columns = np.unique(across * (float(np.ptp(along)) + 1.0) + along)
+    return bool(coarse.n_voxels >= _LAYERS * len(columns) and (high - low)[thin] < _LOW * coarse.size)
+
+
+def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The sides that places see, (k, n), but of partitions: cells of which those in rooms see both.
+
+    A cell is thicker than a partition, so that the rooms on either side of it would contradict each other.
+    """
+    if not len(of_rooms):
+        return sides
+    front, back = np.maximum(of_rooms, 0.0).max(axis=0), np.maximum(-of_rooms, 0.0).max(axis=0)
+    return np.where(np.minimum(front, back) > _BOTH_SIDES, np.float32(0.0), sides)
+
+
+def _starts(
+    sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Weights of the places, (s, k), from which agreement may start: first opinions as different as there are."""
+    starts = np.zeros((_HALVES + 4 + _LEADERS, len(sides)), np.float32)
+    starts[:_HALVES, :_OUTSIDE] = sphere_directions(_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
+    starts[_HALVES, :_OUTSIDE] = 1.0
+    starts[_HALVES + 1, _OUTSIDE:] = 1.0
+    starts[_HALVES + 2] = likely
+    starts[_HALVES + 3] = in_rooms
+    unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
+    news = np.empty(len(sides), np.float32)
+    for start in starts[_HALVES + 4 :]:
+        in_blocks(_tell_news, len(sides), sides, unseen, news, smallest=1)
+        leader = int(np.argmax(news))
+        start[leader] = 1.0
+        unseen[0, sides[leader] > 0.0] = 0.0
+        unseen[1, sides[leader] < 0.0] = 0.0
+    return starts[starts.any(axis=1)]
+
+
+class BearingPlane(NamedTuple):
+    """The plane that bears most: the ground, a table, or a wall behind things.
+
+    Attributes
+    ----------
+    upwards : (3,) float64, unit
+        Its normal, to where nearly all the rest stands; or z, where that lies on both sides of each plane.
+    offset : float
+        Of the plane along it; -inf where there is none.
+    is_ground : bool
+        Whether it is level, and reaches beyond all that stands on it, or lies in a hollow of it.
+    """
+
+    upwards: NDArray[np.float64]
+    offset: float
+    is_ground: bool
+
+
+def bearing_plane(coarse: VoxelGrid, normals: NDArray[np.float64]) -> BearingPlane:
+    """The plane on which most cells lie, if nearly all the rest is on one side of it."""
+    normal, offset, fraction = densest_plane(coarse.centroids, normals)
+    heights = np.einsum("ij,j->i", coarse.centroids, normal) - offset
+    is_rest = np.abs(heights) > _OFF_PLANE * coarse.size
+    above, below = heights[is_rest & (heights > 0.0)].sum(), -heights[is_rest & (heights < 0.0)].sum()
+    if fraction < _BEARS or max(above, below) <= _NEARLY_ALL * (above + below):
+        return BearingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
+    if above < below:
+        normal, offset, heights = -normal, -offset, -heights
+    is_ground = (
+        abs(normal[2]) >= _LEVEL
+        and fraction >= _OF_GROUND
+        and np.mean(is_rest) >= _ANYTHING
+        and np.mean(heights[is_rest] < 0.0) <= _ANYTHING
+        and _level_area(coarse.centroids[is_rest]) < _WITHIN_GROUND * _level_area(coarse.centroids[~is_rest])
+    )
+    return BearingPlane(normal, offset, bool(is_ground))
+
+
+def _level_area(places: NDArray[np.float64]) -> float:
+    """Area of the rectangle along x and y that holds nearly all places."""
+    low, high = np.quantile(places[:, :2], _NEARLY_EVERYTHING, axis=0)
+    return float(np.prod(high - low))
+
+
+def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bool:
+    """Whether all lies before a camera at a place, (3,), that looks along z, around its axis, and not all near that."""
+    rays = centres - place
+    if not (rays[:, 2] > 0.0).all():
+        return False
+    slopes = rays[:, :2] / rays[:, 2:]
+    is_around = (slopes.min(axis=0) < 0.0).all() and (slopes.max(axis=0) > 0.0).all()
+    aside = np.abs(slopes).max(axis=1)
+    return bool(is_around and aside.max() < _WIDE and np.mean(aside > _NARROW) > 0.1)
+
+
+@summing_routine
+def _news(sides: NDArray[np.float32], unseen: NDArray[np.float32]) -> np.float32:
+    """Sum of the cosines that a place sees of sides that no leader has seen."""
+    total = np.float32(0.0)
+    for i in range(len(sides)):
+        total += sides[i] * unseen[0, i] if sides[i] > 0.0 else -sides[i] * unseen[1, i]
+    return total
+
+
+@kernel
+def _tell_news(
+    start: int, stop: int, sides: NDArray[np.float32], unseen: NDArray[np.float32], news: NDArray[np.float32]
+) -> None:
+    """Set what each place sees that no leader has seen."""
+    for k in range(start, stop):
+        news[k] = _news(sides[k], unseen)
+
+
+class _Agreements(NamedTuple):
+    """What s first opinions come to, of k places about the sides of n cells.
+
+    Attributes
+    ----------
+    weights : (s, k) float32, 0..1
+        How much each place counts.
+    outward : (s, n) float32
+        The side on which the outside lies, as seen along the normals: -1, 1, or 0 where no place says.
+    agreed, known : (s, k) float32
+        Sums of the cosines that each place sees on the right side, and on either side of cells whose outside is known.
+    """
+
+    weights: NDArray[np.float32]
+    outward: NDArray[np.float32]
+    agreed: NDArray[np.float32]
+    known: NDArray[np.float32]
+
+
+def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agreements:
+    """What first opinions, weights of the places (s, k), come to, given the sides that each sees, (k, n).
+
+    Sides are signed cosines, 0 hidden. What is found, by turns, is nearly a pair of singular vectors, but no place
+    counts against what it sees.
+    """
+    outward = np.empty((len(starts), sides.shape[1]), np.float32)
+    found = _Agreements(starts.copy(), outward, np.zeros_like(starts), np.zeros_like(starts))
+    in_blocks(_agree, len(starts), sides, found, smallest=1)
+    return found
+
+
+@summing_routine
+def _balance(sides: NDArray[np.float32], outward: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
+    """Sums of the cosines that a place sees, less those on the wrong side, and of all whose outside is known."""
+    net = known = np.float32(0.0)
+    for i in range(len(sides)):
+        value = sides[i] * outward[i]
+        net += value
+        known += abs(value)
+    return net, known
+
+
+@kernel
+def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements) -> None:
+    """Places that agree decide where the outside lies, and those that see it there count, by turns until it stands."""
+    n_places, n = sides.shape
+    total = np.empty(n, np.float32)
+    for s in range(start, stop):
+        weights, outward = found.weights[s], found.outward[s]
+        for i in range(n):
+            outward[i] = 0.0
+        for _ in range(_ROUNDS):
+            for i in range(n):
+                total[i] = 0.0
+            for k in range(n_places):
+                if weights[k] > 0.0:
+                    for i in range(n):
+                        total[i] += weights[k] * sides[k, i]
+            changed = False
+            for i in range(n):
+                side = np.float32(1.0 if total[i] > 0.0 else (-1.0 if total[i] < 0.0 else 0.0))
+                changed = changed or side != outward[i]
+                outward[i] = side
+            if not changed:
+                break
+            largest = np.float32(_TINY)
+            for k in range(n_places):
+                net, known = _balance(sides[k], outward)
+                found.agreed[s, k], found.known[s, k] = (net + known) / 2.0, known
+                net = max(net, np.float32(0.0))
+                weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
+                largest = max(largest, weights[k])
+            for k in range(n_places):
+                weights[k] /= largest
+
+
+def _most_telling(
+    found: _Agreements, looks: _Looks, around: Neighbourhood, likely_counts: float
+) -> tuple[NDArray[np.float64], float]:
+    """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
+
+    Crevices between things are crests from behind, which are seen the better: what little that is decides nothing.
+    A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
+    one of places closed in, as in a room: of that part all but narrow gaps is seen from within.
+    """
+    visible = np.abs(looks.sides).sum(axis=1)
+    different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
+    counts = found.weights[different].astype(np.float64)
+    of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
+    every, closed = counts @ of_parts, counts @ (of_parts * looks.closed[:, None])
+    is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
+    shown = np.empty(len(different))
+    in_blocks(_show, len(different), different, looks.sides, found, around, is_closed, shown, smallest=1)
+    most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
+    for s, fraction in zip(different, shown, strict=True):
+        weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
+        score = min(float(fraction), most_shown - _AS_MUCH)
+        decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
+        score += _DECIDED * float(decided[visible > 0.0].mean())
+        for some, counts in ((looks.from_outside, _OUTSIDE_IN), (looks.likely, likely_counts)):
+            score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
+        if score > most:
+            most, best = score, weights
+    return best.astype(np.float64), most_shown
+
+
+@kernel
+def _show(
+    start: int,
+    stop: int,
+    different: NDArray[np.int64],
+    sides: NDArray[np.float32],
+    found: _Agreements,
+    around: Neighbourhood,
+    is_closed: NDArray[np.bool_],
+    shown: NDArray[np.float64],
+) -> None:
+    """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in.
+
+    Of partitions, on which no place has a vote, either side counts.
+    """
+    n_places, n = sides.shape
+    of_cells, nothing = np.empty(n, np.float32), np.float32(0.0)
+    for d in range(start, stop):
+        weights, outward = found.weights[different[d]], found.outward[different[d]]
+        for i in range(n):
+            of_cells[i] = nothing
+        for k in range(n_places):
+            if weights[k] > 0.0:
+                for i in range(n):
+                    value = sides[k, i] * outward[i] if outward[i] != nothing else abs(sides[k, i])
+                    of_cells[i] += weights[k] * max(value, nothing)
+        total = 0.0
+        for i in range(n):
+            most = of_cells[i]
+            if not is_closed[i]:
+                for a in range(around.indptr[i], around.indptr[i + 1]):
+                    most = max(most, of_cells[around.neighbours[a]])
+            total += min(most / _WELL_SEEN, 1.0)
+        shown[d] = total / n
+
+
+def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Some of the places, by weight and by how much each sees, (k, n) bool, that those before see seldom or never.
+
+    So each of many rooms has one.
+    """
+    places = np.flatnonzero(weights > 0.0)
+    left, sees = weights[places], seen[places].astype(np.float32)
+    interest = np.ones(seen.shape[1], np.float32)
+    chosen: list[int] = []
+    while len(chosen) < _MOST_VIEWS and left.any():
+        best = int(np.argmax(left * np.einsum("kn,n->k", sees, interest)))
+        if len(chosen) >= _VIEWS and (sees[best] @ (interest == 1.0)) < _NEWS * len(interest):
+            break
+        chosen.append(best)
+        interest[sees[best] > 0.0] *= np.float32(0.25)
+        left[best] = 0.0
+    return places[chosen]
+
+
+def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: int = _CELLS) -> VoxelGrid:
+    """Voxels in larger ones, as few as still show their shape, in the frame of `unit_frame`; the outermost surfaces
+    amid a layer of them."""
+    edges = grid.edge_lengths
+    width = float(edges[0] if edges.min() == edges.max() else np.median(edges)) / reach
+    centres = (grid.centroids - middle) / reach
+    size = width * max(1.0, math.sqrt(len(centres) / (1.5 * cells)))  # as many as a surface would have
+    low = bounding_box(centres)[0]
+    while True:
+        shift = 0.5 * size - low
+        coarse = voxel_grid(centres + shift, None, size, Warp())
+        if coarse.n_voxels <= 2 * cells:
+            return replace(coarse, centroids=coarse.centroids - shift)
+        size *= 1.4
+
+
+def _parts(
+    centres: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
+    """Parts of a cloud that are far from each other, the number of each cell's, (n,), the largest first, which has what
+    belongs to none; and boxes in which nearly all of them lies, where the box of all is twice as long.
+
+    A room of whose surroundings little was seen through its windows, or scans of places far apart.
+    """
+    part_of_cell, length = np.zeros(len(centres), np.int64), float((high - low).max())
+    boxes: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    if not length > 0.0:
+        return part_of_cell, boxes
+    blocks = voxel_grid(centres - low, None, length / _BLOCKS, Warp())
+    source = np.repeat(np.arange(blocks.n_voxels), np.diff(blocks.indptr))
+    touching = np.stack((source, blocks.neighbours.astype(np.int64)), axis=1)
+    piece = connected_components(touching, blocks.n_voxels)[blocks.voxel_of_point]
+    counts = np.bincount(piece)
+    for part, number in enumerate(np.argsort(-counts, kind="stable")[:_PARTS]):
+        if counts[number] < _OF_PART * len(centres):
+            break
+        part_of_cell[piece == number] = part
+        lowest, highest = np.quantile(centres[piece == number], _NEARLY_WHOLE, axis=0)
+        if (highest - lowest).max() < _SMALL * length:
+            boxes.append((lowest, highest))
+    return part_of_cell, boxes
+
+
+def _free_places(
+    coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64], finer: int
+) -> NDArray[np.float64]:
+    """Places within the bounding box, the farthest off all surfaces first, (k, 3); so many times as many as usual."""
+    from scipy.spatial import cKDTree
+
+    n, lattice_side = finer * _INSIDE, round(_LATTICE * finer ** (1.0 / 3.0))
+    steps = (np.arange(lattice_side) + 0.5) / lattice_side
+    lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = low + lattice * (high - low)
+    clearance = cKDTree(coarse.centroids).query(places)[0] / coarse.size
+    free = np.flatnonzero(clearance > _CLEARANCE)
+    if not len(free):
+        return places[:0]
+    places, clearance = places[free], clearance[free]
+    hits = hit_fractions(places, coarse.centroids[:: max(1, coarse.n_voxels // _SOME)])
+    among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
+    chosen = among[farthest_first(places[among], int(np.argmax(clearance[among])), int(_SPREAD * n))]
+    order = np.argsort(-clearance, kind="stable")
+    rest = order[~np.isin(order, chosen)][: n - len(chosen)]
+    return places[np.concatenate((chosen, rest))]
