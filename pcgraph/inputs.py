@@ -267,7 +267,7 @@ def fraction(name: str, value: float) -> float:
 
 def _number(value: float) -> float:
     """The value as float; NaN if it is no number."""
-    if isinstance(value, (str, bytes, bool, np.bool_)):
+    if isinstance(value, (str, bytes)):
         return float("nan")
     try:
         return float(value)

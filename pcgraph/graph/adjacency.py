@@ -108,10 +108,14 @@ class Bridges(ShortRepr):
         The two supervoxels of both components whose means lie nearest to each other, i < j, in ascending order.
     widths : (b,) float64, voxel edges
         Distance between centroids of two of their voxels, each the other's nearest; a million at most.
+    between_specks : (b,) bool
+        Whether both ends are specks of at most four points that lie about as near to each other as to anything, as
+        those of a surface do that was sampled too thinly for the voxels.
     """
 
     edges: NDArray[np.int32]
     widths: NDArray[np.float64]
+    between_specks: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

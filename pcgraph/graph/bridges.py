@@ -14,6 +14,7 @@ from pcgraph.voxels.grid import VoxelGrid
 
 _NEAR = 8  # supervoxels around one
 _WIDEST = 1e6  # voxel edges
+_FEW, _AS_NEAR, _WIDEST_BETWEEN = 4, 2.0, 30.0  # points, times the nearest of all, voxel edges: of one thin surface
 
 
 def bridges(
@@ -41,12 +42,13 @@ def bridges(
     """
     k = len(counts)
     component = connected_components(joined, k)
-    specks = np.flatnonzero((np.bincount(component, counts) < counts.mean())[component])
+    sizes = np.bincount(component, counts)
+    specks = np.flatnonzero((sizes < counts.mean())[component])
     if not component.any() or not len(specks):
-        return Bridges(np.empty((0, 2), np.int32), np.empty(0))
+        return Bridges(np.empty((0, 2), np.int32), np.empty(0), np.empty(0, np.bool_))
     places = grid.warped / grid.size
-    sizes = np.bincount(supervoxels, minlength=k)
-    means = np.stack([np.bincount(supervoxels, x, k) / sizes for x in places.T], axis=1)
+    n_voxels = np.bincount(supervoxels, minlength=k)
+    means = np.stack([np.bincount(supervoxels, x, k) / n_voxels for x in places.T], axis=1)
     means -= means[0]
     means /= max(float(np.abs(means).max()), 1.0)  # which are nearer is all that counts, and squares stay finite
     distance, found = cKDTree(means).query(means[specks], k=min(_NEAR + 1, k))
@@ -56,8 +58,17 @@ def bridges(
     involved[edges] = True
     voxels = np.flatnonzero(involved[supervoxels])
     voxels = voxels[np.argsort(supervoxels[voxels], kind="stable")]
-    starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(np.where(involved, sizes, 0))))
-    return Bridges(edges, np.minimum(_widths(edges, starts, places[voxels]), _WIDEST))
+    starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(np.where(involved, n_voxels, 0))))
+    widths = np.minimum(_widths(edges, starts, places[voxels]), _WIDEST)
+    of_few = (sizes <= _FEW)[component[edges]].all(axis=1)
+    return Bridges(edges, widths, of_few & _are_near(component[edges], widths))
+
+
+def _are_near(pairs: NDArray[np.int32], widths: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether the components of each pair, (b, 2), lie about as near to each other as one of them to any other."""
+    nearest = np.full(int(pairs.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(nearest, pairs, widths[:, None])
+    return np.asarray(widths <= np.minimum(_AS_NEAR * nearest[pairs].max(axis=1), _WIDEST_BETWEEN))
 
 
 def _closest_pairs(

@@ -117,7 +117,8 @@ def encode_segmentation(
 def _whole_labels(labels: ArrayLike) -> NDArray[np.int32]:
     """Labels as files hold them."""
     given, limits = np.asarray(labels), np.iinfo(np.int32)
-    if given.dtype.kind not in "iub":
+    is_whole = given.dtype.kind in "iub" or (given.dtype.kind == "f" and bool((given == np.rint(given)).all()))
+    if not is_whole:
         raise ValueError(f"expected labels as whole numbers, got {given.dtype}")
     if given.size and not (limits.min <= given.min() and given.max() <= limits.max):
         raise ValueError(f"expected labels of 32 bits, got {given.min()} to {given.max()}; number them anew")

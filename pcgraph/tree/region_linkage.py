@@ -61,7 +61,8 @@ class RegionLinkage(Linkage):
     continuations behind what hides a surface (`pcgraph.graph.continuations.continuations`) and of planes that bound
     the scene (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts,
     bridges (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of
-    objects, at their mean cost times m / (m + 1).
+    objects, at their mean cost times m / (m + 1); but bridges between specks of a few points that lie about as near to
+    each other as to anything count as contacts at 3 rad, so that a surface sampled too thinly for voxels is no dust.
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
     one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
@@ -103,10 +104,13 @@ class RegionLinkage(Linkage):
         if (hidden := graph.continuations) is not None:
             costs = np.concatenate((costs, np.zeros(len(hidden.pairs))))
             weights = np.concatenate((weights, 2.0 * hidden.crossings))
+        n_bridges = 0
         if (bridges := graph.bridges) is not None:
-            edges, costs = np.concatenate((edges, bridges.edges)), np.concatenate((costs, self.bridge * bridges.widths))
+            of_bridges = np.where(bridges.between_specks, _BETWEEN_SPECKS, self.bridge * bridges.widths)
+            order = np.argsort(~bridges.between_specks, kind="stable")
+            edges, costs = np.concatenate((edges, bridges.edges[order])), np.concatenate((costs, of_bridges[order]))
             weights = np.concatenate((weights, np.full(len(bridges.edges), _BRIDGE_VOXELS)))
-        n_bridges = 0 if bridges is None else len(bridges.edges)
+            n_bridges = int(np.count_nonzero(~bridges.between_specks))
         color = self.color * graph.color_evidence
         return region_linkage(graph, leaves, edges, costs, weights, color, n_bridges, self.relief)
 
@@ -114,6 +118,7 @@ class RegionLinkage(Linkage):
 _STEPS = float(1 << 20)
 _MANY = 40  # edges of a region
 _OF_SEVERAL = 1.0 / 3.0  # of the price of a gap, where scans lie over each other
+_BETWEEN_SPECKS = 3.0  # radians: as of a steep valley
 _BRIDGE_VOXELS = 2.0  # that a bridge counts as a contact where others join it: one on each side
 
 

@@ -25,6 +25,7 @@ _ROWS_OF_CELLS = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (
 _NO_SPACING_M = 0.01
 _IN_ROWS = 1280  # points of which it is asked whether they lie in a row
 _ROW = 0.25  # of the way between a point's two nearest: it lies no farther off their line
+_COPIES = 256  # of a place, at most: where cells hold more, they are things that lie far apart
 _THIN = 0.01  # of its extent: a cloud whose points, at their spacing, cover so little
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -73,7 +74,7 @@ def spacing_and_rows(points: NDArray[np.float64], warp: Warp | None = None) -> t
         )
         full = _fullest(held)
         of_cells = _read(crowd[np.sort(cells[full])])[0]
-        if of_cells > 1000.0 * spacing and len(full) > 1:
+        if of_cells > 1000.0 * spacing and len(full) > 1 and len(crowd) <= _COPIES * len(full):
             return of_cells, rows
     return spacing, rows
 

@@ -126,8 +126,12 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     coarse = coarse_grid(grid, middle, reach, finer * _CELLS)
     low, high = bounding_box(coarse.centroids)
     part_of_cell, boxes = _parts(coarse.centroids, low, high)
-    boxes = [(low, high), *boxes]
-    inside = np.concatenate([_free_places(coarse, *box, max(finer // len(boxes), 1)) for box in boxes])
+    share = max(finer // (len(boxes) + 1), 1)
+    in_boxes = np.concatenate([low[None][:0], *(_free_places(coarse, *box, share) for box in boxes)])
+    in_boxes = in_boxes[hit_fractions(in_boxes, coarse.centroids) >= _CLOSED]
+    if len(in_boxes) < _FEW:  # none of the parts is a room
+        part_of_cell[:], in_boxes = 0, in_boxes[:0]
+    inside = np.concatenate((_free_places(coarse, low, high, share), in_boxes))
     outside = (low + high) / 2.0 + _DISTANCE * lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
@@ -160,9 +164,7 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     looks = _Looks(sides, of_place < _OUTSIDE, likely[of_place], closed[of_place], of_part, part_of_cell)
     weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts)
     chosen = _spread_choice(seen, weights)
-    if _is_layered(
-        coarse
-    ):  # rooms too low to have many places show little at first, and the outside of all of them much
+    if _is_layered(coarse):  # low rooms have few places at first, and the outside of all of them shows much
         shows_most = np.count_nonzero(in_rooms) >= _FEW and shown >= _SHOWS_NEARLY_ALL
     else:
         shows_most = shown >= _SHOWS_MOST or not in_rooms.any()
@@ -200,8 +202,8 @@ def _looks_at_parts(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Number of the place, of k that see cells, (k, n), and of the part, for each look at a part of which it sees some.
 
-    Parts are asked about one by one, as a place before a house sees its front from the right side and the room
-    opposite, into which its sensor looked through a window, from the wrong one.
+    Parts are asked about one by one where one of them is a room, as a place before a house sees its front from the
+    right side and the room opposite, into which its sensor looked through a window, from the wrong one.
     """
     n_parts = int(part_of_cell.max()) + 1
     if n_parts == 1:
@@ -215,8 +217,8 @@ def _is_layered(coarse: VoxelGrid) -> bool:
     """Whether floors and ceilings may lie one over another across the thinnest side, too near for a place between."""
     low, high = bounding_box(coarse.centroids)
     thin = int(np.argmin(high - low))
-    across, along = np.delete(coarse.cells, thin, axis=1).T
-    columns = np.unique(across * (float(np.ptp(along)) + 1.0) + along)
+    across, along = (np.unique(cells, return_inverse=True)[1] for cells in np.delete(coarse.cells, thin, axis=1).T)
+    columns = np.unique(across * coarse.n_voxels + along)
     return bool(coarse.n_voxels >= _LAYERS * len(columns) and (high - low)[thin] < _LOW * coarse.size)
 
 
@@ -240,7 +242,7 @@ def _starts(
     starts[_HALVES, :_OUTSIDE] = 1.0
     starts[_HALVES + 1, _OUTSIDE:] = 1.0
     starts[_HALVES + 2] = likely
-    starts[_HALVES + 3] = in_rooms
+    starts[_HALVES + 3] = in_rooms if np.count_nonzero(in_rooms) >= _FEW else 0.0
     unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
     news = np.empty(len(sides), np.float32)
     for start in starts[_HALVES + 4 :]:

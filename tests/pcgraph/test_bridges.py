@@ -97,3 +97,19 @@ def test_things_apart_stay_whole_in_a_cut_into_as_many(distance):
     truth = np.repeat(np.arange(6), len(one))
     assert pcgraph.metrics.weighted_overlap(result.cut(n=6), truth) == 1.0
     assert np.count_nonzero(np.isinf(result.tree.altitudes)) == 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("times", [5.0, 10.0, 20.0])
+def test_a_surface_sampled_too_thinly_for_the_voxels_is_no_dust(times, seed):
+    """Each of its points was an object of its own: thousands, of a house that was seen from a window."""
+    rng = np.random.default_rng(seed)
+    floor, block = sheet(3.0, 3.0, (0.0, 0.0, 0.0)), sheet(0.6, 0.6, (1.0, 1.0, 0.5))
+    n = 1500
+    side = times * 0.025 * np.sqrt(n)
+    wall = np.stack((rng.uniform(0.0, side, n), np.full(n, 15.0), rng.uniform(0.0, side, n)), axis=1)
+    result = pcgraph.segment(np.concatenate((floor, block, wall)), **SETTINGS)
+    is_wall = np.arange(len(floor) + len(block) + n) >= len(floor) + len(block)
+    assert len(np.unique(result.labels[~is_wall])) == 2
+    counts = np.bincount(result.labels[is_wall & (result.labels >= 0)])
+    assert np.count_nonzero(counts) < 0.05 * n

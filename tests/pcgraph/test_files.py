@@ -156,7 +156,7 @@ def test_labels_of_ones_own_are_whole_numbers_of_any_type(tmp_path, suffix):
     """Those that `np.where` or `np.unique` give ended in a KeyError, and NaN became a label."""
     points = np.random.default_rng(0).random((2000, 3))
     result, file = pcgraph.segment(points), tmp_path / f"own.{suffix}"
-    for dtype in ("?", "u1", "i8", "u8", ">i4"):
+    for dtype in ("?", "u1", "i8", "u8", ">i4", "f4"):
         own = (np.arange(2000) % 2).astype(dtype)
         for labels in (own, own.tolist()):
             pcgraph.write_segmentation(file, points, result, labels)

@@ -135,7 +135,7 @@ def test_a_name_in_place_of_a_linkage_or_method_is_told_which_there_are():
         pcgraph.segment(np.ones((3, 3)), method="Vcs")
 
 
-@pytest.mark.parametrize("wrong", ["0.2", True, b"1"])
+@pytest.mark.parametrize("wrong", ["0.2", b"1"])
 def test_sizes_are_numbers(wrong):
     with pytest.raises(ValueError, match="expected a finite voxel_size"):
         pcgraph.segment(POINTS, voxel_size=wrong)
