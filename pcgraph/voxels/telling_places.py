@@ -414,9 +414,9 @@ def _most_telling(
     """
     visible = np.abs(looks.sides).sum(axis=1)
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
-    counts = found.weights[different].astype(np.float64)
+    of_looks = found.weights[different].astype(np.float64)
     of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
-    every, closed = counts @ of_parts, counts @ (of_parts * looks.closed[:, None])
+    every, closed = of_looks @ of_parts, of_looks @ (of_parts * looks.closed[:, None])
     is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
     shown = np.empty(len(different))
     in_blocks(_show, len(different), different, looks.sides, found, around, is_closed, shown, smallest=1)
