@@ -18,8 +18,9 @@ from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel, summing_routine
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, seen_from
-from pcgraph.voxels.directions import densest_plane, farthest_first, sphere_directions
+from pcgraph.voxels.directions import farthest_first, sphere_directions
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
+from pcgraph.voxels.ground_and_rooms import LEVEL, bearing_plane, is_scanned_room
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 
@@ -28,10 +29,12 @@ _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
 _INSIDE = 64  # free places within the bounding box, of a lattice of
 _LATTICE = 12  # along each side
+_MUCH_SMALLER = 0.2  # than the bounding box: a box along the principal axes
 _CLEARANCE = 2.0  # cells between a free place and the next surface
 _SOME = 1500  # cells are looked for in all directions from a place, about
 _AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
-_BLOCKS, _PARTS, _OF_PART = 16, 3, 0.05  # along the box of all, by which parts are told; parts; of the cells in each
+_BLOCKS, _OF_PART = 16, 0.05  # along the box of all, by which parts are told; of the cells in each
+_PARTS_OF_ANY, _PARTS = 3, 8  # at most, and if they are rooms
 _NEARLY_WHOLE, _SMALL = (0.05, 0.95), 0.5  # quantiles of a part's cells; and how long their box is, of that of all
 _SPREAD = 0.75  # of the free places lie far from each other, the others far from surfaces
 _ROUNDS = 12  # of agreement between places and orientations
@@ -45,15 +48,10 @@ _SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; where rooms are l
 _FEW, _LAYERS, _LOW = 16, 1.7, 8.0  # places in rooms; cells over each other on average, and in height: rooms too low
 _AS_MUCH = 0.004  # of it by which an agreement shows less than another, and yet as much
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
+_OF_ROOM, _NEARLY_CLOSED = 0.2, 0.9  # counts that places are closed in, nearly, where floor and ceiling bound all
 _ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least
-_OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
-_LEVEL = 0.996  # cosine between a plane's normal and z: 5 degrees
-_BEARS, _OF_GROUND = 0.1, 0.25  # of the cells lie on a plane that bears something, and on one that is the ground
-_ANYTHING = 0.02  # of the cells lies off the ground at least, and of those, under it at most
-_NEARLY_EVERYTHING = 0.02, 0.98  # quantiles
-_WITHIN_GROUND = 0.6  # of the ground's area is at most that of all that stands on it
 _VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at from; and more, each of which
 _NEWS = 0.005  # of all cells is seen by first
 _TINY = 1e-12
@@ -125,22 +123,23 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
     coarse = coarse_grid(grid, middle, reach, finer * _CELLS)
     low, high = bounding_box(coarse.centroids)
-    part_of_cell, boxes = _parts(coarse.centroids, low, high)
-    share = max(finer // (len(boxes) + 1), 1)
-    in_boxes = np.concatenate([low[None][:0], *(_free_places(coarse, *box, share) for box in boxes)])
+    normals = either_normals(coarse)
+    points = np.bincount(coarse.voxel_of_point, np.diff(grid.starts), coarse.n_voxels).astype(np.float64)
+    part_of_cell, boxes = _parts(coarse, normals, points)
+    share, upright = max(finer // (len(boxes) + 1), 1), np.eye(3)
+    in_boxes = np.concatenate([low[None][:0], *(_free_places(coarse, *box, upright, share) for box in boxes)])
     in_boxes = in_boxes[hit_fractions(in_boxes, coarse.centroids) >= _CLOSED]
     if len(in_boxes) < _FEW:  # none of the parts is a room
         part_of_cell[:], in_boxes = 0, in_boxes[:0]
-    inside = np.concatenate((_free_places(coarse, low, high, share), in_boxes))
+    inside = np.concatenate((_free_places(coarse, *_smallest_box(coarse.centroids), share), in_boxes))
     outside = (low + high) / 2.0 + _DISTANCE * lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
     if not (high > low).any():
         outside = low + sphere_directions(_OUTSIDE)
-    normals = either_normals(coarse)
     upwards, offset, is_ground = bearing_plane(coarse, normals)
     from_viewpoint = [] if viewpoint is None else [viewpoint]
     if viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids):
         from_viewpoint = [origin]
-    elif upwards[2] < -_LEVEL:  # no accident: the frame stands upright, and things lie in a pit
+    elif upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
         upwards = -upwards
     places = np.concatenate((outside, inside, *(place[None] for place in from_viewpoint)))
     likely = np.zeros(len(places), np.bool_)
@@ -162,7 +161,12 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
     likely_counts = _FROM_VIEWPOINT if from_viewpoint else _ABOVE_GROUND if is_ground else _BEFORE
     looks = _Looks(sides, of_place < _OUTSIDE, likely[of_place], closed[of_place], of_part, part_of_cell)
-    weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts)
+    room_counts = np.zeros(int(part_of_cell.max()) + 1)
+    if np.count_nonzero(in_rooms) >= _FEW:
+        for part in range(len(room_counts)):
+            cells = part_of_cell == part
+            room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
+    weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts, room_counts)
     chosen = _spread_choice(seen, weights)
     if _is_layered(coarse):  # low rooms have few places at first, and the outside of all of them shows much
         shows_most = np.count_nonzero(in_rooms) >= _FEW and shown >= _SHOWS_NEARLY_ALL
@@ -252,50 +256,6 @@ def _starts(
         unseen[0, sides[leader] > 0.0] = 0.0
         unseen[1, sides[leader] < 0.0] = 0.0
     return starts[starts.any(axis=1)]
-
-
-class BearingPlane(NamedTuple):
-    """The plane that bears most: the ground, a table, or a wall behind things.
-
-    Attributes
-    ----------
-    upwards : (3,) float64, unit
-        Its normal, to where nearly all the rest stands; or z, where that lies on both sides of each plane.
-    offset : float
-        Of the plane along it; -inf where there is none.
-    is_ground : bool
-        Whether it is level, and reaches beyond all that stands on it, or lies in a hollow of it.
-    """
-
-    upwards: NDArray[np.float64]
-    offset: float
-    is_ground: bool
-
-
-def bearing_plane(coarse: VoxelGrid, normals: NDArray[np.float64]) -> BearingPlane:
-    """The plane on which most cells lie, if nearly all the rest is on one side of it."""
-    normal, offset, fraction = densest_plane(coarse.centroids, normals)
-    heights = np.einsum("ij,j->i", coarse.centroids, normal) - offset
-    is_rest = np.abs(heights) > _OFF_PLANE * coarse.size
-    above, below = heights[is_rest & (heights > 0.0)].sum(), -heights[is_rest & (heights < 0.0)].sum()
-    if fraction < _BEARS or max(above, below) <= _NEARLY_ALL * (above + below):
-        return BearingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
-    if above < below:
-        normal, offset, heights = -normal, -offset, -heights
-    is_ground = (
-        abs(normal[2]) >= _LEVEL
-        and fraction >= _OF_GROUND
-        and np.mean(is_rest) >= _ANYTHING
-        and np.mean(heights[is_rest] < 0.0) <= _ANYTHING
-        and _level_area(coarse.centroids[is_rest]) < _WITHIN_GROUND * _level_area(coarse.centroids[~is_rest])
-    )
-    return BearingPlane(normal, offset, bool(is_ground))
-
-
-def _level_area(places: NDArray[np.float64]) -> float:
-    """Area of the rectangle along x and y that holds nearly all places."""
-    low, high = np.quantile(places[:, :2], _NEARLY_EVERYTHING, axis=0)
-    return float(np.prod(high - low))
 
 
 def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bool:
@@ -404,7 +364,11 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
 
 
 def _most_telling(
-    found: _Agreements, looks: _Looks, around: Neighbourhood, likely_counts: float
+    found: _Agreements,
+    looks: _Looks,
+    around: Neighbourhood,
+    likely_counts: float,
+    room_counts: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
 
@@ -418,12 +382,13 @@ def _most_telling(
     of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
     every, closed = of_looks @ of_parts, of_looks @ (of_parts * looks.closed[:, None])
     is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
+    rooms_count = ((closed >= _NEARLY_CLOSED * every) & (every > 0.0)) @ room_counts
     shown = np.empty(len(different))
     in_blocks(_show, len(different), different, looks.sides, found, around, is_closed, shown, smallest=1)
     most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
-    for s, fraction in zip(different, shown, strict=True):
+    for s, fraction, of_rooms in zip(different, shown, rooms_count, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
-        score = min(float(fraction), most_shown - _AS_MUCH)
+        score = min(float(fraction), most_shown - _AS_MUCH) + float(of_rooms)
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
         score += _DECIDED * float(decided[visible > 0.0].mean())
         for some, counts in ((looks.from_outside, _OUTSIDE_IN), (looks.likely, likely_counts)):
@@ -505,13 +470,16 @@ def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cell
 
 
 def _parts(
-    centres: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+    coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
     """Parts of a cloud that are far from each other, the number of each cell's, (n,), the largest first, which has what
     belongs to none; and boxes in which nearly all of them lies, where the box of all is twice as long.
 
-    A room of whose surroundings little was seen through its windows, or scans of places far apart.
+    A room of whose surroundings little was seen through its windows, or scans of places far apart: the three largest
+    parts, and others that are rooms.
     """
+    centres = coarse.centroids
+    low, high = bounding_box(centres)
     part_of_cell, length = np.zeros(len(centres), np.int64), float((high - low).max())
     boxes: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     if not length > 0.0:
@@ -520,27 +488,54 @@ def _parts(
     source = np.repeat(np.arange(blocks.n_voxels), np.diff(blocks.indptr))
     touching = np.stack((source, blocks.neighbours.astype(np.int64)), axis=1)
     piece = connected_components(touching, blocks.n_voxels)[blocks.voxel_of_point]
-    counts = np.bincount(piece)
-    for part, number in enumerate(np.argsort(-counts, kind="stable")[:_PARTS]):
+    counts, part = np.bincount(piece), 0
+    for number in np.argsort(-counts, kind="stable")[:_PARTS]:
+        cells = piece == number
         if counts[number] < _OF_PART * len(centres):
             break
-        part_of_cell[piece == number] = part
-        lowest, highest = np.quantile(centres[piece == number], _NEARLY_WHOLE, axis=0)
+        if part >= _PARTS_OF_ANY and not _is_room(cells, coarse, normals, points):
+            continue
+        part_of_cell[cells] = part
+        part += 1
+        lowest, highest = np.quantile(centres[cells], _NEARLY_WHOLE, axis=0)
         if (highest - lowest).max() < _SMALL * length:
             boxes.append((lowest, highest))
     return part_of_cell, boxes
 
 
+def _is_room(
+    cells: NDArray[np.bool_], coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
+) -> bool:
+    """Whether some of the cells are a room that tripods stood in."""
+    return is_scanned_room(coarse.centroids[cells], normals[cells], points[cells], coarse.size)
+
+
+def _smallest_box(
+    centres: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest corner of a box around places, in its own frame, and its axes, rows of (3, 3).
+
+    The bounding box; or one along the principal axes, where that is much smaller, as around a corridor askew.
+    """
+    low, high = bounding_box(centres)
+    offsets = centres - centres.mean(axis=0)
+    axes = np.linalg.eigh(np.einsum("ij,ik->jk", offsets, offsets))[1].T
+    lowest, highest = bounding_box(np.einsum("ij,kj->ik", centres, axes))
+    if np.prod(highest - lowest) < _MUCH_SMALLER * np.prod(high - low):
+        return lowest, highest, axes
+    return low, high, np.eye(3)
+
+
 def _free_places(
-    coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64], finer: int
+    coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64], axes: NDArray[np.float64], finer: int
 ) -> NDArray[np.float64]:
-    """Places within the bounding box, the farthest off all surfaces first, (k, 3); so many times as many as usual."""
+    """Places within a box along axes, the farthest off all surfaces first, (k, 3); so many times as many as usual."""
     from scipy.spatial import cKDTree
 
     n, lattice_side = finer * _INSIDE, round(_LATTICE * finer ** (1.0 / 3.0))
     steps = (np.arange(lattice_side) + 0.5) / lattice_side
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    places = low + lattice * (high - low)
+    places = np.einsum("ij,jk->ik", low + lattice * (high - low), axes)
     clearance = cKDTree(coarse.centroids).query(places)[0] / coarse.size
     free = np.flatnonzero(clearance > _CLEARANCE)
     if not len(free):

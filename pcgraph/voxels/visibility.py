@@ -14,9 +14,9 @@ from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.depth_buffer import cosines_towards, seen_from
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
+from pcgraph.voxels.ground_and_rooms import bearing_plane
 from pcgraph.voxels.telling_places import (
     TellingPlaces,
-    bearing_plane,
     coarse_grid,
     either_normals,
     lengths,

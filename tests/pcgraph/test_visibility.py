@@ -8,8 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcgraph
+from pcgraph.metrics import segmentation_covering
 from pcgraph.voxels.depth_buffer import seen_from
 from pcgraph.voxels.directions import densest_plane
+from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.spacing_law import spacing_law
 
 
@@ -574,6 +576,56 @@ def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
     level = inwards[:, 2] != 0.0
     assert np.mean(facing[level]) > 0.97
     assert np.mean(facing) > 0.75  # of two sheets 12 cm apart, two voxels, one may take the other's side
+
+
+def scanned_corridor(length, places, step, seed=0):
+    """What tripods see of an empty corridor, 2.2 m wide and 2.6 m high: points, ways into it, number of each side."""
+    rng = np.random.default_rng(seed)
+    high = np.array([length, 2.2, 2.6])
+    rays = rays_at(np.radians(np.arange(-64.99, 90, step)), np.radians(np.arange(0.01, 360, step)))
+    points, inwards, sides = [], [], []
+    for x in places:
+        place = np.array([x, 1.1, 1.5])
+        ranges = (np.where(rays > 0, high, 0.0) - place) / rays
+        axis = np.argmin(ranges, axis=1)
+        upper = rays[np.arange(len(rays)), axis] > 0
+        nearest = ranges.min(axis=1) + rng.normal(0.0, 0.002, len(rays))
+        points.append(place + rays * nearest[:, None])
+        inwards.append(np.where(upper, -1.0, 1.0)[:, None] * np.eye(3)[axis])
+        sides.append(2 * axis + upper)
+    return np.concatenate(points), np.concatenate(inwards), np.concatenate(sides)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize(
+    ("length", "places", "step"), [(12.0, (2, 5, 7, 10), 0.9), (20.0, (6, 14), 0.7), (25.0, (4, 8, 12.5, 17, 21), 0.7)]
+)
+def test_an_empty_corridor_is_seen_from_its_tripods(length, places, step, turn):
+    """It is as visible from all around as a crate is, and was taken for one: all of it was one object."""
+    points, inwards, sides = scanned_corridor(length, places, step)
+    points, inwards = turned((points, inwards), turn)
+    result = pcgraph.segment(points)
+    assert result.outliers.mean() < 0.01
+    cosines = np.einsum(
+        "ij,ij->i", result.surface.normals[result.surface.grid.voxel_of_point], inwards[~result.outliers]
+    )
+    assert np.mean(cosines[np.abs(cosines) > 0.7] > 0.0) > 0.97
+    assert segmentation_covering(result.labels, sides) > 0.75  # halfway between two tripods walls are in pieces
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_voxels_are_not_finer_because_points_lie_densely_near_a_tripod(seed):
+    """The slab that was read was there: all of it was joined, and most of the corridor fell apart."""
+    points = scanned_corridor(25.0, (4, 12, 21), 0.9, seed)[0]
+    assert pcgraph.segment(points).voxel_size >= 0.99 * 3.5 * median_spacing(points)
+
+
+@pytest.mark.parametrize("n", [2, 4, 6])
+def test_rooms_far_apart_are_seen_from_within_each(n):
+    """Only the first three of them had places of their own."""
+    rooms = [scanned_corridor(5.0 + 0.3 * k, (1.5, 3.5), 1.2, seed=k)[:2] for k in range(n)]
+    apart = [(points + np.array([60.0 * k, 0.0, 0.0]), inwards) for k, (points, inwards) in enumerate(rooms)]
+    assert fraction_outward(*joined(*apart)) > 0.96
 
 
 @pytest.mark.filterwarnings("ignore:expected far fewer objects")  # the house falls apart

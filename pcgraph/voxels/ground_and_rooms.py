@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the densest planes of a cloud are: the ground, or a table, that bears all; floor and ceiling of a room."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.disjoint_sets import connected_components
+from pcgraph.voxels.directions import densest_plane, plane_basis
+from pcgraph.voxels.grid import VoxelGrid, voxel_grid
+from pcgraph.voxels.warp import Warp
+
+LEVEL = 0.996  # cosine between a plane's normal and z: 5 degrees
+_OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
+_BEARS, _OF_GROUND = 0.1, 0.25  # of the cells lie on a plane that bears something, and on one that is the ground
+_ANYTHING = 0.02  # of the cells lies off the ground at least, and of those, under it at most
+_NEARLY_EVERYTHING = 0.02, 0.98  # quantiles
+_WITHIN_GROUND = 0.6  # of the ground's area is at most that of all that stands on it
+_PARALLEL, _ASIDE = 0.9, 0.2  # cosines between normals on one plane, and on those at right angles
+_UNEVEN = 0.5  # variance of the points in a cell, beyond that of chance, in squares of their mean
+_TOGETHER = 0.2  # correlation, at least, of how densely points lie on either, by the logarithm
+_APART = 4  # cells between floor and ceiling, at least
+_FLOOR_AND_CEILING = 0.25  # of the cells lie on either of them, at least
+_COLUMN, _OVER_EACH_OTHER = 1.5, 0.7  # cells along which they are compared; of the floor has a ceiling over it
+_IN_ONE, _BEYOND = 0.9, 0.02  # of both are in one piece, at least; and of the cells are below or above, at most
+
+
+class BearingPlane(NamedTuple):
+    """The plane that bears most: the ground, a table, or a wall behind things.
+
+    Attributes
+    ----------
+    upwards : (3,) float64, unit
+        Its normal, to where nearly all the rest stands; or z, where that lies on both sides of each plane.
+    offset : float
+        Of the plane along it; -inf where there is none.
+    is_ground : bool
+        Whether it is level, and reaches beyond all that stands on it, or lies in a hollow of it.
+    """
+
+    upwards: NDArray[np.float64]
+    offset: float
+    is_ground: bool
+
+
+def bearing_plane(coarse: VoxelGrid, normals: NDArray[np.float64]) -> BearingPlane:
+    """The plane on which most cells lie, if nearly all the rest is on one side of it."""
+    normal, offset, fraction = densest_plane(coarse.centroids, normals)
+    heights = np.einsum("ij,j->i", coarse.centroids, normal) - offset
+    is_rest = np.abs(heights) > _OFF_PLANE * coarse.size
+    above, below = heights[is_rest & (heights > 0.0)].sum(), -heights[is_rest & (heights < 0.0)].sum()
+    if fraction < _BEARS or max(above, below) <= _NEARLY_ALL * (above + below):
+        return BearingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
+    if above < below:
+        normal, offset, heights = -normal, -offset, -heights
+    is_ground = (
+        abs(normal[2]) >= LEVEL
+        and fraction >= _OF_GROUND
+        and np.mean(is_rest) >= _ANYTHING
+        and np.mean(heights[is_rest] < 0.0) <= _ANYTHING
+        and _level_area(coarse.centroids[is_rest]) < _WITHIN_GROUND * _level_area(coarse.centroids[~is_rest])
+    )
+    return BearingPlane(normal, offset, bool(is_ground))
+
+
+def _level_area(places: NDArray[np.float64]) -> float:
+    """Area of the rectangle along x and y that holds nearly all places."""
+    low, high = np.quantile(places[:, :2], _NEARLY_EVERYTHING, axis=0)
+    return float(np.prod(high - low))
+
+
+def is_scanned_room(
+    centres: NDArray[np.float64], normals: NDArray[np.float64], points: NDArray[np.float64], size: float
+) -> bool:
+    """Whether cells of a size, at n places, (n, 3), with either normals, (n, 3), that hold so many points each, (n,),
+    were seen from tripods between a floor and a ceiling.
+
+    These are two parallel planes: across z, or the normal of the densest plane, or of the densest of those at right
+    angles to that; perhaps opposite walls. Both are in one piece, either covers nearly what the other does, and nothing
+    is below or above: boxes in a row, of which all sides were seen, have gaps between. What was seen elsewhere, through
+    a window, does not count. A closed box alone may be a thing. But who stands in a room is near to floor and ceiling
+    at the same place, and there points lie the denser on both; before a thing one of two opposite sides is seen.
+    """
+    mean = float(points.mean())
+    if points.var() - mean < _UNEVEN * mean * mean:  # not more than points at random would
+        return False
+    z, densest = np.array([0.0, 0.0, 1.0]), densest_plane(centres, normals).normal
+    aside = np.abs(np.einsum("ij,j->i", normals, densest)) < _ASIDE
+    axes = [z, densest]
+    if aside.any():
+        axes.append(densest_plane(centres[aside], normals[aside]).normal)
+    return any(_bound_a_room(centres, normals, points, size, axis) for axis in axes)
+
+
+def _bound_a_room(
+    centres: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    points: NDArray[np.float64],
+    size: float,
+    axis: NDArray[np.float64],
+) -> bool:
+    """Whether the two densest planes across an axis are floor and ceiling as `is_scanned_room` says."""
+    heights = np.einsum("ij,j->i", centres, axis) / size
+    level = np.abs(np.einsum("ij,j->i", normals, axis)) > _PARALLEL
+    if not level.any():
+        return False
+    layers, counts = np.unique(np.floor(heights[level]), return_counts=True)
+    pairs = counts + np.where(np.diff(layers, append=np.inf) == 1.0, np.append(counts[1:], 0), 0)  # planes lie between
+    first = int(np.argmax(pairs))
+    second = int(np.argmax(np.where(np.abs(layers - layers[first]) > _APART, pairs, 0)))
+    floor, ceiling = np.sort(layers[[first, second]]) + 1.0
+    on_floor, on_ceiling = (level & (np.abs(heights - height) < _OFF_PLANE) for height in (floor, ceiling))
+    if first == second or np.mean(on_floor | on_ceiling) < _FLOOR_AND_CEILING:
+        return False
+    flat = np.zeros_like(centres)
+    flat[:, :2] = centres @ plane_basis(axis).T
+    columns = voxel_grid(flat, None, _COLUMN * size, Warp())
+    of_cell = columns.voxel_of_point
+    n_floor, n_ceiling = (np.bincount(of_cell, on, columns.n_voxels) for on in (on_floor, on_ceiling))
+    has_either, has_both = (n_floor > 0.0) | (n_ceiling > 0.0), (n_floor > 0.0) & (n_ceiling > 0.0)
+    source = np.repeat(np.arange(columns.n_voxels), np.diff(columns.indptr))
+    touching = np.stack((source, columns.neighbours.astype(np.int64)), axis=1)
+    piece = connected_components(touching[has_either[touching].all(axis=1)], columns.n_voxels)
+    beyond = has_either[of_cell] & ((heights < floor - _OFF_PLANE) | (heights > ceiling + _OFF_PLANE))
+    most = max(np.count_nonzero(n_floor), np.count_nonzero(n_ceiling))
+    if (
+        np.count_nonzero(has_both) < _OVER_EACH_OTHER * most
+        or np.bincount(piece[has_either]).max() < _IN_ONE * np.count_nonzero(has_either)
+        or np.mean(beyond) > _BEYOND
+    ):
+        return False
+    of_floor, of_ceiling = (
+        np.log(np.bincount(of_cell, on * points, columns.n_voxels)[has_both] / n[has_both])
+        for on, n in ((on_floor, n_floor), (on_ceiling, n_ceiling))
+    )
+    spreads = float(of_floor.std() * of_ceiling.std())
+    return (
+        spreads > 0.0
+        and float(np.mean(of_floor * of_ceiling) - of_floor.mean() * of_ceiling.mean()) >= _TOGETHER * spreads
+    )
