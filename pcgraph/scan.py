@@ -77,12 +77,12 @@ _AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
 # Voxels can be smaller by steps of a quarter of a power of two
 _REFINEMENTS = 4  # at most,
-_FEW_VOXELS = 120_000  # if they are so few,
+_FEW_VOXELS, _MANY_VOXELS = 120_000, 480_000  # and at most to about the latter, for the time's sake,
 _ALL_JOINED = 0.93  # and of them,
 _STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
 _JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
 _THINNED = 0.7  # whose spacing grows by a smaller power of range, near or far,
-_PRICE_OF_ROUGHNESS = 0.25  # less a quarter of their roughness, stay joined,
+_PRICE_OF_ROUGHNESS = 0.25, 0.4  # less so much of their roughness, where voxels were few or not, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _MIN_VOXELS = 500
@@ -195,7 +195,9 @@ def segment(
     outside = _outward_planes(grid, settings.method, law, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
     known = outside.known or cloud.normals is not None
-    scan = Scan(cloud, outside.viewpoint, outside.places, known, grid, outside.planes, initial_labels, seed)
+    scan = Scan(
+        cloud, outside.viewpoint, outside.places, known, grid, outside.planes, initial_labels, seed, grid.warp.seen_from
+    )
     result = segment_scan(scan, None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
@@ -301,6 +303,8 @@ class Scan:
     initial_labels : (v,) int32
         Supervoxels of earlier scans, -1 elsewhere.
     seed_size : float, metres
+    seen_from_one : (3,) float64, metres, optional
+        From where all of it was seen, where that is one place.
     """
 
     cloud: CleanCloud
@@ -311,6 +315,7 @@ class Scan:
     planes: LocalPlanes
     initial_labels: NDArray[np.int32]
     seed_size: float
+    seen_from_one: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -362,7 +367,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     features = edge_features(nodes, touching)
     faces = faces_of(touching.edges, features, len(leaves))
     near, hidden = side_by_side(
-        lambda: gaps(grid, normals, supervoxels, nodes, touching.edges),
+        lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, scan.seen_from_one),
         lambda: continuations(surface, nodes, faces, scan.places),
     )
     hidden = hidden.with_others(bounding_planes(surface, nodes, faces))
@@ -613,26 +618,35 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, deg
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
     than those of points at random. Where not even three quarters are joined, as in a sweep thinned to a point per cube,
     nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
-    read off a slab in the middle. Points of one scan lie less densely where surfaces slant, and its rows far apart, so
-    its grid stays as it is; unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly
-    as many stay joined. Grids of many voxels stay for the time's sake.
+    read off a slab in the middle, which may be the dense part of several scans: so all together have to be joined as
+    well. Points of one scan lie less densely where surfaces slant, and its rows far apart, so its grid stays as it is;
+    unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly as many stay joined. For
+    the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
     n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
-    if n > _FEW_VOXELS or (of_one_scan and (law is None or law.in_halves >= _THINNED)):
+    if of_one_scan and (law is None or law.in_halves >= _THINNED):
         return grid
-    if not _HALF_JOINED <= _joined(degrees) < (_ALL_JOINED if of_one_scan else math.inf):
+    joined = _joined(degrees)
+    if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
         return grid
+    if n > _FEW_VOXELS and joined < _ALL_JOINED:
+        return grid
+    price = _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS]
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
-    joined = _joined(degrees[slab])
-    least = _ALL_JOINED if joined >= _MIN_JOINED else _STILL_JOINED * joined
-    least = _JOINED_OF_SCAN * joined if of_one_scan else least
+    of_slab = _joined(degrees[slab])
+    least = _ALL_JOINED if of_slab >= _MIN_JOINED else _STILL_JOINED * of_slab
+    least = _JOINED_OF_SCAN * of_slab if of_one_scan else least
+    if joined < least and not of_one_scan:
+        return grid
     points = cloud.points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, _REFINEMENTS + 1):
+        if n * 2.0 ** (step / 2.0) > _MANY_VOXELS:  # as many as a surface would have
+            break
         finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
         joined = _joined(np.diff(finer.indptr))
         if joined < least:
             break
-        if joined - _PRICE_OF_ROUGHNESS * roughness(finer) >= least:
+        if joined - price * roughness(finer) >= least:
             size = finer.size
     return grid if size == grid.size else voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
 

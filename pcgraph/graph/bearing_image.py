@@ -18,6 +18,9 @@ from pcgraph.voxels.visibility import standing_for_all
 
 _MAX_CELLS = 4e6
 _MAX_CELLS_PER_VOXEL = 16  # to either side; only voxels that nearly touch the sensor are wider
+_OF_VOXEL = 0.25  # at median distance, a cell through which things are seen; between two voxels
+_MIDDLE, _BEHIND = 0.3, 1.5  # of the way between them, from its middle; and voxel edges farther than both, at least
+_OFF_PLANE, _OFF_SLOPE = 0.75, 0.05  # voxel edges, and of the distance, at least, that it lies off the planes of both
 _MAX_DEPTH = 32  # things one behind the other along a line
 
 
@@ -126,14 +129,32 @@ def bearing_image(view: View) -> BearingImage:
     seen = np.flatnonzero(view.ranges > 0.5 * squares.edge_lengths)  # the sensor's own voxel lies in no direction
     if not len(seen):
         return BearingImage(np.full((1, 1), -1, np.int32))
-    cell = max(float(np.median(squares.widths[seen] / view.ranges[seen])), math.sqrt(4.0 * math.pi / _MAX_CELLS))
-    frame, angles = _frame(view.bearings, seen), np.empty((2, len(seen)))
-    in_blocks(_set_angles, len(seen), view.bearings, seen, frame, angles)
+    lattice, angles = _lattice(view.bearings, seen, float(np.median(squares.widths[seen] / view.ranges[seen])))
+    voxels = np.full(lattice.shape, -1, np.int32)
+    _set_nearest(view.ranges, squares.widths, seen, angles, lattice.first, lattice.cell, voxels)
+    return BearingImage(voxels, bool(angles[0].max() - lattice.first[0] > math.pi))
+
+
+class _Lattice(NamedTuple):
+    """Directions in rows and columns, a cell apart (radians), the first at azimuth and elevation `first`, (2,), in a
+    frame, (3, 3), whose rows point forward, sideways and to the pole."""
+
+    frame: NDArray[np.float64]
+    first: NDArray[np.float64]
+    cell: float
+    shape: tuple[int, int]
+
+
+def _lattice(
+    bearings: NDArray[np.float64], seen: NDArray[np.int64], cell: float
+) -> tuple[_Lattice, NDArray[np.float64]]:
+    """A lattice that holds some directions, and their azimuths and elevations in its frame, (2, s)."""
+    cell = max(cell, math.sqrt(4.0 * math.pi / _MAX_CELLS))
+    frame, angles = _frame(bearings, seen), np.empty((2, len(seen)))
+    in_blocks(_set_angles, len(seen), bearings, seen, frame, angles)
     first, last = angles.min(axis=1), angles.max(axis=1)
     width, height = ((last - first) / cell).astype(np.int64) + 1
-    voxels = np.full((height, width), -1, np.int32)
-    _set_nearest(view.ranges, squares.widths, seen, angles, first, cell, voxels)
-    return BearingImage(voxels, bool(last[0] - first[0] > math.pi))
+    return _Lattice(frame, first, cell, (int(height), int(width))), angles
 
 
 def _frame(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -201,6 +222,124 @@ def _set_nearest(
             for c in range(max(column - aside, 0), min(column + aside + 1, width)):
                 if image[r, c] < 0 or ranges[i] < ranges[image[r, c]]:
                     image[r, c] = i
+
+
+# --- what is seen between two voxels ---
+
+
+def seen_through(
+    place: NDArray[np.float64],
+    centroids: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    edge_lengths: NDArray[np.float64],
+    source: NDArray[np.int64],
+    target: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Whether something behind both is seen, from a place, between two of v voxels.
+
+    Parameters
+    ----------
+    place : (3,) float64, metres
+    centroids : (v, 3) float64, metres
+    normals : (v, 3) float64
+    edge_lengths : (v,) float64, metres
+    source, target : (m,) int64
+        Voxels on either side.
+
+    Returns
+    -------
+    (m,) bool
+        Whether a voxel is farther off than both by one and a half edges, in a direction no farther from the middle
+        between them than three tenths of the way, and lies off both planes: ground farther off is the same ground.
+    """
+    through = np.zeros(len(source), np.bool_)
+    bearings, ranges = np.empty((len(centroids), 3)), np.empty(len(centroids))
+    in_blocks(_look, len(centroids), place, centroids, bearings, ranges)
+    seen = np.flatnonzero(ranges > 0.5 * edge_lengths)
+    if not len(seen):
+        return through
+    lattice, angles = _lattice(bearings, seen, _OF_VOXEL * float(np.median(edge_lengths[seen] / ranges[seen])))
+    farthest = np.full(lattice.shape, -1, np.int32)
+    _set_farthest(ranges, seen, angles, lattice, farthest)
+    ends = _Ends(bearings, ranges, centroids, normals, edge_lengths, source, target)
+    in_blocks(_see_through, len(source), ends, lattice, farthest, through)
+    return through
+
+
+class _Ends(NamedTuple):
+    """Of v voxels the directions, (v, 3), ranges, (v,), centroids and normals, (v, 3), and edge lengths, (v,); and
+    which of them lie on either side, (m,)."""
+
+    bearings: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+    centroids: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    edge_lengths: NDArray[np.float64]
+    source: NDArray[np.int64]
+    target: NDArray[np.int64]
+
+
+@kernel
+def _set_farthest(
+    ranges: NDArray[np.float64],
+    seen: NDArray[np.int64],
+    angles: NDArray[np.float64],
+    lattice: _Lattice,
+    farthest: NDArray[np.int32],
+) -> None:
+    """Set the farthest voxel whose centroid is in each cell of the lattice."""
+    for at in range(len(seen)):
+        column = int((angles[0, at] - lattice.first[0]) / lattice.cell)
+        row = int((angles[1, at] - lattice.first[1]) / lattice.cell)
+        if farthest[row, column] < 0 or ranges[seen[at]] > ranges[farthest[row, column]]:
+            farthest[row, column] = seen[at]
+
+
+@kernel
+def _see_through(
+    start: int,
+    stop: int,
+    ends: _Ends,
+    lattice: _Lattice,
+    farthest: NDArray[np.int32],
+    through: NDArray[np.bool_],
+) -> None:
+    """Set what `seen_through` returns, given the farthest voxel in each cell of the lattice."""
+    (height, width), cell, corner = farthest.shape, lattice.cell, lattice.first
+    frame, bearings, ranges = lattice.frame, ends.bearings, ends.ranges
+    for i in range(start, stop):
+        p, q = ends.source[i], ends.target[i]
+        behind = max(ranges[p], ranges[q]) + _BEHIND * max(ends.edge_lengths[p], ends.edge_lengths[q])
+        along = aside = up = square = across = 0.0
+        for axis in range(3):
+            middle = 0.5 * (ranges[p] * bearings[p, axis] + ranges[q] * bearings[q, axis])
+            along += frame[0, axis] * middle
+            aside += frame[1, axis] * middle
+            up += frame[2, axis] * middle
+            square += middle * middle
+            across += (bearings[p, axis] - bearings[q, axis]) ** 2
+        azimuth = math.atan2(aside, along) - corner[0]
+        elevation = math.asin(min(max(up / math.sqrt(max(square, 1e-300)), -1.0), 1.0)) - corner[1]
+        radius = min(_MIDDLE * math.sqrt(across), _MAX_CELLS_PER_VOXEL * cell)
+        narrowing = max(math.cos(elevation + corner[1]), 1e-3)
+        reach = radius / narrowing
+        for row in range(max(int((elevation - radius) / cell), 0), min(int((elevation + radius) / cell) + 1, height)):
+            for column in range(max(int((azimuth - reach) / cell), 0), min(int((azimuth + reach) / cell) + 1, width)):
+                far = farthest[row, column]
+                x, y = ((column + 0.5) * cell - azimuth) * narrowing, (row + 0.5) * cell - elevation
+                if far >= 0 and x * x + y * y <= radius * radius and ranges[far] > behind:
+                    through[i] = through[i] or (_is_off(far, p, ends) and _is_off(far, q, ends))
+
+
+@routine
+def _is_off(far: int, near: int, ends: _Ends) -> bool:
+    """Whether one voxel lies off the plane of another."""
+    height = square = 0.0
+    for axis in range(3):
+        way = ends.centroids[far, axis] - ends.centroids[near, axis]
+        height += way * ends.normals[near, axis]
+        square += way * way
+    return abs(height) > max(_OFF_PLANE * ends.edge_lengths[near], _OFF_SLOPE * math.sqrt(square))
 
 
 # --- depth edges along the lines of that image ---

@@ -9,9 +9,13 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
+from pcgraph.graph.bearing_image import seen_through
 from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.grid import VoxelGrid, at_ends, boundary_voxels, voxels_within
+
+_SHORTEST, _SEEN_THROUGH = 8, 0.5  # ways across a gap, at most, and of them, through which something is seen
+_SMOOTH = 0.4  # voxel edges off their planes, at most: of a crown something is seen through everywhere
 
 
 def gaps(
@@ -20,6 +24,7 @@ def gaps(
     supervoxels: NDArray[np.int32],
     nodes: NodeFeatures,
     touching: NDArray[np.int32],
+    place: NDArray[np.float64] | None = None,
 ) -> Gaps:
     """Pairs of supervoxels that do not touch, but whose boundary voxels come near each other.
 
@@ -36,6 +41,9 @@ def gaps(
     nodes : NodeFeatures of k supervoxels
     touching : (m, 2) int32
         Pairs of supervoxels that touch, the smaller first, ascending.
+    place : (3,) float64, metres, optional
+        From where all was seen, if from one place. Where something behind is seen from there between two smooth
+        supervoxels, as the floor between equal desks in a row, nothing of either is hidden, or missing: they are apart.
 
     Notes
     -----
@@ -54,6 +62,9 @@ def gaps(
     source, target = source[apart], target[apart]
     key = _keys(supervoxels[source], supervoxels[target], k)
     width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / grid.size, axis=1)
+    if place is not None and len(source):
+        closed = ~_open_ways(grid, normals, supervoxels, nodes, place, source, target.astype(np.int64), key, width)
+        source, target, key, width = source[closed], target[closed], key[closed], width[closed]
     key, width = np.tile(key, 2), np.tile(width, 2)  # each side of each pair
     voxel: NDArray[np.int64] = np.concatenate((source, target))
     other = np.concatenate((supervoxels[target], supervoxels[source]))
@@ -72,6 +83,36 @@ def gaps(
     np.minimum.at(shortest, edge, width)
     weights = np.bincount(edge, np.exp(1.0 - width), len(edges)).astype(np.float64)
     return Gaps(edges, edge_features(nodes, facing), shortest, weights, grid.warp.of_one_scan)
+
+
+def _open_ways(
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    supervoxels: NDArray[np.int32],
+    nodes: NodeFeatures,
+    place: NDArray[np.float64],
+    source: NDArray[np.int64],
+    target: NDArray[np.int64],
+    key: NDArray[np.int64],
+    width: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Which of m pairs of voxels belong to two smooth supervoxels, told by the key, between which something is seen.
+
+    The shortest of the ways between them tell.
+    """
+    order = np.lexsort((width, key))
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    pair = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(key)))
+    shortest = np.arange(len(key)) - starts[pair] < _SHORTEST
+    some, of_pair = order[shortest], pair[shortest]
+    through = seen_through(place, grid.centroids, normals, grid.edge_lengths, source[some], target[some])
+    mean_edge = np.bincount(supervoxels, grid.edge_lengths) / np.bincount(supervoxels)
+    is_smooth = nodes.residual <= _SMOOTH * mean_edge
+    is_open = np.bincount(of_pair, through) >= _SEEN_THROUGH * np.bincount(of_pair)
+    is_open &= (is_smooth[supervoxels[source]] & is_smooth[supervoxels[target]])[order[starts]]
+    opened = np.empty(len(key), np.bool_)
+    opened[order] = is_open[pair]
+    return opened
 
 
 def _ends_of_surfaces(

@@ -67,6 +67,11 @@ class Warp:
         """How normals lie in the warped space."""
         return Slant()
 
+    @property
+    def seen_from(self) -> NDArray[np.float64] | None:
+        """The one place that all points were seen from, (3,) float64, metres, or none."""
+        return None
+
 
 @dataclass(frozen=True, eq=False)
 class CameraWarp(Warp):
@@ -116,6 +121,11 @@ class CameraWarp(Warp):
         return (points[:, 2] - self.viewpoint[2]) / self.reference_depth
 
     @property
+    def seen_from(self) -> NDArray[np.float64]:
+        """The camera's place."""
+        return self.viewpoint
+
+    @property
     def slant(self) -> Slant:
         """A step along z moves along the ray of the pixel."""
         return Slant(depth=1.0 / self.reference_depth)
@@ -159,6 +169,11 @@ class RangeWarp(Warp):
     def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(r / r0)^growth, (n,) float64."""
         return (_ranges(points, self.viewpoint) / self.reference_range) ** self.growth
+
+    @property
+    def seen_from(self) -> NDArray[np.float64]:
+        """The scanner's place."""
+        return self.viewpoint
 
     @property
     def slant(self) -> Slant:

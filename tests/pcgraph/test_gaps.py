@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pcgraph
+from pcgraph.graph.bearing_image import seen_through
 from pcgraph.graph.gaps import gaps
 
 VOXEL = 0.05
@@ -100,3 +101,59 @@ def test_a_cloud_of_one_voxel_has_no_gaps():
     result = pcgraph.segment(np.zeros((5, 3)), voxel_size=1.0)
     assert result.graph.gaps is not None
     assert result.graph.gaps.edges.shape == (0, 2)
+
+
+@pytest.mark.parametrize("behind", [True, False])
+def test_a_gap_through_which_something_is_seen_is_none(behind):
+    """Two tables in one plane, three voxels apart, over a floor, or over nothing: what is missing may be one table."""
+    settings = {"voxel_size": VOXEL, "seed_size": 6 * VOXEL, "viewpoint": (1.0, 0.5, 5.0), "range_growth": 0.5}
+    tables = np.concatenate((sheet(0.0, 1.0), sheet(1.0 + 2.0 * VOXEL, 2.0 + 2.0 * VOXEL)))
+    floor = sheet(-1.0, 3.1, -0.8)
+    result = pcgraph.segment(np.concatenate((tables, floor)) if behind else tables, **settings)
+    left, right = (np.bincount(result.labels[: len(tables)][some]).argmax() for some in halves_of(tables))
+    assert (left == right) != behind
+
+
+def halves_of(tables):
+    """Which points lie left and right of the middle."""
+    return tables[:, 0] < 1.0 + VOXEL, tables[:, 0] > 1.0 + VOXEL
+
+
+def test_between_two_voxels_is_seen_what_lies_farther_off_near_the_middle():
+    places = np.array(
+        [[-0.1, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 1.0, 1.0], [0.2, 1.0, 1.0], [0.2, 1.0, 3.0]]
+    )
+    source, target, facing = np.array([0, 0, 3]), np.array([1, 4, 4]), np.tile([0.0, 0.0, -1.0], (6, 1))
+    through = seen_through(np.zeros(3), places, facing, np.full(6, 0.05), source, target)
+    assert through.tolist() == [True, False, False]  # the last is farther off, but not in the middle
+    no_farther = places[:3] * [[1.0], [1.0], [0.53]]  # than by an edge and a half
+    assert not seen_through(np.zeros(3), no_farther, facing[:3], np.full(3, 0.05), source[:1], target[:1]).any()
+    slanted = np.where(np.arange(6)[:, None] == 0, [1.0, 0.0, -0.1], facing)  # its plane goes on there
+    assert not seen_through(np.zeros(3), places, slanted, np.full(6, 0.05), source[:1], target[:1]).any()
+    one = np.zeros(1, np.int64)
+    assert not seen_through(places[0], places[:1], facing[:1], np.full(1, 0.05), one, one).any()
+
+
+def scan_of_cartons(seed, apart):
+    """Six equal cartons in a row before a wall, seen from a tripod at the origin: points, and the carton of each."""
+    rng = np.random.default_rng(seed)
+    up, around = np.meshgrid(np.radians(np.arange(-60, 20, 0.3)), np.radians(np.arange(20, 160, 0.3)))
+    rays = np.stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)), axis=-1).reshape(-1, 3)
+    ranges = np.minimum(np.where(rays[:, 2] < 0.0, -1.7 / rays[:, 2], np.inf), 4.5 / rays[:, 1])
+    truth = np.full(len(rays), -1)
+    for k in range(6):
+        low = np.array([(k - 2.5) * (0.5 + apart) - 0.25, 3.25 + rng.normal(0.0, 0.004), -1.7])
+        ends = low / rays, (low + np.array([0.5, 0.5, 0.6])) / rays
+        entry, leave = np.minimum(*ends).max(axis=1), np.maximum(*ends).min(axis=1)
+        hit = (entry < leave) & (entry < ranges)
+        ranges[hit], truth[hit] = entry[hit], k
+    near = ranges < 8.0
+    return (rays * (ranges + rng.normal(0.0, 0.003, len(ranges)))[:, None])[near], truth[near]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_equal_cartons_in_a_row_are_objects(seed):
+    """Their tops lie in one plane, and merged across 15 cm at any price: all six were one object."""
+    points, truth = scan_of_cartons(seed, 0.15)
+    labels = pcgraph.segment(points).labels
+    assert len(np.unique([np.bincount(labels[truth == k]).argmax() for k in range(6)])) >= 5
