@@ -115,6 +115,11 @@ class VoxelGrid(ShortRepr):
         """Number of occupied voxels."""
         return len(self.counts)
 
+    def touching_pairs(self) -> NDArray[np.int64]:
+        """Pairs of voxels that touch, (m, 2), each in both orders."""
+        source = np.repeat(np.arange(self.n_voxels), np.diff(self.indptr))
+        return np.stack((source, self.neighbours.astype(np.int64)), axis=1)
+
     @property
     def neighbourhood(self) -> Neighbourhood:
         """Which voxels touch, as kernels take it."""

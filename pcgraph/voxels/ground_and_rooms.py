@@ -116,13 +116,12 @@ def _bound_a_room(
     if first == second or np.mean(on_floor | on_ceiling) < _FLOOR_AND_CEILING:
         return False
     flat = np.zeros_like(centres)
-    flat[:, :2] = centres @ plane_basis(axis).T
+    flat[:, :2] = np.einsum("ij,kj->ik", centres, plane_basis(axis))
     columns = voxel_grid(flat, None, _COLUMN * size, Warp())
     of_cell = columns.voxel_of_point
     n_floor, n_ceiling = (np.bincount(of_cell, on, columns.n_voxels) for on in (on_floor, on_ceiling))
     has_either, has_both = (n_floor > 0.0) | (n_ceiling > 0.0), (n_floor > 0.0) & (n_ceiling > 0.0)
-    source = np.repeat(np.arange(columns.n_voxels), np.diff(columns.indptr))
-    touching = np.stack((source, columns.neighbours.astype(np.int64)), axis=1)
+    touching = columns.touching_pairs()
     piece = connected_components(touching[has_either[touching].all(axis=1)], columns.n_voxels)
     beyond = has_either[of_cell] & ((heights < floor - _OFF_PLANE) | (heights > ceiling + _OFF_PLANE))
     most = max(np.count_nonzero(n_floor), np.count_nonzero(n_ceiling))
@@ -136,8 +135,6 @@ def _bound_a_room(
         np.log(np.bincount(of_cell, on * points, columns.n_voxels)[has_both] / n[has_both])
         for on, n in ((on_floor, n_floor), (on_ceiling, n_ceiling))
     )
+    of_floor, of_ceiling = of_floor - of_floor.mean(), of_ceiling - of_ceiling.mean()
     spreads = float(of_floor.std() * of_ceiling.std())
-    return (
-        spreads > 0.0
-        and float(np.mean(of_floor * of_ceiling) - of_floor.mean() * of_ceiling.mean()) >= _TOGETHER * spreads
-    )
+    return spreads > 0.0 and float(np.mean(of_floor * of_ceiling)) >= _TOGETHER * spreads

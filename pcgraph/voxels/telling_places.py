@@ -485,9 +485,7 @@ def _parts(
     if not length > 0.0:
         return part_of_cell, boxes
     blocks = voxel_grid(centres - low, None, length / _BLOCKS, Warp())
-    source = np.repeat(np.arange(blocks.n_voxels), np.diff(blocks.indptr))
-    touching = np.stack((source, blocks.neighbours.astype(np.int64)), axis=1)
-    piece = connected_components(touching, blocks.n_voxels)[blocks.voxel_of_point]
+    piece = connected_components(blocks.touching_pairs(), blocks.n_voxels)[blocks.voxel_of_point]
     counts, part = np.bincount(piece), 0
     for number in np.argsort(-counts, kind="stable")[:_PARTS]:
         cells = piece == number
