@@ -77,6 +77,7 @@ def compile_kernels() -> None:
     segment(image, np.full(image.shape, 0.5), normals, (0.0, 0.0, 0.0))
     segment(image.reshape(-1, 3))
     some_blocks(image.reshape(-1, 3))
+    _compile_graph_and_tree()  # neither has gaps
 
 
 def must_compile() -> bool:
@@ -157,7 +158,7 @@ def _compile_graph_and_tree() -> None:
     normals = np.tile([0.0, 0, -1], (n, 1))
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
     nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
-    near = gaps(grid, normals, labels, nodes, touching.edges)
+    near = gaps(grid, normals, labels, nodes, touching.edges, np.zeros(3))
     surface = Surface(grid, normals, labels)
     hidden = continuations(surface, nodes, labels, np.zeros((1, 3))).with_others(
         bounding_planes(surface, nodes, labels)
