@@ -629,7 +629,8 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, deg
     joined = _joined(degrees)
     if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
         return grid
-    if n > _FEW_VOXELS and joined < _ALL_JOINED:
+    steps = min(_REFINEMENTS, int(2.0 * math.log2(_MANY_VOXELS / n)))  # to as many voxels as a surface would have
+    if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
         return grid
     price = _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS]
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
@@ -639,9 +640,7 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, deg
     if joined < least and not of_one_scan:
         return grid
     points = cloud.points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
-    for step in range(1, _REFINEMENTS + 1):
-        if n * 2.0 ** (step / 2.0) > _MANY_VOXELS:  # as many as a surface would have
-            break
+    for step in range(1, steps + 1):
         finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
         joined = _joined(np.diff(finer.indptr))
         if joined < least:
