@@ -195,9 +195,7 @@ def segment(
     outside = _outward_planes(grid, settings.method, law, place)
     seed = _seed_size(grid) if seed_size is None else float(seed_size)
     known = outside.known or cloud.normals is not None
-    scan = Scan(
-        cloud, outside.viewpoint, outside.places, known, grid, outside.planes, initial_labels, seed, grid.warp.seen_from
-    )
+    scan = Scan(cloud, outside.viewpoint, outside.places, known, grid, outside.planes, initial_labels, seed)
     result = segment_scan(scan, None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
@@ -303,8 +301,6 @@ class Scan:
     initial_labels : (v,) int32
         Supervoxels of earlier scans, -1 elsewhere.
     seed_size : float, metres
-    seen_from_one : (3,) float64, metres, optional
-        From where all of it was seen, where that is one place.
     """
 
     cloud: CleanCloud
@@ -315,7 +311,6 @@ class Scan:
     planes: LocalPlanes
     initial_labels: NDArray[np.int32]
     seed_size: float
-    seen_from_one: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -366,8 +361,9 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     nodes = node_features(leaves)
     features = edge_features(nodes, touching)
     faces = faces_of(touching.edges, features, len(leaves))
+    seen_from = grid.warp.seen_from if earlier is None else None  # of several scans no place saw all
     near, hidden = side_by_side(
-        lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, scan.seen_from_one),
+        lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, seen_from),
         lambda: continuations(surface, nodes, faces, scan.places),
     )
     hidden = hidden.with_others(bounding_planes(surface, nodes, faces))

@@ -125,13 +125,12 @@ def bearing_image(view: View) -> BearingImage:
     the view, so that a camera's image has neither. Nearer voxels hide farther ones and fill as many cells as their
     width needs.
     """
-    squares = view.squares
-    seen = np.flatnonzero(view.ranges > 0.5 * squares.edge_lengths)  # the sensor's own voxel lies in no direction
-    if not len(seen):
+    found = _lattice(view, 1.0)
+    if found is None:
         return BearingImage(np.full((1, 1), -1, np.int32))
-    lattice, angles = _lattice(view.bearings, seen, float(np.median(squares.widths[seen] / view.ranges[seen])))
+    lattice, seen, angles = found
     voxels = np.full(lattice.shape, -1, np.int32)
-    _set_nearest(view.ranges, squares.widths, seen, angles, lattice.first, lattice.cell, voxels)
+    _set_nearest(view.ranges, view.squares.widths, seen, angles, lattice.first, lattice.cell, voxels)
     return BearingImage(voxels, bool(angles[0].max() - lattice.first[0] > math.pi))
 
 
@@ -145,16 +144,20 @@ class _Lattice(NamedTuple):
     shape: tuple[int, int]
 
 
-def _lattice(
-    bearings: NDArray[np.float64], seen: NDArray[np.int64], cell: float
-) -> tuple[_Lattice, NDArray[np.float64]]:
-    """A lattice that holds some directions, and their azimuths and elevations in its frame, (2, s)."""
+def _lattice(view: View, of_width: float) -> tuple[_Lattice, NDArray[np.int64], NDArray[np.float64]] | None:
+    """A lattice of cells of so many widths of a square at median distance; the squares that lie in a direction, (s,),
+    and their azimuths and elevations in its frame, (2, s). None if all lie at the place."""
+    squares = view.squares
+    seen = np.flatnonzero(view.ranges > 0.5 * squares.edge_lengths)  # the sensor's own voxel lies in no direction
+    if not len(seen):
+        return None
+    cell = of_width * float(np.median(squares.widths[seen] / view.ranges[seen]))
     cell = max(cell, math.sqrt(4.0 * math.pi / _MAX_CELLS))
-    frame, angles = _frame(bearings, seen), np.empty((2, len(seen)))
-    in_blocks(_set_angles, len(seen), bearings, seen, frame, angles)
+    frame, angles = _frame(view.bearings, seen), np.empty((2, len(seen)))
+    in_blocks(_set_angles, len(seen), view.bearings, seen, frame, angles)
     first, last = angles.min(axis=1), angles.max(axis=1)
     width, height = ((last - first) / cell).astype(np.int64) + 1
-    return _Lattice(frame, first, cell, (int(height), int(width))), angles
+    return _Lattice(frame, first, cell, (int(height), int(width))), seen, angles
 
 
 def _frame(bearings: NDArray[np.float64], seen: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -227,24 +230,8 @@ def _set_nearest(
 # --- what is seen between two voxels ---
 
 
-def seen_through(
-    place: NDArray[np.float64],
-    centroids: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    edge_lengths: NDArray[np.float64],
-    source: NDArray[np.int64],
-    target: NDArray[np.int64],
-) -> NDArray[np.bool_]:
-    """Whether something behind both is seen, from a place, between two of v voxels.
-
-    Parameters
-    ----------
-    place : (3,) float64, metres
-    centroids : (v, 3) float64, metres
-    normals : (v, 3) float64
-    edge_lengths : (v,) float64, metres
-    source, target : (m,) int64
-        Voxels on either side.
+def seen_through(view: View, source: NDArray[np.int64], target: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether something behind both is seen between two voxels, for each of m pairs of all that a view has, (m,).
 
     Returns
     -------
@@ -252,31 +239,13 @@ def seen_through(
         Whether a voxel is farther off than both by one and a half edges, in a direction no farther from the middle
         between them than three tenths of the way, and lies off both planes: ground farther off is the same ground.
     """
-    through = np.zeros(len(source), np.bool_)
-    bearings, ranges = np.empty((len(centroids), 3)), np.empty(len(centroids))
-    in_blocks(_look, len(centroids), place, centroids, bearings, ranges)
-    seen = np.flatnonzero(ranges > 0.5 * edge_lengths)
-    if not len(seen):
-        return through
-    lattice, angles = _lattice(bearings, seen, _OF_VOXEL * float(np.median(edge_lengths[seen] / ranges[seen])))
-    farthest = np.full(lattice.shape, -1, np.int32)
-    _set_farthest(ranges, seen, angles, lattice, farthest)
-    ends = _Ends(bearings, ranges, centroids, normals, edge_lengths, source, target)
-    in_blocks(_see_through, len(source), ends, lattice, farthest, through)
+    through, found = np.zeros(len(source), np.bool_), _lattice(view, _OF_VOXEL)
+    if found is not None:
+        lattice, seen, angles = found
+        farthest = np.full(lattice.shape, -1, np.int32)
+        _set_farthest(view.ranges, seen, angles, lattice, farthest)
+        in_blocks(_see_through, len(source), source, target, view, lattice, farthest, through)
     return through
-
-
-class _Ends(NamedTuple):
-    """Of v voxels the directions, (v, 3), ranges, (v,), centroids and normals, (v, 3), and edge lengths, (v,); and
-    which of them lie on either side, (m,)."""
-
-    bearings: NDArray[np.float64]
-    ranges: NDArray[np.float64]
-    centroids: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    edge_lengths: NDArray[np.float64]
-    source: NDArray[np.int64]
-    target: NDArray[np.int64]
 
 
 @kernel
@@ -299,17 +268,19 @@ def _set_farthest(
 def _see_through(
     start: int,
     stop: int,
-    ends: _Ends,
+    source: NDArray[np.int64],
+    target: NDArray[np.int64],
+    view: View,
     lattice: _Lattice,
     farthest: NDArray[np.int32],
     through: NDArray[np.bool_],
 ) -> None:
     """Set what `seen_through` returns, given the farthest voxel in each cell of the lattice."""
     (height, width), cell, corner = farthest.shape, lattice.cell, lattice.first
-    frame, bearings, ranges = lattice.frame, ends.bearings, ends.ranges
+    frame, bearings, ranges, edge_lengths = lattice.frame, view.bearings, view.ranges, view.squares.edge_lengths
     for i in range(start, stop):
-        p, q = ends.source[i], ends.target[i]
-        behind = max(ranges[p], ranges[q]) + _BEHIND * max(ends.edge_lengths[p], ends.edge_lengths[q])
+        p, q = source[i], target[i]
+        behind = max(ranges[p], ranges[q]) + _BEHIND * max(edge_lengths[p], edge_lengths[q])
         along = aside = up = square = across = 0.0
         for axis in range(3):
             middle = 0.5 * (ranges[p] * bearings[p, axis] + ranges[q] * bearings[q, axis])
@@ -328,18 +299,18 @@ def _see_through(
                 far = farthest[row, column]
                 x, y = ((column + 0.5) * cell - azimuth) * narrowing, (row + 0.5) * cell - elevation
                 if far >= 0 and x * x + y * y <= radius * radius and ranges[far] > behind:
-                    through[i] = through[i] or (_is_off(far, p, ends) and _is_off(far, q, ends))
+                    through[i] = through[i] or (_is_off(far, p, view.squares) and _is_off(far, q, view.squares))
 
 
 @routine
-def _is_off(far: int, near: int, ends: _Ends) -> bool:
+def _is_off(far: int, near: int, squares: Squares) -> bool:
     """Whether one voxel lies off the plane of another."""
     height = square = 0.0
     for axis in range(3):
-        way = ends.centroids[far, axis] - ends.centroids[near, axis]
-        height += way * ends.normals[near, axis]
+        way = squares.centroids[far, axis] - squares.centroids[near, axis]
+        height += way * squares.normals[near, axis]
         square += way * way
-    return abs(height) > max(_OFF_PLANE * ends.edge_lengths[near], _OFF_SLOPE * math.sqrt(square))
+    return abs(height) > max(_OFF_PLANE * squares.edge_lengths[near], _OFF_SLOPE * math.sqrt(square))
 
 
 # --- depth edges along the lines of that image ---

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
-from pcgraph.graph.bearing_image import seen_through
+from pcgraph.graph.bearing_image import seen_through, squares_of, view_from
 from pcgraph.graph.contacts import edge_features, facing_sides
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.grid import VoxelGrid, at_ends, boundary_voxels, voxels_within
+from pcgraph.voxels.surface import Surface
 
 _SHORTEST, _SEEN_THROUGH = 8, 0.5  # ways across a gap, at most, and of them, through which something is seen
 _SMOOTH = 0.4  # voxel edges off their planes, at most: of a crown something is seen through everywhere
@@ -105,7 +106,8 @@ def _open_ways(
     pair = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(key)))
     shortest = np.arange(len(key)) - starts[pair] < _SHORTEST
     some, of_pair = order[shortest], pair[shortest]
-    through = seen_through(place, grid.centroids, normals, grid.edge_lengths, source[some], target[some])
+    view = view_from(place, squares_of(Surface(grid, normals, supervoxels)))
+    through = seen_through(view, source[some], target[some])
     mean_edge = np.bincount(supervoxels, grid.edge_lengths) / np.bincount(supervoxels)
     is_smooth = nodes.residual <= _SMOOTH * mean_edge
     is_open = np.bincount(of_pair, through) >= _SEEN_THROUGH * np.bincount(of_pair)

@@ -124,8 +124,7 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     coarse = coarse_grid(grid, middle, reach, finer * _CELLS)
     low, high = bounding_box(coarse.centroids)
     normals = either_normals(coarse)
-    points = np.bincount(coarse.voxel_of_point, np.diff(grid.starts), coarse.n_voxels).astype(np.float64)
-    part_of_cell, boxes = _parts(coarse, normals, points)
+    part_of_cell, boxes = _parts(coarse, normals, grid)
     share, upright = max(finer // (len(boxes) + 1), 1), np.eye(3)
     in_boxes = np.concatenate([low[None][:0], *(_free_places(coarse, *box, upright, share) for box in boxes)])
     in_boxes = in_boxes[hit_fractions(in_boxes, coarse.centroids) >= _CLOSED]
@@ -165,7 +164,7 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     if np.count_nonzero(in_rooms) >= _FEW:
         for part in range(len(room_counts)):
             cells = part_of_cell == part
-            room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
+            room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, grid)
     weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts, room_counts)
     chosen = _spread_choice(seen, weights)
     if _is_layered(coarse):  # low rooms have few places at first, and the outside of all of them shows much
@@ -470,7 +469,7 @@ def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cell
 
 
 def _parts(
-    coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
+    coarse: VoxelGrid, normals: NDArray[np.float64], grid: VoxelGrid
 ) -> tuple[NDArray[np.int64], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
     """Parts of a cloud that are far from each other, the number of each cell's, (n,), the largest first, which has what
     belongs to none; and boxes in which nearly all of them lies, where the box of all is twice as long.
@@ -491,7 +490,7 @@ def _parts(
         cells = piece == number
         if counts[number] < _OF_PART * len(centres):
             break
-        if part >= _PARTS_OF_ANY and not _is_room(cells, coarse, normals, points):
+        if part >= _PARTS_OF_ANY and not _is_room(cells, coarse, normals, grid):
             continue
         part_of_cell[cells] = part
         part += 1
@@ -501,10 +500,9 @@ def _parts(
     return part_of_cell, boxes
 
 
-def _is_room(
-    cells: NDArray[np.bool_], coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
-) -> bool:
-    """Whether some of the cells are a room that tripods stood in."""
+def _is_room(cells: NDArray[np.bool_], coarse: VoxelGrid, normals: NDArray[np.float64], grid: VoxelGrid) -> bool:
+    """Whether some cells of the coarse grid are a room that tripods stood in."""
+    points = np.bincount(coarse.voxel_of_point, np.diff(grid.starts), coarse.n_voxels).astype(np.float64)
     return is_scanned_room(coarse.centroids[cells], normals[cells], points[cells], coarse.size)
 
 

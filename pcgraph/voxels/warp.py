@@ -40,12 +40,9 @@ class Warp:
     ----------
     max_gap : float, voxel edges
         Distance between the means of two voxels, at most, that a gap lies between.
-    of_one_scan : bool
-        Whether voxels grow with the distance from the one place that all points were seen from.
     """
 
     max_gap: ClassVar[float] = 3.0
-    of_one_scan: ClassVar[bool] = False
 
     def check(self, points: NDArray[np.float64]) -> None:
         """ValueError if a point has no place in the warped space."""
@@ -69,8 +66,13 @@ class Warp:
 
     @property
     def seen_from(self) -> NDArray[np.float64] | None:
-        """The one place that all points were seen from, (3,) float64, metres, or none."""
+        """The place, (3,) float64, metres, that all points were seen from, if voxels grow with the distance from it."""
         return None
+
+    @property
+    def of_one_scan(self) -> bool:
+        """Whether there is such a place."""
+        return self.seen_from is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +92,6 @@ class CameraWarp(Warp):
     -----
     Source: the single-camera transform of PCL's VCCS (x/z, y/z, ln z), here with a scale that keeps metres.
     """
-
-    of_one_scan: ClassVar[bool] = True
 
     viewpoint: NDArray[np.float64]
     reference_depth: float
@@ -149,7 +149,6 @@ class RangeWarp(Warp):
 
     # A scanner's rows lie farther apart than the points along them.
     max_gap: ClassVar[float] = 6.0
-    of_one_scan: ClassVar[bool] = True
 
     viewpoint: NDArray[np.float64]
     reference_range: float

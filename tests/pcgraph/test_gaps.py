@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import pcgraph
-from pcgraph.graph.bearing_image import seen_through
+from pcgraph.graph.bearing_image import Squares, seen_through, view_from
 from pcgraph.graph.gaps import gaps
+from pcgraph.voxels.grid import Neighbourhood
 
 VOXEL = 0.05
 
@@ -119,19 +120,28 @@ def halves_of(tables):
     return tables[:, 0] < 1.0 + VOXEL, tables[:, 0] > 1.0 + VOXEL
 
 
+def view(place, places, normals):
+    """Voxels of 5 cm as they are seen from a place."""
+    edges, n = np.full(len(places), 0.05), len(places)
+    touching = Neighbourhood(np.zeros(n + 1, np.uint64), np.empty(0, np.uint32))
+    return view_from(
+        place, Squares(np.arange(n), places, normals, edges, edges, np.arange(n, dtype=np.int32), touching)
+    )
+
+
 def test_between_two_voxels_is_seen_what_lies_farther_off_near_the_middle():
     places = np.array(
         [[-0.1, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 1.0, 1.0], [0.2, 1.0, 1.0], [0.2, 1.0, 3.0]]
     )
     source, target, facing = np.array([0, 0, 3]), np.array([1, 4, 4]), np.tile([0.0, 0.0, -1.0], (6, 1))
-    through = seen_through(np.zeros(3), places, facing, np.full(6, 0.05), source, target)
+    through = seen_through(view(np.zeros(3), places, facing), source, target)
     assert through.tolist() == [True, False, False]  # the last is farther off, but not in the middle
     no_farther = places[:3] * [[1.0], [1.0], [0.53]]  # than by an edge and a half
-    assert not seen_through(np.zeros(3), no_farther, facing[:3], np.full(3, 0.05), source[:1], target[:1]).any()
+    assert not seen_through(view(np.zeros(3), no_farther, facing[:3]), source[:1], target[:1]).any()
     slanted = np.where(np.arange(6)[:, None] == 0, [1.0, 0.0, -0.1], facing)  # its plane goes on there
-    assert not seen_through(np.zeros(3), places, slanted, np.full(6, 0.05), source[:1], target[:1]).any()
+    assert not seen_through(view(np.zeros(3), places, slanted), source[:1], target[:1]).any()
     one = np.zeros(1, np.int64)
-    assert not seen_through(places[0], places[:1], facing[:1], np.full(1, 0.05), one, one).any()
+    assert not seen_through(view(places[0], places[:1], facing[:1]), one, one).any()
 
 
 def scan_of_cartons(seed, apart):
