@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How large voxels and supervoxels are, so that surfaces stay whole and show their detail."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pcgraph.inputs import CleanCloud
+from pcgraph.voxels.grid import VoxelGrid, occupied_cells, voxel_grid
+from pcgraph.voxels.spacing_law import SpacingLaw
+from pcgraph.voxels.surface import roughness
+
+VOXELS_PER_SEED = 5.0  # voxel edges between seeds, at most,
+_MIN_VOXELS_PER_SEED = 3.0  # and at least
+_MANY_SUPERVOXELS = 800
+_MANY_ON_SMOOTH = 3200  # where surfaces are
+_SMOOTH = 0.1  # smooth, in voxel edges of roughness at most,
+_WELL_JOINED = 0.9  # and so many of the voxels are joined
+_VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
+_MIN_JOINED = 0.75  # of the voxels have
+_HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have
+_AROUND_ON_SURFACE = 5  # others around them, at least
+_ENLARGEMENTS = 10
+# Voxels can be smaller by steps of a quarter of a power of two
+_REFINEMENTS = 4  # at most,
+_FEW_VOXELS, _MANY_VOXELS = 120_000, 320_000  # and at most to about the latter, for the time's sake,
+_ALL_JOINED = 0.93  # and of them,
+_STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
+_JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
+_THINNED = 0.7  # whose spacing grows by a smaller power of range, near or far,
+_PRICE_OF_ROUGHNESS = 0.25, 0.4  # less so much of their roughness, where voxels were few or not, stay joined,
+_SLAB = 1 << 14  # as so many in the middle tell
+_MIN_VOXELS = 500
+
+
+def seed_spacing(grid: VoxelGrid) -> float:
+    """Five voxel edges; less, but three at least, where that leaves few supervoxels.
+
+    On smooth surfaces that are seen from all around, as those of meshes and of thinned clouds, many are better: their
+    normals are exact, and small things need supervoxels of their own.
+    """
+    usual, smaller = _edges_per_seed(grid, _MANY_SUPERVOXELS), _edges_per_seed(grid, _MANY_ON_SMOOTH)
+    if smaller < usual and not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _WELL_JOINED:
+        usual = smaller if roughness(grid) <= _SMOOTH else usual
+    return grid.size * usual
+
+
+def _edges_per_seed(grid: VoxelGrid, many: int) -> float:
+    """Voxel edges between seeds that give so many supervoxels, within what is sensible."""
+    edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * many))
+    return min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
+
+
+def fitting_grid(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, largest: float) -> VoxelGrid:
+    """The grid, or one of larger voxels where surfaces fall apart, or of smaller ones where they would stay whole.
+
+    On a surface most voxels have at least five others around them.
+    """
+    degrees = np.diff(grid.indptr)
+    larger = _without_dust(cloud, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else grid
+    return _with_detail(cloud, grid, law, degrees) if larger is grid else larger
+
+
+def _joined(degrees: NDArray[np.int64]) -> float:
+    """Fraction of the voxels that have as many others around them as on a surface."""
+    return float(np.mean(degrees >= _AROUND_ON_SURFACE))
+
+
+def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> VoxelGrid:
+    """The grid, or one of voxels larger by half powers of two, enough to join what falls apart.
+
+    What is no surface at any size, as a line, stays. So does the grid where half of it is joined and larger voxels
+    hardly join more, as they do not far rings of a sweep. Where less than half of one scan is joined at first, as of a
+    sweep of few beams, half is enough, unless larger voxels join much more.
+    """
+    cells, size, joined, joined_at_first = [grid.cells, grid.cells], grid.size, 0.0, _joined(degrees)
+    few_beams, best = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size
+    for step in range(1, _ENLARGEMENTS + 1):
+        size *= math.sqrt(2.0)
+        if size > largest:
+            break
+        # After two steps eight cells are one, so that only the first step needs the points.
+        scaled = cells[0] / 2.0 if step > 1 else grid.warp.forward(cloud.points) / size
+        larger, degrees = occupied_cells(scaled, size)
+        if len(larger) < _MIN_VOXELS:
+            break
+        cells, before, joined = [cells[1], larger], joined, _joined(degrees)
+        if few_beams and joined >= _HALF_JOINED:
+            if before >= _HALF_JOINED and joined - before < _MIN_GAIN:
+                break
+            best = size
+        if joined >= _MIN_JOINED:
+            if joined_at_first < _HALF_JOINED or joined - joined_at_first >= _MIN_GAIN * step:
+                best = size
+            break
+    return grid if best == grid.size else voxel_grid(cloud.points, cloud.colors, best, grid.warp, cloud.features)
+
+
+def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]) -> VoxelGrid:
+    """The grid, or one of voxels smaller by quarters of a power of two, down to a half, where nearly all stay joined.
+
+    So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
+    than those of points at random. Where not even three quarters are joined, as in a sweep thinned to a point per cube,
+    nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
+    read off a slab in the middle, which may be the dense part of several scans: so all together have to be joined as
+    well. Points of one scan lie less densely where surfaces slant, and its rows far apart, so its grid stays as it is;
+    unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly as many stay joined. For
+    the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
+    """
+    n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
+    if of_one_scan and (law is None or law.in_halves >= _THINNED):
+        return grid
+    joined = _joined(degrees)
+    if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
+        return grid
+    steps = min(_REFINEMENTS, int(2.0 * math.log2(_MANY_VOXELS / n)))  # to as many voxels as a surface would have
+    if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
+        return grid
+    price = _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS]
+    slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
+    of_slab = _joined(degrees[slab])
+    least = _ALL_JOINED if of_slab >= _MIN_JOINED else _STILL_JOINED * of_slab
+    least = _JOINED_OF_SCAN * of_slab if of_one_scan else least
+    if joined < least and not of_one_scan:
+        return grid
+    points = cloud.points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
+    for step in range(1, steps + 1):
+        finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
+        joined = _joined(np.diff(finer.indptr))
+        if joined < least:
+            break
+        if joined - price * roughness(finer) >= least:
+            size = finer.size
+    return grid if size == grid.size else voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
