@@ -45,7 +45,7 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.directions import farthest_first
 from pcgraph.voxels.evidence import color_evidence
-from pcgraph.voxels.fitting import fitting_grid, seed_spacing
+from pcgraph.voxels.fitting import fitting_grading, fitting_grid, seed_spacing
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
@@ -167,6 +167,8 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
         grid = fitting_grid(cloud, grid, law, math.inf if seed_size is None else float(seed_size))
+        if seed_size is None and (grading := fitting_grading(grid)) is not None:
+            grid = voxel_grid(cloud.points, cloud.colors, grid.size, grid.warp, cloud.features, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     warn_of_volume(grid)
@@ -240,7 +242,8 @@ def update(
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
     before.grid.warp.check(cloud.points)
-    seen = voxel_grid(cloud.points, cloud.colors, before.grid.size, before.grid.warp, cloud.features)
+    of_voxels = before.grid.size, before.grid.warp, cloud.features, before.grid.grading
+    seen = voxel_grid(cloud.points, cloud.colors, *of_voxels)
     lonely = (outlier_voxels(seen) | detached_voxels(seen)) & ~is_near(seen, before.grid)
     cloud, seen, place = _without(lonely, cloud, seen, place)
     if place is not None and place.ndim == 1 and viewpoint is not None:
@@ -326,9 +329,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
         normals[scan.initial_labels >= 0] = earlier.surface.normals
-    supervoxels = checked_supervoxels(
-        method.supervoxels(grid, normals, scan.seed_size, scan.initial_labels), grid.n_voxels, method
-    )
+    supervoxels = _supervoxels(method, grid, normals, scan.seed_size, scan.initial_labels)
     surface = Surface(grid, normals, supervoxels)
 
     def with_points() -> tuple[NDArray[np.int32], Moments]:
@@ -366,6 +367,33 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         feature_scaling=cloud.scaling,
         **vars(settings),
     )
+
+
+def _supervoxels(
+    method: SupervoxelMethod,
+    grid: VoxelGrid,
+    normals: NDArray[np.float64],
+    seed_size: float,
+    initial: NDArray[np.int32],
+) -> NDArray[np.int32]:
+    """Supervoxels by a method, (v,) int32: level by level, as many voxel edges from each other at each.
+
+    Those of earlier scans keep their numbers.
+    """
+    if grid.levels is None:
+        return checked_supervoxels(method.supervoxels(grid, normals, seed_size, initial), grid.n_voxels, method)
+    found, n_found = np.empty(grid.n_voxels, np.int32), int(initial.max()) + 1
+    for of_level, level in grid.of_levels():
+        earlier, number = np.unique(initial[of_level], return_inverse=True)
+        own = (number - np.count_nonzero(earlier < 0)).astype(np.int32)
+        earlier = earlier[earlier >= 0]
+        seed = seed_size * (level.size / grid.size)
+        labels = method.supervoxels(level, normals[of_level], seed, own)
+        labels = checked_supervoxels(labels, level.n_voxels, method)
+        n_new = int(labels.max()) + 1 - len(earlier)
+        found[of_level] = np.concatenate((earlier, n_found + np.arange(n_new)))[labels]
+        n_found += n_new
+    return found
 
 
 def _leaves(

@@ -38,6 +38,7 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels import telling_places
+from pcgraph.voxels.grading import Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.sampling import some_blocks
@@ -78,6 +79,7 @@ def compile_kernels() -> None:
     segment(image.reshape(-1, 3))
     some_blocks(image.reshape(-1, 3))
     _compile_graph_and_tree()  # neither has gaps
+    _compile_levels()
 
 
 def must_compile() -> bool:
@@ -166,6 +168,13 @@ def _compile_graph_and_tree() -> None:
     graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden)
     graph = replace(graph, bridges=bridges(grid, labels, leaves.counts, graph.joined))
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
+
+
+def _compile_levels() -> None:
+    """Compile what voxels of several sizes take beside."""
+    everywhere = Grading(np.array(list(np.ndindex(3, 3, 3))) - 1.0, np.ones(27, np.int8))
+    grid = voxel_grid(_step()[0].reshape(-1, 3), None, 3.5 * _SPACING, Warp(), None, everywhere)
+    at_ends(grid, np.zeros(1, np.int64))
 
 
 def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -65,7 +65,8 @@ def bounding_planes(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int
     ways = [_hidden_ways(surface, scene, pieces, some[0], border) for some, border in zip(planes, borders, strict=True)]
     hidings = np.concatenate((np.empty((0, 2), np.int64), *ways))
     ends = surface.grid.warped[hidings]
-    far = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > surface.grid.warp.max_gap * surface.grid.size
+    edges = surface.grid.warped_edges[hidings].max(axis=1)
+    far = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > surface.grid.warp.max_gap * edges
     found = continuations_of(surface, nodes, hidings[far])
     return replace(found, coplanar=np.ones(len(found.pairs), np.bool_))
 

@@ -59,7 +59,9 @@ def bridges(
     voxels = np.flatnonzero(involved[supervoxels])
     voxels = voxels[np.argsort(supervoxels[voxels], kind="stable")]
     starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(np.where(involved, n_voxels, 0))))
-    widths = np.minimum(_widths(edges, starts, places[voxels]), _WIDEST)
+    larger = np.ones(k)
+    np.maximum.at(larger, supervoxels[voxels], (grid.warped_edges / grid.size)[voxels])
+    widths = np.minimum(_widths(edges, starts, places[voxels]) / larger[edges].max(axis=1), _WIDEST)
     of_few = (sizes <= _FEW)[component[edges]].all(axis=1)
     return Bridges(edges, widths, of_few & _are_near(component[edges], widths))
 

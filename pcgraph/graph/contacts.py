@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.parallel import kernel, routine
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, Neighbourhood, VoxelGrid
+from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, most_around
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def _boundary_voxels(around: Neighbourhood, supervoxels: NDArray[np.int32]):  # 
     voxel, other = np.empty(len(neighbours), np.int32), np.empty(len(neighbours), np.int32)
     pair = np.empty(len(neighbours), np.int32)
     keys, slots = np.empty(512, np.int64), np.full(2048, -1, np.int32)
-    seen = np.empty(MAX_NEIGHBOURS + 1, np.int32)
+    seen = np.empty(most_around(indptr) + 1, np.int32)
     used = n_keys = 0
     for i in range(len(supervoxels)):
         own = last = supervoxels[i]

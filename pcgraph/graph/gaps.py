@@ -62,7 +62,9 @@ def gaps(
     in_blocks(_find_apart, len(source), source, target, supervoxels, starts, touching[:, 1].copy(), apart)
     source, target = source[apart], target[apart]
     key = _keys(supervoxels[source], supervoxels[target], k)
-    width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / grid.size, axis=1)
+    larger = grid.warped_edges
+    larger = np.maximum(larger[source], larger[target])
+    width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / larger[:, None], axis=1)
     if place is not None and len(source):
         closed = ~_open_ways(grid, normals, supervoxels, nodes, place, source, target.astype(np.int64), key, width)
         source, target, key, width = source[closed], target[closed], key[closed], width[closed]

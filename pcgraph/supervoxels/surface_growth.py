@@ -24,7 +24,7 @@ from pcgraph.supervoxels.clustering import (
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.voxels.cells import fetch_batch
 from pcgraph.voxels.evidence import color_evidence
-from pcgraph.voxels.grid import MAX_NEIGHBOURS, Neighbourhood, VoxelGrid
+from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, most_around
 from pcgraph.voxels.surface import LocalPlanes, local_planes
 
 _SLACK = 0.5  # voxel edges off a supervoxel's plane that noise may be
@@ -161,8 +161,8 @@ def _assign(
     points, order, starts = members
     indptr, neighbours = around
     weight = _PLACE_WEIGHT * _PLACE_WEIGHT
-    near, others = np.empty((MAX_NEIGHBOURS, 8)), np.empty(MAX_NEIGHBOURS + 1, np.uint32)
-    labels = np.empty(MAX_NEIGHBOURS + 1, np.int32)
+    most = most_around(indptr)
+    near, others, labels = np.empty((most, 8)), np.empty(most + 1, np.uint32), np.empty(most + 1, np.int32)
     places, nearest = np.empty((0, 3)), np.empty(0, np.int32)
     first = start
     while first < stop:

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.inputs import CleanCloud
-from pcgraph.voxels.grid import VoxelGrid, occupied_cells, voxel_grid
+from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
+from pcgraph.voxels.grading import BLOCK, Grading
+from pcgraph.voxels.grid import VoxelGrid, VoxelLists, occupied_cells, touching_counts, touching_voxels, voxel_grid
 from pcgraph.voxels.spacing_law import SpacingLaw
 from pcgraph.voxels.surface import roughness
 
@@ -34,6 +36,11 @@ _THINNED = 0.7  # whose spacing grows by a smaller power of range, near or far,
 _PRICE_OF_ROUGHNESS = 0.25, 0.4  # less so much of their roughness, where voxels were few or not, stay joined,
 _SLAB = 1 << 14  # as so many in the middle tell
 _MIN_VOXELS = 500
+# Voxels can be larger in some blocks
+_LEVELS = 3  # by so many powers of two at most,
+_APART = 0.6  # where fewer of them are joined
+_LEAST, _MORE = 20, 0.2  # and of so many larger ones at least _MIN_JOINED, and so many more by each power of two,
+_NEARLY_ALL, _HARDLY_ANY = 0.98, 0.003  # if fewer of all are joined, and more of all lie there
 
 
 def seed_spacing(grid: VoxelGrid) -> float:
@@ -135,3 +142,60 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, deg
         if joined - price * roughness(finer) >= least:
             size = finer.size
     return grid if size == grid.size else voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
+
+
+def fitting_grading(grid: VoxelGrid) -> Grading | None:
+    """Blocks in which voxels are larger by powers of two, as points lie too far apart there; None if there are few.
+
+    So it is far from the tripods of several scans, near one of which spacing was read. Whether surfaces fall apart is
+    asked of each block and the 26 around it. Voxels of one scan grow with range already.
+
+    Parameters
+    ----------
+    grid : VoxelGrid
+        Its voxels are of one size.
+    """
+    joined = np.diff(grid.indptr) >= _AROUND_ON_SURFACE
+    if grid.warp.of_one_scan or np.mean(joined) >= _NEARLY_ALL:
+        return None
+    keys, pitch = cell_keys(grid.cells / BLOCK, grid.size)
+    ordered, order = sorted_keys(keys)
+    starts = starts_of_runs(ordered)
+    block = np.empty(grid.n_voxels, np.int64)
+    block[order] = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    around, blocks = touching_voxels(ordered[starts[:-1]], *pitch), np.floor(grid.cells[order[starts[:-1]]] / BLOCK)
+    at_first, _ = _joined_around(joined, block, around)
+    levels, asked = np.zeros(len(at_first), np.int8), at_first < _APART
+    cells, of_block = grid.cells, block
+    for level in range(1, _LEVELS + 1):
+        if not asked.any():
+            break
+        cells = np.floor(cells / 2.0)
+        keys, pitch = cell_keys(cells, grid.size)
+        ordered, order = sorted_keys(keys)
+        first = starts_of_runs(ordered)[:-1]
+        cells, of_block = cells[order[first]], of_block[order[first]]
+        joined = touching_counts(ordered[first], *pitch) >= _AROUND_ON_SURFACE
+        share, n = _joined_around(joined, of_block, around)
+        whole = asked & (share >= _MIN_JOINED) & (n >= _LEAST)
+        whole &= (at_first < _HALF_JOINED) | (share - at_first >= _MORE * level)
+        levels[whole] = level
+        asked &= ~whole
+    larger = levels > 0
+    if np.mean(larger[block]) < _HARDLY_ANY:
+        return None
+    return Grading(blocks[larger], levels[larger])
+
+
+def _joined_around(
+    joined: NDArray[np.bool_], block: NDArray[np.int64], around: VoxelLists
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fraction of the voxels in each block and those around it that are joined, and how many there are, (b,) each."""
+    n_blocks = len(around.indptr) - 1
+    of_block = np.repeat(np.arange(n_blocks), np.diff(around.indptr))
+    sums = []
+    for counted in (np.ones(len(joined)), joined):
+        own = np.bincount(block, counted, n_blocks)
+        sums.append((own + np.bincount(of_block, own[around.neighbours], n_blocks)).astype(np.float64))
+    n, n_joined = sums
+    return n_joined / np.maximum(n, 1.0), n

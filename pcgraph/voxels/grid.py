@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.columns import group_means
-from pcgraph.parallel import in_blocks, kernel
+from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import cell_keys, gallop, sorted_keys, starts_of_runs
+from pcgraph.voxels.grading import BLOCK, Grading, enlarged
 from pcgraph.voxels.warp import Warp
 
 # Offsets inside a voxel and colours are summed as whole numbers: such sums do not depend on the points' order.
 _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
 MAX_NEIGHBOURS = 26
-"""Voxels around a voxel."""
+"""Voxels around a voxel, at most, but of a larger one beside smaller ones."""
 MAX_GAP = Warp.max_gap
 """Voxel edges between the means of two voxels, at most, that a gap lies between, but in scans whose voxels grow."""
 _STRETCH = 1024  # cells in a row of which the cells around are counted,
@@ -61,16 +64,16 @@ class Neighbourhood(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VoxelGrid(ShortRepr):
-    """Occupied voxels of a cloud in ascending order of grid coordinates, whatever the points' order.
+    """Occupied voxels of a cloud in ascending order of level and grid coordinates, whatever the points' order.
 
     Attributes
     ----------
     size : float, metres
-        Edge length of a voxel in the warped space. The grid is aligned with the origin of that space.
+        Edge length of a voxel in the warped space, at level 0. The grid is aligned with the origin of that space.
     warp : Warp
         To that space.
     cells : (v, 3) float64
-        Grid coordinates, whole numbers.
+        Grid coordinates, whole numbers, in edges of the voxel itself.
     voxel_of_point : (n,) int32
         Voxel of each point.
     order : (n,) int64
@@ -84,7 +87,7 @@ class VoxelGrid(ShortRepr):
     centroids : (v, 3) float64, metres, the points' frame
         The same place in the points' frame.
     edge_lengths : (v,) float64, metres
-        Edge length of each voxel in the points' frame; `size` throughout unless a camera warp is in use.
+        Edge length of each voxel in the points' frame.
     colors : (v, 3) float64, 0..1, or None
         Mean colour of the voxel's points.
     indptr : (v + 1,) int64
@@ -93,6 +96,10 @@ class VoxelGrid(ShortRepr):
         i, ascending.
     features : (v, d) float64, -4..4, or None
         Means of the voxel's points' features, scaled.
+    levels : (v,) int8, or None
+        How many times the edge of each voxel is doubled; None if that of none is.
+    grading : Grading, or None
+        Where they are doubled.
     """
 
     size: float
@@ -109,11 +116,28 @@ class VoxelGrid(ShortRepr):
     indptr: NDArray[np.int64]
     neighbours: NDArray[np.int32]
     features: NDArray[np.float64] | None = None
+    levels: NDArray[np.int8] | None = None
+    grading: Grading | None = None
 
     @property
     def n_voxels(self) -> int:
         """Number of occupied voxels."""
         return len(self.counts)
+
+    @property
+    def warped_edges(self) -> NDArray[np.float64]:
+        """Edge length of each voxel in the warped space, (v,) float64, metres."""
+        return enlarged(np.full(self.n_voxels, self.size), self.levels)
+
+    def of_levels(self) -> Iterator[tuple[NDArray[np.bool_], VoxelGrid]]:
+        """Which voxels are of each level, (v,) bool, and the grid of these alone, whose voxels have one size."""
+        if self.levels is None:
+            yield np.ones(self.n_voxels, np.bool_), self
+            return
+        for level in np.unique(self.levels):
+            of_level = self.levels == level
+            size = math.ldexp(self.size, int(level))
+            yield of_level, replace(grid_without(self, ~of_level), size=size, levels=None, grading=None)
 
     def touching_pairs(self) -> NDArray[np.int64]:
         """Pairs of voxels that touch, (m, 2), each in both orders."""
@@ -149,6 +173,7 @@ def grid_without(grid: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
         indptr=np.concatenate(([0], np.cumsum(degrees))),
         neighbours=np.concatenate(lists),
         features=None if grid.features is None else grid.features.take(kept, axis=0),
+        levels=None if grid.levels is None else grid.levels[kept],
     )
 
 
@@ -182,6 +207,7 @@ def voxel_grid(
     size: float,
     warp: Warp,
     features: NDArray[np.float32] | None = None,
+    grading: Grading | None = None,
 ) -> VoxelGrid:
     """Voxel grid over finite points.
 
@@ -195,6 +221,8 @@ def voxel_grid(
     warp : Warp
         To the space in which voxels are cubes of this size.
     features : (n, d) float32, scaled, or None
+    grading : Grading, optional
+        Where voxels are larger.
 
     Raises
     ------
@@ -203,17 +231,21 @@ def voxel_grid(
     """
     with np.errstate(over="ignore"):
         scaled = warp.forward(points) / size
-    keys, pitch = cell_keys(scaled, size)
+    level_of_point = None if grading is None else grading.levels_of(scaled)
+    if level_of_point is not None:
+        scaled = scaled / enlarged(np.ones(len(scaled)), level_of_point)[:, None]
+    keys, pitch = _keys_of_levels(scaled, level_of_point, size)
     ordered, order = sorted_keys(keys)
     starts = starts_of_runs(ordered)
     n_voxels = len(starts) - 1
+    levels = None if level_of_point is None else level_of_point[order[starts[:-1]]]
     voxel_of_point, cells, warped = np.empty(len(points), np.int32), np.empty((n_voxels, 3)), np.empty((n_voxels, 3))
     in_blocks(_gather, n_voxels, starts, order, scaled, voxel_of_point, cells, warped)
-    warped *= size
+    warped *= size if levels is None else enlarged(np.full(n_voxels, size), levels)[:, None]
     centroids = warp.backward(warped)
     if colors is not None:
         colors = _sorted_means(colors, starts, order, _COLOR_STEPS)
-    indptr, neighbours = touching_voxels(ordered[starts[:-1]], *pitch)
+    indptr, neighbours = _touching(ordered[starts[:-1]], pitch, cells, levels)
     return VoxelGrid(
         size=size,
         warp=warp,
@@ -224,11 +256,13 @@ def voxel_grid(
         counts=np.diff(starts),
         warped=warped,
         centroids=centroids,
-        edge_lengths=size * warp.scale(centroids),
+        edge_lengths=enlarged(size * warp.scale(centroids), levels),
         colors=colors,
         indptr=indptr,
         neighbours=neighbours,
         features=None if features is None else group_means(features, voxel_of_point, n_voxels),
+        levels=levels,
+        grading=grading,
     )
 
 
@@ -275,6 +309,16 @@ def _gather(
         warped[v, 0], warped[v, 1], warped[v, 2] = cell_x + x / total, cell_y + y / total, cell_z + z / total
 
 
+@routine
+def most_around(indptr: NDArray[np.uint64]) -> int:
+    """Most voxels around any, given where the lists of a `Neighbourhood` start: 26, but of larger ones more."""
+    most = MAX_NEIGHBOURS
+    for i in range(len(indptr) - 1):
+        here = int(indptr[i + 1] - indptr[i])
+        most = here if here > most else most
+    return most
+
+
 @kernel
 def _average(
     start: int,
@@ -298,6 +342,74 @@ def _average(
 
 
 # --- which occupied voxels touch ---
+
+
+def _keys_of_levels(
+    cells: NDArray[np.float64], levels: NDArray[np.int8] | None, size: float
+) -> tuple[NDArray[np.int64], tuple[int, int]]:
+    """`cell_keys` of places in edges of their own voxels, which sort by level first; (n,) levels, or None if all are 0.
+
+    Raises
+    ------
+    ValueError
+        The places span so many cells that the numbers do not fit.
+    """
+    keys, pitch = cell_keys(cells, size)
+    if levels is not None:
+        of_level = int(keys.max()) + 2 * pitch[0]  # cells of two levels never lie beside each other
+        if of_level > (1 << 62) >> 3:
+            raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
+        keys += levels * np.int64(of_level)
+    return keys, pitch
+
+
+def _touching(
+    keys: NDArray[np.int64], pitch: tuple[int, int], cells: NDArray[np.float64], levels: NDArray[np.int8] | None
+) -> VoxelLists:
+    """`touching_voxels`, with those of other levels."""
+    same = touching_voxels(keys, *pitch)
+    if levels is None:
+        return same
+    finer, coarser = _touching_across(cells, levels)
+    n, counts = len(keys), np.diff(same.indptr)
+    larger = np.bincount(finer, minlength=n)
+    smaller = np.bincount(coarser, minlength=n)
+    indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(smaller + counts + larger)))
+    neighbours = np.empty(indptr[-1], np.int32)
+    neighbours[_rows(indptr[:-1] + smaller, counts)] = same.neighbours
+    neighbours[_rows(indptr[:-1], smaller)] = finer[np.lexsort((finer, coarser))]
+    neighbours[_rows(indptr[:-1] + smaller + counts, larger)] = coarser[np.lexsort((coarser, finer))]
+    return VoxelLists(indptr, neighbours)
+
+
+def _rows(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places of rows of so many that start at these, one row after the other."""
+    return np.arange(counts.sum()) + np.repeat(starts - np.cumsum(counts) + counts, counts)
+
+
+def _touching_across(
+    cells: NDArray[np.float64], levels: NDArray[np.int8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of voxels of two levels that touch, the finer ones and the coarser ones, (m,) each."""
+    finer, coarser, present = [np.empty(0, np.int64)], [np.empty(0, np.int64)], np.unique(levels)
+    for level in present[:-1]:
+        per_block = BLOCK >> int(level)
+        in_block = cells % per_block
+        at_border = ((in_block == 0.0) | (in_block == per_block - 1.0)).any(axis=1)
+        fine = np.flatnonzero((levels == level) & at_border)
+        for other in present[present > level]:
+            coarse, ratio = np.flatnonzero(levels == other), 2.0 ** (int(other) - int(level))
+            low, high = np.floor((cells[fine] - 1.0) / ratio), np.floor((cells[fine] + 1.0) / ratio)
+            keys, pitch = cell_keys(np.concatenate((cells[coarse], low, high)), 1.0)
+            sought, at_low = keys[: len(coarse)], keys[len(coarse) : len(coarse) + len(fine)]
+            for corner in np.ndindex(2, 2, 2):
+                within = np.all((low < high) | (np.array(corner) == 0), axis=1)
+                target = at_low[within] + corner[0] * pitch[0] + corner[1] * pitch[1] + corner[2]
+                at = np.minimum(np.searchsorted(sought, target), len(sought) - 1)
+                touches = sought[at] == target
+                finer.append(fine[within][touches])
+                coarser.append(coarse[at[touches]])
+    return np.concatenate(finer), np.concatenate(coarser)
 
 
 def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -343,6 +455,13 @@ def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Voxe
     lists = in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, True)
     neighbours = lists[0] if len(lists) == 1 else np.concatenate(lists)
     return VoxelLists(np.concatenate((np.zeros(1, np.int64), np.cumsum(counts))), neighbours)
+
+
+def touching_counts(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> NDArray[np.int64]:
+    """How many of the 26 around each of some voxels are occupied, (v,); arguments as for `touching_voxels`."""
+    counts = np.empty(len(keys), np.int64)
+    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, False)
+    return counts
 
 
 @kernel
@@ -403,7 +522,7 @@ def at_ends(grid: VoxelGrid, voxels: NDArray[np.int64]) -> NDArray[np.bool_]:
     Seen along no axis are six of the eight places beside it taken, as they are on each surface seen from its front.
     """
     ends = np.empty(len(voxels), np.bool_)
-    in_blocks(_find_ends, len(voxels), voxels, grid.cells, grid.neighbourhood, ends)
+    in_blocks(_find_ends, len(voxels), voxels, grid.cells, grid.levels, grid.neighbourhood, ends)
     return ends
 
 
@@ -413,6 +532,7 @@ def _find_ends(
     stop: int,
     voxels: NDArray[np.int64],
     cells: NDArray[np.float64],
+    levels: NDArray[np.int8] | None,
     around: Neighbourhood,
     ends: NDArray[np.bool_],
 ) -> None:
@@ -422,13 +542,25 @@ def _find_ends(
         taken[:] = False
         for a in range(around.indptr[i], around.indptr[i + 1]):
             j = around.neighbours[a]
-            x, y, z = cells[j, 0] - cells[i, 0], cells[j, 1] - cells[i, 1], cells[j, 2] - cells[i, 2]
-            right, ahead, above = int(x) + 1, int(y) + 1, int(z) + 1
+            right, ahead, above = (
+                _beside(cells, levels, i, j, 0),
+                _beside(cells, levels, i, j, 1),
+                _beside(cells, levels, i, j, 2),
+            )
             taken[0, ahead, above] = taken[1, right, above] = taken[2, right, ahead] = True
         ends[m] = True
         for axis in range(3):
             taken[axis, 1, 1] = False
             ends[m] = ends[m] and taken[axis].sum() < _OF_SURFACE
+
+
+@routine
+def _beside(cells: NDArray[np.float64], levels: NDArray[np.int8] | None, i: int, j: int, axis: int) -> int:
+    """0, 1 or 2: whether voxel j, which touches voxel i, lies before it, in line with it or behind it along an axis."""
+    step = cells[j, axis] - cells[i, axis]
+    if levels is not None and levels[i] != levels[j]:
+        step = math.floor((cells[j, axis] + 0.5) * 2.0 ** (levels[j] - levels[i])) - cells[i, axis]
+    return int(min(max(step, -1.0), 1.0)) + 1
 
 
 def voxels_within(
@@ -441,6 +573,8 @@ def voxels_within(
 ) -> VoxelLists:
     """The voxels whose points' mean lies within some voxel edges of that of each of m voxels, without itself.
 
+    Of two voxels of different levels the larger one's edge counts.
+
     Parameters
     ----------
     grid : VoxelGrid of v voxels
@@ -452,6 +586,8 @@ def voxels_within(
     later : bool
         Whether only those of larger numbers than the voxel's own are sought: each pair once.
     """
+    if grid.levels is not None:
+        return _within_of_levels(grid, voxels, reach, np.arange(grid.n_voxels) if among is None else among, later)
     keys, pitch = cell_keys(grid.cells, grid.size)
     places, counts = grid.warped / grid.size, np.zeros(len(voxels), np.int64)
     around = _Places(keys[voxels], places[voxels])
@@ -459,6 +595,34 @@ def voxels_within(
     found = np.concatenate(in_blocks(_within, len(voxels), around, sought, pitch, reach, later, counts))
     indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     return VoxelLists(indptr, found if among is None else among.astype(np.int32)[found])
+
+
+def _within_of_levels(
+    grid: VoxelGrid, voxels: NDArray[np.int64], reach: float, among: NDArray[np.int64], later: bool
+) -> VoxelLists:
+    """`voxels_within` of voxels of several sizes: level by level, what lies within edges of voxels of that level."""
+    assert grid.levels is not None
+    source, target = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for level in np.unique(grid.levels):
+        places = grid.warped / math.ldexp(grid.size, int(level))
+        keys, pitch = cell_keys(places, grid.size)
+        for ones, others, of_both in (
+            (voxels[grid.levels[voxels] == level], among[grid.levels[among] == level], True),
+            (voxels[grid.levels[voxels] == level], among[grid.levels[among] < level], False),
+            (voxels[grid.levels[voxels] < level], among[grid.levels[among] == level], False),
+        ):
+            ones, others = (some[np.argsort(keys[some], kind="stable")] for some in (ones, others))
+            counts = np.zeros(len(ones), np.int64)
+            around, sought = _Places(keys[ones], places[ones]), _Places(keys[others], places[others])
+            found = in_blocks(_within, len(ones), around, sought, pitch, reach, later and of_both, counts)
+            source.append(np.repeat(ones, counts))
+            target.append(others[np.concatenate(found)])
+    sources, targets = np.concatenate(source), np.concatenate(target)
+    if later:
+        sources, targets = sources[sources < targets], targets[sources < targets]
+    order = np.lexsort((targets, sources))
+    counts = np.bincount(np.searchsorted(voxels, sources), minlength=len(voxels))
+    return VoxelLists(np.concatenate((np.zeros(1, np.int64), np.cumsum(counts))), targets[order].astype(np.int32))
 
 
 class _Places(NamedTuple):
@@ -537,7 +701,7 @@ class GridUnion:
 
 
 def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
-    """Union of two grids of the same size and warp.
+    """Union of two grids of the same size, warp and grading.
 
     Raises
     ------
@@ -549,7 +713,8 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
     if (a.features is None) != (b.features is None):
         raise ValueError("expected features with both scans or with neither, got them with one")
     cells = np.vstack((a.cells, b.cells))
-    keys, pitch = cell_keys(cells, a.size)
+    levels = None if a.levels is None or b.levels is None else np.concatenate((a.levels, b.levels))
+    keys, pitch = _keys_of_levels(cells, levels, a.size)
     unique_keys, at, voxel = np.unique(keys, return_index=True, return_inverse=True)
     first, second = voxel[: a.n_voxels], voxel[a.n_voxels :]
     counts = np.zeros(len(unique_keys), np.int64)
@@ -569,7 +734,8 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
     centroids = a.warp.backward(warped)
     points_of_b = np.zeros(len(counts) + 1, np.int64)
     points_of_b[second + 1] = b.counts
-    indptr, neighbours = touching_voxels(unique_keys, *pitch)
+    levels = None if levels is None else levels[at]
+    indptr, neighbours = _touching(unique_keys, pitch, cells[at], levels)
     grid = VoxelGrid(
         size=a.size,
         warp=a.warp,
@@ -580,10 +746,12 @@ def grid_union(a: VoxelGrid, b: VoxelGrid) -> GridUnion:
         counts=counts,
         warped=warped,
         centroids=centroids,
-        edge_lengths=a.size * a.warp.scale(centroids),
+        edge_lengths=enlarged(a.size * a.warp.scale(centroids), levels),
         colors=colors,
         indptr=indptr,
         neighbours=neighbours,
         features=features,
+        levels=levels,
+        grading=a.grading,
     )
     return GridUnion(grid, first, second)

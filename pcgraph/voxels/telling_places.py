@@ -121,10 +121,10 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     middle, reach = unit_frame(grid, grid.centroids)
     origin = -middle / reach
     viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
-    coarse = coarse_grid(grid, middle, reach, finer * _CELLS)
+    coarse, points = coarse_grid(grid, middle, reach, finer * _CELLS)
     low, high = bounding_box(coarse.centroids)
     normals = either_normals(coarse)
-    part_of_cell, boxes = _parts(coarse, normals, grid)
+    part_of_cell, boxes = _parts(coarse, normals, points)
     share, upright = max(finer // (len(boxes) + 1), 1), np.eye(3)
     in_boxes = np.concatenate([low[None][:0], *(_free_places(coarse, *box, upright, share) for box in boxes)])
     in_boxes = in_boxes[hit_fractions(in_boxes, coarse.centroids) >= _CLOSED]
@@ -164,7 +164,7 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     if np.count_nonzero(in_rooms) >= _FEW:
         for part in range(len(room_counts)):
             cells = part_of_cell == part
-            room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, grid)
+            room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
     weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts, room_counts)
     chosen = _spread_choice(seen, weights)
     if _is_layered(coarse):  # low rooms have few places at first, and the outside of all of them shows much
@@ -452,24 +452,66 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
     return places[chosen]
 
 
-def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: int = _CELLS) -> VoxelGrid:
+class CoarseGrid(NamedTuple):
+    """Voxels in larger ones, c of them.
+
+    Attributes
+    ----------
+    cells : VoxelGrid
+        In the frame of `unit_frame`.
+    points : (c,) float64
+        How many points each holds.
+    """
+
+    cells: VoxelGrid
+    points: NDArray[np.float64]
+
+
+def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: int = _CELLS) -> CoarseGrid:
     """Voxels in larger ones, as few as still show their shape, in the frame of `unit_frame`; the outermost surfaces
     amid a layer of them."""
-    edges = grid.edge_lengths
-    width = float(edges[0] if edges.min() == edges.max() else np.median(edges)) / reach
-    centres = (grid.centroids - middle) / reach
-    size = width * max(1.0, math.sqrt(len(centres) / (1.5 * cells)))  # as many as a surface would have
+    places, points, width = _places_on_surfaces(grid)
+    centres, width = (places - middle) / reach, width / reach
+    size = width * max(1.0, math.sqrt(np.minimum(points, 1.0).sum() / (1.5 * cells)))  # as many as a surface would have
     low = bounding_box(centres)[0]
     while True:
         shift = 0.5 * size - low
         coarse = voxel_grid(centres + shift, None, size, Warp())
         if coarse.n_voxels <= 2 * cells:
-            return replace(coarse, centroids=coarse.centroids - shift)
+            held = np.bincount(coarse.voxel_of_point, points, coarse.n_voxels).astype(np.float64)
+            return CoarseGrid(replace(coarse, centroids=coarse.centroids - shift), held)
         size *= 1.4
 
 
+def _places_on_surfaces(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Places about as far from each other as voxels of level 0 are, (n, 3), the points for which each stands, (n,), and
+    that distance: voxels' means, and of larger voxels as many as these cover on their planes."""
+    points, edges = np.diff(grid.starts).astype(np.float64), grid.edge_lengths
+    if grid.levels is None:
+        return grid.centroids, points, float(edges[0] if edges.min() == edges.max() else np.median(edges))
+    normals, places, held = either_normals(grid), [], []
+    for level in np.unique(grid.levels):
+        some, across = np.flatnonzero(grid.levels == level), 1 << int(level)
+        ones, others = _along_planes(normals[some])
+        steps = ((np.arange(across) + 0.5) / across - 0.5) * math.ldexp(grid.size, int(level))
+        for one in steps:
+            for other in steps:
+                places.append(grid.centroids[some] + one * ones + other * others)
+                held.append(points[some] / across**2)
+    return np.concatenate(places), np.concatenate(held), grid.size
+
+
+def _along_planes(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two unit vectors at right angles to each other and to each of n unit normals, (n, 3) each."""
+    beside = np.zeros_like(normals)
+    beside[np.arange(len(normals)), np.argmin(np.abs(normals), axis=1)] = 1.0
+    ones = np.cross(normals, beside)
+    ones /= lengths(ones)[:, None]
+    return ones, np.cross(normals, ones)
+
+
 def _parts(
-    coarse: VoxelGrid, normals: NDArray[np.float64], grid: VoxelGrid
+    coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
     """Parts of a cloud that are far from each other, the number of each cell's, (n,), the largest first, which has what
     belongs to none; and boxes in which nearly all of them lies, where the box of all is twice as long.
@@ -490,7 +532,7 @@ def _parts(
         cells = piece == number
         if counts[number] < _OF_PART * len(centres):
             break
-        if part >= _PARTS_OF_ANY and not _is_room(cells, coarse, normals, grid):
+        if part >= _PARTS_OF_ANY and not _is_room(cells, coarse, normals, points):
             continue
         part_of_cell[cells] = part
         part += 1
@@ -500,9 +542,10 @@ def _parts(
     return part_of_cell, boxes
 
 
-def _is_room(cells: NDArray[np.bool_], coarse: VoxelGrid, normals: NDArray[np.float64], grid: VoxelGrid) -> bool:
+def _is_room(
+    cells: NDArray[np.bool_], coarse: VoxelGrid, normals: NDArray[np.float64], points: NDArray[np.float64]
+) -> bool:
     """Whether some cells of the coarse grid are a room that tripods stood in."""
-    points = np.bincount(coarse.voxel_of_point, np.diff(grid.starts), coarse.n_voxels).astype(np.float64)
     return is_scanned_room(coarse.centroids[cells], normals[cells], points[cells], coarse.size)
 
 

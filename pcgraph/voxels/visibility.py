@@ -237,7 +237,7 @@ def likelier_place(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[n
     visible, other_is = _visible_fraction(grid, place, normals), _visible_fraction(grid, other, normals)
     if max(visible, other_is) <= _MUCH_MORE * min(visible, other_is):
         middle, reach = unit_frame(grid, grid.centroids)
-        coarse = coarse_grid(grid, middle, reach)
+        coarse = coarse_grid(grid, middle, reach).cells
         upwards, offset, _ = bearing_plane(coarse, either_normals(coarse))
         before = [bool((one - middle) / reach @ upwards >= offset) for one in (place, other)]
         if before[0] != before[1]:
