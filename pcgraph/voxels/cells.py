@@ -38,7 +38,7 @@ def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> NDArray[np.fl
     return np.array(((low_x, low_y, low_z), (high_x, high_y, high_z)))
 
 
-def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
+def cell_keys(scaled: NDArray[np.float64], size: float, spare: int = 2) -> tuple[NDArray[np.int64], tuple[int, int]]:
     """One whole number per place that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
 
     Parameters
@@ -47,6 +47,9 @@ def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int6
         Places in units of a cell; cells are the unit cubes.
     size : float, metres
         Edge length of a cell, for the message.
+    spare : int, >= 2
+        Cells to spare at the end of every row: of those that are farther along it or beside it by so many, at most,
+        none is taken for one of the next row.
 
     Raises
     ------
@@ -57,13 +60,12 @@ def cell_keys(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.int6
     low, high = np.floor(bounding_box(scaled))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
-    if not _fits(high - low):
+    if not _fits(high - low, spare):
         cells = np.stack([_without_gaps(np.floor(scaled[:, axis])) for axis in range(3)], axis=1)
         low, high = bounding_box(cells)
-        if not _fits(high - low):
+        if not _fits(high - low, spare):
             raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
-    # Two spare cells per axis keep a row's end from touching the next row's start.
-    extent = (high - low).astype(np.int64) + 3
+    extent = (high - low).astype(np.int64) + 1 + spare
     pitch = (int(extent[1] * extent[2]), int(extent[2]))
     keys = np.empty(len(cells), np.int64)
     in_blocks(_number_cells, len(cells), cells, low, *pitch, keys)
@@ -182,8 +184,8 @@ def _number_cells(
         keys[p] = x * pitch_x + y * pitch_y + np.int64(np.floor(cells[p, 2]) - low[2])
 
 
-def _fits(span: NDArray[np.float64]) -> bool:
-    return bool(span.max() < _MAX_KEY) and bool(np.prod(span + 3.0) < _MAX_KEY)
+def _fits(span: NDArray[np.float64], spare: int) -> bool:
+    return bool(span.max() < _MAX_KEY) and bool(np.prod(span + 1.0 + spare) < _MAX_KEY)
 
 
 def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -588,7 +588,7 @@ def voxels_within(
     """
     if grid.levels is not None:
         return _within_of_levels(grid, voxels, reach, np.arange(grid.n_voxels) if among is None else among, later)
-    keys, pitch = cell_keys(grid.cells, grid.size)
+    keys, pitch = cell_keys(grid.cells, grid.size, max(math.ceil(reach), 2))
     places, counts = grid.warped / grid.size, np.zeros(len(voxels), np.int64)
     around = _Places(keys[voxels], places[voxels])
     sought = _Places(keys, places) if among is None else _Places(keys[among], places[among])
@@ -605,7 +605,7 @@ def _within_of_levels(
     source, target = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for level in np.unique(grid.levels):
         places = grid.warped / math.ldexp(grid.size, int(level))
-        keys, pitch = cell_keys(places, grid.size)
+        keys, pitch = cell_keys(places, grid.size, max(math.ceil(reach), 2))
         for ones, others, of_both in (
             (voxels[grid.levels[voxels] == level], among[grid.levels[among] == level], True),
             (voxels[grid.levels[voxels] == level], among[grid.levels[among] < level], False),

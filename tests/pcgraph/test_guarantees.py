@@ -30,7 +30,8 @@ def assert_covered_and_connected(points, result, outliers=0.01):
         assert labels.shape == np.shape(points)[:-1]
         assert np.array_equal(labels.reshape(-1) >= 0, finite)
         assert np.bincount(labels[labels >= 0]).all()  # 0, 1, 2, ... with none left out
-    grid = voxel_grid(flat[finite], None, result.voxel_size, result.surface.grid.warp)
+    of_result = result.surface.grid
+    grid = voxel_grid(flat[finite], None, of_result.size, of_result.warp, None, of_result.grading)
     leaf = result.supervoxels.reshape(-1)[finite]
     # Of a voxel on a boundary the points may belong to several supervoxels: each of its shares is a piece.
     owners = int(leaf.max()) + 1

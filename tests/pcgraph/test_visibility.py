@@ -598,7 +598,13 @@ def scanned_corridor(length, places, step, seed=0):
 
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize(
-    ("length", "places", "step"), [(12.0, (2, 5, 7, 10), 0.9), (20.0, (6, 14), 0.7), (25.0, (4, 8, 12.5, 17, 21), 0.7)]
+    ("length", "places", "step"),
+    [
+        (12.0, (2, 5, 7, 10), 0.9),
+        (20.0, (4, 16), 0.9),
+        (20.0, (6, 14), 0.7),
+        (25.0, (4, 8, 12.5, 17, 21), 0.7),
+    ],
 )
 def test_an_empty_corridor_is_seen_from_its_tripods(length, places, step, turn):
     """It is as visible from all around as a crate is, and was taken for one: all of it was one object."""
@@ -610,7 +616,7 @@ def test_an_empty_corridor_is_seen_from_its_tripods(length, places, step, turn):
         "ij,ij->i", result.surface.normals[result.surface.grid.voxel_of_point], inwards[~result.outliers]
     )
     assert np.mean(cosines[np.abs(cosines) > 0.7] > 0.0) > 0.97
-    assert segmentation_covering(result.labels, sides) > 0.75  # halfway between two tripods walls are in pieces
+    assert segmentation_covering(result.labels, sides) > 0.85  # though points lie far apart halfway between tripods
 
 
 @pytest.mark.parametrize("seed", [0, 1])
