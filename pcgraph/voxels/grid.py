@@ -310,12 +310,11 @@ def _gather(
 
 
 @routine
-def most_around(indptr: NDArray[np.uint64]) -> int:
+def most_around(indptr: NDArray[np.uint64]) -> np.int64:
     """Most voxels around any, given where the lists of a `Neighbourhood` start: 26, but of larger ones more."""
-    most = MAX_NEIGHBOURS
+    most = np.int64(MAX_NEIGHBOURS)
     for i in range(len(indptr) - 1):
-        here = int(indptr[i + 1] - indptr[i])
-        most = here if here > most else most
+        most = max(most, np.int64(indptr[i + 1] - indptr[i]))
     return most
 
 
