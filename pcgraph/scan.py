@@ -227,7 +227,8 @@ def update(
 
     Notes
     -----
-    Nothing is ever taken away: what has moved between the scans is there twice.
+    Nothing is ever taken away: what has moved between the scans is there twice. Voxels stay as large as the first scan
+    needed, also where that had points far apart and a later one has many.
     """
     if not isinstance(earlier, Segmentation):
         raise ValueError(f"expected the Segmentation of the scans so far, got {type(earlier).__name__}")
@@ -242,10 +243,12 @@ def update(
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
     before.grid.warp.check(cloud.points)
-    of_voxels = before.grid.size, before.grid.warp, cloud.features, before.grid.grading
-    seen = voxel_grid(cloud.points, cloud.colors, *of_voxels)
-    lonely = (outlier_voxels(seen) | detached_voxels(seen)) & ~is_near(seen, before.grid)
-    cloud, seen, place = _without(lonely, cloud, seen, place)
+    size, warp, grading = before.grid.size, before.grid.warp, before.grid.grading
+    seen = voxel_grid(cloud.points, cloud.colors, size, warp, cloud.features)
+    cloud, seen, place = _without(outlier_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
+    if grading is not None:
+        seen = voxel_grid(cloud.points, cloud.colors, size, warp, cloud.features, grading)
+    cloud, seen, place = _without(detached_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, seen)
     union = grid_union(before.grid, seen)

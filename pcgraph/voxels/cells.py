@@ -38,7 +38,9 @@ def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> NDArray[np.fl
     return np.array(((low_x, low_y, low_z), (high_x, high_y, high_z)))
 
 
-def cell_keys(scaled: NDArray[np.float64], size: float, spare: int = 2) -> tuple[NDArray[np.int64], tuple[int, int]]:
+def cell_keys(
+    scaled: NDArray[np.float64], size: float, spare: int = 2, rooms: int = 1
+) -> tuple[NDArray[np.int64], tuple[int, int]]:
     """One whole number per place that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
 
     Parameters
@@ -50,6 +52,8 @@ def cell_keys(scaled: NDArray[np.float64], size: float, spare: int = 2) -> tuple
     spare : int, >= 2
         Cells to spare at the end of every row: of those that are farther along it or beside it by so many, at most,
         none is taken for one of the next row.
+    rooms : int
+        How many times as many numbers there have to be.
 
     Raises
     ------
@@ -60,10 +64,10 @@ def cell_keys(scaled: NDArray[np.float64], size: float, spare: int = 2) -> tuple
     low, high = np.floor(bounding_box(scaled))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
-    if not _fits(high - low, spare):
+    if not _fits(high - low, spare, rooms):
         cells = np.stack([_without_gaps(np.floor(scaled[:, axis])) for axis in range(3)], axis=1)
         low, high = bounding_box(cells)
-        if not _fits(high - low, spare):
+        if not _fits(high - low, spare, rooms):
             raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
     extent = (high - low).astype(np.int64) + 1 + spare
     pitch = (int(extent[1] * extent[2]), int(extent[2]))
@@ -184,8 +188,8 @@ def _number_cells(
         keys[p] = x * pitch_x + y * pitch_y + np.int64(np.floor(cells[p, 2]) - low[2])
 
 
-def _fits(span: NDArray[np.float64], spare: int) -> bool:
-    return bool(span.max() < _MAX_KEY) and bool(np.prod(span + 1.0 + spare) < _MAX_KEY)
+def _fits(span: NDArray[np.float64], spare: int, rooms: int) -> bool:
+    return bool(span.max() < _MAX_KEY) and bool(rooms * np.prod(span + 1.0 + spare) < _MAX_KEY)
 
 
 def _without_gaps(cells: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -158,13 +158,13 @@ def grid_without(grid: VoxelGrid, voxels: NDArray[np.bool_]) -> VoxelGrid:
     point_number = np.cumsum(point_stays) - 1
     degrees = np.empty(len(kept), np.int64)
     lists = in_blocks(_kept_neighbours, len(kept), kept, grid.neighbourhood, stays, number, degrees)
-    counts = grid.counts[kept]
+    counts, held = grid.counts[kept], np.diff(grid.starts)
     return replace(
         grid,
         cells=grid.cells.take(kept, axis=0),
         voxel_of_point=number[grid.voxel_of_point[point_stays]],
-        order=point_number[grid.order[np.repeat(stays, np.diff(grid.starts))]],
-        starts=np.concatenate(([0], np.cumsum(counts))),
+        order=point_number[grid.order[np.repeat(stays, held)]],
+        starts=np.concatenate(([0], np.cumsum(held[kept]))),
         counts=counts,
         warped=grid.warped.take(kept, axis=0),
         centroids=grid.centroids.take(kept, axis=0),
@@ -348,18 +348,21 @@ def _keys_of_levels(
 ) -> tuple[NDArray[np.int64], tuple[int, int]]:
     """`cell_keys` of places in edges of their own voxels, which sort by level first; (n,) levels, or None if all are 0.
 
+    Cells of each level count from the first block: coordinates of a map, in cells of all levels, span all of it.
+
     Raises
     ------
     ValueError
         The places span so many cells that the numbers do not fit.
     """
-    keys, pitch = cell_keys(cells, size)
-    if levels is not None:
-        of_level = int(keys.max()) + 2 * pitch[0]  # cells of two levels never lie beside each other
-        if of_level > (1 << 62) >> 3:
-            raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
-        keys += levels * np.int64(of_level)
-    return keys, pitch
+    if levels is None:
+        return cell_keys(cells, size)
+    per_block = BLOCK / enlarged(np.ones(len(cells)), levels)[:, None]
+    whole = np.floor(cells)
+    whole -= per_block * np.floor(whole / per_block).min(axis=0)
+    keys, pitch = cell_keys(whole, size, rooms=2 * (int(levels.max()) + 1))
+    of_level = keys.max() + 2 * pitch[0]  # cells of two levels never lie beside each other
+    return keys + levels * of_level, pitch
 
 
 def _touching(

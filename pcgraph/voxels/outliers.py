@@ -37,6 +37,7 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     Parameters
     ----------
     grid : VoxelGrid of v voxels
+        Of one size.
 
     Notes
     -----
@@ -152,9 +153,13 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
 
 
 def is_near(grid: VoxelGrid, other: VoxelGrid) -> NDArray[np.bool_]:
-    """Whether each voxel lies within three voxel edges of one of another grid of the same size and warp, (v,) bool."""
-    distances = cKDTree(other.warped / other.size).query(grid.warped / grid.size, distance_upper_bound=MAX_GAP)[0]
-    near: NDArray[np.bool_] = np.isfinite(distances)
+    """Whether each voxel lies within three edges, of the larger one, of a voxel of another grid of the same size and
+    warp, (v,) bool."""
+    near = np.zeros(grid.n_voxels, np.bool_)
+    for of_level, level in other.of_levels():
+        edges = np.maximum(grid.warped_edges, level.size)
+        distances = cKDTree(other.warped[of_level]).query(grid.warped)[0]
+        near |= distances <= MAX_GAP * edges
     return near
 
 

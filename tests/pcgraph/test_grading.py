@@ -17,14 +17,15 @@ from pcgraph.metrics import segmentation_covering
 from pcgraph.voxels.fitting import fitting_grading
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, grid_union, grid_without, voxel_grid, voxels_within
+from pcgraph.voxels.outliers import is_near
 from pcgraph.voxels.warp import Warp, choose_warp
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def graded(rng: np.random.Generator, n: int) -> tuple[NDArray[np.float64], Grading]:
-    """Points along the borders of blocks of random levels, in units of a cell."""
-    points = rng.choice([-1, 0, 1, 2], (n, 3)) * float(BLOCK) + rng.uniform(-5.0, 5.0, (n, 3))
+def graded(rng: np.random.Generator, n: int, far: float = 0.0) -> tuple[NDArray[np.float64], Grading]:
+    """Points along the borders of blocks of random levels, in units of a cell, so many blocks from the origin."""
+    points = (rng.choice([-1, 0, 1, 2], (n, 3)) + far) * float(BLOCK) + rng.uniform(-5.0, 5.0, (n, 3))
     blocks = np.unique(np.floor(points / BLOCK), axis=0)
     blocks = blocks[rng.random(len(blocks)) < 0.8]
     return points, Grading(blocks, rng.integers(1, 5, len(blocks)).astype(np.int8))
@@ -36,9 +37,9 @@ def corners(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=seeds, n=st.integers(1, 400))
-def test_voxels_that_touch_are_cubes_that_share_a_point(seed: int, n: int) -> None:
-    points, grading = graded(np.random.default_rng(seed), n)
+@given(seed=seeds, n=st.integers(1, 400), far=st.sampled_from([0.0, 7e6, -3e6]))
+def test_voxels_that_touch_are_cubes_that_share_a_point(seed: int, n: int, far: float) -> None:
+    points, grading = graded(np.random.default_rng(seed), n, far)
     grid = voxel_grid(points, None, 1.0, Warp(), None, grading)
     low, high = corners(grid)
     assert np.all((points >= low[grid.voxel_of_point]) & (points < high[grid.voxel_of_point]))
@@ -98,6 +99,9 @@ def test_a_union_is_the_grid_of_all_points_and_levels_are_grids_of_their_own(see
             assert np.array_equal(getattr(level, name), getattr(alone, name))
     gone = rng.random(whole.n_voxels) < 0.5
     gone[0] = False
+    left = grid_without(union, gone)
+    for v, members in enumerate(np.split(left.order, left.starts[1:-1])):
+        assert np.array_equal(members, np.flatnonzero(left.voxel_of_point == v))
     left = grid_without(whole, gone)
     again = voxel_grid(points[~gone[whole.voxel_of_point]], None, 1.0, Warp(), None, grading)
     assert np.array_equal(left.neighbours, again.neighbours)
@@ -143,6 +147,22 @@ def test_half_of_a_scene_may_be_thinned(thinner: float) -> None:
     assert not larger[grid.centroids[:, 0] < 3.0].any()
     assert np.mean(np.diff(grid.indptr) >= 5) > 0.9
     assert_covered_and_connected(points, result)
+
+
+def test_a_scene_of_several_densities_may_lie_in_a_map() -> None:
+    """Keys of all levels together spanned the way from the map's origin to the scene."""
+    points, truth = two_densities(20.0)
+    result = pcgraph.segment(points + np.array([456_789.0, 5_212_345.0, 300.0]))
+    assert result.surface.grid.levels.max() > 0
+    assert segmentation_covering(result.labels, truth) > 0.95
+
+
+def test_what_is_near_counts_in_edges_of_the_larger_voxel() -> None:
+    everywhere = Grading(np.zeros((1, 3)), np.array([3], np.int8))
+    large = voxel_grid(np.array([[1.0, 1.0, 1.0]]), None, 1.0, Warp(), None, everywhere)
+    for away, near in ((15.0, True), (23.9, True), (24.1, False)):
+        small = voxel_grid(np.array([[1.0 + away, 1.0, 1.0]]), None, 1.0, Warp(), None, everywhere)
+        assert is_near(small, large)[0] == is_near(large, small)[0] == near
 
 
 def test_where_points_lie_evenly_voxels_have_one_size() -> None:
