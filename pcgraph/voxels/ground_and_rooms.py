@@ -21,10 +21,10 @@ _NEARLY_EVERYTHING = 0.02, 0.98  # quantiles
 _WITHIN_GROUND = 0.6  # of the ground's area is at most that of all that stands on it
 _PARALLEL, _ASIDE = 0.9, 0.2  # cosines between normals on one plane, and on those at right angles
 _UNEVEN = 0.5  # variance of the points in a cell, beyond that of chance, in squares of their mean
-_TOGETHER = 0.2  # correlation, at least, of how densely points lie on either, by the logarithm
+_TOGETHER = 0.2, 0.8  # correlation, at least, of how densely points lie on either, by the logarithm, if both are whole, or not
 _APART = 4  # cells between floor and ceiling, at least
 _FLOOR_AND_CEILING = 0.25  # of the cells lie on either of them, at least
-_COLUMN, _OVER_EACH_OTHER = 1.5, 0.7  # cells along which they are compared; of the floor has a ceiling over it
+_COLUMN, _OVER_EACH_OTHER, _HALF_OVER = 1.5, 0.7, 0.5  # cells along which they are compared; of the floor has a ceiling over it
 _IN_ONE, _BEYOND = 0.9, 0.02  # of both are in one piece, at least; and of the cells are below or above, at most
 
 
@@ -125,16 +125,14 @@ def _bound_a_room(
     piece = connected_components(touching[has_either[touching].all(axis=1)], columns.n_voxels)
     beyond = has_either[of_cell] & ((heights < floor - _OFF_PLANE) | (heights > ceiling + _OFF_PLANE))
     most = max(np.count_nonzero(n_floor), np.count_nonzero(n_ceiling))
-    if (
-        np.count_nonzero(has_both) < _OVER_EACH_OTHER * most
-        or np.bincount(piece[has_either]).max() < _IN_ONE * np.count_nonzero(has_either)
-        or np.mean(beyond) > _BEYOND
-    ):
+    covered, in_one = np.count_nonzero(has_both) / most, np.bincount(piece[has_either]).max()
+    if covered < _HALF_OVER or np.mean(beyond) > _BEYOND:
         return False
+    in_parts = covered < _OVER_EACH_OTHER or in_one < _IN_ONE * np.count_nonzero(has_either)
     of_floor, of_ceiling = (
         np.log(np.bincount(of_cell, on * points, columns.n_voxels)[has_both] / n[has_both])
         for on, n in ((on_floor, n_floor), (on_ceiling, n_ceiling))
     )
     of_floor, of_ceiling = of_floor - of_floor.mean(), of_ceiling - of_ceiling.mean()
     spreads = float(of_floor.std() * of_ceiling.std())
-    return spreads > 0.0 and float(np.mean(of_floor * of_ceiling)) >= _TOGETHER * spreads
+    return spreads > 0.0 and float(np.mean(of_floor * of_ceiling)) >= _TOGETHER[bool(in_parts)] * spreads
