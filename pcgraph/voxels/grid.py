@@ -392,15 +392,21 @@ def _rows(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.in
 def _touching_across(
     cells: NDArray[np.float64], levels: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of voxels of two levels that touch, the finer ones and the coarser ones, (m,) each."""
+    """Pairs of voxels of two levels that touch, the finer ones and the coarser ones, (m,) each.
+
+    They lie at the borders of blocks.
+    """
     finer, coarser, present = [np.empty(0, np.int64)], [np.empty(0, np.int64)], np.unique(levels)
     for level in present[:-1]:
-        per_block = BLOCK >> int(level)
-        in_block = cells % per_block
+        per_block = float(BLOCK >> int(level))
+        of_level = np.flatnonzero(levels == level)
+        in_block = cells[of_level] % per_block
         at_border = ((in_block == 0.0) | (in_block == per_block - 1.0)).any(axis=1)
-        fine = np.flatnonzero((levels == level) & at_border)
+        of_level = of_level[at_border]
+        blocks = np.floor(cells[of_level] / per_block)
         for other in present[present > level]:
             coarse, ratio = np.flatnonzero(levels == other), 2.0 ** (int(other) - int(level))
+            fine = of_level[_beside_blocks(blocks, np.floor(cells[coarse] / (per_block / ratio)))]
             low, high = np.floor((cells[fine] - 1.0) / ratio), np.floor((cells[fine] + 1.0) / ratio)
             keys, pitch = cell_keys(np.concatenate((cells[coarse], low, high)), 1.0)
             sought, at_low = keys[: len(coarse)], keys[len(coarse) : len(coarse) + len(fine)]
@@ -412,6 +418,14 @@ def _touching_across(
                 finer.append(fine[within][touches])
                 coarser.append(coarse[at[touches]])
     return np.concatenate(finer), np.concatenate(coarser)
+
+
+def _beside_blocks(blocks: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of n blocks, (n, 3), touch one of some others."""
+    steps = np.stack(np.meshgrid(*3 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(-1, 3)
+    around = (np.unique(others, axis=0)[:, None] + steps).reshape(-1, 3)
+    keys = cell_keys(np.concatenate((around, blocks)), 1.0)[0]
+    return np.isin(keys[len(around) :], keys[: len(around)])
 
 
 def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

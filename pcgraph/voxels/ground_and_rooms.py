@@ -21,10 +21,11 @@ _NEARLY_EVERYTHING = 0.02, 0.98  # quantiles
 _WITHIN_GROUND = 0.6  # of the ground's area is at most that of all that stands on it
 _PARALLEL, _ASIDE = 0.9, 0.2  # cosines between normals on one plane, and on those at right angles
 _UNEVEN = 0.5  # variance of the points in a cell, beyond that of chance, in squares of their mean
-_TOGETHER = 0.2, 0.8  # correlation, at least, of how densely points lie on either, by the logarithm, if both are whole, or not
+_TOGETHER, _IN_STEP = 0.2, 0.8  # correlation, at least, of how densely points lie on either, by the logarithm; of parts
 _APART = 4  # cells between floor and ceiling, at least
 _FLOOR_AND_CEILING = 0.25  # of the cells lie on either of them, at least
-_COLUMN, _OVER_EACH_OTHER, _HALF_OVER = 1.5, 0.7, 0.5  # cells along which they are compared; of the floor has a ceiling over it
+_COLUMN = 1.5  # cells along which they are compared
+_OVER_EACH_OTHER, _HALF_OVER = 0.7, 0.5  # of the floor has a ceiling over it; of parts
 _IN_ONE, _BEYOND = 0.9, 0.02  # of both are in one piece, at least; and of the cells are below or above, at most
 
 
@@ -82,7 +83,8 @@ def is_scanned_room(
     angles to that; perhaps opposite walls. Both are in one piece, either covers nearly what the other does, and nothing
     is below or above: boxes in a row, of which all sides were seen, have gaps between. What was seen elsewhere, through
     a window, does not count. A closed box alone may be a thing. But who stands in a room is near to floor and ceiling
-    at the same place, and there points lie the denser on both; before a thing one of two opposite sides is seen.
+    at the same place, and there points lie the denser on both; before a thing one of two opposite sides is seen. Where
+    they do so nearly everywhere, both may be in parts, as halfway between two tripods far apart.
     """
     mean = float(points.mean())
     if points.var() - mean < _UNEVEN * mean * mean:  # not more than points at random would
@@ -135,4 +137,5 @@ def _bound_a_room(
     )
     of_floor, of_ceiling = of_floor - of_floor.mean(), of_ceiling - of_ceiling.mean()
     spreads = float(of_floor.std() * of_ceiling.std())
-    return spreads > 0.0 and float(np.mean(of_floor * of_ceiling)) >= _TOGETHER[bool(in_parts)] * spreads
+    together = float(np.mean(of_floor * of_ceiling))
+    return spreads > 0.0 and together >= (_IN_STEP if in_parts else _TOGETHER) * spreads

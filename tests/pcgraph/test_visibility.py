@@ -578,14 +578,14 @@ def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
     assert np.mean(facing) > 0.75  # of two sheets 12 cm apart, two voxels, one may take the other's side
 
 
-def scanned_corridor(length, places, step, seed=0):
-    """What tripods see of an empty corridor, 2.2 m wide and 2.6 m high: points, ways into it, number of each side."""
+def scanned_corridor(length, places, step, seed=0, width=2.2, height=2.6):
+    """What tripods in the middle see of an empty corridor or hall: points, ways into it, number of each side."""
     rng = np.random.default_rng(seed)
-    high = np.array([length, 2.2, 2.6])
+    high = np.array([length, width, height])
     rays = rays_at(np.radians(np.arange(-64.99, 90, step)), np.radians(np.arange(0.01, 360, step)))
     points, inwards, sides = [], [], []
     for x in places:
-        place = np.array([x, 1.1, 1.5])
+        place = np.array([x, width / 2.0, 1.5])
         ranges = (np.where(rays > 0, high, 0.0) - place) / rays
         axis = np.argmin(ranges, axis=1)
         upper = rays[np.arange(len(rays)), axis] > 0
@@ -617,6 +617,19 @@ def test_an_empty_corridor_is_seen_from_its_tripods(length, places, step, turn):
     )
     assert np.mean(cosines[np.abs(cosines) > 0.7] > 0.0) > 0.97
     assert segmentation_covering(result.labels, sides) > 0.85  # though points lie far apart halfway between tripods
+
+
+@pytest.mark.parametrize(
+    ("length", "places", "step", "width", "height"),
+    [(120.0, (20, 60, 100), 1.1, 40.0, 5.0), (120.0, (15, 45), 1.0, 40.0, 5.0), (100.0, (10, 50, 90), 1.3, 30.0, 4.0)],
+)
+def test_a_low_hall_is_seen_from_its_tripods(length, places, step, width, height):
+    """Of its floor less than 0.7 had a ceiling over it in cells of a metre, and its places saw out at its far ends."""
+    points, inwards, _ = scanned_corridor(length, places, step, 0, width, height)
+    result = pcgraph.segment(points)
+    normals = result.surface.normals[result.surface.grid.voxel_of_point]
+    cosines = np.einsum("ij,ij->i", normals, inwards[~result.outliers])
+    assert np.mean(cosines[np.abs(cosines) > 0.7] > 0.0) > 0.97
 
 
 @pytest.mark.parametrize("seed", [0, 1])
