@@ -45,7 +45,7 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.directions import farthest_first
 from pcgraph.voxels.evidence import color_evidence
-from pcgraph.voxels.fitting import fitting_grading, fitting_grid, seed_spacing
+from pcgraph.voxels.fitting import fitting_grading, fitting_size, seed_spacing
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
@@ -166,9 +166,11 @@ def segment(
     warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
-        grid = fitting_grid(cloud, grid, law, math.inf if seed_size is None else float(seed_size))
+        voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
+        if voxel != grid.size:
+            grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         if seed_size is None and (grading := fitting_grading(grid)) is not None:
-            grid = voxel_grid(cloud.points, cloud.colors, grid.size, grid.warp, cloud.features, grading)
+            grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     warn_of_volume(grid)

@@ -8,7 +8,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.inputs import CleanCloud
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import VoxelGrid, VoxelLists, occupied_cells, touching_counts, touching_voxels, voxel_grid
@@ -61,14 +60,26 @@ def _edges_per_seed(grid: VoxelGrid, many: int) -> float:
     return min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 
-def fitting_grid(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, largest: float) -> VoxelGrid:
-    """The grid, or one of larger voxels where surfaces fall apart, or of smaller ones where they would stay whole.
+def fitting_size(
+    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, largest: float = math.inf
+) -> float:
+    """The size of the voxels, or a larger one where surfaces fall apart, or a smaller one where they would stay whole.
 
     On a surface most voxels have at least five others around them.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, metres
+        Those in the grid.
+    grid : VoxelGrid
+        Its voxels are of one size.
+    law : SpacingLaw, optional
+        How spacing depends on range, where that was asked.
+    largest : float, metres
     """
     degrees = np.diff(grid.indptr)
-    larger = _without_dust(cloud, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else grid
-    return _with_detail(cloud, grid, law, degrees) if larger is grid else larger
+    larger = _without_dust(points, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else grid.size
+    return _with_detail(points, grid, law, degrees) if larger == grid.size else larger
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
@@ -76,10 +87,10 @@ def _joined(degrees: NDArray[np.int64]) -> float:
     return float(np.mean(degrees >= _AROUND_ON_SURFACE))
 
 
-def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> VoxelGrid:
-    """The grid, or one of voxels larger by half powers of two, enough to join what falls apart.
+def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> float:
+    """The size, or one larger by half powers of two, enough to join what falls apart.
 
-    What is no surface at any size, as a line, stays. So does the grid where half of it is joined and larger voxels
+    What is no surface at any size, as a line, stays. So does the size where half of it is joined and larger voxels
     hardly join more, as they do not far rings of a sweep. Where less than half of one scan is joined at first, as of a
     sweep of few beams, half is enough, unless larger voxels join much more.
     """
@@ -90,7 +101,7 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]
         if size > largest:
             break
         # After two steps eight cells are one, so that only the first step needs the points.
-        scaled = cells[0] / 2.0 if step > 1 else grid.warp.forward(cloud.points) / size
+        scaled = cells[0] / 2.0 if step > 1 else grid.warp.forward(points) / size
         larger, degrees = occupied_cells(scaled, size)
         if len(larger) < _MIN_VOXELS:
             break
@@ -103,11 +114,13 @@ def _without_dust(cloud: CleanCloud, grid: VoxelGrid, degrees: NDArray[np.int64]
             if joined_at_first < _HALF_JOINED or joined - joined_at_first >= _MIN_GAIN * step:
                 best = size
             break
-    return grid if best == grid.size else voxel_grid(cloud.points, cloud.colors, best, grid.warp, cloud.features)
+    return best
 
 
-def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]) -> VoxelGrid:
-    """The grid, or one of voxels smaller by quarters of a power of two, down to a half, where nearly all stay joined.
+def _with_detail(
+    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]
+) -> float:
+    """The size, or one smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
     So voxels follow how evenly points lie, not only how near to each other: those of a mesh's vertices can be smaller
     than those of points at random. Where not even three quarters are joined, as in a sweep thinned to a point per cube,
@@ -119,29 +132,29 @@ def _with_detail(cloud: CleanCloud, grid: VoxelGrid, law: SpacingLaw | None, deg
     """
     n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
     if of_one_scan and (law is None or law.in_halves >= _THINNED):
-        return grid
+        return size
     joined = _joined(degrees)
     if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
-        return grid
+        return size
     steps = min(_REFINEMENTS, int(2.0 * math.log2(_MANY_VOXELS / n)))  # to as many voxels as a surface would have
     if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
-        return grid
+        return size
     price = _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS]
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
     of_slab = _joined(degrees[slab])
     least = _ALL_JOINED if of_slab >= _MIN_JOINED else _STILL_JOINED * of_slab
     least = _JOINED_OF_SCAN * of_slab if of_one_scan else least
     if joined < least and not of_one_scan:
-        return grid
-    points = cloud.points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
+        return size
+    some = points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, steps + 1):
-        finer = voxel_grid(points, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
+        finer = voxel_grid(some, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
         joined = _joined(np.diff(finer.indptr))
         if joined < least:
             break
         if joined - price * roughness(finer) >= least:
             size = finer.size
-    return grid if size == grid.size else voxel_grid(cloud.points, cloud.colors, size, grid.warp, cloud.features)
+    return size
 
 
 def fitting_grading(grid: VoxelGrid) -> Grading | None:
