@@ -119,11 +119,68 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
 def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, finer: int) -> tuple[TellingPlaces, bool]:
     """The places, with so many times as many cells, and whether more of them would hardly show more."""
     middle, reach = unit_frame(grid, grid.centroids)
-    origin = -middle / reach
-    viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
     coarse, points = coarse_grid(grid, middle, reach, finer * _CELLS)
-    low, high = bounding_box(coarse.centroids)
     normals = either_normals(coarse)
+    viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
+    tried, part_of_cell = _places_to_try(coarse, points, normals, -middle / reach, viewpoint, finer)
+    seen = seen_from(tried.places, coarse.centroids, coarse.edge_lengths, normals)
+    sides = facing_cosines(tried.places, coarse.centroids, normals, seen)
+    in_rooms = tried.closed >= _CLOSED
+    voting = _without_partitions(sides, sides[in_rooms])
+    starts = _starts(voting, tried.places[:_OUTSIDE], tried.likely, in_rooms)
+    of_place, of_part = _looks_at_parts(seen, part_of_cell)
+    if of_part.any():
+        asked = of_part[:, None] == part_of_cell
+        seen, sides, voting = (np.where(asked, every[of_place], every.dtype.type(0)) for every in (seen, sides, voting))
+    found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
+    from_outside, likely, closed = of_place < _OUTSIDE, tried.likely[of_place], tried.closed[of_place]
+    looks = _Looks(sides, from_outside, likely, closed, of_part, part_of_cell)
+    room_counts, has_rooms = np.zeros(int(part_of_cell.max()) + 1), np.count_nonzero(in_rooms) >= _FEW
+    for part in range(len(room_counts) if has_rooms else 0):
+        cells = part_of_cell == part
+        room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
+    weights, shown = _most_telling(found, looks, coarse.neighbourhood, tried.likely_counts, room_counts)
+    chosen = _spread_choice(seen, weights)
+    if _is_layered(coarse):  # low rooms have few places at first, and the outside of all of them shows much
+        shows_most = has_rooms and shown >= _SHOWS_NEARLY_ALL
+    else:
+        shows_most = shown >= _SHOWS_MOST or not in_rooms.any()
+    telling = TellingPlaces(
+        tried.places[of_place[chosen]], weights[chosen], of_part[chosen], coarse.centroids, part_of_cell
+    )
+    return telling, bool(shows_most or coarse.n_voxels > grid.n_voxels // 2)
+
+
+class _Tried(NamedTuple):
+    """Places from which a cloud may have been seen: k of them, the first around it.
+
+    Attributes
+    ----------
+    places : (k, 3) float64, in the frame of `unit_frame`
+    closed : (k,) float64
+        Fraction of the directions in which a place within has something; 0 of others.
+    likely : (k,) bool
+        The viewpoint or origin, if all was seen from about there; else those around that are before what bears things.
+    likely_counts : float
+        What it counts where as much is seen.
+    """
+
+    places: NDArray[np.float64]
+    closed: NDArray[np.float64]
+    likely: NDArray[np.bool_]
+    likely_counts: float
+
+
+def _places_to_try(
+    coarse: VoxelGrid,
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    viewpoint: NDArray[np.float64] | None,
+    finer: int,
+) -> tuple[_Tried, NDArray[np.int64]]:
+    """Places around the coarse grid, and within, there so many times as many as usual; and the part of each cell."""
+    low, high = bounding_box(coarse.centroids)
     part_of_cell, boxes = _parts(coarse, normals, points)
     share, upright = max(finer // (len(boxes) + 1), 1), np.eye(3)
     in_boxes = np.concatenate([low[None][:0], *(_free_places(coarse, *box, upright, share) for box in boxes)])
@@ -131,49 +188,26 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     if len(in_boxes) < _FEW:  # none of the parts is a room
         part_of_cell[:], in_boxes = 0, in_boxes[:0]
     inside = np.concatenate((_free_places(coarse, *_smallest_box(coarse.centroids), share), in_boxes))
-    outside = (low + high) / 2.0 + _DISTANCE * lengths((high - low)[None]) / 2.0 * sphere_directions(_OUTSIDE)
+    directions = sphere_directions(_OUTSIDE)
+    outside = (low + high) / 2.0 + _DISTANCE * lengths((high - low)[None]) / 2.0 * directions
     if not (high > low).any():
-        outside = low + sphere_directions(_OUTSIDE)
+        outside = low + directions
     upwards, offset, is_ground = bearing_plane(coarse, normals)
-    from_viewpoint = [] if viewpoint is None else [viewpoint]
     if viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids):
-        from_viewpoint = [origin]
+        viewpoint = origin
     elif upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
         upwards = -upwards
-    places = np.concatenate((outside, inside, *(place[None] for place in from_viewpoint)))
+    places, closed = (
+        np.concatenate((outside, inside)),
+        np.concatenate((np.zeros(_OUTSIDE), hit_fractions(inside, coarse.centroids))),
+    )
+    if viewpoint is not None:
+        places, closed = np.concatenate((places, viewpoint[None])), np.append(closed, 0.0)
+        likely = np.arange(len(places)) == len(places) - 1
+        return _Tried(places, closed, likely, _FROM_VIEWPOINT), part_of_cell
     likely = np.zeros(len(places), np.bool_)
-    if from_viewpoint:
-        likely[-1] = True
-    else:
-        likely[:_OUTSIDE] = sphere_directions(_OUTSIDE) @ upwards > 0.0
-    seen = seen_from(places, coarse.centroids, coarse.edge_lengths, normals)
-    sides = facing_cosines(places, coarse.centroids, normals, seen)
-    closed = np.zeros(len(places))
-    closed[_OUTSIDE : _OUTSIDE + len(inside)] = hit_fractions(inside, coarse.centroids)
-    in_rooms = closed >= _CLOSED
-    voting = _without_partitions(sides, sides[in_rooms])
-    starts = _starts(voting, outside, likely, in_rooms)
-    of_place, of_part = _looks_at_parts(seen, part_of_cell)
-    if of_part.any():
-        asked = of_part[:, None] == part_of_cell
-        seen, sides, voting = (np.where(asked, every[of_place], every.dtype.type(0)) for every in (seen, sides, voting))
-    found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
-    likely_counts = _FROM_VIEWPOINT if from_viewpoint else _ABOVE_GROUND if is_ground else _BEFORE
-    looks = _Looks(sides, of_place < _OUTSIDE, likely[of_place], closed[of_place], of_part, part_of_cell)
-    room_counts = np.zeros(int(part_of_cell.max()) + 1)
-    if np.count_nonzero(in_rooms) >= _FEW:
-        for part in range(len(room_counts)):
-            cells = part_of_cell == part
-            room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
-    weights, shown = _most_telling(found, looks, coarse.neighbourhood, likely_counts, room_counts)
-    chosen = _spread_choice(seen, weights)
-    if _is_layered(coarse):  # low rooms have few places at first, and the outside of all of them shows much
-        shows_most = np.count_nonzero(in_rooms) >= _FEW and shown >= _SHOWS_NEARLY_ALL
-    else:
-        shows_most = shown >= _SHOWS_MOST or not in_rooms.any()
-    shows_most = shows_most or coarse.n_voxels > grid.n_voxels // 2
-    telling = TellingPlaces(places[of_place[chosen]], weights[chosen], of_part[chosen], coarse.centroids, part_of_cell)
-    return telling, shows_most
+    likely[:_OUTSIDE] = directions @ upwards > 0.0
+    return _Tried(places, closed, likely, _ABOVE_GROUND if is_ground else _BEFORE), part_of_cell
 
 
 class _Looks(NamedTuple):
