@@ -42,7 +42,7 @@ class RegionLinkage(Linkage):
     -----
     Two regions A and B merge at
 
-        ((c + relief R + c0 + c1 ln(1 + l / l0)) s + max(c - c2, 0) max(s0 - s, 0) u)
+        ((c + relief R + H + c0 + c1 ln(1 + l / l0)) s + max(c - c2, 0) max(s0 - s, 0) u)
             E / (E + e0) (l / (l + l0))^1/2 (1 + M / (r m))^1/4 m / (m + m0),    s = (w / (b + w))^3/4
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
@@ -67,14 +67,20 @@ class RegionLinkage(Linkage):
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
     one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
 
-        R = (s^2 b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
+        R = (t^2 b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
 
-    where s is the fraction of the smaller region's contacts that are with the larger one, and b counts up to b1 w; d is
+    where t is the fraction of the smaller region's contacts that are with the larger one, and b counts up to b1 w; d is
     the distance of the smaller one's mean from the larger one's plane, p the variance of its distances to that plane
     and q that of the larger one's own, in voxel edges. R is 0 where the larger one is not r1 times as large, and where
     the smaller one lies behind it: as with concavity, what stands out of a surface is another thing, and what is sunk
     into it, as panes in a wall, is not. Where it is not known from where the cloud was seen, either side counts, as
     which is the outer one of a bare sheet is a guess.
+
+    H, radians, says that the smaller region is a heap or a hump on the larger one: a valley runs all around it, so that
+    s is small, but there is no other way out of it. As R, it is 0 where the larger one is not r1 times as large; and,
+    whatever is known of the sides, where the smaller one lies behind its plane, as the floor of a pit does.
+
+        H = h1 max(c - h0, 0) t^8 u m / (m + m2)
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
@@ -143,6 +149,8 @@ class _Shape(NamedTuple):
     r1: float
     v0: float
     d1: float
+    h0: float
+    h1: float
     objects: float  # altitude of objects, radians
 
 
@@ -165,6 +173,8 @@ _SHAPE = _Shape(
     r1=2.0,
     v0=0.075,
     d1=3.0,
+    h0=0.3,
+    h1=9.0,
     objects=RegionLinkage.default_object_altitude,
 )
 
@@ -177,11 +187,14 @@ class _Outlines(NamedTuple):
     perimeters : (n,) float64
         Contacts with all others, in voxels of both sides.
     outward : (n, 3) float64
-        Sums of their supervoxels' normals, by mass; zero if it is not known from where they were seen.
+        Sums of their supervoxels' normals, by mass.
+    sides_known : bool
+        Whether it is known from where they were seen.
     """
 
     perimeters: NDArray[np.float64]
     outward: NDArray[np.float64]
+    sides_known: bool
 
 
 def region_linkage(
@@ -226,8 +239,8 @@ def region_linkage(
     altitudes = np.empty(len(edges))
     in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
     perimeters = np.bincount(edges.ravel(), np.repeat(weights, 2), graph.n_nodes)
-    outward = (state.masses[:, None] if graph.sides_known else 0.0) * graph.node_features.normal
-    outlines = _Outlines(perimeters.astype(np.float64), outward)
+    outward = state.masses[:, None] * graph.node_features.normal
+    outlines = _Outlines(perimeters.astype(np.float64), outward, graph.sides_known)
     contracted = ContractedGraph.of(graph.n_nodes, edges, altitudes, sums)
     _merge(state, outlines, relief, contracted, _SHAPE)
     merges = contracted.merges()
@@ -263,11 +276,11 @@ def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: Contra
     """Merge along the lowest edge until there is none.
 
     After a merge all edges of the merged region get new altitudes; of a region with many, whose altitudes each merge
-    hardly changes, an edge gets it when it comes up. Then, too, it is seen whether relief raises it.
+    hardly changes, an edge gets it when it comes up. Then, too, it is seen whether one stands out, which raises it.
     """
     heap, halves, clusters, sums = graph.heap, graph.halves, graph.clusters, graph.sums
-    perimeters, outward = outlines
-    # After how many merges each region changed, each altitude was computed, and it was last asked for relief.
+    perimeters, outward, _ = outlines
+    # After how many merges each region changed, each altitude was computed, and it was last asked what stands out.
     changed, computed = np.zeros(len(clusters), np.int64), np.zeros(len(heap.edges), np.int64)
     asked, normal = np.full(len(heap.edges), -1), np.empty(3)
     while heap.size[0] > 0:
@@ -279,7 +292,7 @@ def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: Contra
             continue
         if asked[edge] < computed[edge]:
             asked[edge] = computed[edge]
-            stands_out = relief * _relief(state, outlines, sums[1, edge], a, b, shape, normal)
+            stands_out = _standing_out(state, outlines, sums, edge, a, b, relief, shape, normal)
             if stands_out > 0.0:
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
                 continue
@@ -327,34 +340,43 @@ def _altitude(
 
 
 @routine
-def _relief(
+def _standing_out(
     state: RegionState,
     outlines: _Outlines,
-    contact: float,
+    sums: NDArray[np.float64],
+    edge: int,
     a: int,
     b: int,
+    relief: float,
     shape: _Shape,
     normal: NDArray[np.float64],
 ) -> float:
-    """How much the smaller of two regions stands in relief, 0..1: R of `RegionLinkage`; `normal` is scratch."""
+    """How much the smaller region at an edge stands out of the larger one, radians: relief R + H of `RegionLinkage`.
+
+    `normal` is scratch.
+    """
     if state.masses[b] < state.masses[a]:
         a, b = b, a
-    smaller, larger = state.masses[a], state.masses[b]
+    smaller, larger, contact = state.masses[a], state.masses[b], sums[1, edge]
     if shape.r1 * smaller >= larger or plane_normal(state.scatters[b], normal) < 0.0:
         return 0.0
-    width = shape.width * math.sqrt(smaller)
-    share = min(contact / outlines.perimeters[a], 1.0)
-    within = share * share * min(0.5 * contact / (shape.b1 * width), 1.0)
     x, y, z = normal
-    scatter, inner, outer = state.scatters[a], state.centroids[a], state.centroids[b]
+    inner, outer = state.centroids[a], state.centroids[b]
     distance = x * (inner[0] - outer[0]) + y * (inner[1] - outer[1]) + z * (inner[2] - outer[2])
+    outwards = x * outlines.outward[b, 0] + y * outlines.outward[b, 1] + z * outlines.outward[b, 2]
+    share, cost, heap = min(contact / outlines.perimeters[a], 1.0), sums[0, edge] / contact, 0.0
+    if cost > shape.h0 and distance * outwards >= 0.0:
+        heap = shape.h1 * (cost - shape.h0) * share**8 * sums[2, edge] / contact
+    elif outlines.sides_known and distance * outwards < 0.0:
+        return 0.0  # it lies behind
+    width = shape.width * math.sqrt(smaller)
+    within = share * share * min(0.5 * contact / (shape.b1 * width), 1.0)
+    scatter = state.scatters[a]
     spread = x * x * scatter[0] + y * y * scatter[1] + z * z * scatter[2]
     spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])
-    if distance * (x * outlines.outward[b, 0] + y * outlines.outward[b, 1] + z * outlines.outward[b, 2]) < 0.0:
-        return 0.0  # it lies behind
-    square = distance * distance
+    square, off = distance * distance, 0.0
     noise = shape.v0 + 4.0 * spread / smaller + state.residuals[b] / larger
-    if square < 0.1 * noise:
-        return 0.0  # it would be less than 1e-8
-    off = 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (shape.d1 * shape.d1)))
-    return within * within * (1.0 - shape.r1 * smaller / larger) * smaller / (smaller + shape.m2) * off
+    if square >= 0.1 * noise:  # else it would be less than 1e-8
+        off = 1.0 / ((1.0 + (noise / square) ** 8) * (1.0 + square / (shape.d1 * shape.d1)))
+    in_relief = within * within * (1.0 - shape.r1 * smaller / larger) * off
+    return (relief * in_relief + heap) * smaller / (smaller + shape.m2)

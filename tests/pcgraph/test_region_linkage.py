@@ -56,9 +56,12 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     increase = max(increase, least)
     scale, width = increase / length, 7.7 * math.sqrt(n.min() / mean)
     stands_out = relief * _relief(leaves, unit, length, width) if side > 0.0 or not known else 0.0
+    smooth = 1.0 / (1.0 + (0.05 / 0.03) ** 2)
+    if side > 0.0 and times_as_large > 2:
+        stands_out += 9.0 * max(cost - 0.3, 0.0) * smooth * n.min() / (n.min() + 10.0 * mean)
     evidence = cost + stands_out + 0.08 + 0.04 * math.log(1 + scale / 0.1)
     shortness = (width / (length + width)) ** 0.75
-    steep = max(cost - 0.45, 0.0) * max(0.5 - shortness, 0.0) / (1.0 + (0.05 / 0.03) ** 2)
+    steep = max(cost - 0.45, 0.0) * max(0.5 - shortness, 0.0) * smooth
     assert cost < 1.0 or steep > 0.05
     evidence = evidence * shortness + steep
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1))
@@ -144,22 +147,35 @@ def test_a_thing_in_a_hollow_of_rolling_ground_is_no_less_one_than_on_a_hill():
     assert sum(np.mean(found > 0) > 0.9 for found in alone) == things
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_steep_heaps_are_objects_however_long_the_line_around_them(seed):
+@pytest.mark.parametrize(("degrees", "noise"), [(28.0, 0.01), (33.0, 0.03), (38.0, 0.06), (48.0, 0.06)])
+@pytest.mark.parametrize("seed", range(2))
+def test_heaps_are_objects_however_long_the_line_around_them(degrees, noise, seed):
+    """Of 28 to 43 degrees, as sand and gravel lie, they were one object with the ground, of 48 in more noise."""
     rng = np.random.default_rng(seed)
     places, radii = rng.uniform(0.0, 30.0, (60_000, 2)), np.array([3.0, 4.0, 5.0, 6.0])
     middles = np.array([(8.0, 8.0), (22.0, 8.0), (8.0, 22.0), (22.0, 22.0)])
     off = np.linalg.norm(places[:, None] - middles, axis=2)
-    heights = np.tan(np.radians(48.0)) * np.maximum(radii - off, 0.0)
-    points = np.column_stack((places, heights.max(axis=1) + rng.normal(0.0, 0.03, len(places))))
+    heights = np.tan(np.radians(degrees)) * np.maximum(radii - off, 0.0)
+    points = np.column_stack((places, heights.max(axis=1) + rng.normal(0.0, noise, len(places))))
     truth = np.where(heights.max(axis=1) > 0.0, heights.argmax(axis=1) + 1, 0)
-    assert pcgraph.metrics.segmentation_covering(pcgraph.segment(points).labels, truth) > 0.97
+    assert pcgraph.metrics.segmentation_covering(pcgraph.segment(points).labels, truth) > 0.96
 
 
-@pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.1, 0.2), (0.1, 0.3)])
+@pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.08, 0.2), (0.1, 0.3)])
 def test_a_gentle_hill_is_no_object(height, slope):
+    """Of 22 degrees at most: the valley around it is below the altitude of objects."""
     points, _ = _wall(height, slope)
     assert pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0)).labels.max() == 0
+
+
+@pytest.mark.parametrize("slope", [0.15, 0.2])
+def test_a_hollow_of_which_a_valley_surrounds_the_floor_is_no_object(slope):
+    points, truth = _wall(-0.1, slope)
+    found = pcgraph.segment(points, viewpoint=(1.0, 0.75, 3.0))
+    assert found.labels.max() == 0
+    heap = pcgraph.segment(points * [1.0, 1.0, -1.0], viewpoint=(1.0, 0.75, 3.0))
+    assert heap.labels.max() == 1
+    assert pcgraph.metrics.segmentation_covering(heap.labels, truth) > 0.95
 
 
 @pytest.mark.parametrize("kind", ["random", "chain", "star"])
