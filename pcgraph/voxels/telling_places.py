@@ -51,7 +51,8 @@ _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # wh
 _OF_ROOM, _NEARLY_CLOSED = 0.2, 0.8  # counts that places are closed in, nearly, where floor and ceiling bound all
 _ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
-_NARROW = 0.2  # and beyond which it sees a tenth of all, at least
+_NARROW = 0.2  # and beyond which it sees a tenth of all, at least;
+_FROM_CAMERA = 0.92  # of what is visible from the other side of a pit, or table, is from a camera over it, at least
 _VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at from; and more, each of which
 _NEWS = 0.005  # of all cells is seen by first
 _TINY = 1e-12
@@ -193,7 +194,8 @@ def _places_to_try(
     if not (high > low).any():
         outside = low + directions
     upwards, offset, is_ground = bearing_plane(coarse, normals)
-    if viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids):
+    sees = viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids)
+    if sees and (abs(upwards[2]) < LEVEL or _sees_as_much(origin, upwards, coarse, normals)):
         viewpoint = origin
     elif upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
         upwards = -upwards
@@ -300,6 +302,19 @@ def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bo
     is_around = (slopes.min(axis=0) < 0.0).all() and (slopes.max(axis=0) > 0.0).all()
     aside = np.abs(slopes).max(axis=1)
     return bool(is_around and aside.max() < _WIDE and np.mean(aside > _NARROW) > 0.1)
+
+
+def _sees_as_much(
+    place: NDArray[np.float64], upwards: NDArray[np.float64], coarse: VoxelGrid, normals: NDArray[np.float64]
+) -> bool:
+    """Whether nearly as much is visible from a place as from its mirror image on the other side of all.
+
+    Below a pit, that is seen from above, its floor hides its walls.
+    """
+    low, high = bounding_box(coarse.centroids)
+    opposite = place - 2.0 * ((place - (low + high) / 2.0) @ upwards) * upwards
+    seen = seen_from(np.stack((place, opposite)), coarse.centroids, coarse.edge_lengths, normals).mean(axis=1)
+    return bool(seen[0] >= _FROM_CAMERA * seen[1])
 
 
 @summing_routine
