@@ -199,10 +199,8 @@ def _places_to_try(
         viewpoint = origin
     elif upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
         upwards = -upwards
-    places, closed = (
-        np.concatenate((outside, inside)),
-        np.concatenate((np.zeros(_OUTSIDE), hit_fractions(inside, coarse.centroids))),
-    )
+    places = np.concatenate((outside, inside))
+    closed = np.concatenate((np.zeros(_OUTSIDE), hit_fractions(inside, coarse.centroids)))
     if viewpoint is not None:
         places, closed = np.concatenate((places, viewpoint[None])), np.append(closed, 0.0)
         likely = np.arange(len(places)) == len(places) - 1

@@ -147,9 +147,12 @@ def test_a_thing_in_a_hollow_of_rolling_ground_is_no_less_one_than_on_a_hill():
     assert sum(np.mean(found > 0) > 0.9 for found in alone) == things
 
 
-@pytest.mark.parametrize(("degrees", "noise"), [(28.0, 0.01), (33.0, 0.03), (38.0, 0.06), (48.0, 0.06)])
-@pytest.mark.parametrize("seed", range(2))
-def test_heaps_are_objects_however_long_the_line_around_them(degrees, noise, seed):
+@pytest.mark.parametrize(
+    ("degrees", "noise", "least"),
+    [(28.0, 0.01, 0.97), (33.0, 0.03, 0.97), (38.0, 0.06, 0.96), (48.0, 0.03, 0.97), (48.0, 0.06, 0.96)],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_heaps_are_objects_however_long_the_line_around_them(degrees, noise, least, seed):
     """Of 28 to 43 degrees, as sand and gravel lie, they were one object with the ground, of 48 in more noise."""
     rng = np.random.default_rng(seed)
     places, radii = rng.uniform(0.0, 30.0, (60_000, 2)), np.array([3.0, 4.0, 5.0, 6.0])
@@ -158,7 +161,7 @@ def test_heaps_are_objects_however_long_the_line_around_them(degrees, noise, see
     heights = np.tan(np.radians(degrees)) * np.maximum(radii - off, 0.0)
     points = np.column_stack((places, heights.max(axis=1) + rng.normal(0.0, noise, len(places))))
     truth = np.where(heights.max(axis=1) > 0.0, heights.argmax(axis=1) + 1, 0)
-    assert pcgraph.metrics.segmentation_covering(pcgraph.segment(points).labels, truth) > 0.96
+    assert pcgraph.metrics.segmentation_covering(pcgraph.segment(points).labels, truth) > least
 
 
 @pytest.mark.parametrize(("height", "slope"), [(0.0, None), (0.05, 0.2), (0.08, 0.2), (0.1, 0.3)])
