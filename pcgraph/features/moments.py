@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.columns import group_means
-from pcgraph.parallel import kernel, routine, side_by_side
+from pcgraph.parallel import in_blocks, kernel, routine, side_by_side
 from pcgraph.short_repr import ShortRepr
+from pcgraph.voxels.eigen import AXES
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,51 +92,70 @@ def moments_of_groups(
     """
     of_features = None if features is None else group_means(features, groups, n_groups)
     if colors is None:
-        counts, centroids, scatters = _mean_and_scatter(points, groups, n_groups, about_first=True)
+        counts, centroids, scatters = _mean_and_scatter(points, groups, n_groups)
         return Moments(counts, centroids, scatters, None, features=of_features)
     (counts, centroids, scatters), (_, means, color_scatters) = side_by_side(
-        partial(_mean_and_scatter, points, groups, n_groups, about_first=True),
-        partial(_mean_and_scatter, colors, groups, n_groups, about_first=False),
+        partial(_mean_and_scatter, points, groups, n_groups),
+        partial(_mean_and_scatter, colors, groups, n_groups),
     )
     return Moments(counts, centroids, scatters, means, color_scatters, features=of_features)
 
 
 def _mean_and_scatter(
-    values: NDArray[np.float64], groups: NDArray[np.int32], n_groups: int, about_first: bool
+    values: NDArray[np.float64], groups: NDArray[np.int32], n_groups: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Counts (k,), means (k, 3) and scatters (k, 3, 3), first about each group's first value or zero, then the mean."""
-    counts, scatters = np.zeros(n_groups, np.int64), np.zeros((n_groups, 3, 3))
-    reference, shifts = np.zeros((n_groups, 3)), np.zeros((n_groups, 3))
-    _sum_up(values, groups, about_first, counts, reference, shifts, scatters)
-    for row, column in ((1, 0), (2, 0), (2, 1)):
-        scatters[:, row, column] = scatters[:, column, row]
-    return counts, reference + shifts, scatters
+    """Counts (k,), means (k, 3) and scatters (k, 3, 3): in one pass, about each group's first value, then its mean."""
+    counts, sums, first = np.zeros(n_groups, np.int64), np.zeros((n_groups, 9)), np.empty((n_groups, 3))
+    means, scatters = np.empty((n_groups, 3)), np.empty((n_groups, 3, 3))
+    _sum_up(values, groups, counts, first, sums)
+    in_blocks(_centre, n_groups, counts, first, sums, means, scatters)
+    return counts, means, scatters
 
 
 @kernel
-def _sum_up(values, groups, about_first, counts, reference, shifts, scatters):  # type: ignore[no-untyped-def]
-    """Sum up numbers, mean differences from a reference, and upper triangles of scatters, in two passes."""
+def _sum_up(
+    values: NDArray[np.float64],
+    groups: NDArray[np.int32],
+    counts: NDArray[np.int64],
+    first: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Sum up numbers, and differences from the first value of each group, and their products xx, yy, zz, xy, xz, yz."""
     for i in range(len(groups)):
         s = groups[i]
-        for axis in range(3):
-            if about_first and counts[s] == 0:
-                reference[s, axis] = values[i, axis]
-            shifts[s, axis] += values[i, axis] - reference[s, axis]
+        if counts[s] == 0:
+            first[s, 0], first[s, 1], first[s, 2] = values[i, 0], values[i, 1], values[i, 2]
+        x, y, z = values[i, 0] - first[s, 0], values[i, 1] - first[s, 1], values[i, 2] - first[s, 2]
         counts[s] += 1
-    for s in range(len(counts)):
+        sums[s, 0] += x
+        sums[s, 1] += y
+        sums[s, 2] += z
+        sums[s, 3] += x * x
+        sums[s, 4] += y * y
+        sums[s, 5] += z * z
+        sums[s, 6] += x * y
+        sums[s, 7] += x * z
+        sums[s, 8] += y * z
+
+
+@kernel
+def _centre(
+    start: int,
+    stop: int,
+    counts: NDArray[np.int64],
+    first: NDArray[np.float64],
+    sums: NDArray[np.float64],
+    means: NDArray[np.float64],
+    scatters: NDArray[np.float64],
+) -> None:
+    """Set means, and scatters about them, from sums about the first values."""
+    for s in range(start, stop):
         for axis in range(3):
-            shifts[s, axis] /= counts[s]
-    for i in range(len(groups)):
-        s = groups[i]
-        x = values[i, 0] - reference[s, 0] - shifts[s, 0]
-        y = values[i, 1] - reference[s, 1] - shifts[s, 1]
-        z = values[i, 2] - reference[s, 2] - shifts[s, 2]
-        scatters[s, 0, 0] += x * x
-        scatters[s, 0, 1] += x * y
-        scatters[s, 0, 2] += x * z
-        scatters[s, 1, 1] += y * y
-        scatters[s, 1, 2] += y * z
-        scatters[s, 2, 2] += z * z
+            means[s, axis] = first[s, axis] + sums[s, axis] / counts[s]
+        for column in range(6):
+            one, other = AXES[column]
+            about = sums[s, 3 + column] - sums[s, one] * sums[s, other] / counts[s]
+            scatters[s, one, other] = scatters[s, other, one] = max(about, 0.0) if one == other else about
 
 
 def moments_up_tree(leaves: Moments, parents: NDArray[np.int32]) -> Moments:
