@@ -83,7 +83,7 @@ class RegionLinkage(Linkage):
         H = h1 max(c - h0, 0) t^8 u m / (m + m2)
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
-    bins and airborne scans (docs/benchmarks.md); none is far from others that do as well.
+    bins and airborne scans (docs/pcgraph_benchmarks.md); none is far from others that do as well.
     """
 
     cost: BoundaryCost = field(default_factory=BoundaryCost)
