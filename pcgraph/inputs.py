@@ -188,9 +188,15 @@ def clean_cloud(
     flat = array.reshape(-1, 3)
     if not len(flat):
         raise ValueError("expected at least one point, got an empty cloud")
-    kept = np.flatnonzero(np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2]))
+    is_point = np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2])
+    if len(shape) == 2:
+        is_zero = (flat[:, 0] == 0) & (flat[:, 1] == 0) & (flat[:, 2] == 0)
+        if np.count_nonzero(is_zero) > 1:  # what many cameras' drivers write where they saw nothing
+            is_point &= ~is_zero
+    kept = np.flatnonzero(is_point)
     if not len(kept):
-        raise ValueError(f"expected at least one finite point, but all {len(flat)} points are NaN or infinite")
+        no_points = "NaN or infinite" + (", or (0, 0, 0) as holes are" if len(shape) == 2 else "")
+        raise ValueError(f"expected at least one finite point, but all {len(flat)} points are {no_points}")
     with np.errstate(over="ignore"):  # long doubles
         places = _rows(flat, kept).astype(np.float64, order="C")
     none = np.empty(0, np.int64)
@@ -208,22 +214,20 @@ def clean_cloud(
     return replace(clean, features=scaling.scaled(numbers), scaling=scaling)
 
 
-def clean_viewpoint(viewpoint: ArrayLike | None, cloud: CleanCloud) -> NDArray[np.float64] | None:
-    """The viewpoint, (3,) or (n, 3) float64, metres: as given, the origin of an organised cloud, or None.
+def clean_viewpoint(viewpoint: ArrayLike, cloud: CleanCloud) -> NDArray[np.float64]:
+    """The viewpoint that was given, (3,) or (n, 3) float64, metres.
 
     Nearly the same place for each point is one viewpoint, as of a sweep whose scanner moved a little.
     """
-    if viewpoint is not None:
-        given = _numbers("viewpoint", viewpoint).astype(np.float64)
-        per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
-        position = given.reshape(-1, 3).take(cloud.kept, axis=0) if per_point else given
-        if position.shape not in ((3,), cloud.points.shape) or not (np.abs(position) <= _LARGEST).all():
-            raise ValueError(
-                f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
-                f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
-            )
-        return position if position.ndim == 1 or not len(position) else _one_place(position, cloud.points)
-    return np.zeros(3) if len(cloud.shape) == 2 else None
+    given = _numbers("viewpoint", viewpoint).astype(np.float64)
+    per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
+    position = given.reshape(-1, 3).take(cloud.kept, axis=0) if per_point else given
+    if position.shape not in ((3,), cloud.points.shape) or not (np.abs(position) <= _LARGEST).all():
+        raise ValueError(
+            f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
+            f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
+        )
+    return position if position.ndim == 1 or not len(position) else _one_place(position, cloud.points)
 
 
 def _one_place(places: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -34,6 +34,7 @@ from pcgraph.inputs import (
     non_negative,
     positive,
 )
+from pcgraph.organised import image_viewpoint, is_camera
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint, warn_of_volume
 from pcgraph.segmentation import Segmentation
@@ -68,7 +69,6 @@ _FEW_OUTLIERS = 0.95  # of the points are left
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _LOOKED_FROM = 3  # places, where the cloud was not seen from one; of viewpoints, from those of the points
 _ASKED_FOR_PLACES = 64  # in so many voxels
-_SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
 
 
 def segment(
@@ -93,18 +93,20 @@ def segment(
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
         Of a `Cloud`, and of a file that `read_cloud` reads, colours, normals and viewpoint are used too where none
         are given (not a viewpoint of zeros, which PCD files hold where none is known).
-        NaN and infinite points are left out and labelled -1, outliers, no denser around than noise would be, -2
-        (`pcgraph.voxels.outliers.outlier_voxels`). Organised points (h, w, 3) are taken for a
-        camera's image in the camera's frame (z forward) unless `viewpoint` or `camera` say otherwise.
+        NaN and infinite points are left out and labelled -1, and so are those of organised clouds (h, w, 3) that are
+        exactly (0, 0, 0), if there are several, as cameras' drivers write holes; outliers, no denser around than noise
+        would be, -2 (`pcgraph.voxels.outliers.outlier_voxels`). Organised points are taken for a camera's image in the
+        camera's frame (z forward) if they look like one, unless `viewpoint` or `camera` say otherwise.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
         Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
     viewpoint : (3,) or points' shape float, metres, the points' frame, optional
         Where the sensor stood, for all points or for each (which is one for all, if no two are farther apart than a
-        fiftieth of the range); estimated normals point to its side, and convexity depends on that. Default: the origin
-        for organised clouds. A list of points whose spacing grows with range from one place
-        (`pcgraph.voxels.spacing_law`) was seen from there; of any other, the outside is found from what is visible from
-        free places (`pcgraph.voxels.visibility.visible_sides`).
+        fiftieth of the range); estimated normals point to its side, and convexity depends on that. Default: of
+        organised clouds the origin, if neighbours lie side by side as seen from there, as in their sensor's frame, or
+        the place of the camera that sees each point at its pixel (`pcgraph.organised`). Any other cloud whose spacing
+        grows with range from one place (`pcgraph.voxels.spacing_law`) was seen from there; of all others, the outside
+        is found from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
     features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
         What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
@@ -118,8 +120,7 @@ def segment(
     camera : bool, optional
         Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
         depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, with x/z
-        and y/z in the order of columns and rows, unless voxels grow with range. (A missing point stored as (0, 0, 0)
-        lies at the viewpoint: make it NaN.)
+        and y/z in the order of columns and rows, unless voxels grow with range.
     range_growth : float, 0..1, without 1
         Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
         scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece. Default:
@@ -153,7 +154,7 @@ def segment(
     method = SurfaceGrowth() if method is None else method
     settings = Settings.of(method, RegionLinkage() if linkage is None else linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals, features)
-    place = clean_viewpoint(viewpoint, cloud)
+    place = _place(viewpoint, cloud, bool(camera))
     compile_in_two_processes()
     n_points = len(cloud.points)
     for _ in range(2):
@@ -240,7 +241,7 @@ def update(
     method = earlier.method if method is None else method
     settings = Settings.of(method, earlier.linkage if linkage is None else linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals, features, earlier.feature_scaling)
-    place = clean_viewpoint(viewpoint, cloud)
+    place = _place(viewpoint, cloud, False)
     compile_in_two_processes()
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
@@ -318,6 +319,14 @@ class Settings:
             raise ValueError(_refusal("linkage", "Linkage", linkage))
         altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
         return cls(method, linkage, non_negative("object_altitude", altitude))
+
+
+def _place(viewpoint: ArrayLike | None, cloud: CleanCloud, camera: bool) -> NDArray[np.float64] | None:
+    """From where a cloud was seen, (3,) or (n, 3): as given, of a camera's image the origin, else as organised points
+    tell; None if nothing does."""
+    if viewpoint is not None:
+        return clean_viewpoint(viewpoint, cloud)
+    return np.zeros(3) if camera and len(cloud.shape) == 2 else image_viewpoint(cloud)
 
 
 def _refusal(argument: str, family: str, given: object) -> str:
@@ -433,7 +442,7 @@ def _scale(
 ) -> tuple[float, SpacingLaw | None, Warp]:
     """The voxel size; how spacing depends on range, where that counts for place or scale; and how voxels grow."""
     if camera is None:
-        camera = position is not None and _is_camera(cloud, position, range_growth)
+        camera = position is not None and not range_growth and is_camera(cloud, position)
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
@@ -556,32 +565,3 @@ def _voxel_size(voxel_size: float | None, seed_size: float | None, spacing: Call
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
     return voxel
-
-
-def _is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64], range_growth: float | None) -> bool:
-    """Whether a camera at the viewpoint may have taken this as one image: what lies to the right is in a column there.
-
-    Other organised clouds, as height maps and the rows of a turning scanner, may also lie in front of a place.
-    """
-    if len(cloud.shape) != 2 or viewpoint.ndim != 1 or range_growth:
-        return False
-    if not cloud.points[:, 2].min() > viewpoint[2]:
-        return False
-    some = np.random.default_rng(0).integers(len(cloud.points), size=_SOME_PIXELS)
-    rays = cloud.points[some] - viewpoint
-    with np.errstate(over="ignore"):  # of points in the camera
-        x, y = (rays[:, :2] / rays[:, 2:]).T
-    row, column = np.divmod(cloud.kept[some], cloud.shape[1])
-    orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second of an image on its side
-    return any(all(_rank_correlation(a, b) >= _IN_ORDER for a, b in order) for order in orders)
-
-
-def _rank_correlation(a: NDArray[np.number], b: NDArray[np.number]) -> float:
-    """How far one column rises or falls with another, 0..1 (Spearman); 1 where one is constant."""
-    ranks = []
-    for values in (a, b):
-        _, place, number = np.unique(values, return_inverse=True, return_counts=True)
-        if len(number) == 1:
-            return 1.0
-        ranks.append((np.cumsum(number) - 0.5 * number)[place])
-    return abs(float(np.corrcoef(*ranks)[0, 1]))

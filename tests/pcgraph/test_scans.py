@@ -10,6 +10,9 @@ from test_guarantees import assert_covered_and_connected
 
 import pcgraph
 from pcgraph.features.moments import moments_of_groups
+from pcgraph.inputs import clean_cloud
+from pcgraph.metrics import weighted_overlap
+from pcgraph.organised import image_viewpoint
 from pcgraph.voxels.warp import RangeWarp
 
 
@@ -138,6 +141,45 @@ def test_what_is_in_the_order_of_its_rays_is_an_image(moved):
         "a column": image[:, 20:21],
     }
     assert pcgraph.segment(clouds[moved]).camera
+
+
+def test_an_image_in_another_frame_was_seen_from_its_camera(rooms):
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # to a frame whose z points up
+    for view, *_ in rooms:
+        result = pcgraph.segment((view.points @ turn.T + [300.0, -20.0, 1.5]).astype(np.float32), view.colors)
+        assert np.allclose(result.viewpoint, [300.0, -20.0, 1.5], atol=1e-3)
+        towards = np.einsum("ij,ij->i", result.surface.normals, result.viewpoint - result.surface.grid.centroids)
+        assert np.mean(towards < 0.0) < 0.001
+        assert weighted_overlap(result.labels, view.things) > 0.95
+
+
+def test_a_height_map_in_another_frame_was_seen_by_no_camera():
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, 80), np.linspace(-1.0, 1.0, 80))
+    z = 0.3 * np.exp(-8.0 * (x**2 + y**2)) + np.where(np.hypot(x - 0.5, y) < 0.2, 0.4, 0.0)
+    assert image_viewpoint(clean_cloud(np.stack((x, y, z), axis=-1), None, None)) is None
+
+
+def test_a_turning_scanner_in_its_own_frame_sees_from_the_origin():
+    azimuth, elevation = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False), np.linspace(-0.4, 0.1, 32))
+    rays = np.stack((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1)
+    ranges = np.where(np.abs(azimuth - 2.0) < 0.3, 3.0, np.minimum(8.0 + np.cos(3.0 * azimuth), 40.0))
+    assert (pcgraph.segment(rays * ranges[..., None]).viewpoint == 0.0).all()
+
+
+def test_zeros_in_an_image_are_holes(rooms):
+    view, *_ = rooms[0]
+    holes = np.isnan(view.points[..., 0]) | (np.random.default_rng(0).random(view.points.shape[:2]) < 0.1)
+    with_nan = np.where(holes[..., None], np.nan, view.points)
+    expected = pcgraph.segment(with_nan, view.colors)
+    for kind in (np.float64, np.float32):
+        result = pcgraph.segment(np.where(holes[..., None], 0.0, with_nan.astype(kind)), view.colors)
+        assert result.camera
+        assert (result.labels[holes] == -1).all()
+    assert np.array_equal(
+        pcgraph.segment(np.where(holes[..., None], 0.0, with_nan), view.colors).labels, expected.labels
+    )
+    with pytest.raises(ValueError, match="all 12 points are NaN or infinite, or \\(0, 0, 0\\)"):
+        pcgraph.segment(np.zeros((3, 4, 3)))
 
 
 def test_height_maps_and_turning_scanners_are_no_images():
