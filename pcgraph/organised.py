@@ -7,13 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.inputs import CleanCloud
+from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing
+from pcgraph.voxels.warp import Warp
 
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
-_SOME_PAIRS, _FEW_PAIRS = 8192, 64  # neighbours of which it is asked whether they are so from the origin,
+_SOME_PAIRS, _FEW_PAIRS = 2048, 64  # neighbours of which it is asked whether they are so from the origin,
 _FAR_APART, _HARDLY_ANY = 2.5, 0.001  # or this many times as far apart as most; and how many of them may be
 _ON_PIXEL, _NEARLY_ALL = 1.0, 0.95  # pixels by which points may be off their own, and how many are not
 _DEGENERATE = 1e-4  # of the largest singular value: where the last but one is less, as of a plane, no camera is told
 _FAR_OFF = 100.0  # extents of the points: a camera so far off is none
+_SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps of depth are read; and how many have one,
+_ROUNDING = 1e-6  # of the largest inverse depth, and more
+_FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step is so many voxel edges, at most, if
+# voxels need not be more than so many times as large as pixels would have them
 
 
 def image_viewpoint(cloud: CleanCloud) -> NDArray[np.float64] | None:
@@ -102,6 +108,44 @@ def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
     row, column = np.divmod(cloud.kept[some], cloud.shape[1])
     orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second of an image on its side
     return any(all(_rank_correlation(a, b) >= _IN_ORDER for a, b in order) for order in orders)
+
+
+def spacing_of_image(cloud: CleanCloud, warp: Warp) -> float:
+    """How far apart points are that a camera at the warp's place tells from each other, metres, in the warp's space.
+
+    It is the median distance to the nearest; more, up to four times that, where the camera's depth is coarser than the
+    voxels that this makes, at the depth of what is far.
+
+    Notes
+    -----
+    Depth by triangulation comes in steps of inverse depth, so of z^2 in depth (Khoshelham and Elberink 2012), while
+    pixels are z apart: from some depth on a surface is a stack of sheets that touch no other.
+    """
+    camera = np.zeros(3) if warp.seen_from is None else warp.seen_from
+    inverse = np.full(cloud.shape, np.nan)
+    inverse.reshape(-1)[cloud.kept] = 1.0 / (cloud.points[:, 2] - camera[2])
+    rows = [image[:: max(1, image.size // _SOME_TRIPLES)] for image in (inverse, inverse.T)]
+    far = 1.0 / float(np.nanquantile(rows[0], 1.0 - _FAR))
+    step = (
+        min(filter(None, map(_step_along, rows)), default=0.0)
+        * far
+        * far
+        / float(warp.scale(camera[None] + [0.0, 0.0, far])[0])
+    )
+    spacing = median_spacing(cloud.points, warp)
+    return max(spacing, min(step / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * spacing))
+
+
+def _step_along(rows: NDArray[np.float64]) -> float:
+    """Twice what the inverse depth of a pixel differs by from the mean of its two neighbours' in a row, 1/metres.
+
+    It is the median over those where it differs at all; 0 where it hardly differs anywhere. On a plane inverse depth is
+    linear in the pixels, whatever its slant, so what is left is noise, or steps.
+    """
+    differences = np.abs(rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:])
+    differences = differences[np.isfinite(differences)]
+    differing = differences[differences > _ROUNDING * np.nanmax(rows)]
+    return float(np.median(differing)) if len(differing) > _DIFFERING * len(differences) else 0.0
 
 
 def _rank_correlation(a: NDArray[np.number], b: NDArray[np.number]) -> float:

@@ -34,7 +34,7 @@ from pcgraph.inputs import (
     non_negative,
     positive,
 )
-from pcgraph.organised import image_viewpoint, is_camera
+from pcgraph.organised import image_viewpoint, is_camera, spacing_of_image
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint, warn_of_volume
 from pcgraph.segmentation import Segmentation
@@ -49,7 +49,7 @@ from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.fitting import fitting_grading, fitting_size, seed_spacing
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
-from pcgraph.voxels.spacing import median_spacing, spacing_and_rows
+from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface
 from pcgraph.voxels.telling_places import telling_places
@@ -63,7 +63,6 @@ from pcgraph.voxels.visibility import (
 from pcgraph.voxels.warp import Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
-VOXELS_PER_SPACING = 3.5
 RANGE_GROWTH = 0.5
 _FEW_OUTLIERS = 0.95  # of the points are left
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
@@ -448,13 +447,15 @@ def _scale(
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
         law = spacing_law(cloud.points) if position is None else None
         warp = _warp(cloud, position, law, camera, growth)
-        return _voxel_size(voxel_size, seed_size, partial(median_spacing, cloud.points, warp)), law, warp
-    (spacing, rows), of_all = side_by_side(
+        image = camera and len(cloud.shape) == 2
+        spacing = partial(spacing_of_image, cloud) if image else partial(median_spacing, cloud.points)
+        return _voxel_size(voxel_size, seed_size, lambda: spacing(warp)), law, warp
+    (even, rows), of_all = side_by_side(
         partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position)
     )
     law = law_on_rings(cloud.points, of_all, rows, position)
     growth = RANGE_GROWTH if may_grow and law.holds else growth
-    return _voxel_size(voxel_size, seed_size, lambda: spacing), law, _warp(cloud, position, law, camera, growth)
+    return _voxel_size(voxel_size, seed_size, lambda: even), law, _warp(cloud, position, law, camera, growth)
 
 
 def _warp(

@@ -15,6 +15,9 @@ from pcgraph.voxels.rings import Rows
 from pcgraph.voxels.sampling import BLOCKS, blocks_of, each_place_once, some_places
 from pcgraph.voxels.warp import Warp
 
+VOXELS_PER_SPACING = 3.5
+"""Edge of a voxel over the spacing of the points, unless surfaces need larger or smaller ones."""
+
 _SAMPLE = 4096  # points whose nearest neighbour is sought
 _TRIES = 64
 _NEIGHBOUR = 8

@@ -219,14 +219,14 @@ def test_images_with_holes_rows_and_columns_missing(rng, h, w, camera):
     image[holes, rng.integers(3)] = rng.choice([np.nan, np.inf, -np.inf])
     colors = rng.random((h, w, 3))
     colors[holes] = np.nan  # of a point that is not there, the colour does not matter
-    result = pcgraph.segment(image, colors, camera=camera)
+    result = pcgraph.segment(image, colors, viewpoint=(0, 0, 0), camera=camera)
     assert_covered_and_connected(image, result)
     assert np.array_equal(np.isnan(result.saliency()), holes)
     result.occlusions()
     result.primitives(image)
-    # The same points without the holes are the same supervoxels.
-    flat = image[~holes]
-    same = pcgraph.segment(flat, colors[~holes], viewpoint=(0, 0, 0), camera=result.camera)
+    # The same points without the holes are the same supervoxels, given what their order told of the camera's depth.
+    flat, sizes = image[~holes], {"voxel_size": result.voxel_size, "seed_size": result.seed_size}
+    same = pcgraph.segment(flat, colors[~holes], viewpoint=(0, 0, 0), camera=result.camera, **sizes)
     assert np.array_equal(same.supervoxels, result.supervoxels[~holes])
     assert np.array_equal(same.tree.altitudes, result.tree.altitudes)
 

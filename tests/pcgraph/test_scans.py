@@ -12,8 +12,9 @@ import pcgraph
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
-from pcgraph.organised import image_viewpoint
-from pcgraph.voxels.warp import RangeWarp
+from pcgraph.organised import image_viewpoint, spacing_of_image
+from pcgraph.voxels.spacing import median_spacing
+from pcgraph.voxels.warp import RangeWarp, choose_warp
 
 
 def plate():
@@ -164,6 +165,40 @@ def test_a_turning_scanner_in_its_own_frame_sees_from_the_origin():
     rays = np.stack((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1)
     ranges = np.where(np.abs(azimuth - 2.0) < 0.3, 3.0, np.minimum(8.0 + np.cos(3.0 * azimuth), 40.0))
     assert (pcgraph.segment(rays * ranges[..., None]).viewpoint == 0.0).all()
+
+
+def image_of_a_hall(end, noise=0.0, step=0.0, shape=(240, 320)):
+    """A depth image, (h, w, 3), of a floor, two walls and a wall at the end, and which of these; depths by noise and
+    steps of inverse depth, 1/metres."""
+    rng, (h, w) = np.random.default_rng(0), shape
+    y, x = (np.mgrid[:h, :w] + 0.5 - np.array([h, w]).reshape(2, 1, 1) / 2.0) / (0.9 * w)
+    walls = np.stack([np.full(shape, end), *(1.2 / np.maximum(way, 1e-9) for way in (y, x, -x))])
+    inverse = 1.0 / walls.min(axis=0) + noise * rng.normal(size=shape)
+    inverse = np.round(inverse / step) * step if step else inverse
+    return np.stack((x, y, np.ones(shape)), axis=-1) / inverse[..., None], walls.argmin(axis=0)
+
+
+@pytest.mark.parametrize("noise", [0.5e-3, 1.4e-3])
+def test_steps_of_depth_are_read_off_an_image(noise):
+    points, _ = image_of_a_hall(4.0, noise, 2.85e-3)
+    cloud = clean_cloud(points, None, None)
+    warp = choose_warp(cloud.points, np.zeros(3), True, 0.0)
+    far = np.quantile(cloud.points[:, 2], 0.8)
+    needed = 2.85e-3 * far * warp.reference_depth / 0.75 / 3.5
+    assert spacing_of_image(cloud, warp) == pytest.approx(
+        min(needed, 4.0 * median_spacing(cloud.points, warp)), rel=0.02
+    )
+    fine, _ = image_of_a_hall(4.0, 0.05 * noise)
+    cloud = clean_cloud(fine, None, None)
+    assert spacing_of_image(cloud, warp) == median_spacing(cloud.points, warp)
+
+
+@pytest.mark.parametrize("end", [3.0, 4.0, 5.0, 6.0])
+def test_walls_far_from_a_camera_whose_depth_is_coarse_are_whole(end):
+    points, walls = image_of_a_hall(end, 1.4e-3, 2.85e-3, (480, 640))
+    result = pcgraph.segment(points)
+    assert weighted_overlap(result.labels, walls) > 0.9
+    assert result.objects.max() < 8
 
 
 def test_zeros_in_an_image_are_holes(rooms):
