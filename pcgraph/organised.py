@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.inputs import CleanCloud
+from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing
 from pcgraph.voxels.warp import Warp
 
@@ -20,6 +24,9 @@ _SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps o
 _ROUNDING = 1e-6  # of the largest inverse depth, and more
 _FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step is so many voxel edges, at most, if
 # voxels need not be more than so many times as large as pixels would have them
+_STEEP, _CLEARLY = 20.0, 6.0  # pixels across, and steps of depth: what flies lies more than that before and behind,
+_WIDEST, _FLATTER = 4, 0.3  # within so many pixels the slope, of inverse depth, is so many times what it is there,
+_FEWEST_FLYING, _MOST_FLYING = 1e-4, 0.2  # if it is so many of all
 
 
 def image_viewpoint(cloud: CleanCloud) -> NDArray[np.float64] | None:
@@ -110,30 +117,61 @@ def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
     return any(all(_rank_correlation(a, b) >= _IN_ORDER for a, b in order) for order in orders)
 
 
-def spacing_of_image(cloud: CleanCloud, warp: Warp) -> float:
-    """How far apart points are that a camera at the warp's place tells from each other, metres, in the warp's space.
+class DepthImage(NamedTuple):
+    """What a camera measured, pixel by pixel.
 
-    It is the median distance to the nearest; more, up to four times that, where the camera's depth is coarser than the
-    voxels that this makes, at the depth of what is far.
-
-    Notes
-    -----
-    Depth by triangulation comes in steps of inverse depth, so of z^2 in depth (Khoshelham and Elberink 2012), while
-    pixels are z apart: from some depth on a surface is a stack of sheets that touch no other.
+    Attributes
+    ----------
+    camera : (3,) float64, metres
+        Its place.
+    depths : (h, w) float64, metres
+        From there along the optical axis, z; NaN where nothing was seen.
+    step : float, 1/metres
+        By which inverse depth is noisy, or goes in steps; 0 where it is so fine that it does not show.
     """
-    camera = np.zeros(3) if warp.seen_from is None else warp.seen_from
-    inverse = np.full(cloud.shape, np.nan)
-    inverse.reshape(-1)[cloud.kept] = 1.0 / (cloud.points[:, 2] - camera[2])
-    rows = [image[:: max(1, image.size // _SOME_TRIPLES)] for image in (inverse, inverse.T)]
-    far = 1.0 / float(np.nanquantile(rows[0], 1.0 - _FAR))
-    step = (
-        min(filter(None, map(_step_along, rows)), default=0.0)
-        * far
-        * far
-        / float(warp.scale(camera[None] + [0.0, 0.0, far])[0])
-    )
-    spacing = median_spacing(cloud.points, warp)
-    return max(spacing, min(step / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * spacing))
+
+    camera: NDArray[np.float64]
+    depths: NDArray[np.float64]
+    step: float
+
+    @classmethod
+    def of(cls, cloud: CleanCloud, camera: NDArray[np.float64]) -> DepthImage:
+        """The image of organised points, given the camera's place, (3,)."""
+        depths = np.full(cloud.shape, np.nan)
+        depths.reshape(-1)[cloud.kept] = cloud.points[:, 2] - camera[2]
+        along = (_step_along(1.0 / image[:: max(1, image.size // _SOME_TRIPLES)]) for image in (depths, depths.T))
+        return cls(camera, depths, min(filter(None, along), default=0.0))
+
+    def spacing(self, cloud: CleanCloud, warp: Warp) -> float:
+        """How far apart points are that the camera tells from each other, metres, in the space of its warp.
+
+        It is the median distance to the nearest; more, up to four times that, where depth is coarser than the voxels
+        that this makes, at the depth of what is far.
+
+        Notes
+        -----
+        Depth by triangulation comes in steps of inverse depth, so of z^2 in depth (Khoshelham and Elberink 2012),
+        while pixels are z apart: from some depth on a surface is a stack of sheets that touch no other.
+        """
+        spacing = median_spacing(cloud.points, warp)
+        far = np.quantile(cloud.points[:: max(1, len(cloud.points) // _SOME_TRIPLES), 2], _FAR)
+        depth = far - self.camera[2]
+        coarse = self.step * depth * depth / float(warp.scale(np.array([[0.0, 0.0, far]]))[0])
+        return max(spacing, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * spacing))
+
+    def flying(self, cloud: CleanCloud) -> NDArray[np.bool_]:
+        """Which of the n points fly, (n,) bool: they lie between a surface and what it hides, on neither.
+
+        Their depth is a mix of both. It rises, or falls, from one neighbour to the other in a row or column, by twenty
+        times as much as pixels are apart on each side, or on one side, if nothing is seen on the other; and some pixels
+        on it does so no more, as it would on a plane seen edge-on. Where more than a fifth of all would fly, or fewer
+        than one in ten thousand, none does.
+        """
+        flying = np.empty(cloud.shape, np.bool_)
+        least = _STEEP * _angle_between_pixels(cloud, self.depths)
+        in_blocks(_find_flying, len(flying), self.depths, least, _CLEARLY * self.step, flying, smallest=MIN_ROWS)
+        found = flying.reshape(-1)[cloud.kept]
+        return found if _FEWEST_FLYING <= np.mean(found) <= _MOST_FLYING else np.zeros_like(found)
 
 
 def _step_along(rows: NDArray[np.float64]) -> float:
@@ -144,8 +182,68 @@ def _step_along(rows: NDArray[np.float64]) -> float:
     """
     differences = np.abs(rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:])
     differences = differences[np.isfinite(differences)]
+    if not len(differences):
+        return 0.0
     differing = differences[differences > _ROUNDING * np.nanmax(rows)]
     return float(np.median(differing)) if len(differing) > _DIFFERING * len(differences) else 0.0
+
+
+def _angle_between_pixels(cloud: CleanCloud, depths: NDArray[np.float64]) -> float:
+    """Median distance between neighbours in a row, across the optical axis, over their depth; 0 if there are none."""
+    some = np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PAIRS))
+    beside = np.minimum(some + 1, len(cloud.kept) - 1)
+    pairs = (cloud.kept[beside] == cloud.kept[some] + 1) & (cloud.kept[some] % cloud.shape[1] < cloud.shape[1] - 1)
+    one, other = (cloud.points[at[pairs], :2] for at in (some, beside))
+    at, to = (depths.reshape(-1)[cloud.kept[at[pairs]]] for at in (some, beside))
+    return float(np.median(np.linalg.norm(other - one, axis=1) / np.sqrt(at * to))) if pairs.any() else 0.0
+
+
+@kernel
+def _find_flying(
+    start: int,
+    stop: int,
+    depths: NDArray[np.float64],
+    least_slope: float,
+    least_step: float,
+    flying: NDArray[np.bool_],
+) -> None:
+    """Set which pixels of some rows fly."""
+    h, w = depths.shape
+    for i in range(start, stop):
+        for j in range(w):
+            own = depths[i, j]
+            limit = max(least_slope * own, least_step * own * own)
+            beside = abs(depths[i, max(j - 1, 0)] - own) > limit or abs(depths[i, min(j + 1, w - 1)] - own) > limit
+            above = abs(depths[max(i - 1, 0), j] - own) > limit or abs(depths[min(i + 1, h - 1), j] - own) > limit
+            flying[i, j] = (beside and _is_mixed(depths[i], j, limit)) or (above and _is_mixed(depths[:, j], i, limit))
+
+
+@routine
+def _is_mixed(line: NDArray[np.float64], at: int, limit: float) -> bool:
+    """Whether a pixel of a line lies behind one neighbour and before the other by more than a limit, or the other is
+    NaN; and whether such a slope ends on both sides."""
+    before = line[at - 1] - line[at] if at > 0 else 0.0
+    after = line[at + 1] - line[at] if at + 1 < len(line) else 0.0
+    between = min(before, after) < -limit and max(before, after) > limit
+    at_hole = (abs(before) > limit and math.isnan(after)) or (abs(after) > limit and math.isnan(before))
+    return bool((between or at_hole) and _ends(line, at, -1) and _ends(line, at, 1))
+
+
+@routine
+def _ends(line: NDArray[np.float64], at: int, way: int) -> bool:
+    """Whether a slope ends some pixels along a line, in a hole or on a surface: on a plane inverse depth goes on as it
+    went, be it seen edge-on."""
+    for _ in range(_WIDEST):
+        following = at + 2 * way
+        if following < 0 or following >= len(line):
+            return False
+        here, there, beyond = line[at], line[at + way], line[following]
+        if math.isnan(there) or math.isnan(beyond):
+            return True
+        if abs(1.0 / beyond - 1.0 / there) < _FLATTER * abs(1.0 / there - 1.0 / here):
+            return True
+        at += way
+    return False
 
 
 def _rank_correlation(a: NDArray[np.number], b: NDArray[np.number]) -> float:

@@ -34,7 +34,7 @@ from pcgraph.inputs import (
     non_negative,
     positive,
 )
-from pcgraph.organised import image_viewpoint, is_camera, spacing_of_image
+from pcgraph.organised import DepthImage, image_viewpoint, is_camera
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint, warn_of_volume
 from pcgraph.segmentation import Segmentation
@@ -155,9 +155,12 @@ def segment(
     cloud = clean_cloud(points, colors, normals, features)
     place = _place(viewpoint, cloud, bool(camera))
     compile_in_two_processes()
+    camera = _is_camera(cloud, place, range_growth) if camera is None else camera
+    image = _depth_image(cloud, place, camera)
+    cloud = _without_flying(cloud, image)
     n_points = len(cloud.points)
     for _ in range(2):
-        voxel, law, warp = _scale(cloud, place, camera, range_growth, voxel_size, seed_size)
+        voxel, law, warp = _scale(cloud, place, image, camera, range_growth, voxel_size, seed_size)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
@@ -246,6 +249,8 @@ def update(
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     size, warp, grading = before.grid.size, before.grid.warp, before.grid.grading
+    image = _depth_image(cloud, place, _is_camera(cloud, place, None))
+    cloud = _without_flying(cloud, image)
     seen = voxel_grid(cloud.points, cloud.colors, size, warp, cloud.features)
     cloud, seen, place = _without(outlier_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
     if grading is not None:
@@ -318,6 +323,24 @@ class Settings:
             raise ValueError(_refusal("linkage", "Linkage", linkage))
         altitude = linkage.default_object_altitude if object_altitude is None else object_altitude
         return cls(method, linkage, non_negative("object_altitude", altitude))
+
+
+def _is_camera(cloud: CleanCloud, place: NDArray[np.float64] | None, range_growth: float | None) -> bool:
+    """Whether a camera at the place took a cloud, unless voxels are to grow with range."""
+    return place is not None and not range_growth and is_camera(cloud, place)
+
+
+def _depth_image(cloud: CleanCloud, place: NDArray[np.float64] | None, camera: bool) -> DepthImage | None:
+    """The image that a camera took, or None."""
+    if place is None or place.ndim != 1 or not camera or len(cloud.shape) != 2:
+        return None
+    return DepthImage.of(cloud, place)
+
+
+def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
+    """The cloud without points whose depth is a mix of two."""
+    flying = np.zeros(0, np.bool_) if image is None else image.flying(cloud)
+    return cloud.without(flying) if flying.any() else cloud
 
 
 def _place(viewpoint: ArrayLike | None, cloud: CleanCloud, camera: bool) -> NDArray[np.float64] | None:
@@ -434,21 +457,19 @@ def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArr
 def _scale(
     cloud: CleanCloud,
     position: NDArray[np.float64] | None,
-    camera: bool | None,
+    image: DepthImage | None,
+    camera: bool,
     range_growth: float | None,
     voxel_size: float | None,
     seed_size: float | None,
 ) -> tuple[float, SpacingLaw | None, Warp]:
     """The voxel size; how spacing depends on range, where that counts for place or scale; and how voxels grow."""
-    if camera is None:
-        camera = position is not None and not range_growth and is_camera(cloud, position)
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
         law = spacing_law(cloud.points) if position is None else None
         warp = _warp(cloud, position, law, camera, growth)
-        image = camera and len(cloud.shape) == 2
-        spacing = partial(spacing_of_image, cloud) if image else partial(median_spacing, cloud.points)
+        spacing = partial(median_spacing, cloud.points) if image is None else partial(image.spacing, cloud)
         return _voxel_size(voxel_size, seed_size, lambda: spacing(warp)), law, warp
     (even, rows), of_all = side_by_side(
         partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position)

@@ -36,4 +36,7 @@ def test_shuffled_real_cloud_gives_the_same_supervoxels(real_clouds):
         pcgraph.metrics.weighted_overlap(first.labels[order], second.labels) == 1.0
     )
     organised = pcgraph.segment(cloud.points, cloud.colors)
-    assert np.array_equal(organised.supervoxels[finite], first.supervoxels)
+    left = ~organised.outliers[finite]  # the image tells which pixels mix two depths
+    assert left.mean() > 0.999
+    of_list = pcgraph.segment(points[left], colors[left], camera=True)
+    assert np.array_equal(organised.supervoxels[finite][left], of_list.supervoxels)

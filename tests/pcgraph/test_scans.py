@@ -12,7 +12,7 @@ import pcgraph
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
-from pcgraph.organised import image_viewpoint, spacing_of_image
+from pcgraph.organised import DepthImage, image_viewpoint
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.warp import RangeWarp, choose_warp
 
@@ -185,12 +185,12 @@ def test_steps_of_depth_are_read_off_an_image(noise):
     warp = choose_warp(cloud.points, np.zeros(3), True, 0.0)
     far = np.quantile(cloud.points[:, 2], 0.8)
     needed = 2.85e-3 * far * warp.reference_depth / 0.75 / 3.5
-    assert spacing_of_image(cloud, warp) == pytest.approx(
+    assert DepthImage.of(cloud, np.zeros(3)).spacing(cloud, warp) == pytest.approx(
         min(needed, 4.0 * median_spacing(cloud.points, warp)), rel=0.02
     )
     fine, _ = image_of_a_hall(4.0, 0.05 * noise)
     cloud = clean_cloud(fine, None, None)
-    assert spacing_of_image(cloud, warp) == median_spacing(cloud.points, warp)
+    assert DepthImage.of(cloud, np.zeros(3)).spacing(cloud, warp) == median_spacing(cloud.points, warp)
 
 
 @pytest.mark.parametrize("end", [3.0, 4.0, 5.0, 6.0])
@@ -199,6 +199,46 @@ def test_walls_far_from_a_camera_whose_depth_is_coarse_are_whole(end):
     result = pcgraph.segment(points)
     assert weighted_overlap(result.labels, walls) > 0.9
     assert result.objects.max() < 8
+
+
+def mixed_at_edges(seed, fraction=0.3):
+    """A depth image, (h, w, 3), of three boards before a wall, which of these, and which pixels are mixed of two."""
+    rng, (h, w) = np.random.default_rng(seed), (240, 320)
+    y, x = np.mgrid[:h, :w]
+    depths, truth = np.full((h, w), 2.0), np.zeros((h, w), int)
+    for number, (top, left) in enumerate(((30, 30), (90, 130), (60, 240)), start=1):
+        inside = (abs(y - top - 50) < 50) & (abs(x - left - 25) < 25)
+        depths[inside], truth[inside] = 1.0 + 0.2 * number, number
+    beside = np.zeros((h, w), bool)
+    beside[:, 1:] = depths[:, 1:] > depths[:, :-1] + 0.1
+    mixed = beside & (rng.random((h, w)) < fraction)
+    depths[mixed] -= rng.uniform(0.2, 0.8, mixed.sum()) * (depths - np.roll(depths, 1, axis=1))[mixed]
+    rays = np.stack(((x - w / 2) / 300.0, (y - h / 2) / 300.0, np.ones((h, w))), axis=-1)
+    return rays * (depths + 0.001 * rng.normal(size=(h, w)))[..., None], truth, mixed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pixels_that_mix_two_depths_are_outliers(seed):
+    points, truth, mixed = mixed_at_edges(seed)
+    result = pcgraph.segment(points)
+    assert np.mean(result.outliers[mixed]) > 0.9
+    assert np.mean(result.outliers[~mixed]) < 0.002
+    assert result.objects.max() + 1 == 4
+    assert weighted_overlap(result.labels, truth) > 0.99
+    again = pcgraph.update(result, points)
+    assert np.mean(again.outliers[mixed]) > 0.9
+
+
+@pytest.mark.parametrize("height", [0.1, 0.3, 1.5])
+def test_no_pixel_flies_on_a_floor_before_a_low_camera(height):
+    y, x = (np.mgrid[:240, :320] - np.array([119.5, 159.5]).reshape(2, 1, 1)) / 300.0
+    depths = np.where(y > 0.0, height / np.maximum(y, 1e-9), np.nan)
+    depths[depths > 200.0 * height] = np.nan
+    image = np.stack((x, y, np.ones_like(x)), axis=-1) * depths[..., None]
+    for noise in (0.0, 1e-3):
+        noisy = image * (1.0 + noise * np.random.default_rng(0).normal(size=(240, 320, 1)))
+        cloud = clean_cloud(noisy, None, None)
+        assert not DepthImage.of(cloud, np.zeros(3)).flying(cloud).any()
 
 
 def test_zeros_in_an_image_are_holes(rooms):
