@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pcgraph.depth_image import DepthImage, image_view, is_camera
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
@@ -34,7 +35,6 @@ from pcgraph.inputs import (
     non_negative,
     positive,
 )
-from pcgraph.organised import DepthImage, image_viewpoint, is_camera
 from pcgraph.parallel import side_by_side
 from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint, warn_of_volume
 from pcgraph.segmentation import Segmentation
@@ -103,7 +103,7 @@ def segment(
         Where the sensor stood, for all points or for each (which is one for all, if no two are farther apart than a
         fiftieth of the range); estimated normals point to its side, and convexity depends on that. Default: of
         organised clouds the origin, if neighbours lie side by side as seen from there, as in their sensor's frame, or
-        the place of the camera that sees each point at its pixel (`pcgraph.organised`). Any other cloud whose spacing
+        the place of the camera that sees each point at its pixel (`pcgraph.depth_image`). Any other cloud whose spacing
         grows with range from one place (`pcgraph.voxels.spacing_law`) was seen from there; of all others, the outside
         is found from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
     features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
@@ -153,10 +153,10 @@ def segment(
     method = SurfaceGrowth() if method is None else method
     settings = Settings.of(method, RegionLinkage() if linkage is None else linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals, features)
-    place = _place(viewpoint, cloud, bool(camera))
+    place, axis = _view(viewpoint, cloud, bool(camera))
     compile_in_two_processes()
     camera = _is_camera(cloud, place, range_growth) if camera is None else camera
-    image = _depth_image(cloud, place, camera)
+    image = _depth_image(cloud, place, axis, camera)
     cloud = _without_flying(cloud, image)
     n_points = len(cloud.points)
     for _ in range(2):
@@ -243,13 +243,13 @@ def update(
     method = earlier.method if method is None else method
     settings = Settings.of(method, earlier.linkage if linkage is None else linkage, object_altitude)
     cloud = clean_cloud(points, colors, normals, features, earlier.feature_scaling)
-    place = _place(viewpoint, cloud, False)
+    place, axis = _view(viewpoint, cloud, False)
     compile_in_two_processes()
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     size, warp, grading = before.grid.size, before.grid.warp, before.grid.grading
-    image = _depth_image(cloud, place, _is_camera(cloud, place, None))
+    image = _depth_image(cloud, place, axis, _is_camera(cloud, place, None))
     cloud = _without_flying(cloud, image)
     seen = voxel_grid(cloud.points, cloud.colors, size, warp, cloud.features)
     cloud, seen, place = _without(outlier_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
@@ -330,11 +330,13 @@ def _is_camera(cloud: CleanCloud, place: NDArray[np.float64] | None, range_growt
     return place is not None and not range_growth and is_camera(cloud, place)
 
 
-def _depth_image(cloud: CleanCloud, place: NDArray[np.float64] | None, camera: bool) -> DepthImage | None:
-    """The image that a camera took, or None."""
-    if place is None or place.ndim != 1 or not camera or len(cloud.shape) != 2:
+def _depth_image(
+    cloud: CleanCloud, place: NDArray[np.float64] | None, axis: NDArray[np.float64] | None, camera: bool
+) -> DepthImage | None:
+    """The image that a camera took, along z or the axis that the points told; None if it was no camera."""
+    if place is None or place.ndim != 1 or len(cloud.shape) != 2 or not (camera or axis is not None):
         return None
-    return DepthImage.of(cloud, place)
+    return DepthImage.of(cloud, place, None if camera else axis)
 
 
 def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
@@ -343,12 +345,17 @@ def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
     return cloud.without(flying) if flying.any() else cloud
 
 
-def _place(viewpoint: ArrayLike | None, cloud: CleanCloud, camera: bool) -> NDArray[np.float64] | None:
+def _view(
+    viewpoint: ArrayLike | None, cloud: CleanCloud, camera: bool
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """From where a cloud was seen, (3,) or (n, 3): as given, of a camera's image the origin, else as organised points
-    tell; None if nothing does."""
+    tell; and the axis of the camera that they tell. None if nothing does."""
     if viewpoint is not None:
-        return clean_viewpoint(viewpoint, cloud)
-    return np.zeros(3) if camera and len(cloud.shape) == 2 else image_viewpoint(cloud)
+        return clean_viewpoint(viewpoint, cloud), None
+    if camera and len(cloud.shape) == 2:
+        return np.zeros(3), None
+    view = image_view(cloud)
+    return (None, None) if view is None else view
 
 
 def _refusal(argument: str, family: str, given: object) -> str:
@@ -464,19 +471,24 @@ def _scale(
     seed_size: float | None,
 ) -> tuple[float, SpacingLaw | None, Warp]:
     """The voxel size; how spacing depends on range, where that counts for place or scale; and how voxels grow."""
+
+    def spacing(warp: Warp, of_points: float | None) -> float:
+        of_points = median_spacing(cloud.points, warp) if of_points is None else of_points
+        return of_points if image is None else image.spacing(of_points, warp)
+
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
         law = spacing_law(cloud.points) if position is None else None
         warp = _warp(cloud, position, law, camera, growth)
-        spacing = partial(median_spacing, cloud.points) if image is None else partial(image.spacing, cloud)
-        return _voxel_size(voxel_size, seed_size, lambda: spacing(warp)), law, warp
+        return _voxel_size(voxel_size, seed_size, partial(spacing, warp, None)), law, warp
     (even, rows), of_all = side_by_side(
         partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position)
     )
     law = law_on_rings(cloud.points, of_all, rows, position)
     growth = RANGE_GROWTH if may_grow and law.holds else growth
-    return _voxel_size(voxel_size, seed_size, lambda: even), law, _warp(cloud, position, law, camera, growth)
+    warp = _warp(cloud, position, law, camera, growth)
+    return _voxel_size(voxel_size, seed_size, partial(spacing, warp, even)), law, warp
 
 
 def _warp(

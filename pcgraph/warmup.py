@@ -25,6 +25,7 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
+from pcgraph.depth_image import DepthImage
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph import contacts
@@ -34,7 +35,6 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import clean_cloud
-from pcgraph.organised import DepthImage
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage

@@ -58,6 +58,7 @@ STOREYS = [
     "hierarchy",
     "voxels",
     "inputs",
+    "depth_image",
     "features",
     "supervoxels",
     "graph",

@@ -9,10 +9,10 @@ from clouds import patch, same_partition, two_boxes_on_a_plane
 from test_guarantees import assert_covered_and_connected
 
 import pcgraph
+from pcgraph.depth_image import DepthImage, image_view
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
-from pcgraph.organised import DepthImage, image_viewpoint
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.warp import RangeWarp, choose_warp
 
@@ -154,10 +154,16 @@ def test_an_image_in_another_frame_was_seen_from_its_camera(rooms):
         assert weighted_overlap(result.labels, view.things) > 0.95
 
 
+def test_an_image_in_coordinates_of_a_map_was_not_seen_from_their_origin():
+    points, _ = image_of_a_hall(4.0)
+    on_map = points[..., [0, 2, 1]] * [1.0, 1.0, -1.0] + [5e5, 5e6, 100.0]  # the camera looks north
+    assert np.allclose(image_view(clean_cloud(on_map, None, None)).place, [5e5, 5e6, 100.0], atol=1e-3)
+
+
 def test_a_height_map_in_another_frame_was_seen_by_no_camera():
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, 80), np.linspace(-1.0, 1.0, 80))
     z = 0.3 * np.exp(-8.0 * (x**2 + y**2)) + np.where(np.hypot(x - 0.5, y) < 0.2, 0.4, 0.0)
-    assert image_viewpoint(clean_cloud(np.stack((x, y, z), axis=-1), None, None)) is None
+    assert image_view(clean_cloud(np.stack((x, y, z), axis=-1), None, None)) is None
 
 
 def test_a_turning_scanner_in_its_own_frame_sees_from_the_origin():
@@ -185,12 +191,14 @@ def test_steps_of_depth_are_read_off_an_image(noise):
     warp = choose_warp(cloud.points, np.zeros(3), True, 0.0)
     far = np.quantile(cloud.points[:, 2], 0.8)
     needed = 2.85e-3 * far * warp.reference_depth / 0.75 / 3.5
-    assert DepthImage.of(cloud, np.zeros(3)).spacing(cloud, warp) == pytest.approx(
+    assert DepthImage.of(cloud, np.zeros(3)).spacing(median_spacing(cloud.points, warp), warp) == pytest.approx(
         min(needed, 4.0 * median_spacing(cloud.points, warp)), rel=0.02
     )
     fine, _ = image_of_a_hall(4.0, 0.05 * noise)
     cloud = clean_cloud(fine, None, None)
-    assert DepthImage.of(cloud, np.zeros(3)).spacing(cloud, warp) == median_spacing(cloud.points, warp)
+    assert DepthImage.of(cloud, np.zeros(3)).spacing(median_spacing(cloud.points, warp), warp) == median_spacing(
+        cloud.points, warp
+    )
 
 
 @pytest.mark.parametrize("end", [3.0, 4.0, 5.0, 6.0])

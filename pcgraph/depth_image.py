@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the order of organised points tells: from where they were seen, and whether a camera took them."""
+"""Depth images: what the order of organised points tells of the camera that took them, and of its failures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pcgraph.inputs import CleanCloud
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
-from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing
+from pcgraph.voxels.spacing import VOXELS_PER_SPACING
 from pcgraph.voxels.warp import Warp
 
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
@@ -19,7 +19,7 @@ _SOME_PAIRS, _FEW_PAIRS = 2048, 64  # neighbours of which it is asked whether th
 _FAR_APART, _HARDLY_ANY = 2.5, 0.001  # or this many times as far apart as most; and how many of them may be
 _ON_PIXEL, _NEARLY_ALL = 1.0, 0.95  # pixels by which points may be off their own, and how many are not
 _DEGENERATE = 1e-4  # of the largest singular value: where the last but one is less, as of a plane, no camera is told
-_FAR_OFF = 100.0  # extents of the points: a camera so far off is none
+_FAR_OFF = 1000.0  # extents of the points: a place so far off is that of no sensor
 _SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps of depth are read; and how many have one,
 _ROUNDING = 1e-6  # of the largest inverse depth, and more
 _FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step is so many voxel edges, at most, if
@@ -29,15 +29,29 @@ _WIDEST, _FLATTER = 4, 0.3  # within so many pixels the slope, of inverse depth,
 _FEWEST_FLYING, _MOST_FLYING = 1e-4, 0.2  # if it is so many of all
 
 
-def image_viewpoint(cloud: CleanCloud) -> NDArray[np.float64] | None:
-    """From where an organised cloud was seen, (3,) float64, metres; None if it does not tell, or is a list of points.
+class ImageView(NamedTuple):
+    """From where an organised cloud was seen.
+
+    Attributes
+    ----------
+    place : (3,) float64, metres
+    axis : (3,) float64, or None
+        Of unit length, forwards, of the camera that took it; None if that may have been any other sensor.
+    """
+
+    place: NDArray[np.float64]
+    axis: NDArray[np.float64] | None
+
+
+def image_view(cloud: CleanCloud) -> ImageView | None:
+    """From where an organised cloud was seen; None if it does not tell, or is a list of points.
 
     The origin, if neighbours lie side by side as seen from there, as in the frame of their sensor; else the centre of
     the pinhole camera that sees each point at its pixel, whatever frame the points are in.
     """
     if len(cloud.shape) != 2:
         return None
-    return np.zeros(3) if _seen_from_origin(cloud) else _camera_centre(cloud)
+    return ImageView(np.zeros(3), None) if _seen_from_origin(cloud) else _camera(cloud)
 
 
 def _seen_from_origin(cloud: CleanCloud) -> bool:
@@ -46,19 +60,26 @@ def _seen_from_origin(cloud: CleanCloud) -> bool:
     Then the ways to them make much the same angle, also where one of them hides what lies behind it. From elsewhere
     those at such edges lie far apart.
     """
-    width = cloud.shape[1]
+    low, high = cloud.bounds
+    if float(np.abs(low + high).max()) / 2.0 > _FAR_OFF * float((high - low).max()) > 0.0:
+        return False
     some = np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PAIRS))
     far_apart = []
-    for step in (1, width):
-        beside = np.minimum(np.searchsorted(cloud.kept, cloud.kept[some] + step), len(cloud.kept) - 1)
-        pairs = cloud.kept[beside] == cloud.kept[some] + step
-        if step == 1:
-            pairs &= cloud.kept[some] % width < width - 1
-        one, other = (_directions(cloud.points[at[pairs]]) for at in (some, beside))
+    for step in (1, cloud.shape[1]):
+        one, other = (_directions(cloud.points[at]) for at in _pairs_beside(cloud, some, step))
         angles = np.linalg.norm(one - other, axis=1)
         if len(angles) >= _FEW_PAIRS:
             far_apart.append(float(np.mean(angles > _FAR_APART * np.median(angles))))
     return not far_apart or min(far_apart) <= _HARDLY_ANY
+
+
+def _pairs_beside(cloud: CleanCloud, some: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Those of some points, ascending, that have a neighbour in their row (a step of 1) or column (of a row's width),
+    and these."""
+    sought, width = cloud.kept[some] + step, cloud.shape[1]
+    beside = np.minimum(np.searchsorted(cloud.kept, sought), len(cloud.kept) - 1)
+    pairs = (cloud.kept[beside] == sought) & ((step != 1) | (sought % width > 0))
+    return some[pairs], beside[pairs]
 
 
 def _directions(rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -67,13 +88,13 @@ def _directions(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
-def _camera_centre(cloud: CleanCloud) -> NDArray[np.float64] | None:
-    """The centre, (3,), of the camera that sees each point at its pixel; None if there is none, or all is one plane.
+def _camera(cloud: CleanCloud) -> ImageView | None:
+    """The camera that sees each point at its pixel; None if there is none, or all is one plane.
 
     Notes
     -----
-    Resection by the direct linear transform (Hartley and Zisserman 2004, 7.1). Noise of a depth camera is along the
-    rays, so it does not move the pixels.
+    Resection by the direct linear transform (Hartley and Zisserman 2004, 7.1; centre and axis 6.2). Noise of a depth
+    camera is along the rays, so it does not move the pixels.
     """
     some = np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PIXELS)
     low, high = cloud.bounds
@@ -96,7 +117,8 @@ def _camera_centre(cloud: CleanCloud) -> NDArray[np.float64] | None:
     centre = np.linalg.svd(camera)[2][-1]
     if not np.linalg.norm(centre[:3]) <= _FAR_OFF * abs(centre[3]):
         return None
-    return (low + high) / 2.0 + scale * centre[:3] / centre[3]
+    forwards = camera[2, :3] * np.sign(depth[0])
+    return ImageView((low + high) / 2.0 + scale * centre[:3] / centre[3], forwards / np.linalg.norm(forwards))
 
 
 def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
@@ -122,42 +144,46 @@ class DepthImage(NamedTuple):
 
     Attributes
     ----------
-    camera : (3,) float64, metres
-        Its place.
+    place : (3,) float64, metres
+        Of the camera.
+    axis : (3,) float64
+        Of unit length, forwards.
     depths : (h, w) float64, metres
-        From there along the optical axis, z; NaN where nothing was seen.
+        From there along the axis; NaN where nothing was seen.
     step : float, 1/metres
         By which inverse depth is noisy, or goes in steps; 0 where it is so fine that it does not show.
     """
 
-    camera: NDArray[np.float64]
+    place: NDArray[np.float64]
+    axis: NDArray[np.float64]
     depths: NDArray[np.float64]
     step: float
 
     @classmethod
-    def of(cls, cloud: CleanCloud, camera: NDArray[np.float64]) -> DepthImage:
-        """The image of organised points, given the camera's place, (3,)."""
+    def of(cls, cloud: CleanCloud, place: NDArray[np.float64], axis: NDArray[np.float64] | None = None) -> DepthImage:
+        """The image of organised points, given the camera's place and its axis, z by default."""
+        axis = np.array([0.0, 0.0, 1.0]) if axis is None else axis
         depths = np.full(cloud.shape, np.nan)
-        depths.reshape(-1)[cloud.kept] = cloud.points[:, 2] - camera[2]
+        depths.reshape(-1)[cloud.kept] = np.einsum("ij,j->i", cloud.points, axis) - place @ axis
+        depths[~(depths > 0.0)] = np.nan  # of a camera that was told and is none
         along = (_step_along(1.0 / image[:: max(1, image.size // _SOME_TRIPLES)]) for image in (depths, depths.T))
-        return cls(camera, depths, min(filter(None, along), default=0.0))
+        return cls(place, axis, depths, min(filter(None, along), default=0.0))
 
-    def spacing(self, cloud: CleanCloud, warp: Warp) -> float:
-        """How far apart points are that the camera tells from each other, metres, in the space of its warp.
+    def spacing(self, of_points: float, warp: Warp) -> float:
+        """How far apart points are that the camera tells from each other, metres, in the space of a warp.
 
-        It is the median distance to the nearest; more, up to four times that, where depth is coarser than the voxels
-        that this makes, at the depth of what is far.
+        It is the distance to the nearest, of most points; more, up to four times that, where depth is coarser than the
+        voxels that this makes, at the depth of what is far.
 
         Notes
         -----
         Depth by triangulation comes in steps of inverse depth, so of z^2 in depth (Khoshelham and Elberink 2012),
         while pixels are z apart: from some depth on a surface is a stack of sheets that touch no other.
         """
-        spacing = median_spacing(cloud.points, warp)
-        far = np.quantile(cloud.points[:: max(1, len(cloud.points) // _SOME_TRIPLES), 2], _FAR)
-        depth = far - self.camera[2]
-        coarse = self.step * depth * depth / float(warp.scale(np.array([[0.0, 0.0, far]]))[0])
-        return max(spacing, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * spacing))
+        some = self.depths[:: max(1, self.depths.size // _SOME_TRIPLES)]
+        depth = float(np.nanquantile(some, _FAR)) if np.isfinite(some).any() else 0.0
+        coarse = self.step * depth * depth / float(warp.scale((self.place + depth * self.axis)[None])[0])
+        return max(of_points, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * of_points))
 
     def flying(self, cloud: CleanCloud) -> NDArray[np.bool_]:
         """Which of the n points fly, (n,) bool: they lie between a surface and what it hides, on neither.
@@ -168,10 +194,17 @@ class DepthImage(NamedTuple):
         than one in ten thousand, none does.
         """
         flying = np.empty(cloud.shape, np.bool_)
-        least = _STEEP * _angle_between_pixels(cloud, self.depths)
+        least = _STEEP * self._between_pixels(cloud)
         in_blocks(_find_flying, len(flying), self.depths, least, _CLEARLY * self.step, flying, smallest=MIN_ROWS)
         found = flying.reshape(-1)[cloud.kept]
         return found if _FEWEST_FLYING <= np.mean(found) <= _MOST_FLYING else np.zeros_like(found)
+
+    def _between_pixels(self, cloud: CleanCloud) -> float:
+        """Median distance of neighbours in a row, at a depth of 1; 0 if there are none."""
+        some = np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PAIRS))
+        one, other = _pairs_beside(cloud, some, 1)
+        ways = [(cloud.points[at] - self.place) / self.depths.reshape(-1)[cloud.kept[at], None] for at in (one, other)]
+        return float(np.median(np.linalg.norm(ways[1] - ways[0], axis=1))) if len(one) else 0.0
 
 
 def _step_along(rows: NDArray[np.float64]) -> float:
@@ -186,16 +219,6 @@ def _step_along(rows: NDArray[np.float64]) -> float:
         return 0.0
     differing = differences[differences > _ROUNDING * np.nanmax(rows)]
     return float(np.median(differing)) if len(differing) > _DIFFERING * len(differences) else 0.0
-
-
-def _angle_between_pixels(cloud: CleanCloud, depths: NDArray[np.float64]) -> float:
-    """Median distance between neighbours in a row, across the optical axis, over their depth; 0 if there are none."""
-    some = np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PAIRS))
-    beside = np.minimum(some + 1, len(cloud.kept) - 1)
-    pairs = (cloud.kept[beside] == cloud.kept[some] + 1) & (cloud.kept[some] % cloud.shape[1] < cloud.shape[1] - 1)
-    one, other = (cloud.points[at[pairs], :2] for at in (some, beside))
-    at, to = (depths.reshape(-1)[cloud.kept[at[pairs]]] for at in (some, beside))
-    return float(np.median(np.linalg.norm(other - one, axis=1) / np.sqrt(at * to))) if pairs.any() else 0.0
 
 
 @kernel
