@@ -20,6 +20,7 @@ _FAR_APART, _HARDLY_ANY = 2.5, 0.001  # or this many times as far apart as most;
 _ON_PIXEL, _NEARLY_ALL = 1.0, 0.95  # pixels by which points may be off their own, and how many are not
 _DEGENERATE = 1e-4  # of the largest singular value: where the last but one is less, as of a plane, no camera is told
 _FAR_OFF = 1000.0  # extents of the points: a place so far off is that of no sensor
+_SAME_PLACE = 0.02  # extents: a place that was given is the camera's
 _SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps of depth are read; and how many have one,
 _ROUNDING = 1e-6  # of the largest inverse depth, and more
 _FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step is so many voxel edges, at most, if
@@ -52,6 +53,14 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
     if len(cloud.shape) != 2:
         return None
     return ImageView(np.zeros(3), None) if _seen_from_origin(cloud) else _camera(cloud)
+
+
+def axis_at(place: NDArray[np.float64], cloud: CleanCloud) -> NDArray[np.float64] | None:
+    """The axis of the camera that took an organised cloud, if that stood at a place that was given, (3,); else None."""
+    view = image_view(cloud)
+    if view is None or np.abs(view.place - place).max() > _SAME_PLACE * float(np.ptp(cloud.bounds, axis=0).max()):
+        return None
+    return view.axis
 
 
 def _seen_from_origin(cloud: CleanCloud) -> bool:
@@ -166,7 +175,8 @@ class DepthImage(NamedTuple):
         depths = np.full(cloud.shape, np.nan)
         depths.reshape(-1)[cloud.kept] = np.einsum("ij,j->i", cloud.points, axis) - place @ axis
         depths[~(depths > 0.0)] = np.nan  # of a camera that was told and is none
-        along = (_step_along(1.0 / image[:: max(1, image.size // _SOME_TRIPLES)]) for image in (depths, depths.T))
+        with np.errstate(over="ignore"):  # of the tiniest depths
+            along = [_step_along(1.0 / image[:: max(1, image.size // _SOME_TRIPLES)]) for image in (depths, depths.T)]
         return cls(place, axis, depths, min(filter(None, along), default=0.0))
 
     def spacing(self, of_points: float, warp: Warp) -> float:

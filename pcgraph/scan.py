@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.depth_image import DepthImage, image_view, is_camera
+from pcgraph.depth_image import DepthImage, axis_at, image_view, is_camera
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
@@ -350,10 +350,11 @@ def _view(
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """From where a cloud was seen, (3,) or (n, 3): as given, of a camera's image the origin, else as organised points
     tell; and the axis of the camera that they tell. None if nothing does."""
-    if viewpoint is not None:
-        return clean_viewpoint(viewpoint, cloud), None
-    if camera and len(cloud.shape) == 2:
+    if viewpoint is None and camera and len(cloud.shape) == 2:
         return np.zeros(3), None
+    if viewpoint is not None:
+        given = clean_viewpoint(viewpoint, cloud)
+        return given, axis_at(given, cloud) if given.ndim == 1 and not camera else None
     view = image_view(cloud)
     return (None, None) if view is None else view
 

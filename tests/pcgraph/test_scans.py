@@ -154,6 +154,14 @@ def test_an_image_in_another_frame_was_seen_from_its_camera(rooms):
         assert weighted_overlap(result.labels, view.things) > 0.95
 
 
+def test_an_image_whose_viewpoint_is_given_is_the_one_that_is_found():
+    points, walls = image_of_a_hall(5.0, 1.4e-3, 2.85e-3)
+    world = points[..., [0, 2, 1]] * [1.0, 1.0, -1.0] + [3.0, 2.0, 1.2]
+    found, given = pcgraph.segment(world), pcgraph.segment(world, viewpoint=[3.0, 2.0, 1.2])
+    assert given.voxel_size == pytest.approx(found.voxel_size, rel=1e-6)
+    assert weighted_overlap(given.labels, walls) > 0.9
+
+
 def test_an_image_in_coordinates_of_a_map_was_not_seen_from_their_origin():
     points, _ = image_of_a_hall(4.0)
     on_map = points[..., [0, 2, 1]] * [1.0, 1.0, -1.0] + [5e5, 5e6, 100.0]  # the camera looks north
