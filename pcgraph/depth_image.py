@@ -52,7 +52,11 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
     """
     if len(cloud.shape) != 2:
         return None
-    return ImageView(np.zeros(3), None) if _seen_from_origin(cloud) else _camera(cloud)
+    origin, far_apart = ImageView(np.zeros(3), None), _neighbours_far_apart(cloud)
+    if max(far_apart, default=0.0) <= _HARDLY_ANY:
+        return origin
+    camera = _camera(cloud)
+    return origin if camera is None and min(far_apart) <= _HARDLY_ANY else camera
 
 
 def axis_at(place: NDArray[np.float64], cloud: CleanCloud) -> NDArray[np.float64] | None:
@@ -63,15 +67,17 @@ def axis_at(place: NDArray[np.float64], cloud: CleanCloud) -> NDArray[np.float64
     return view.axis
 
 
-def _seen_from_origin(cloud: CleanCloud) -> bool:
-    """Whether neighbours in a row, or in a column, lie side by side as seen from the origin.
+def _neighbours_far_apart(cloud: CleanCloud) -> list[float]:
+    """Fraction of the neighbours in a row, and of those in a column, that do not lie side by side as seen from the
+    origin.
 
-    Then the ways to them make much the same angle, also where one of them hides what lies behind it. From elsewhere
-    those at such edges lie far apart.
+    Of what was seen from there the ways to them make much the same angle, also where one of them hides what lies behind
+    it; but for columns of a scanner whose beams are not evenly spread. From elsewhere those at such edges lie far
+    apart.
     """
     low, high = cloud.bounds
     if float(np.abs(low + high).max()) / 2.0 > _FAR_OFF * float((high - low).max()) > 0.0:
-        return False
+        return [1.0, 1.0]
     some = np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PAIRS))
     far_apart = []
     for step in (1, cloud.shape[1]):
@@ -79,7 +85,7 @@ def _seen_from_origin(cloud: CleanCloud) -> bool:
         angles = np.linalg.norm(one - other, axis=1)
         if len(angles) >= _FEW_PAIRS:
             far_apart.append(float(np.mean(angles > _FAR_APART * np.median(angles))))
-    return not far_apart or min(far_apart) <= _HARDLY_ANY
+    return far_apart
 
 
 def _pairs_beside(cloud: CleanCloud, some: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -126,8 +132,10 @@ def _camera(cloud: CleanCloud) -> ImageView | None:
     centre = np.linalg.svd(camera)[2][-1]
     if not np.linalg.norm(centre[:3]) <= _FAR_OFF * abs(centre[3]):
         return None
+    place = (low + high) / 2.0 + scale * centre[:3] / centre[3]
     forwards = camera[2, :3] * np.sign(depth[0])
-    return ImageView((low + high) / 2.0 + scale * centre[:3] / centre[3], forwards / np.linalg.norm(forwards))
+    forwards /= np.linalg.norm(forwards)
+    return ImageView(place, forwards) if ((cloud.points - place) @ forwards > 0.0).all() else None
 
 
 def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:

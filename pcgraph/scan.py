@@ -94,8 +94,8 @@ def segment(
         are given (not a viewpoint of zeros, which PCD files hold where none is known).
         NaN and infinite points are left out and labelled -1, and so are those of organised clouds (h, w, 3) that are
         exactly (0, 0, 0), if there are several, as cameras' drivers write holes; outliers, no denser around than noise
-        would be, -2 (`pcgraph.voxels.outliers.outlier_voxels`). Organised points are taken for a camera's image in the
-        camera's frame (z forward) if they look like one, unless `viewpoint` or `camera` say otherwise.
+        would be, -2 (`pcgraph.voxels.outliers.outlier_voxels`). Organised points are taken for a camera's image, in
+        whatever frame, if they look like one, unless `camera` says otherwise.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
         Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.
@@ -117,9 +117,10 @@ def segment(
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
         least, where that would leave fewer than some 800 supervoxels, or 3200 on smooth surfaces.
     camera : bool, optional
-        Whether voxels grow in proportion to depth z from the viewpoint, being `voxel_size` at the median
-        depth, as a camera's pixels do. Default: organised clouds that lie in front of the one viewpoint, with x/z
-        and y/z in the order of columns and rows, unless voxels grow with range.
+        Whether voxels grow in proportion to depth from the viewpoint, being `voxel_size` at the median depth, as a
+        camera's pixels do. Default: organised clouds that a camera took, unless voxels grow with range: those in front
+        of the one viewpoint, with x/z and y/z in the order of columns and rows, and those of which the order of pixels
+        tells place and axis of a camera. Otherwise, and of lists, the camera looks along +z.
     range_growth : float, 0..1, without 1
         Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
         scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece. Default:
@@ -155,7 +156,7 @@ def segment(
     cloud = clean_cloud(points, colors, normals, features)
     place, axis = _view(viewpoint, cloud, bool(camera))
     compile_in_two_processes()
-    camera = _is_camera(cloud, place, range_growth) if camera is None else camera
+    camera = _is_camera(cloud, place, axis, range_growth) if camera is None else camera
     image = _depth_image(cloud, place, axis, camera)
     cloud = _without_flying(cloud, image)
     n_points = len(cloud.points)
@@ -249,7 +250,7 @@ def update(
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     size, warp, grading = before.grid.size, before.grid.warp, before.grid.grading
-    image = _depth_image(cloud, place, axis, _is_camera(cloud, place, None))
+    image = _depth_image(cloud, place, axis, _is_camera(cloud, place, axis, None))
     cloud = _without_flying(cloud, image)
     seen = voxel_grid(cloud.points, cloud.colors, size, warp, cloud.features)
     cloud, seen, place = _without(outlier_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
@@ -325,9 +326,14 @@ class Settings:
         return cls(method, linkage, non_negative("object_altitude", altitude))
 
 
-def _is_camera(cloud: CleanCloud, place: NDArray[np.float64] | None, range_growth: float | None) -> bool:
-    """Whether a camera at the place took a cloud, unless voxels are to grow with range."""
-    return place is not None and not range_growth and is_camera(cloud, place)
+def _is_camera(
+    cloud: CleanCloud,
+    place: NDArray[np.float64] | None,
+    axis: NDArray[np.float64] | None,
+    range_growth: float | None,
+) -> bool:
+    """Whether a camera at the place took a cloud, along an axis that its points told or z; not if range is to count."""
+    return place is not None and not range_growth and (axis is not None or is_camera(cloud, place))
 
 
 def _depth_image(
@@ -336,7 +342,7 @@ def _depth_image(
     """The image that a camera took, along z or the axis that the points told; None if it was no camera."""
     if place is None or place.ndim != 1 or len(cloud.shape) != 2 or not (camera or axis is not None):
         return None
-    return DepthImage.of(cloud, place, None if camera else axis)
+    return DepthImage.of(cloud, place, axis)
 
 
 def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
@@ -481,26 +487,31 @@ def _scale(
     may_grow = range_growth is None and not camera
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
         law = spacing_law(cloud.points) if position is None else None
-        warp = _warp(cloud, position, law, camera, growth)
+        warp = _warp(cloud, position, law, image, camera, growth)
         return _voxel_size(voxel_size, seed_size, partial(spacing, warp, None)), law, warp
     (even, rows), of_all = side_by_side(
         partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position)
     )
     law = law_on_rings(cloud.points, of_all, rows, position)
     growth = RANGE_GROWTH if may_grow and law.holds else growth
-    warp = _warp(cloud, position, law, camera, growth)
+    warp = _warp(cloud, position, law, image, camera, growth)
     return _voxel_size(voxel_size, seed_size, partial(spacing, warp, even)), law, warp
 
 
 def _warp(
-    cloud: CleanCloud, position: NDArray[np.float64] | None, law: SpacingLaw | None, camera: bool, growth: float
+    cloud: CleanCloud,
+    position: NDArray[np.float64] | None,
+    law: SpacingLaw | None,
+    image: DepthImage | None,
+    camera: bool,
+    growth: float,
 ) -> Warp:
     """How voxels grow, about the place from which the cloud was seen, which a law may tell, or else the origin."""
     if not (camera or growth):
         return Warp()
     if position is None:
         position = law.viewpoint if law is not None and law.holds else np.zeros(3)
-    return choose_warp(cloud.points, position, camera, growth)
+    return choose_warp(cloud.points, position, camera, growth, None if image is None else image.axis)
 
 
 def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:

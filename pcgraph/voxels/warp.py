@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -17,19 +17,23 @@ _MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are 
 
 
 class Slant(NamedTuple):
-    """How normals lie in the warped space: a plane's n becomes m = n + ray (n . r) r + depth (n_x x + n_y y) e_z.
+    """How normals lie in the warped space: a plane's n becomes m = n + ray (n . r) r + depth (n . w) a.
 
-    x, y are the warped place, r its direction, e_z the z axis. Then a step dX in the warped space leaves the plane by
-    m . dX, in metres of the warped space: scale(p) m = J^-T n, J being the derivative of `Warp.forward` at p.
+    r is the direction of the warped place, w what of it lies across the axis a. Then a step dX in the warped space
+    leaves the plane by m . dX, in metres of the warped space: scale(p) m = J^-T n, J being the derivative of
+    `Warp.forward` at p.
 
     Attributes
     ----------
     ray : float
     depth : float, 1 / metres
+    axis : three floats
+        Of unit length.
     """
 
     ray: float = 0.0
     depth: float = 0.0
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -79,14 +83,17 @@ class Warp:
 class CameraWarp(Warp):
     """Voxels that grow in proportion to depth, as a camera's pixels do on what it sees.
 
-    With p = point - viewpoint and the reference depth z0, the warped position is z0 (x/z, y/z, ln(z/z0)).
+    With p = point - viewpoint, z = p . a along the axis a and the reference depth z0, the warped position is
+    z0 ((p - z a)/z + ln(z/z0) a); of one that looks along z: z0 (x/z, y/z, ln(z/z0)).
 
     Attributes
     ----------
     viewpoint : (3,) float64, metres
-        Centre of projection; the optical axis is the z axis.
+        Centre of projection.
     reference_depth : float, metres
         Depth at which the warp keeps lengths.
+    axis : (3,) float64
+        Optical axis, forwards, of unit length.
 
     Notes
     -----
@@ -95,30 +102,33 @@ class CameraWarp(Warp):
 
     viewpoint: NDArray[np.float64]
     reference_depth: float
+    axis: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     def check(self, points: NDArray[np.float64]) -> None:
         """ValueError if a point does not lie in front of the camera."""
-        if points[:, 2].min() <= self.viewpoint[2]:
+        least, place = float(_along(points, self.axis).min()), float(self.viewpoint @ self.axis)
+        if least <= place:
             raise ValueError(
-                f"expected all points in front of the camera (z > {self.viewpoint[2]:g} m), as voxels grow with depth, "
-                f"got z down to {points[:, 2].min():g} m; segment (the first scan, for update) with camera=False"
+                f"expected all points in front of the camera (z > {place:g} m), as voxels grow with depth, "
+                f"got z down to {least:g} m; segment (the first scan, for update) with camera=False"
             )
 
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64; points must lie in front of the viewpoint."""
         warped = np.empty((len(points), 3))
-        in_blocks(_project, len(points), points, self.viewpoint, self.reference_depth, warped)
+        in_blocks(_project, len(points), points, self.viewpoint, self.axis, self.reference_depth, warped)
         return warped
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of warped positions."""
-        depth = self.reference_depth * np.exp(warped[:, 2] / self.reference_depth)
-        lateral = warped[:, :2] * (depth / self.reference_depth)[:, None]
-        return np.column_stack((lateral, depth)) + self.viewpoint
+        along = _along(warped, self.axis)
+        depth = self.reference_depth * np.exp(along / self.reference_depth)
+        lateral = (warped - along[:, None] * self.axis) * (depth / self.reference_depth)[:, None]
+        return lateral + depth[:, None] * self.axis + self.viewpoint
 
     def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth over reference depth, (n,) float64."""
-        return (points[:, 2] - self.viewpoint[2]) / self.reference_depth
+        return (_along(points, self.axis) - self.viewpoint @ self.axis) / self.reference_depth
 
     @property
     def seen_from(self) -> NDArray[np.float64]:
@@ -127,8 +137,9 @@ class CameraWarp(Warp):
 
     @property
     def slant(self) -> Slant:
-        """A step along z moves along the ray of the pixel."""
-        return Slant(depth=1.0 / self.reference_depth)
+        """A step along the axis moves along the ray of the pixel."""
+        x, y, z = self.axis.tolist()
+        return Slant(depth=1.0 / self.reference_depth, axis=(x, y, z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +203,11 @@ def _median(values: NDArray[np.float64]) -> float:
     return float(near[at] if n % 2 else near[at - 1 : at + 1].mean())
 
 
+def _along(points: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coordinates of points, (n, 3), along an axis, (n,)."""
+    return np.einsum("ij,j->i", points, axis)
+
+
 def _ranges(points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
     """Ranges of points from a viewpoint, (n,) float64, metres; at least `_MIN_LENGTH`."""
     ranges = np.empty(len(points))
@@ -215,7 +231,10 @@ def warped_normal(
         square = max(x * x + y * y + z * z, _MIN_LENGTH)
         along = slant.ray * (a * x + b * y + c * z) / square
         return a + along * x, b + along * y, c + along * z
-    return a, b, c + slant.depth * (a * x + b * y)
+    u, v, w = slant.axis
+    along = x * u + y * v + z * w
+    turn = slant.depth * (a * (x - along * u) + b * (y - along * v) + c * (z - along * w))
+    return a + turn * u, b + turn * v, c + turn * w
 
 
 @kernel
@@ -250,20 +269,27 @@ def _project(
     stop: int,
     points: NDArray[np.float64],
     viewpoint: NDArray[np.float64],
+    axis: NDArray[np.float64],
     reference_depth: float,
     warped: NDArray[np.float64],
 ) -> None:
     """Set places of points as a camera sees them, in metres at the reference depth."""
     for p in range(start, stop):
-        depth = points[p, 2] - viewpoint[2]
+        x, y, z = points[p, 0] - viewpoint[0], points[p, 1] - viewpoint[1], points[p, 2] - viewpoint[2]
+        depth = x * axis[0] + y * axis[1] + z * axis[2]
         scale = reference_depth / depth
-        warped[p, 0] = (points[p, 0] - viewpoint[0]) * scale
-        warped[p, 1] = (points[p, 1] - viewpoint[1]) * scale
-        warped[p, 2] = -np.log(scale) * reference_depth
+        along = -np.log(scale) * reference_depth
+        warped[p, 0] = (x - depth * axis[0]) * scale + along * axis[0]
+        warped[p, 1] = (y - depth * axis[1]) * scale + along * axis[1]
+        warped[p, 2] = (z - depth * axis[2]) * scale + along * axis[2]
 
 
 def choose_warp(
-    points: NDArray[np.float64], viewpoint: NDArray[np.float64], camera: bool, range_growth: float = 0.0
+    points: NDArray[np.float64],
+    viewpoint: NDArray[np.float64],
+    camera: bool,
+    range_growth: float = 0.0,
+    axis: NDArray[np.float64] | None = None,
 ) -> Warp:
     """Camera warp about the median depth, range warp about the median range, or the identity.
 
@@ -273,9 +299,11 @@ def choose_warp(
         Finite, n >= 1.
     viewpoint : (3,) float64, metres
     camera : bool
-        Whether a camera at the viewpoint that looks along +z took the points.
+        Whether a camera at the viewpoint took the points.
     range_growth : float, 0..1, without 1
         Power of the range with which voxels grow; 0 for voxels of one size.
+    axis : (3,) float64, optional
+        Along which the camera looks, of unit length. Default: +z.
 
     Raises
     ------
@@ -293,6 +321,7 @@ def choose_warp(
         return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
     if not camera:
         return Warp()
-    warp = CameraWarp(viewpoint, _median(points[:, 2]) - float(viewpoint[2]))
+    axis = np.array([0.0, 0.0, 1.0]) if axis is None else axis
+    warp = CameraWarp(viewpoint, _median(_along(points, axis)) - float(viewpoint @ axis), axis)
     warp.check(points)
     return warp

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from clouds import patch, same_partition, two_boxes_on_a_plane
+from scipy.spatial.transform import Rotation
 from test_guarantees import assert_covered_and_connected
 
 import pcgraph
@@ -14,7 +15,7 @@ from pcgraph.features.moments import moments_of_groups
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
 from pcgraph.voxels.spacing import median_spacing
-from pcgraph.voxels.warp import RangeWarp, choose_warp
+from pcgraph.voxels.warp import CameraWarp, RangeWarp, choose_warp, warped_normal
 
 
 def plate():
@@ -150,6 +151,7 @@ def test_an_image_in_another_frame_was_seen_from_its_camera(rooms):
         result = pcgraph.segment((view.points @ turn.T + [300.0, -20.0, 1.5]).astype(np.float32), view.colors)
         assert np.allclose(result.viewpoint, [300.0, -20.0, 1.5], atol=1e-3)
         towards = np.einsum("ij,ij->i", result.surface.normals, result.viewpoint - result.surface.grid.centroids)
+        assert result.camera
         assert np.mean(towards < 0.0) < 0.001
         assert weighted_overlap(result.labels, view.things) > 0.95
 
@@ -166,6 +168,15 @@ def test_an_image_in_coordinates_of_a_map_was_not_seen_from_their_origin():
     points, _ = image_of_a_hall(4.0)
     on_map = points[..., [0, 2, 1]] * [1.0, 1.0, -1.0] + [5e5, 5e6, 100.0]  # the camera looks north
     assert np.allclose(image_view(clean_cloud(on_map, None, None)).place, [5e5, 5e6, 100.0], atol=1e-3)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_edges_along_one_axis_of_an_image_tell_that_it_was_moved(axis):
+    rays = np.stack((*np.meshgrid(np.arange(-40, 40) / 70.0, np.arange(-30, 30) / 70.0), np.ones((60, 80))), axis=-1)
+    points = rays * (2.0 + 0.3 * (rays[..., axis] > 0.0) + 0.01 * np.sin(9.0 * rays[..., 1 - axis]))[..., None]
+    assert (image_view(clean_cloud(points, None, None)).place == 0.0).all()
+    moved = image_view(clean_cloud(points + np.array([1.0, 2.0, 3.0]), None, None))
+    assert np.allclose(moved.place, [1.0, 2.0, 3.0], atol=1e-6)
 
 
 def test_a_height_map_in_another_frame_was_seen_by_no_camera():
@@ -316,6 +327,24 @@ def test_range_warp_is_its_own_inverse_and_scales_as_it_says(growth):
     across *= 1e-6 / np.linalg.norm(across, axis=1, keepdims=True)
     steps = np.linalg.norm(warp.forward(points + across) - warped, axis=1)
     assert 1e-6 / steps == pytest.approx(warp.scale(points), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cameras_warp_along_any_axis_is_that_along_z_turned(seed):
+    turn = Rotation.random(random_state=seed).as_matrix()
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((-1.0, -1.0, 2.0), (1.0, 1.0, 4.0), (200, 3))
+    place = np.array([5.0, -2.0, 1.0])
+    ahead, turned = CameraWarp(np.zeros(3), 3.0), CameraWarp(place, 3.0, turn @ [0.0, 0.0, 1.0])
+    there = points @ turn.T + place
+    assert turned.forward(there) == pytest.approx(ahead.forward(points) @ turn.T, abs=1e-12)
+    assert turned.backward(turned.forward(there)) == pytest.approx(there, abs=1e-12)
+    assert turned.scale(there) == pytest.approx(ahead.scale(points))
+    for x, n in zip(ahead.forward(points), rng.normal(size=(200, 3)), strict=True):
+        expected = turn @ warped_normal.py_func(ahead.slant, *x, *n)
+        assert warped_normal.py_func(turned.slant, *(turn @ x), *(turn @ n)) == pytest.approx(expected, abs=1e-12)
+    with pytest.raises(ValueError, match="in front of the camera"):
+        turned.check(2.0 * place - there)
 
 
 def scanned_ground(rings=20, n=1000):
