@@ -145,7 +145,7 @@ def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
     """
     if len(cloud.shape) != 2 or viewpoint.ndim != 1:
         return False
-    if not cloud.points[:, 2].min() > viewpoint[2]:
+    if not cloud.bounds[0][2] > viewpoint[2]:
         return False
     some = np.random.default_rng(0).integers(len(cloud.points), size=_SOME_PIXELS)
     rays = cloud.points[some] - viewpoint
@@ -181,11 +181,13 @@ class DepthImage(NamedTuple):
         """The image of organised points, given the camera's place and its axis, z by default."""
         axis = np.array([0.0, 0.0, 1.0]) if axis is None else axis
         depths = np.full(cloud.shape, np.nan)
-        depths.reshape(-1)[cloud.kept] = np.einsum("ij,j->i", cloud.points, axis) - place @ axis
-        depths[~(depths > 0.0)] = np.nan  # of a camera that was told and is none
+        along = np.einsum("ij,j->i", cloud.points, axis) - place @ axis
+        if along.min() <= 0.0:  # of a camera that was told and is none
+            along[along <= 0.0] = np.nan
+        depths.reshape(-1)[cloud.kept] = along
         with np.errstate(over="ignore"):  # of the tiniest depths
-            along = [_step_along(1.0 / image[:: max(1, image.size // _SOME_TRIPLES)]) for image in (depths, depths.T)]
-        return cls(place, axis, depths, min(filter(None, along), default=0.0))
+            steps = [_step_along(1.0 / image[:: max(1, image.size // _SOME_TRIPLES)]) for image in (depths, depths.T)]
+        return cls(place, axis, depths, min(filter(None, steps), default=0.0))
 
     def spacing(self, of_points: float, warp: Warp) -> float:
         """How far apart points are that the camera tells from each other, metres, in the space of a warp.
