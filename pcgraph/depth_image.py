@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.inputs import CleanCloud
+from pcgraph.inputs import CleanCloud, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING
-from pcgraph.voxels.warp import Warp
+from pcgraph.voxels.warp import FORWARDS, Warp, along_axis
 
 _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
 _SOME_PAIRS, _FEW_PAIRS = 2048, 64  # neighbours of which it is asked whether they are so from the origin,
@@ -78,10 +78,9 @@ def _neighbours_far_apart(cloud: CleanCloud) -> list[float]:
     low, high = cloud.bounds
     if float(np.abs(low + high).max()) / 2.0 > _FAR_OFF * float((high - low).max()) > 0.0:
         return [1.0, 1.0]
-    some = np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PAIRS))
-    far_apart = []
+    some, far_apart = _some_points(cloud, _SOME_PAIRS), []
     for step in (1, cloud.shape[1]):
-        one, other = (_directions(cloud.points[at]) for at in _pairs_beside(cloud, some, step))
+        one, other = (unit_rows(cloud.points[at]) for at in _pairs_beside(cloud, some, step))
         angles = np.linalg.norm(one - other, axis=1)
         if len(angles) >= _FEW_PAIRS:
             far_apart.append(float(np.mean(angles > _FAR_APART * np.median(angles))))
@@ -97,10 +96,9 @@ def _pairs_beside(cloud: CleanCloud, some: NDArray[np.int64], step: int) -> tupl
     return some[pairs], beside[pairs]
 
 
-def _directions(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows, (n, 3), of length 1; of zeros zeros."""
-    scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+def _some_points(cloud: CleanCloud, number: int) -> NDArray[np.int64]:
+    """Numbers of so many points, ascending, some perhaps twice; always the same."""
+    return np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=number))
 
 
 def _camera(cloud: CleanCloud) -> ImageView | None:
@@ -111,7 +109,7 @@ def _camera(cloud: CleanCloud) -> ImageView | None:
     Resection by the direct linear transform (Hartley and Zisserman 2004, 7.1; centre and axis 6.2). Noise of a depth
     camera is along the rays, so it does not move the pixels.
     """
-    some = np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PIXELS)
+    some = _some_points(cloud, _SOME_PIXELS)
     low, high = cloud.bounds
     scale = max(float((high - low).max()) / 2.0, np.finfo(np.float64).tiny)
     places = np.column_stack(((cloud.points[some] - (low + high) / 2.0) / scale, np.ones(len(some))))
@@ -135,7 +133,7 @@ def _camera(cloud: CleanCloud) -> ImageView | None:
     place = (low + high) / 2.0 + scale * centre[:3] / centre[3]
     forwards = camera[2, :3] * np.sign(depth[0])
     forwards /= np.linalg.norm(forwards)
-    return ImageView(place, forwards) if ((cloud.points - place) @ forwards > 0.0).all() else None
+    return ImageView(place, forwards) if (along_axis(cloud.points - place, forwards) > 0.0).all() else None
 
 
 def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
@@ -147,7 +145,7 @@ def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
         return False
     if not cloud.bounds[0][2] > viewpoint[2]:
         return False
-    some = np.random.default_rng(0).integers(len(cloud.points), size=_SOME_PIXELS)
+    some = _some_points(cloud, _SOME_PIXELS)
     rays = cloud.points[some] - viewpoint
     with np.errstate(over="ignore"):  # of points in the camera
         x, y = (rays[:, :2] / rays[:, 2:]).T
@@ -179,9 +177,9 @@ class DepthImage(NamedTuple):
     @classmethod
     def of(cls, cloud: CleanCloud, place: NDArray[np.float64], axis: NDArray[np.float64] | None = None) -> DepthImage:
         """The image of organised points, given the camera's place and its axis, z by default."""
-        axis = np.array([0.0, 0.0, 1.0]) if axis is None else axis
+        axis = np.array(FORWARDS) if axis is None else axis
         depths = np.full(cloud.shape, np.nan)
-        along = np.einsum("ij,j->i", cloud.points, axis) - place @ axis
+        along = along_axis(cloud.points, axis) - place @ axis
         if along.min() <= 0.0:  # of a camera that was told and is none
             along[along <= 0.0] = np.nan
         depths.reshape(-1)[cloud.kept] = along
@@ -221,8 +219,7 @@ class DepthImage(NamedTuple):
 
     def _between_pixels(self, cloud: CleanCloud) -> float:
         """Median distance of neighbours in a row, at a depth of 1; 0 if there are none."""
-        some = np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=_SOME_PAIRS))
-        one, other = _pairs_beside(cloud, some, 1)
+        one, other = _pairs_beside(cloud, _some_points(cloud, _SOME_PAIRS), 1)
         ways = [(cloud.points[at] - self.place) / self.depths.reshape(-1)[cloud.kept[at], None] for at in (one, other)]
         return float(np.median(np.linalg.norm(ways[1] - ways[0], axis=1))) if len(one) else 0.0
 

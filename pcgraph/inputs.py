@@ -328,8 +328,13 @@ def _normals(normals: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np
     with np.errstate(over="ignore", invalid="ignore"):  # long doubles, signalling NaN
         array = _same_shape("normals", normals, shape).take(kept, axis=0).astype(np.float64)
     array[~np.isfinite(array).all(axis=1)] = 0.0
-    array /= np.maximum(np.abs(array).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return array / np.maximum(np.linalg.norm(array, axis=1, keepdims=True), 1e-300)
+    return unit_rows(array)
+
+
+def unit_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows, (n, 3), of length 1, however tiny or large they are; of zeros zeros."""
+    scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
 def _features(features: ArrayLike, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -347,7 +347,9 @@ def _depth_image(
 
 def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
     """The cloud without points whose depth is a mix of two."""
-    flying = np.zeros(0, np.bool_) if image is None else image.flying(cloud)
+    if image is None:
+        return cloud
+    flying = image.flying(cloud)
     return cloud.without(flying) if flying.any() else cloud
 
 

@@ -14,6 +14,8 @@ from pcgraph.parallel import in_blocks, kernel, routine
 
 _SOME = 2048  # values
 _MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
+FORWARDS = (0.0, 0.0, 1.0)
+"""Where a camera looks in its own frame."""
 
 
 class Slant(NamedTuple):
@@ -33,7 +35,7 @@ class Slant(NamedTuple):
 
     ray: float = 0.0
     depth: float = 0.0
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    axis: tuple[float, float, float] = FORWARDS
 
 
 @dataclass(frozen=True)
@@ -102,11 +104,11 @@ class CameraWarp(Warp):
 
     viewpoint: NDArray[np.float64]
     reference_depth: float
-    axis: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    axis: NDArray[np.float64] = field(default_factory=lambda: np.array(FORWARDS))
 
     def check(self, points: NDArray[np.float64]) -> None:
         """ValueError if a point does not lie in front of the camera."""
-        least, place = float(_along(points, self.axis).min()), float(self.viewpoint @ self.axis)
+        least, place = float(along_axis(points, self.axis).min()), float(self.viewpoint @ self.axis)
         if least <= place:
             raise ValueError(
                 f"expected all points in front of the camera (z > {place:g} m), as voxels grow with depth, "
@@ -121,14 +123,14 @@ class CameraWarp(Warp):
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of warped positions."""
-        along = _along(warped, self.axis)
+        along = along_axis(warped, self.axis)
         depth = self.reference_depth * np.exp(along / self.reference_depth)
         lateral = (warped - along[:, None] * self.axis) * (depth / self.reference_depth)[:, None]
         return lateral + depth[:, None] * self.axis + self.viewpoint
 
     def scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Depth over reference depth, (n,) float64."""
-        return (_along(points, self.axis) - self.viewpoint @ self.axis) / self.reference_depth
+        return (along_axis(points, self.axis) - self.viewpoint @ self.axis) / self.reference_depth
 
     @property
     def seen_from(self) -> NDArray[np.float64]:
@@ -203,7 +205,7 @@ def _median(values: NDArray[np.float64]) -> float:
     return float(near[at] if n % 2 else near[at - 1 : at + 1].mean())
 
 
-def _along(points: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def along_axis(points: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coordinates of points, (n, 3), along an axis, (n,)."""
     return np.einsum("ij,j->i", points, axis)
 
@@ -321,7 +323,7 @@ def choose_warp(
         return RangeWarp(viewpoint, distance, range_growth) if distance > _MIN_LENGTH else Warp()
     if not camera:
         return Warp()
-    axis = np.array([0.0, 0.0, 1.0]) if axis is None else axis
-    warp = CameraWarp(viewpoint, _median(_along(points, axis)) - float(viewpoint @ axis), axis)
+    axis = np.array(FORWARDS) if axis is None else axis
+    warp = CameraWarp(viewpoint, _median(along_axis(points, axis)) - float(viewpoint @ axis), axis)
     warp.check(points)
     return warp
