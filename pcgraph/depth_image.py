@@ -88,7 +88,7 @@ def _neighbours_far_apart(cloud: CleanCloud) -> list[float]:
 
 
 def _pairs_beside(cloud: CleanCloud, some: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Those of some points, ascending, that have a neighbour in their row (a step of 1) or column (of a row's width),
+    """Those of some points that have a neighbour in their row (a step of 1) or column (of a row's width),
     and these."""
     sought, width = cloud.kept[some] + step, cloud.shape[1]
     beside = np.minimum(np.searchsorted(cloud.kept, sought), len(cloud.kept) - 1)
@@ -97,8 +97,8 @@ def _pairs_beside(cloud: CleanCloud, some: NDArray[np.int64], step: int) -> tupl
 
 
 def _some_points(cloud: CleanCloud, number: int) -> NDArray[np.int64]:
-    """Numbers of so many points, ascending, some perhaps twice; always the same."""
-    return np.sort(np.random.default_rng(0).integers(len(cloud.kept), size=number))
+    """Numbers of so many points, some perhaps twice; always the same."""
+    return np.random.default_rng(0).integers(len(cloud.kept), size=number)
 
 
 def _camera(cloud: CleanCloud) -> ImageView | None:
