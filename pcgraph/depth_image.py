@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pcgraph.inputs import CleanCloud, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
+from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING
 from pcgraph.voxels.warp import FORWARDS, Warp, along_axis
 
@@ -209,13 +210,14 @@ class DepthImage(NamedTuple):
         Their depth is a mix of both. It rises, or falls, from one neighbour to the other in a row or column, by twenty
         times as much as pixels are apart on each side, or on one side, if nothing is seen on the other; and some pixels
         on it does so no more, as it would on a plane seen edge-on. Where more than a fifth of all would fly, or fewer
-        than one in ten thousand, none does.
+        than one in ten thousand, none does; nor in clouds of fewer than 1000 points.
         """
         flying = np.empty(cloud.shape, np.bool_)
         least = _STEEP * self._between_pixels(cloud)
         in_blocks(_find_flying, len(flying), self.depths, least, _CLEARLY * self.step, flying, smallest=MIN_ROWS)
         found = flying.reshape(-1)[cloud.kept]
-        return found if _FEWEST_FLYING <= np.mean(found) <= _MOST_FLYING else np.zeros_like(found)
+        some_fly = len(found) >= MIN_POINTS and _FEWEST_FLYING <= np.mean(found) <= _MOST_FLYING
+        return found if some_fly else np.zeros_like(found)
 
     def _between_pixels(self, cloud: CleanCloud) -> float:
         """Median distance of neighbours in a row, at a depth of 1; 0 if there are none."""

@@ -16,8 +16,9 @@ from pcgraph.voxels.grid import MAX_GAP, MAX_NEIGHBOURS, Neighbourhood, VoxelGri
 
 OUTLIER = -2
 """Label of a point that belongs to nothing."""
+MIN_POINTS = 1000
+"""Of fewer points none is called an outlier."""
 
-_MIN_POINTS = 1000  # of fewer points none is called an outlier
 _SPARSE = 0.25  # of the median number of points around a point
 _FAINT = 0.12  # of the mean number of points in the voxels around
 _CHANCE = 1e-4  # with which noise alone is as dense as what is kept
@@ -53,7 +54,7 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     n_points = int(grid.counts.sum())
     around = np.empty(grid.n_voxels, np.int64)
     in_blocks(_count_around, grid.n_voxels, grid.neighbourhood, grid.counts, around)
-    if n_points < _MIN_POINTS:  # only now: the cloud that kernels are warmed up on is small
+    if n_points < MIN_POINTS:  # only now: the cloud that kernels are warmed up on is small
         return nothing
     points = np.cumsum(np.bincount(around, grid.counts))
     typical = float(np.searchsorted(points, (n_points + 1) // 2))  # median over the points
@@ -131,7 +132,7 @@ def detached_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
         has = degrees[few] > slot
         alone[has] &= is_few[grid.neighbours[grid.indptr[few[has]] + slot]]
     few = few[alone]
-    if not len(few) or int(grid.counts.sum()) < _MIN_POINTS:
+    if not len(few) or int(grid.counts.sum()) < MIN_POINTS:
         return detached
     near = voxels_within(grid, few, MAX_GAP, np.flatnonzero(boundary_voxels(grid)))
     of, to = [np.repeat(few, np.diff(near.indptr))], [near.neighbours]

@@ -256,6 +256,13 @@ def test_pixels_that_mix_two_depths_are_outliers(seed):
     assert np.mean(again.outliers[mixed]) > 0.9
 
 
+def test_no_pixel_of_a_tiny_image_flies():
+    points, _, mixed = mixed_at_edges(0)
+    rows, columns = np.nonzero(mixed)
+    near = points[rows[0] : rows[0] + 20, columns[0] - 20 : columns[0] + 20]
+    assert not pcgraph.segment(near).outliers.any()
+
+
 @pytest.mark.parametrize("height", [0.1, 0.3, 1.5])
 def test_no_pixel_flies_on_a_floor_before_a_low_camera(height):
     y, x = (np.mgrid[:240, :320] - np.array([119.5, 159.5]).reshape(2, 1, 1)) / 300.0
