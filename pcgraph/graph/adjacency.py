@@ -108,6 +108,8 @@ class Bridges(ShortRepr):
         The two supervoxels of both components whose means lie nearest to each other, i < j, in ascending order.
     widths : (b,) float64, voxel edges
         Distance between centroids of two of their voxels, each the other's nearest; a million at most.
+    voxel_edge : (b,) float64, metres
+        Mean edge length of the voxels of both.
     between_specks : (b,) bool
         Whether both ends are specks of at most four points that lie about as near to each other as to anything, as
         those of a surface do that was sampled too thinly for the voxels.
@@ -115,6 +117,7 @@ class Bridges(ShortRepr):
 
     edges: NDArray[np.int32]
     widths: NDArray[np.float64]
+    voxel_edge: NDArray[np.float64]
     between_specks: NDArray[np.bool_]
 
 
@@ -159,6 +162,17 @@ class AdjacencyGraph(ShortRepr):
     def n_nodes(self) -> int:
         """Number of supervoxels."""
         return len(self.node_features.size)
+
+    @property
+    def voxel_edge(self) -> float:
+        """Edge length of a voxel, metres: median over contacts, or where there are none over gaps, or over bridges.
+
+        1 where there are none of these, and the graph tells no length.
+        """
+        for beside in (self.edge_features, self.gaps and self.gaps.edge_features, self.bridges):
+            if beside is not None and len(beside.voxel_edge):
+                return float(np.median(beside.voxel_edge))
+        return 1.0
 
     @property
     def joined(self) -> NDArray[np.int32]:

@@ -45,7 +45,7 @@ def bridges(
     sizes = np.bincount(component, counts)
     specks = np.flatnonzero((sizes < counts.mean())[component])
     if not component.any() or not len(specks):
-        return Bridges(np.empty((0, 2), np.int32), np.empty(0), np.empty(0, np.bool_))
+        return Bridges(np.empty((0, 2), np.int32), np.empty(0), np.empty(0), np.empty(0, np.bool_))
     places = grid.warped / grid.size
     n_voxels = np.bincount(supervoxels, minlength=k)
     means = np.stack([np.bincount(supervoxels, x, k) / n_voxels for x in places.T], axis=1)
@@ -62,8 +62,9 @@ def bridges(
     larger = np.ones(k)
     np.maximum.at(larger, supervoxels[voxels], (grid.warped_edges / grid.size)[voxels])
     widths = np.minimum(_widths(edges, starts, places[voxels]) / larger[edges].max(axis=1), _WIDEST)
+    edge_lengths = np.bincount(supervoxels, grid.edge_lengths, k) / n_voxels
     of_few = (sizes <= _FEW)[component[edges]].all(axis=1)
-    return Bridges(edges, widths, of_few & _are_near(component[edges], widths))
+    return Bridges(edges, widths, edge_lengths[edges].mean(axis=1), of_few & _are_near(component[edges], widths))
 
 
 def _are_near(pairs: NDArray[np.int32], widths: NDArray[np.float64]) -> NDArray[np.bool_]:

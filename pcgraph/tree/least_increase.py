@@ -92,8 +92,7 @@ def regions_of(
     graph: AdjacencyGraph, leaves: Moments, position: float, normal: float, color: float, plane: float
 ) -> Regions:
     """Supervoxels as regions, in lengths of a voxel edge and masses of a mean supervoxel."""
-    near = graph.edge_features if len(graph.edges) or graph.gaps is None else graph.gaps.edge_features
-    unit = float(np.median(near.voxel_edge)) if len(near.voxel_edge) else 1.0
+    unit = graph.voxel_edge
     mean_count = leaves.counts.mean()
     centroids = leaves.centroids / unit
     columns: list[NDArray[np.float64]] = []

@@ -298,6 +298,17 @@ def test_a_power_of_two_as_unit_changes_ties_at_most(rng, n, shape, power, growt
         assert second.tree.altitudes == pytest.approx(first.tree.altitudes, rel=1e-9)
 
 
+@pytest.mark.parametrize("unit", [2.0**-10, 2.0, 2.0**10])
+def test_the_unit_of_points_that_nothing_but_bridges_joins_does_not_matter(unit):
+    points = np.array([[0.2, 0.02, 0.0], [0.52, 1.07, 0.0], [0.94, 0.43, 0.0], [1.01, 0.63, 0.25]])  # Hypothesis' own
+    first, second = (
+        pcgraph.segment(points * u, voxel_size=0.14 * u, viewpoint=np.array([1.7, 1.6, 1.1]) * u) for u in (1.0, unit)
+    )
+    assert len(first.graph.joined) == 0 and len(first.graph.bridges.edges) == 3
+    assert first.tree.altitudes.max() > 0.0
+    assert np.array_equal(first.tree.altitudes, second.tree.altitudes)
+
+
 @quick
 @given(rng=rngs, steps=st.tuples(*[st.integers(-(2**9), 2**9)] * 3))
 def test_a_shift_by_whole_cells_of_both_grids_changes_ties_at_most(rng, steps):
