@@ -42,7 +42,7 @@ class RegionLinkage(Linkage):
     -----
     Two regions A and B merge at
 
-        ((c + relief R + H + c0 + c1 ln(1 + l / l0)) s + max(c - c2, 0) max(s0 - s, 0) u)
+        ((c + relief R + H + c0 + c1 ln(1 + l / l0)) s + max(c - c2, 0) max(s0 - s, 0) u + k1 c (1 - s) D m / (m + m2))
             E / (E + e0) (l / (l + l0))^1/2 (1 + M / (r m))^1/4 m / (m + m0),    s = (w / (b + w))^3/4
 
     where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
@@ -57,10 +57,13 @@ class RegionLinkage(Linkage):
     counts half at least, s0, however long the line, so that a heap is told from the ground; but only as far as the
     surfaces beside it are smooth, so that the crown of a tree is not parted at its clefts: u is the mean over the
     contacts of 1 / (1 + (v / v1)^2), where v is the circular variance of the rougher supervoxel's normals, 1 less the
-    length of their mean. Contacts are touching voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at none
-    continuations behind what hides a surface (`pcgraph.graph.continuations.continuations`) and of planes that bound
-    the scene (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts,
-    bridges (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of
+    length of their mean. A valley along which colours change, as where a door or a curtain is before its wall, counts
+    however long it is: D, 0..1, is d^2 / (1 + d^2), d being the distance of the two mean colours, times `color`. Prints
+    and shadows, on one plane or over an edge, have no valley, and what has no colours has D = 0. Contacts are touching
+    voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at none continuations behind what hides a surface
+    (`pcgraph.graph.continuations.continuations`) and of planes that bound the scene
+    (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts, bridges
+    (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of
     objects, at their mean cost times m / (m + 1); but bridges between specks of a few points that lie about as near to
     each other as to anything count as contacts at 3 rad, so that a surface sampled too thinly for voxels is no dust.
 
@@ -151,6 +154,7 @@ class _Shape(NamedTuple):
     d1: float
     h0: float
     h1: float
+    k1: float
     objects: float  # altitude of objects, radians
 
 
@@ -175,6 +179,7 @@ _SHAPE = _Shape(
     d1=3.0,
     h0=0.3,
     h1=9.0,
+    k1=8.0,
     objects=RegionLinkage.default_object_altitude,
 )
 
@@ -334,6 +339,11 @@ def _altitude(
     evidence = (cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)) * shortness
     if cost > shape.c2 and shortness < shape.s0:
         evidence += (cost - shape.c2) * (shape.s0 - shortness) * sums[2, edge] / sums[1, edge]
+    contrast = 0.0
+    for channel in range(state.values.shape[1]):
+        gap = state.values[a, channel] - state.values[b, channel]
+        contrast += gap * gap
+    evidence += shape.k1 * cost * (1.0 - shortness) * contrast / (1.0 + contrast) * smaller / (smaller + shape.m2)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(math.sqrt(1.0 + larger / (shape.r * smaller))) * smaller / (smaller + shape.m0)
     return round(evidence * _STEPS) / _STEPS

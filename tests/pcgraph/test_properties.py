@@ -304,7 +304,8 @@ def test_the_unit_of_points_that_nothing_but_bridges_joins_does_not_matter(unit)
     first, second = (
         pcgraph.segment(points * u, voxel_size=0.14 * u, viewpoint=np.array([1.7, 1.6, 1.1]) * u) for u in (1.0, unit)
     )
-    assert len(first.graph.joined) == 0 and len(first.graph.bridges.edges) == 3
+    assert len(first.graph.joined) == 0
+    assert len(first.graph.bridges.edges) == 3
     assert first.tree.altitudes.max() > 0.0
     assert np.array_equal(first.tree.altitudes, second.tree.altitudes)
 

@@ -27,9 +27,10 @@ from pcgraph.tree.region_linkage import RegionLinkage, region_linkage
         (5, 60.0, 1000.0, 0.0, 1.2),
     ],
 )
-def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, uneven, cost, known, side):
+@pytest.mark.parametrize("color", [0.0, 2.0])
+def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, relief, uneven, cost, known, side, color):
     """With the smaller region before the larger one, or behind it, if that is known; and that one flat, or uneven; a
-    contact short or long for their size, and a valley flat or steep.
+    contact short or long for their size, a valley flat or steep, and colours that count or do not.
     """
     graph, leaves, _, _ = random_graph("random", 2, np.random.default_rng(0))
     grown = leaves.counts * np.array([1, times_as_large])
@@ -38,9 +39,11 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     leaves.scatters[grown.argmax()] += uneven * unit**2 * grown.max() * np.eye(3)
     nodes = replace(graph.node_features, normal=_normals_towards_the_smaller(leaves, side))
     graph = replace(graph, node_features=nodes, sides_known=known)
-    leaves = replace(leaves, normals=nodes.normal * [[1.0], [0.95]])
+    leaves = replace(
+        leaves, normals=nodes.normal * [[1.0], [0.95]], colors=np.array([[0.9, 0.2, 0.1], [0.5, 0.3, 0.3]])
+    )
     costs, weights = np.array([cost]), np.array([weight])
-    found = region_linkage(graph, leaves, graph.edges, costs, weights, relief=relief).altitudes[0]
+    found = region_linkage(graph, leaves, graph.edges, costs, weights, color, relief=relief).altitudes[0]
     mean = leaves.counts.mean()
 
     def residual(scatter):
@@ -51,6 +54,8 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     apart = leaves.centroids[0] - leaves.centroids[1]
     union = a + b + n[0] * n[1] / n.sum() * np.outer(apart, apart)
     increase, length = residual(union) - residual(a) - residual(b), weight / 2
+    square = color**2 * (0.4**2 + 0.1**2 + 0.2**2)
+    increase += n[0] * n[1] / n.sum() / mean * square
     least = 0.3 * n.min() / mean * (residual(leaves.scatters[n.argmax()]) / (n.max() / mean) - 2.0)
     assert (least > increase) == (uneven > 0.0)
     increase = max(increase, least)
@@ -63,7 +68,8 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
     shortness = (width / (length + width)) ** 0.75
     steep = max(cost - 0.45, 0.0) * max(0.5 - shortness, 0.0) * smooth
     assert cost < 1.0 or steep > 0.05
-    evidence = evidence * shortness + steep
+    of_colors = 8.0 * cost * (1.0 - shortness) * square / (1.0 + square) * n.min() / (n.min() + 10.0 * mean)
+    evidence = evidence * shortness + steep + of_colors
     weighed = increase / (increase + 1.0) * math.sqrt(scale / (scale + 0.1))
     weighed *= (1.0 + n.max() / (100.0 * n.min())) ** 0.25 * n.min() / (n.min() + 0.1 * mean)
     assert found == pytest.approx(evidence * weighed, rel=1e-5, abs=2e-6)
@@ -239,3 +245,30 @@ def test_colour_that_is_noise_changes_no_object():
     noise = np.random.default_rng(0).random((len(points), 3))
     result = pcgraph.segment(points, noise, viewpoint=viewpoint)
     assert pcgraph.metrics.segmentation_covering(result.labels, truth) > 0.99
+
+
+def _wedge(degrees, colors):
+    """Two strips that meet at 180 degrees less so many, along a line three times as long as they are wide: a valley."""
+    rng, n = np.random.default_rng(0), 30_000
+    x, y = rng.uniform(-1.0, 1.0, n), rng.uniform(0.0, 6.0, n)
+    points = np.stack((x, y, np.abs(x) * math.tan(math.radians(degrees) / 2.0)), axis=1) + rng.normal(0, 0.002, (n, 3))
+    right = x > 0.0
+    return points, np.clip(np.array(colors)[right.astype(int)] + rng.normal(0.0, 0.02, (n, 3)), 0.0, 1.0), right
+
+
+_WHITE, _BROWN = (0.8, 0.8, 0.8), (0.5, 0.3, 0.2)
+
+
+@pytest.mark.parametrize("degrees", [15, 25])
+def test_a_valley_along_which_colours_change_parts_objects_however_long(degrees):
+    points, colors, right = _wedge(degrees, (_WHITE, _BROWN))
+    labels = pcgraph.segment(points, colors, viewpoint=(0.0, 3.0, 8.0)).labels
+    assert pcgraph.metrics.segmentation_covering(labels, right.astype(int)) > 0.99
+
+
+@pytest.mark.parametrize(
+    ("degrees", "colors"), [(25, (_WHITE, _WHITE)), (-25, (_WHITE, _BROWN)), (0, (_WHITE, _BROWN))]
+)
+def test_without_a_valley_or_without_a_change_of_colour_one_thing_stays_one(degrees, colors):
+    points, colors, _ = _wedge(degrees, colors)
+    assert pcgraph.segment(points, colors, viewpoint=(0.0, 3.0, 8.0)).objects.max() == 0
