@@ -169,7 +169,8 @@ class AdjacencyGraph(ShortRepr):
 
         1 where there are none of these, and the graph tells no length.
         """
-        for beside in (self.edge_features, self.gaps and self.gaps.edge_features, self.bridges):
+        gaps = None if self.gaps is None else self.gaps.edge_features
+        for beside in (self.edge_features, gaps, self.bridges):
             if beside is not None and len(beside.voxel_edge):
                 return float(np.median(beside.voxel_edge))
         return 1.0
