@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.inputs import CleanCloud, unit_rows
+from pcgraph.inputs import CleanCloud, Pixels, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
 from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING
@@ -51,24 +51,31 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
     The origin, if neighbours lie side by side as seen from there, as in the frame of their sensor; else the centre of
     the pinhole camera that sees each point at its pixel, whatever frame the points are in.
     """
-    if len(cloud.shape) != 2:
+    if cloud.image is None:
         return None
-    origin, far_apart = ImageView(np.zeros(3), None), _neighbours_far_apart(cloud)
-    if max(far_apart, default=0.0) <= _HARDLY_ANY:
+    origin, far_apart = ImageView(np.zeros(3), None), _neighbours_far_apart(cloud, cloud.image)
+    told = max(far_apart, default=0.0) <= _HARDLY_ANY
+    if told and is_camera(cloud, origin.place):
         return origin
-    camera = _camera(cloud)
+    camera = _camera(cloud, cloud.image)
+    if told:
+        if camera is None or not _is_same_place(camera.place, origin.place, cloud):
+            return origin
+        return ImageView(origin.place, camera.axis)
     return origin if camera is None and min(far_apart) <= _HARDLY_ANY else camera
 
 
 def axis_at(place: NDArray[np.float64], cloud: CleanCloud) -> NDArray[np.float64] | None:
     """The axis of the camera that took an organised cloud, if that stood at a place that was given, (3,); else None."""
     view = image_view(cloud)
-    if view is None or np.abs(view.place - place).max() > _SAME_PLACE * float(np.ptp(cloud.bounds, axis=0).max()):
-        return None
-    return view.axis
+    return None if view is None or not _is_same_place(view.place, place, cloud) else view.axis
 
 
-def _neighbours_far_apart(cloud: CleanCloud) -> list[float]:
+def _is_same_place(one: NDArray[np.float64], other: NDArray[np.float64], cloud: CleanCloud) -> bool:
+    return bool(np.abs(one - other).max() <= _SAME_PLACE * float(np.ptp(cloud.bounds, axis=0).max()))
+
+
+def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
     """Fraction of the neighbours in a row, and of those in a column, that do not lie side by side as seen from the
     origin.
 
@@ -79,30 +86,30 @@ def _neighbours_far_apart(cloud: CleanCloud) -> list[float]:
     low, high = cloud.bounds
     if float(np.abs(low + high).max()) / 2.0 > _FAR_OFF * float((high - low).max()) > 0.0:
         return [1.0, 1.0]
-    some, far_apart = _some_points(cloud, _SOME_PAIRS), []
-    for step in (1, cloud.shape[1]):
-        one, other = (unit_rows(cloud.points[at]) for at in _pairs_beside(cloud, some, step))
+    some, far_apart = _some_of(len(cloud.points), _SOME_PAIRS), []
+    for step in (1, image.shape[1]):
+        one, other = (unit_rows(cloud.points[at]) for at in _pairs_beside(image, some, step))
         angles = np.linalg.norm(one - other, axis=1)
         if len(angles) >= _FEW_PAIRS:
             far_apart.append(float(np.mean(angles > _FAR_APART * np.median(angles))))
     return far_apart
 
 
-def _pairs_beside(cloud: CleanCloud, some: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pairs_beside(image: Pixels, some: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Those of some points that have a neighbour in their row (a step of 1) or column (of a row's width),
     and these."""
-    sought, width = cloud.kept[some] + step, cloud.shape[1]
-    beside = np.minimum(np.searchsorted(cloud.kept, sought), len(cloud.kept) - 1)
-    pairs = (cloud.kept[beside] == sought) & ((step != 1) | (sought % width > 0))
+    sought, width = image.at[some] + step, image.shape[1]
+    beside = np.minimum(np.searchsorted(image.at, sought), len(image.at) - 1)
+    pairs = (image.at[beside] == sought) & ((step != 1) | (sought % width > 0))
     return some[pairs], beside[pairs]
 
 
-def _some_points(cloud: CleanCloud, number: int) -> NDArray[np.int64]:
-    """Numbers of so many points, some perhaps twice; always the same."""
-    return np.random.default_rng(0).integers(len(cloud.kept), size=number)
+def _some_of(n: int, number: int) -> NDArray[np.int64]:
+    """Numbers of so many of n points, some perhaps twice; always the same."""
+    return np.random.default_rng(0).integers(n, size=number)
 
 
-def _camera(cloud: CleanCloud) -> ImageView | None:
+def _camera(cloud: CleanCloud, image: Pixels) -> ImageView | None:
     """The camera that sees each point at its pixel; None if there is none, or all is one plane.
 
     Notes
@@ -110,12 +117,12 @@ def _camera(cloud: CleanCloud) -> ImageView | None:
     Resection by the direct linear transform (Hartley and Zisserman 2004, 7.1; centre and axis 6.2). Noise of a depth
     camera is along the rays, so it does not move the pixels.
     """
-    some = _some_points(cloud, _SOME_PIXELS)
+    some = _some_of(len(cloud.points), _SOME_PIXELS)
     low, high = cloud.bounds
     scale = max(float((high - low).max()) / 2.0, np.finfo(np.float64).tiny)
     places = np.column_stack(((cloud.points[some] - (low + high) / 2.0) / scale, np.ones(len(some))))
-    half = max(cloud.shape) / 2.0
-    pixels = np.stack(np.divmod(cloud.kept[some], cloud.shape[1]), axis=1) / half - 1.0
+    half = max(image.shape) / 2.0
+    pixels = np.stack(np.divmod(image.at[some], image.shape[1]), axis=1) / half - 1.0
     none = np.zeros_like(places)
     rows = [np.hstack((*sides, -pixels[:, [i]] * places)) for i, sides in enumerate(((places, none), (none, places)))]
     values, vectors = np.linalg.svd(np.concatenate(rows), full_matrices=False)[1:]
@@ -142,15 +149,15 @@ def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
 
     Other organised clouds, as height maps and the rows of a turning scanner, may also lie in front of a place.
     """
-    if len(cloud.shape) != 2 or viewpoint.ndim != 1:
+    if cloud.image is None or viewpoint.ndim != 1:
         return False
     if not cloud.bounds[0][2] > viewpoint[2]:
         return False
-    some = _some_points(cloud, _SOME_PIXELS)
+    some = _some_of(len(cloud.points), _SOME_PIXELS)
     rays = cloud.points[some] - viewpoint
     with np.errstate(over="ignore"):  # of points in the camera
         x, y = (rays[:, :2] / rays[:, 2:]).T
-    row, column = np.divmod(cloud.kept[some], cloud.shape[1])
+    row, column = np.divmod(cloud.image.at[some], cloud.image.shape[1])
     orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second of an image on its side
     return any(all(_rank_correlation(a, b) >= _IN_ORDER for a, b in order) for order in orders)
 
@@ -164,6 +171,8 @@ class DepthImage(NamedTuple):
         Of the camera.
     axis : (3,) float64
         Of unit length, forwards.
+    pixels : Pixels
+        In which its n points are.
     depths : (h, w) float64, metres
         From there along the axis; NaN where nothing was seen.
     step : float, 1/metres
@@ -172,21 +181,24 @@ class DepthImage(NamedTuple):
 
     place: NDArray[np.float64]
     axis: NDArray[np.float64]
+    pixels: Pixels
     depths: NDArray[np.float64]
     step: float
 
     @classmethod
-    def of(cls, cloud: CleanCloud, place: NDArray[np.float64], axis: NDArray[np.float64] | None = None) -> DepthImage:
-        """The image of organised points, given the camera's place and its axis, z by default."""
+    def of(
+        cls, points: NDArray[np.float64], image: Pixels, place: NDArray[np.float64], axis: NDArray[np.float64] | None
+    ) -> DepthImage:
+        """The image whose pixels n points are, (n, 3), given the camera's place and its axis, None for z."""
         axis = np.array(FORWARDS) if axis is None else axis
-        depths = np.full(cloud.shape, np.nan)
-        along = along_axis(cloud.points, axis) - place @ axis
+        depths = np.full(image.shape, np.nan)
+        along = along_axis(points, axis) - place @ axis
         if along.min() <= 0.0:  # of a camera that was told and is none
             along[along <= 0.0] = np.nan
-        depths.reshape(-1)[cloud.kept] = along
+        depths.reshape(-1)[image.at] = along
         with np.errstate(over="ignore"):  # of the tiniest depths
-            steps = [_step_along(1.0 / image[:: max(1, image.size // _SOME_TRIPLES)]) for image in (depths, depths.T)]
-        return cls(place, axis, depths, min(filter(None, steps), default=0.0))
+            steps = [_step_along(1.0 / rows[:: max(1, rows.size // _SOME_TRIPLES)]) for rows in (depths, depths.T)]
+        return cls(place, axis, image, depths, min(filter(None, steps), default=0.0))
 
     def spacing(self, of_points: float, warp: Warp) -> float:
         """How far apart points are that the camera tells from each other, metres, in the space of a warp.
@@ -204,25 +216,26 @@ class DepthImage(NamedTuple):
         coarse = self.step * depth * depth / float(warp.scale((self.place + depth * self.axis)[None])[0])
         return max(of_points, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * of_points))
 
-    def flying(self, cloud: CleanCloud) -> NDArray[np.bool_]:
-        """Which of the n points fly, (n,) bool: they lie between a surface and what it hides, on neither.
+    def flying(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of its points fly, (n, 3), as (n,) bool: they lie between a surface and what it hides, on neither.
 
         Their depth is a mix of both. It rises, or falls, from one neighbour to the other in a row or column, by twenty
         times as much as pixels are apart on each side, or on one side, if nothing is seen on the other; and some pixels
         on it does so no more, as it would on a plane seen edge-on. Where more than a fifth of all would fly, or fewer
         than one in ten thousand, none does; nor in clouds of fewer than 1000 points.
         """
-        flying = np.empty(cloud.shape, np.bool_)
-        least = _STEEP * self._between_pixels(cloud)
+        flying = np.empty(self.depths.shape, np.bool_)
+        least = _STEEP * self._between_pixels(points)
         in_blocks(_find_flying, len(flying), self.depths, least, _CLEARLY * self.step, flying, smallest=MIN_ROWS)
-        found = flying.reshape(-1)[cloud.kept]
+        found = flying.reshape(-1)[self.pixels.at]
         some_fly = len(found) >= MIN_POINTS and _FEWEST_FLYING <= np.mean(found) <= _MOST_FLYING
         return found if some_fly else np.zeros_like(found)
 
-    def _between_pixels(self, cloud: CleanCloud) -> float:
+    def _between_pixels(self, points: NDArray[np.float64]) -> float:
         """Median distance of neighbours in a row, at a depth of 1; 0 if there are none."""
-        one, other = _pairs_beside(cloud, _some_points(cloud, _SOME_PAIRS), 1)
-        ways = [(cloud.points[at] - self.place) / self.depths.reshape(-1)[cloud.kept[at], None] for at in (one, other)]
+        one, other = _pairs_beside(self.pixels, _some_of(len(points), _SOME_PAIRS), 1)
+        depths = self.depths.reshape(-1)[self.pixels.at]
+        ways = [(points[at] - self.place) / depths[at, None] for at in (one, other)]
         return float(np.median(np.linalg.norm(ways[1] - ways[0], axis=1))) if len(one) else 0.0
 
 

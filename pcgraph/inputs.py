@@ -106,6 +106,21 @@ def _columns(cloud: Cloud, names: list[str]) -> NDArray[np.float64]:
     return np.concatenate(columns, axis=-1)
 
 
+class Pixels(NamedTuple):
+    """Which pixels n points are.
+
+    Attributes
+    ----------
+    shape : (h, w)
+        Rows and columns of their image.
+    at : (n,) int64
+        Flat indices of the pixels, ascending.
+    """
+
+    shape: tuple[int, int]
+    at: NDArray[np.int64]
+
+
 @dataclass(frozen=True, eq=False)
 class CleanCloud(ShortRepr):
     """The finite points of a cloud.
@@ -125,6 +140,8 @@ class CleanCloud(ShortRepr):
         Scaled.
     scaling : RobustScaling of d columns, or None
         By which they were.
+    image : Pixels, or None
+        Which pixels of an image the points are; None if they are a mere list.
     """
 
     points: NDArray[np.float64]
@@ -135,6 +152,7 @@ class CleanCloud(ShortRepr):
     outliers: NDArray[np.int64]
     features: NDArray[np.float32] | None = None
     scaling: RobustScaling | None = None
+    image: Pixels | None = None
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -143,7 +161,7 @@ class CleanCloud(ShortRepr):
 
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""
-        if len(labels) == math.prod(self.shape):
+        if len(labels) == math.prod(self.shape) and (len(self.shape) == 2 or self.image is None):
             return labels.astype(np.int32).reshape(self.shape)
         full = np.full(self.shape, -1, np.int32)
         full.reshape(-1)[self.kept] = labels
@@ -161,6 +179,19 @@ class CleanCloud(ShortRepr):
             kept=self.kept[left],
             outliers=np.sort(np.concatenate((self.outliers, self.kept[outliers]))),
             features=None if self.features is None else self.features.take(left, axis=0),
+            image=None if self.image is None else Pixels(self.image.shape, self.image.at[left]),
+        )
+
+    def as_image(self, order: NDArray[np.int64], image: Pixels) -> CleanCloud:
+        """The points in another order, (n,), that of these pixels."""
+        return replace(
+            self,
+            points=self.points.take(order, axis=0),
+            colors=None if self.colors is None else self.colors.take(order, axis=0),
+            normals=None if self.normals is None else self.normals.take(order, axis=0),
+            kept=self.kept[order],
+            features=None if self.features is None else self.features.take(order, axis=0),
+            image=image,
         )
 
 
@@ -201,6 +232,8 @@ def clean_cloud(
         places = _rows(flat, kept).astype(np.float64, order="C")
     none = np.empty(0, np.int64)
     clean = CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
+    if len(shape) == 2:
+        clean = replace(clean, image=Pixels(shape, kept))
     largest = float(np.abs(clean.bounds).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")

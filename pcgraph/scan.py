@@ -36,6 +36,7 @@ from pcgraph.inputs import (
     positive,
 )
 from pcgraph.parallel import side_by_side
+from pcgraph.pixels import with_pixels
 from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint, warn_of_volume
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod, checked_supervoxels
@@ -103,7 +104,8 @@ def segment(
         Where the sensor stood, for all points or for each (which is one for all, if no two are farther apart than a
         fiftieth of the range); estimated normals point to its side, and convexity depends on that. Default: of
         organised clouds the origin, if neighbours lie side by side as seen from there, as in their sensor's frame, or
-        the place of the camera that sees each point at its pixel (`pcgraph.depth_image`). Any other cloud whose spacing
+        the place of the camera that sees each point at its pixel (`pcgraph.depth_image`). Lists in a camera's own frame
+        are organised clouds, as rays tell their pixels (`pcgraph.pixels`). Any other cloud whose spacing
         grows with range from one place (`pcgraph.voxels.spacing_law`) was seen from there; of all others, the outside
         is found from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
     features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
@@ -153,7 +155,7 @@ def segment(
     points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
     method = SurfaceGrowth() if method is None else method
     settings = Settings.of(method, RegionLinkage() if linkage is None else linkage, object_altitude)
-    cloud = clean_cloud(points, colors, normals, features)
+    cloud = with_pixels(clean_cloud(points, colors, normals, features))
     place, axis = _view(viewpoint, cloud, bool(camera))
     compile_in_two_processes()
     camera = _is_camera(cloud, place, axis, range_growth) if camera is None else camera
@@ -243,7 +245,7 @@ def update(
         object_altitude = earlier.object_altitude
     method = earlier.method if method is None else method
     settings = Settings.of(method, earlier.linkage if linkage is None else linkage, object_altitude)
-    cloud = clean_cloud(points, colors, normals, features, earlier.feature_scaling)
+    cloud = with_pixels(clean_cloud(points, colors, normals, features, earlier.feature_scaling))
     place, axis = _view(viewpoint, cloud, False)
     compile_in_two_processes()
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
@@ -340,16 +342,16 @@ def _depth_image(
     cloud: CleanCloud, place: NDArray[np.float64] | None, axis: NDArray[np.float64] | None, camera: bool
 ) -> DepthImage | None:
     """The image that a camera took, along z or the axis that the points told; None if it was no camera."""
-    if place is None or place.ndim != 1 or len(cloud.shape) != 2 or not (camera or axis is not None):
+    if place is None or place.ndim != 1 or cloud.image is None or not (camera or axis is not None):
         return None
-    return DepthImage.of(cloud, place, axis)
+    return DepthImage.of(cloud.points, cloud.image, place, axis)
 
 
 def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
     """The cloud without points whose depth is a mix of two."""
     if image is None:
         return cloud
-    flying = image.flying(cloud)
+    flying = image.flying(cloud.points)
     return cloud.without(flying) if flying.any() else cloud
 
 
@@ -358,7 +360,7 @@ def _view(
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """From where a cloud was seen, (3,) or (n, 3): as given, of a camera's image the origin, else as organised points
     tell; and the axis of the camera that they tell. None if nothing does."""
-    if viewpoint is None and camera and len(cloud.shape) == 2:
+    if viewpoint is None and camera and cloud.image is not None:
         return np.zeros(3), None
     if viewpoint is not None:
         given = clean_viewpoint(viewpoint, cloud)

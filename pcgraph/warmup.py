@@ -34,7 +34,7 @@ from pcgraph.graph.bounding_planes import bounding_planes
 from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
-from pcgraph.inputs import clean_cloud
+from pcgraph.inputs import Pixels, clean_cloud
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
@@ -126,8 +126,8 @@ def compile_voxels() -> None:
     planes = method.planes(grid, np.zeros(3))
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
     method.supervoxel_of_point(points, grid, planes, supervoxels)
-    cloud = clean_cloud(_step()[0], None, None)
-    DepthImage.of(cloud, np.zeros(3)).flying(cloud)
+    seen = clean_cloud(_step()[0], None, None).points
+    DepthImage.of(seen, Pixels((len(seen), 1), np.arange(len(seen))), np.zeros(3), None).flying(seen)
     telling_places._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
 
 

@@ -59,6 +59,7 @@ STOREYS = [
     "voxels",
     "inputs",
     "depth_image",
+    "pixels",
     "features",
     "supervoxels",
     "graph",

@@ -14,6 +14,7 @@ from pcgraph.depth_image import DepthImage, image_view
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.inputs import clean_cloud
 from pcgraph.metrics import weighted_overlap
+from pcgraph.pixels import with_pixels
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.warp import CameraWarp, RangeWarp, choose_warp, warped_normal
 
@@ -210,14 +211,14 @@ def test_steps_of_depth_are_read_off_an_image(noise):
     warp = choose_warp(cloud.points, np.zeros(3), True, 0.0)
     far = np.quantile(cloud.points[:, 2], 0.8)
     needed = 2.85e-3 * far * warp.reference_depth / 0.75 / 3.5
-    assert DepthImage.of(cloud, np.zeros(3)).spacing(median_spacing(cloud.points, warp), warp) == pytest.approx(
-        min(needed, 4.0 * median_spacing(cloud.points, warp)), rel=0.02
-    )
+    assert DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(
+        median_spacing(cloud.points, warp), warp
+    ) == pytest.approx(min(needed, 4.0 * median_spacing(cloud.points, warp)), rel=0.02)
     fine, _ = image_of_a_hall(4.0, 0.05 * noise)
     cloud = clean_cloud(fine, None, None)
-    assert DepthImage.of(cloud, np.zeros(3)).spacing(median_spacing(cloud.points, warp), warp) == median_spacing(
-        cloud.points, warp
-    )
+    assert DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).spacing(
+        median_spacing(cloud.points, warp), warp
+    ) == median_spacing(cloud.points, warp)
 
 
 @pytest.mark.parametrize("end", [3.0, 4.0, 5.0, 6.0])
@@ -256,6 +257,86 @@ def test_pixels_that_mix_two_depths_are_outliers(seed):
     assert np.mean(again.outliers[mixed]) > 0.9
 
 
+_FRAMES = {  # of cameras: z forwards, as OpenGL's, and x forwards
+    "z": np.eye(3),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "x": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+}
+
+
+def measured(points):
+    return np.isfinite(points).all(axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("forwards", _FRAMES)
+def test_a_list_in_its_cameras_frame_is_its_image(forwards, seed):
+    points, truth, mixed = mixed_at_edges(seed)
+    points = (points @ _FRAMES[forwards].T).astype(np.float32)
+    order = np.random.default_rng(seed).permutation(points[..., 0].size)
+    image, as_list = pcgraph.segment(points), pcgraph.segment(points.reshape(-1, 3)[order])
+    assert image.camera
+    assert as_list.camera
+    if forwards == "z":  # other axes are found by resection, from other pixels
+        assert as_list.voxel_size == image.voxel_size
+        assert np.array_equal(as_list.labels, image.labels.reshape(-1)[order])
+    assert as_list.voxel_size == pytest.approx(image.voxel_size, rel=1e-6)
+    assert np.array_equal(as_list.outliers, image.outliers.reshape(-1)[order])
+    assert weighted_overlap(as_list.labels, image.labels.reshape(-1)[order]) > 0.999
+    assert np.mean(as_list.outliers[mixed.reshape(-1)[order]]) > 0.9
+    assert weighted_overlap(image.labels, truth) > 0.99
+
+
+def test_a_list_of_what_a_camera_saw_of_a_room_has_the_objects_of_its_image(rooms):
+    for view, *_ in rooms:
+        seen = measured(view.points)
+        image, as_list = (
+            pcgraph.segment(p, c) for p, c in ((view.points, view.colors), (view.points[seen], view.colors[seen]))
+        )
+        assert as_list.camera
+        assert np.array_equal(as_list.viewpoint, np.zeros(3))
+        assert weighted_overlap(as_list.labels, image.labels[seen]) > 0.99
+        again = pcgraph.update(as_list, view.points[seen], view.colors[seen])
+        assert again.tree.n_leaves == as_list.tree.n_leaves
+
+
+def test_a_part_of_an_image_with_features_and_viewpoints_keeps_what_each_point_has():
+    points, truth, _ = mixed_at_edges(0, fraction=0.0)
+    part = (truth > 0) | (np.random.default_rng(0).random(truth.shape) < 0.7)
+    as_list, of_list = points[part], truth[part]
+    as_list[5] = np.nan
+    shuffled = np.random.default_rng(1).permutation(len(as_list))
+    given = {"features": of_list[shuffled], "viewpoint": np.zeros((len(as_list), 3))}
+    result = pcgraph.segment(as_list[shuffled], np.repeat(of_list[shuffled, None], 3, axis=1) / 4.0, **given)
+    assert result.labels[shuffled == 5] == -1
+    assert weighted_overlap(result.labels, of_list[shuffled]) > 0.99
+    pure = [len(np.unique(of_list[shuffled][result.supervoxels == s])) == 1 for s in range(result.tree.n_leaves)]
+    assert np.mean(pure) > 0.99
+
+
+@pytest.mark.parametrize("made", ["in millimetres", "twice", "turned", "moved", "with noise", "few"])
+def test_lists_that_are_not_the_pixels_of_one_image_are_mere_lists(made):
+    rng, (points, _, _) = np.random.default_rng(0), mixed_at_edges(0)
+    points = points.reshape(-1, 3)
+    clouds = {
+        "in millimetres": np.rint(1000.0 * points),
+        "twice": np.concatenate((points, 1.01 * points)),
+        "turned": points @ Rotation.from_rotvec((0.1, 0.2, 0.0)).as_matrix().T,
+        "moved": points + np.array([0.01, 0.0, 0.0]),
+        "with noise": np.concatenate((points, rng.uniform(points.min(axis=0), points.max(axis=0), (50, 3)))),
+        "few": points[rng.random(len(points)) < 0.1],
+    }
+    cloud = clean_cloud(clouds[made], None, None)
+    assert with_pixels(cloud) is cloud
+
+
+@pytest.mark.parametrize("height", [1.0, 2.0])
+def test_grids_of_points_at_one_height_or_two_are_no_images(height):
+    x, y = np.meshgrid(np.arange(-40, 60) / 64.0, np.arange(-30, 50) / 64.0)
+    cloud = clean_cloud(np.stack((x, y, np.where(x > 0.3, height, 1.0)), axis=-1).reshape(-1, 3), None, None)
+    assert with_pixels(cloud) is cloud
+
+
 def test_no_pixel_of_a_tiny_image_flies():
     points, _, mixed = mixed_at_edges(0)
     rows, columns = np.nonzero(mixed)
@@ -272,7 +353,7 @@ def test_no_pixel_flies_on_a_floor_before_a_low_camera(height):
     for noise in (0.0, 1e-3):
         noisy = image * (1.0 + noise * np.random.default_rng(0).normal(size=(240, 320, 1)))
         cloud = clean_cloud(noisy, None, None)
-        assert not DepthImage.of(cloud, np.zeros(3)).flying(cloud).any()
+        assert not DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).flying(cloud.points).any()
 
 
 def test_zeros_in_an_image_are_holes(rooms):
