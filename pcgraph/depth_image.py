@@ -29,6 +29,7 @@ _FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step i
 _STEEP, _CLEARLY = 20.0, 6.0  # pixels across, and steps of depth: what flies lies more than that before and behind,
 _WIDEST, _FLATTER = 4, 0.3  # within so many pixels the slope, of inverse depth, is so many times what it is there,
 _FEWEST_FLYING, _MOST_FLYING = 1e-4, 0.2  # if it is so many of all
+_WHOLE = 0.9  # of the points of a list have one to their right, at least, if it was not thinned
 
 
 class ImageView(NamedTuple):
@@ -46,14 +47,18 @@ class ImageView(NamedTuple):
 
 
 def image_view(cloud: CleanCloud) -> ImageView | None:
-    """From where an organised cloud was seen; None if it does not tell, or is a list of points.
+    """From where a cloud whose pixels are known was seen; None if it does not tell, or is a mere list of points.
 
-    The origin, if neighbours lie side by side as seen from there, as in the frame of their sensor; else the centre of
-    the pinhole camera that sees each point at its pixel, whatever frame the points are in.
+    The origin, of a list whose rays told its pixels, or if neighbours lie side by side as seen from there, as in the
+    frame of their sensor; else the centre of the pinhole camera that sees each point at its pixel, whatever frame the
+    points are in.
     """
     if cloud.image is None:
         return None
-    origin, far_apart = ImageView(np.zeros(3), None), _neighbours_far_apart(cloud, cloud.image)
+    origin = ImageView(np.zeros(3), cloud.image.axis)
+    if origin.axis is not None:
+        return origin
+    far_apart = _neighbours_far_apart(cloud, cloud.image)
     told = max(far_apart, default=0.0) <= _HARDLY_ANY
     if told and is_camera(cloud, origin.place):
         return origin
@@ -86,7 +91,7 @@ def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
     low, high = cloud.bounds
     if float(np.abs(low + high).max()) / 2.0 > _FAR_OFF * float((high - low).max()) > 0.0:
         return [1.0, 1.0]
-    some, far_apart = _some_of(len(cloud.points), _SOME_PAIRS), []
+    some, far_apart = _some_of(image, _SOME_PAIRS), []
     for step in (1, image.shape[1]):
         one, other = (unit_rows(cloud.points[at]) for at in _pairs_beside(image, some, step))
         angles = np.linalg.norm(one - other, axis=1)
@@ -99,14 +104,14 @@ def _pairs_beside(image: Pixels, some: NDArray[np.int64], step: int) -> tuple[ND
     """Those of some points that have a neighbour in their row (a step of 1) or column (of a row's width),
     and these."""
     sought, width = image.at[some] + step, image.shape[1]
-    beside = np.minimum(np.searchsorted(image.at, sought), len(image.at) - 1)
+    beside = image.order[np.minimum(np.searchsorted(image.at, sought, sorter=image.order), len(image.order) - 1)]
     pairs = (image.at[beside] == sought) & ((step != 1) | (sought % width > 0))
     return some[pairs], beside[pairs]
 
 
-def _some_of(n: int, number: int) -> NDArray[np.int64]:
-    """Numbers of so many of n points, some perhaps twice; always the same."""
-    return np.random.default_rng(0).integers(n, size=number)
+def _some_of(image: Pixels, number: int) -> NDArray[np.int64]:
+    """Numbers of so many points, some perhaps twice; always the same, whatever their order."""
+    return image.order[np.random.default_rng(0).integers(len(image.order), size=number)]
 
 
 def _camera(cloud: CleanCloud, image: Pixels) -> ImageView | None:
@@ -117,7 +122,7 @@ def _camera(cloud: CleanCloud, image: Pixels) -> ImageView | None:
     Resection by the direct linear transform (Hartley and Zisserman 2004, 7.1; centre and axis 6.2). Noise of a depth
     camera is along the rays, so it does not move the pixels.
     """
-    some = _some_of(len(cloud.points), _SOME_PIXELS)
+    some = _some_of(image, _SOME_PIXELS)
     low, high = cloud.bounds
     scale = max(float((high - low).max()) / 2.0, np.finfo(np.float64).tiny)
     places = np.column_stack(((cloud.points[some] - (low + high) / 2.0) / scale, np.ones(len(some))))
@@ -153,7 +158,7 @@ def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
         return False
     if not cloud.bounds[0][2] > viewpoint[2]:
         return False
-    some = _some_of(len(cloud.points), _SOME_PIXELS)
+    some = _some_of(cloud.image, _SOME_PIXELS)
     rays = cloud.points[some] - viewpoint
     with np.errstate(over="ignore"):  # of points in the camera
         x, y = (rays[:, :2] / rays[:, 2:]).T
@@ -222,8 +227,11 @@ class DepthImage(NamedTuple):
         Their depth is a mix of both. It rises, or falls, from one neighbour to the other in a row or column, by twenty
         times as much as pixels are apart on each side, or on one side, if nothing is seen on the other; and some pixels
         on it does so no more, as it would on a plane seen edge-on. Where more than a fifth of all would fly, or fewer
-        than one in ten thousand, none does; nor in clouds of fewer than 1000 points.
+        than one in ten thousand, none does; nor in clouds of fewer than 1000 points, nor in lists that were thinned, in
+        which what is missing is no hole.
         """
+        if self.pixels.axis is not None and np.mean(np.diff(self.pixels.at[self.pixels.order]) == 1) < _WHOLE:
+            return np.zeros(len(points), np.bool_)
         flying = np.empty(self.depths.shape, np.bool_)
         least = _STEEP * self._between_pixels(points)
         in_blocks(_find_flying, len(flying), self.depths, least, _CLEARLY * self.step, flying, smallest=MIN_ROWS)
@@ -233,7 +241,7 @@ class DepthImage(NamedTuple):
 
     def _between_pixels(self, points: NDArray[np.float64]) -> float:
         """Median distance of neighbours in a row, at a depth of 1; 0 if there are none."""
-        one, other = _pairs_beside(self.pixels, _some_of(len(points), _SOME_PAIRS), 1)
+        one, other = _pairs_beside(self.pixels, _some_of(self.pixels, _SOME_PAIRS), 1)
         depths = self.depths.reshape(-1)[self.pixels.at]
         ways = [(points[at] - self.place) / depths[at, None] for at in (one, other)]
         return float(np.median(np.linalg.norm(ways[1] - ways[0], axis=1))) if len(one) else 0.0

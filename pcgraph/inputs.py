@@ -114,11 +114,17 @@ class Pixels(NamedTuple):
     shape : (h, w)
         Rows and columns of their image.
     at : (n,) int64
-        Flat indices of the pixels, ascending.
+        Flat index of each point's pixel.
+    order : (n,) int64
+        The points in the order of their pixels.
+    axis : (3,) float64, or None
+        Along which the camera looks, of unit length, if they came as a list that tells it; None of organised points.
     """
 
     shape: tuple[int, int]
     at: NDArray[np.int64]
+    order: NDArray[np.int64]
+    axis: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +167,7 @@ class CleanCloud(ShortRepr):
 
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""
-        if len(labels) == math.prod(self.shape) and (len(self.shape) == 2 or self.image is None):
+        if len(labels) == math.prod(self.shape):
             return labels.astype(np.int32).reshape(self.shape)
         full = np.full(self.shape, -1, np.int32)
         full.reshape(-1)[self.kept] = labels
@@ -169,7 +175,7 @@ class CleanCloud(ShortRepr):
         return full
 
     def without(self, outliers: NDArray[np.bool_]) -> CleanCloud:
-        """The points but for some, (n,) bool."""
+        """The points but for some, (n,) bool; as a mere list."""
         left = np.flatnonzero(~outliers)
         return replace(
             self,
@@ -179,19 +185,7 @@ class CleanCloud(ShortRepr):
             kept=self.kept[left],
             outliers=np.sort(np.concatenate((self.outliers, self.kept[outliers]))),
             features=None if self.features is None else self.features.take(left, axis=0),
-            image=None if self.image is None else Pixels(self.image.shape, self.image.at[left]),
-        )
-
-    def as_image(self, order: NDArray[np.int64], image: Pixels) -> CleanCloud:
-        """The points in another order, (n,), that of these pixels."""
-        return replace(
-            self,
-            points=self.points.take(order, axis=0),
-            colors=None if self.colors is None else self.colors.take(order, axis=0),
-            normals=None if self.normals is None else self.normals.take(order, axis=0),
-            kept=self.kept[order],
-            features=None if self.features is None else self.features.take(order, axis=0),
-            image=image,
+            image=None,
         )
 
 
@@ -233,7 +227,7 @@ def clean_cloud(
     none = np.empty(0, np.int64)
     clean = CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
     if len(shape) == 2:
-        clean = replace(clean, image=Pixels(shape, kept))
+        clean = replace(clean, image=Pixels(shape, kept, np.arange(len(kept))))
     largest = float(np.abs(clean.bounds).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")

@@ -17,27 +17,31 @@ _SOME, _LEAST = 4096, 2e-5  # values that are looked at first; steps below so mu
 _ADJACENT = 0.1  # quantile of the steps that is one between neighbours
 _OFF = 0.1  # pixels by which a ray may be off its own
 _NOTHING = -1  # to divide by
+_MOST_PIXELS = 1 << 20  # in a row or column
 _FILLED, _NARROWEST = 0.2, 8  # of an image at least, by points; and pixels, rows and columns
 
 
 def with_pixels(cloud: CleanCloud) -> CleanCloud:
-    """The cloud, in the order of its pixels if it is a list that a pinhole camera at the origin took, along any axis.
+    """The cloud, with the pixels of its points if it is a list that a pinhole camera at the origin took.
 
-    That a list is such an image is exact: in the camera's frame x/z and y/z of all points are whole multiples of one
-    over the focal length, up to a shift, as rays of pixels are; single precision leaves a thousandth of a pixel of it.
-    No two points are one pixel, and at least a fifth of the pixels in rows and columns between the first and the last
-    are points. A grid of points at one height is not said to be one, as it is as even without a division.
+    That a list is such an image is exact: in the camera's frame x/z and y/z of all points (or those over whichever axis
+    looks forwards) are whole multiples of one over the focal length, up to a shift, as rays of pixels are; single
+    precision leaves a thousandth of a pixel of it. No two points are one pixel, and at least a fifth of the pixels in
+    rows and columns between the first and the last are points. A grid of points at one height is not said to be one, as
+    it is as even without a division.
     """
     if cloud.image is not None or len(cloud.points) < MIN_POINTS:
         return cloud
-    points = cloud.points
+    points, some = cloud.points, some_points(cloud.points)
     low, high = cloud.bounds
     for axis in (2, 0, 1):
         if low[axis] > 0.0 or high[axis] < 0.0:
             across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
-            rows, columns = (even_steps(points, i, axis) for i in across)
-            if rows is not None and columns is not None and None in (even_steps(points, i, _NOTHING) for i in across):
-                return _in_order(cloud, rows, columns)
+            rows, columns = (even_steps(points, some, i, axis) for i in across)
+            if rows is None or columns is None:
+                continue
+            if any(even_steps(points, some, i, _NOTHING) is None for i in across):
+                return _as_image(cloud, rows, columns, np.sign(low[axis]) * np.eye(3)[axis])
     return cloud
 
 
@@ -48,18 +52,38 @@ class Steps(NamedTuple):
     number: int
 
 
-def even_steps(points: NDArray[np.float64], axis: int, over: int) -> Steps | None:
+def some_points(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Some thousands of points, (n, 3), in no order that means anything: the same ones in whatever order they came."""
+    return np.concatenate(in_blocks(_drawn, len(points), points, _SOME / len(points)))
+
+
+@kernel
+def _drawn(start: int, stop: int, points: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
+    """About that fraction of some points, by their bits."""
+    bits, n = points.view(np.uint64), 0
+    found = np.empty((stop - start, 3))
+    for i in range(start, stop):
+        mixed = np.uint64(0)
+        for axis in range(3):
+            mixed = (mixed ^ bits[i, axis]) * np.uint64(0x9E3779B97F4A7C15)  # Fibonacci hashing, Knuth 6.4
+            mixed ^= mixed >> np.uint64(32)
+        if np.float64(mixed >> np.uint64(11)) < fraction * 9007199254740992.0:
+            found[n] = points[i]
+            n += 1
+    return found[:n]
+
+
+def even_steps(points: NDArray[np.float64], some: NDArray[np.float64], axis: int, over: int) -> Steps | None:
     """Coordinates of points, (n, 3), over those along another axis (-1: over 1) as whole numbers of one step.
 
-    None if they are not even.
+    None if they are not even, which is asked of some of them first, (m, 3).
     """
     n = len(points)
-    some = points if n <= _SOME else points[np.random.default_rng(0).integers(n, size=_SOME)]
     with np.errstate(over="ignore", invalid="ignore"):  # of points in the camera
         values = np.sort(some[:, axis] if over == _NOTHING else some[:, axis] / some[:, over])
         step = _step(values)
-    if step <= 0.0 or not _is_even((values - values[0]) / step):
-        return None
+        if step <= 0.0 or not _is_even((values - values[0]) / step):
+            return None
     ends = np.array(in_blocks(_ends, n, points, axis, over))
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
     at = np.empty(n, np.int64)
@@ -92,9 +116,9 @@ def _count_steps(
     """Set how many steps from the least the coordinates of some points are; whether all are even."""
     for i in range(start, stop):
         steps = (_coordinate(points, i, axis, over) - low) / step
-        at[i] = np.int64(np.rint(steps))
-        if not abs(steps - np.rint(steps)) <= _OFF:
+        if not (abs(steps - np.rint(steps)) <= _OFF and steps <= _MOST_PIXELS):
             return False
+        at[i] = np.int64(np.rint(steps))
     return True
 
 
@@ -105,28 +129,29 @@ def _coordinate(points: NDArray[np.float64], i: int, axis: int, over: int) -> fl
 
 def _step(ascending: NDArray[np.float64]) -> float:
     """The distance between neighbours, if values are even: the mean, once known by how many each is from the last."""
-    span = float(ascending[-1] - ascending[0])
+    span = float(ascending[-1] - ascending[0]) if len(ascending) else 0.0
     steps = np.diff(ascending)
     steps = steps[steps > _LEAST * span]
     if len(steps) < _NARROWEST - 1:
         return 0.0
-    return span / float(np.rint(steps / np.quantile(steps, _ADJACENT)).sum())
+    step = span / float(np.rint(steps / np.quantile(steps, _ADJACENT)).sum())
+    if not span <= _MOST_PIXELS * step:
+        return 0.0
+    return step * int(np.gcd.reduce(np.rint((ascending - ascending[0]) / step).astype(np.int64)))  # it may be a half
 
 
 def _is_even(values: NDArray[np.float64]) -> bool:
     return bool((np.abs(values - np.rint(values)) <= _OFF).all())
 
 
-def _in_order(cloud: CleanCloud, rows: Steps, columns: Steps) -> CleanCloud:
-    """The cloud in the order of pixels; as it is if two points are in one, or few in any."""
+def _as_image(cloud: CleanCloud, rows: Steps, columns: Steps, axis: NDArray[np.float64]) -> CleanCloud:
+    """The cloud with its pixels; as it is if two points are in one, or few in any."""
     shape = (rows.number, columns.number)
     n = len(cloud.points)
     if min(shape) < _NARROWEST or n < _FILLED * shape[0] * shape[1]:
         return cloud
-    pixels = rows.at * columns.number + columns.at
-    if (np.diff(pixels) > 0).all():
-        return replace(cloud, image=Pixels(shape, pixels))
-    point_of_pixel = np.full(shape[0] * shape[1], -1)
-    point_of_pixel[pixels] = np.arange(n)
-    order = point_of_pixel[point_of_pixel >= 0]
-    return cloud if len(order) < n else cloud.as_image(order, Pixels(shape, pixels[order]))
+    at = rows.at * columns.number + columns.at
+    point_at = np.full(shape[0] * shape[1], -1)
+    point_at[at] = np.arange(n)
+    order = point_at[point_at >= 0]
+    return cloud if len(order) < n else replace(cloud, image=Pixels(shape, at, order, axis))

@@ -361,7 +361,7 @@ def _view(
     """From where a cloud was seen, (3,) or (n, 3): as given, of a camera's image the origin, else as organised points
     tell; and the axis of the camera that they tell. None if nothing does."""
     if viewpoint is None and camera and cloud.image is not None:
-        return np.zeros(3), None
+        return np.zeros(3), cloud.image.axis
     if viewpoint is not None:
         given = clean_viewpoint(viewpoint, cloud)
         return given, axis_at(given, cloud) if given.ndim == 1 and not camera else None

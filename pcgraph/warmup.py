@@ -35,7 +35,7 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import Pixels, clean_cloud
-from pcgraph.pixels import even_steps
+from pcgraph.pixels import even_steps, some_points
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
@@ -81,6 +81,7 @@ def compile_kernels() -> None:
     segment(image, np.full(image.shape, 0.5), normals, (0.0, 0.0, 0.0))
     segment(image.reshape(-1, 3))
     some_blocks(image.reshape(-1, 3))
+    _compile_pixels()
     _compile_graph_and_tree()  # neither has gaps
     _compile_levels()
 
@@ -128,8 +129,9 @@ def compile_voxels() -> None:
     supervoxels = method.supervoxels(grid, planes.normals, 21.0 * _SPACING, np.full(grid.n_voxels, -1, np.int32))
     method.supervoxel_of_point(points, grid, planes, supervoxels)
     seen = clean_cloud(_step()[0], None, None).points
-    DepthImage.of(seen, Pixels((len(seen), 1), np.arange(len(seen))), np.zeros(3), None).flying(seen)
-    even_steps(seen, 0, 2)
+    every = np.arange(len(seen))
+    DepthImage.of(seen, Pixels((len(seen), 1), every, every), np.zeros(3), None).flying(seen)
+    _compile_pixels()
     telling_places._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
 
 
@@ -181,6 +183,12 @@ def _compile_levels() -> None:
     everywhere = Grading(np.array(list(np.ndindex(3, 3, 3))) - 1.0, np.ones(27, np.int8))
     grid = voxel_grid(_step()[0].reshape(-1, 3), None, 3.5 * _SPACING, Warp(), None, everywhere)
     at_ends(grid, np.zeros(1, np.int64))
+
+
+def _compile_pixels() -> None:
+    """Compile what asks lists of points, of some size, for the pixels they are."""
+    points = _step()[0].reshape(-1, 3)
+    even_steps(points, some_points(points), 0, -1)  # x is even
 
 
 def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:

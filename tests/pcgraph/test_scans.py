@@ -287,6 +287,45 @@ def test_a_list_in_its_cameras_frame_is_its_image(forwards, seed):
     assert weighted_overlap(image.labels, truth) > 0.99
 
 
+def test_what_a_list_that_is_an_image_tells_of_its_points_is_in_their_order():
+    points, truth, _ = mixed_at_edges(0)
+    points, truth = points.reshape(-1, 3), truth.reshape(-1)
+    order = np.random.default_rng(0).permutation(len(points))
+    first, second = pcgraph.segment(points), pcgraph.segment(points[order])
+    assert first.camera
+    assert second.camera
+    for name in ("labels", "supervoxels", "outliers", "parts"):
+        assert np.array_equal(getattr(first, name)[order], getattr(second, name))
+    assert np.allclose(first.saliency()[order], second.saliency(), atol=1e-5, equal_nan=True)
+    grid, kept = second.surface.grid, ~second.outliers
+    off = np.linalg.norm(grid.centroids[grid.voxel_of_point] - points[order][kept], axis=1)
+    assert (off <= np.sqrt(3.0) * grid.edge_lengths[grid.voxel_of_point] * 1.5).all()
+    places = np.where((points[:, :1] > 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0))
+    seen = pcgraph.segment(points[order], viewpoint=places[order])
+    assert np.array_equal(seen.viewpoint, places[order][~seen.outliers])
+
+
+def test_a_slanted_plane_in_any_cameras_frame_is_its_image():
+    rays = image_of_steps()
+    points = rays / rays[..., 2:] / (1.0 + 0.3 * (rays[..., :1] / rays[..., 2:]))
+    sizes = []
+    for turn in _FRAMES.values():
+        result = pcgraph.segment(points.reshape(-1, 3) @ turn.T)
+        assert result.camera
+        sizes.append(result.voxel_size)
+    assert sizes == pytest.approx([sizes[0]] * 3, rel=1e-2)
+
+
+@pytest.mark.parametrize("left", [0.3, 0.6])
+def test_no_pixel_of_a_thinned_list_flies(left):
+    points, truth, _ = mixed_at_edges(0, fraction=0.0)
+    kept = np.random.default_rng(0).random(truth.shape) < left
+    result = pcgraph.segment(points[kept])
+    assert result.camera
+    assert np.mean(result.outliers) < 1e-4
+    assert weighted_overlap(result.labels, truth[kept]) > 0.99
+
+
 def test_a_list_of_what_a_camera_saw_of_a_room_has_the_objects_of_its_image(rooms):
     for view, *_ in rooms:
         seen = measured(view.points)
