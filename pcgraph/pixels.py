@@ -32,16 +32,18 @@ def with_pixels(cloud: CleanCloud) -> CleanCloud:
     """
     if cloud.image is not None or len(cloud.points) < MIN_POINTS:
         return cloud
-    points, some = cloud.points, some_points(cloud.points)
     low, high = cloud.bounds
-    for axis in (2, 0, 1):
-        if low[axis] > 0.0 or high[axis] < 0.0:
-            across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
-            rows, columns = (even_steps(points, some, i, axis) for i in across)
-            if rows is None or columns is None:
-                continue
-            if any(even_steps(points, some, i, _NOTHING) is None for i in across):
-                return _as_image(cloud, rows, columns, np.sign(low[axis]) * np.eye(3)[axis])
+    forwards = [axis for axis in (2, 0, 1) if low[axis] > 0.0 or high[axis] < 0.0]
+    if not forwards:
+        return cloud
+    points, some = cloud.points, some_points(cloud.points)
+    for axis in forwards:
+        across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
+        rows, columns = (even_steps(points, some, i, axis) for i in across)
+        if rows is None or columns is None:
+            continue
+        if any(even_steps(points, some, i, _NOTHING) is None for i in across):
+            return _as_image(cloud, rows, columns, np.sign(low[axis]) * np.eye(3)[axis])
     return cloud
 
 

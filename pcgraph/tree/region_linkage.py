@@ -15,7 +15,7 @@ from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
-from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, unite
+from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, squared_distance, unite
 from pcgraph.tree.linkage import Linkage, Merges, check_cost, check_numbers
 from pcgraph.voxels.eigen import plane_normal
 
@@ -331,7 +331,8 @@ def _altitude(
     if len(sums) > 3 and sums[3, edge] == sums[1, edge]:  # nothing but bridges
         return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), round(shape.objects * _STEPS) + 1) / _STEPS
     uneven = state.residuals[a if state.masses[a] == larger else b] / larger - shape.q0
-    increase = max(energy_increase(state, a, b), shape.e1 * smaller * uneven, 0.0)
+    contrast = squared_distance(state.values, a, b)
+    increase = max(energy_increase(state, a, b, contrast), shape.e1 * smaller * uneven, 0.0)
     scale = increase / length
     width = shape.width * math.sqrt(smaller)
     shortness = width / (length + width)
@@ -339,10 +340,6 @@ def _altitude(
     evidence = (cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)) * shortness
     if cost > shape.c2 and shortness < shape.s0:
         evidence += (cost - shape.c2) * (shape.s0 - shortness) * sums[2, edge] / sums[1, edge]
-    contrast = 0.0
-    for channel in range(state.values.shape[1]):
-        gap = state.values[a, channel] - state.values[b, channel]
-        contrast += gap * gap
     evidence += shape.k1 * cost * (1.0 - shortness) * contrast / (1.0 + contrast) * smaller / (smaller + shape.m2)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(math.sqrt(1.0 + larger / (shape.r * smaller))) * smaller / (smaller + shape.m0)
