@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.inputs import CleanCloud, Pixels
 from pcgraph.parallel import in_blocks, inlined, kernel
 from pcgraph.voxels.outliers import MIN_POINTS
+from pcgraph.voxels.sampling import thinned
 
 _SOME, _LEAST = 4096, 2e-5  # values that are looked at first; steps below so much of all they span are rounding
 _ADJACENT = 0.1  # quantile of the steps that is one between neighbours
@@ -36,7 +37,7 @@ def with_pixels(cloud: CleanCloud) -> CleanCloud:
     forwards = [axis for axis in (2, 0, 1) if low[axis] > 0.0 or high[axis] < 0.0]
     if not forwards:
         return cloud
-    points, some = cloud.points, some_points(cloud.points)
+    points, some = cloud.points, thinned(cloud.points, _SOME)
     for axis in forwards:
         across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
         rows, columns = (even_steps(points, some, i, axis) for i in across)
@@ -52,27 +53,6 @@ class Steps(NamedTuple):
 
     at: NDArray[np.int64]
     number: int
-
-
-def some_points(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Some thousands of points, (n, 3), in no order that means anything: the same ones in whatever order they came."""
-    return np.concatenate(in_blocks(_drawn, len(points), points, _SOME / len(points)))
-
-
-@kernel
-def _drawn(start: int, stop: int, points: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
-    """About that fraction of some points, by their bits."""
-    bits, n = points.view(np.uint64), 0
-    found = np.empty((stop - start, 3))
-    for i in range(start, stop):
-        mixed = np.uint64(0)
-        for axis in range(3):
-            mixed = (mixed ^ bits[i, axis]) * np.uint64(0x9E3779B97F4A7C15)  # Fibonacci hashing, Knuth 6.4
-            mixed ^= mixed >> np.uint64(32)
-        if np.float64(mixed >> np.uint64(11)) < fraction * 9007199254740992.0:
-            found[n] = points[i]
-            n += 1
-    return found[:n]
 
 
 def even_steps(points: NDArray[np.float64], some: NDArray[np.float64], axis: int, over: int) -> Steps | None:

@@ -35,7 +35,7 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import Pixels, clean_cloud
-from pcgraph.pixels import even_steps, some_points
+from pcgraph.pixels import even_steps
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
@@ -44,7 +44,7 @@ from pcgraph.voxels import telling_places
 from pcgraph.voxels.grading import Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
-from pcgraph.voxels.sampling import some_blocks
+from pcgraph.voxels.sampling import some_blocks, thinned
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.surface import Surface
@@ -188,7 +188,7 @@ def _compile_levels() -> None:
 def _compile_pixels() -> None:
     """Compile what asks lists of points, of some size, for the pixels they are."""
     points = _step()[0].reshape(-1, 3)
-    even_steps(points, some_points(points), 0, -1)  # x is even
+    even_steps(points, thinned(points, len(points) // 2), 0, -1)  # x is even
 
 
 def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
