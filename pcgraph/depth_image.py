@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.inputs import CleanCloud, Pixels, unit_rows
+from pcgraph.inputs import CleanCloud, ImageView, Pixels, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
+from pcgraph.resection import FAR_OFF, NO_PLANE, resection
 from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING
 from pcgraph.voxels.warp import FORWARDS, Warp, along_axis
@@ -19,8 +20,6 @@ _SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well 
 _SOME_PAIRS, _FEW_PAIRS = 2048, 64  # neighbours of which it is asked whether they are so from the origin,
 _FAR_APART, _HARDLY_ANY = 2.5, 0.001  # or this many times as far apart as most; and how many of them may be
 _ON_PIXEL, _NEARLY_ALL = 1.0, 0.95  # pixels by which points may be off their own, and how many are not
-_DEGENERATE = 1e-4  # of the largest singular value: where the last but one is less, as of a plane, no camera is told
-_FAR_OFF = 1000.0  # extents of the points: a place so far off is that of no sensor
 _SAME_PLACE = 0.02  # extents: a place that was given is the camera's
 _SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps of depth are read; and how many have one,
 _ROUNDING = 1e-6  # of the largest inverse depth, and more
@@ -32,32 +31,16 @@ _FEWEST_FLYING, _MOST_FLYING = 1e-4, 0.2  # if it is so many of all
 _WHOLE = 0.9  # of the points of a list have one to their right, at least, if it was not thinned
 
 
-class ImageView(NamedTuple):
-    """From where an organised cloud was seen.
-
-    Attributes
-    ----------
-    place : (3,) float64, metres
-    axis : (3,) float64, or None
-        Of unit length, forwards, of the camera that took it; None if that may have been any other sensor.
-    """
-
-    place: NDArray[np.float64]
-    axis: NDArray[np.float64] | None
-
-
 def image_view(cloud: CleanCloud) -> ImageView | None:
     """From where a cloud whose pixels are known was seen; None if it does not tell, or is a mere list of points.
 
-    The origin, of a list whose rays told its pixels, or if neighbours lie side by side as seen from there, as in the
-    frame of their sensor; else the centre of the pinhole camera that sees each point at its pixel, whatever frame the
-    points are in.
+    That of the camera whose list of points told its pixels. Of organised points the origin, if neighbours lie side by
+    side as seen from there, as in the frame of their sensor; else the centre of the pinhole camera that sees each point
+    at its pixel, whatever frame the points are in.
     """
-    if cloud.image is None:
-        return None
-    origin = ImageView(np.zeros(3), cloud.image.axis)
-    if origin.axis is not None:
-        return origin
+    if cloud.image is None or cloud.image.view is not None:
+        return None if cloud.image is None else cloud.image.view
+    origin = ImageView(np.zeros(3), None)
     far_apart = _neighbours_far_apart(cloud, cloud.image)
     told = max(far_apart, default=0.0) <= _HARDLY_ANY
     if told and is_camera(cloud, origin.place):
@@ -89,7 +72,7 @@ def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
     apart.
     """
     low, high = cloud.bounds
-    if float(np.abs(low + high).max()) / 2.0 > _FAR_OFF * float((high - low).max()) > 0.0:
+    if float(np.abs(low + high).max()) / 2.0 > FAR_OFF * float((high - low).max()) > 0.0:
         return [1.0, 1.0]
     some, far_apart = _some_of(image, _SOME_PAIRS), []
     for step in (1, image.shape[1]):
@@ -115,38 +98,21 @@ def _some_of(image: Pixels, number: int) -> NDArray[np.int64]:
 
 
 def _camera(cloud: CleanCloud, image: Pixels) -> ImageView | None:
-    """The camera that sees each point at its pixel; None if there is none, or all is one plane.
-
-    Notes
-    -----
-    Resection by the direct linear transform (Hartley and Zisserman 2004, 7.1; centre and axis 6.2). Noise of a depth
-    camera is along the rays, so it does not move the pixels.
-    """
-    some = _some_of(image, _SOME_PIXELS)
-    low, high = cloud.bounds
-    scale = max(float((high - low).max()) / 2.0, np.finfo(np.float64).tiny)
-    places = np.column_stack(((cloud.points[some] - (low + high) / 2.0) / scale, np.ones(len(some))))
-    half = max(image.shape) / 2.0
-    pixels = np.stack(np.divmod(image.at[some], image.shape[1]), axis=1) / half - 1.0
-    none = np.zeros_like(places)
-    rows = [np.hstack((*sides, -pixels[:, [i]] * places)) for i, sides in enumerate(((places, none), (none, places)))]
-    values, vectors = np.linalg.svd(np.concatenate(rows), full_matrices=False)[1:]
-    if values[-2] <= _DEGENERATE * values[0]:
+    """The camera that sees each point at its pixel; None if there is none, or all is one plane."""
+    some, (low, high) = _some_of(image, _SOME_PIXELS), cloud.bounds
+    pixels = np.stack(np.divmod(image.at[some], image.shape[1]), axis=1).astype(np.float64)
+    camera = resection(cloud.points[some], pixels, NO_PLANE)
+    if camera is None:
         return None
-    camera = vectors[-1].reshape(3, 4)
-    row, column, depth = camera @ places.T
+    seen_at, depth = camera.pixels(cloud.points[some])
     if not (depth > 0.0).all() and not (depth < 0.0).all():
         return None
-    off = np.hypot(row / depth - pixels[:, 0], column / depth - pixels[:, 1]) * half
-    if np.mean(off <= _ON_PIXEL) < _NEARLY_ALL:
+    if np.mean(np.linalg.norm(seen_at - pixels, axis=1) <= _ON_PIXEL) < _NEARLY_ALL:
         return None
-    centre = np.linalg.svd(camera)[2][-1]
-    if not np.linalg.norm(centre[:3]) <= _FAR_OFF * abs(centre[3]):
+    place, forwards = camera.place(low, high), camera.matrix[2, :3] * np.sign(depth[0])
+    if place is None or not (along_axis(cloud.points - place, forwards) > 0.0).all():
         return None
-    place = (low + high) / 2.0 + scale * centre[:3] / centre[3]
-    forwards = camera[2, :3] * np.sign(depth[0])
-    forwards /= np.linalg.norm(forwards)
-    return ImageView(place, forwards) if (along_axis(cloud.points - place, forwards) > 0.0).all() else None
+    return ImageView(place, forwards)
 
 
 def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
@@ -230,7 +196,7 @@ class DepthImage(NamedTuple):
         than one in ten thousand, none does; nor in clouds of fewer than 1000 points, nor in lists that were thinned, in
         which what is missing is no hole.
         """
-        if self.pixels.axis is not None and np.mean(np.diff(self.pixels.at[self.pixels.order]) == 1) < _WHOLE:
+        if self.pixels.view is not None and np.mean(np.diff(self.pixels.at[self.pixels.order]) == 1) < _WHOLE:
             return np.zeros(len(points), np.bool_)
         flying = np.empty(self.depths.shape, np.bool_)
         least = _STEEP * self._between_pixels(points)

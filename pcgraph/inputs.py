@@ -17,6 +17,7 @@ from pcgraph.cloud import Cloud
 from pcgraph.columns import RobustScaling
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
+from pcgraph.voxels.sampling import sample
 
 _SMALLEST = 1e-250
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow
@@ -106,6 +107,20 @@ def _columns(cloud: Cloud, names: list[str]) -> NDArray[np.float64]:
     return np.concatenate(columns, axis=-1)
 
 
+class ImageView(NamedTuple):
+    """From where an image was seen.
+
+    Attributes
+    ----------
+    place : (3,) float64, metres
+    axis : (3,) float64, or None
+        Of unit length, forwards, of the camera that took it; None if that may have been any other sensor.
+    """
+
+    place: NDArray[np.float64]
+    axis: NDArray[np.float64] | None
+
+
 class Pixels(NamedTuple):
     """Which pixels n points are.
 
@@ -117,14 +132,14 @@ class Pixels(NamedTuple):
         Flat index of each point's pixel.
     order : (n,) int64
         The points in the order of their pixels.
-    axis : (3,) float64, or None
-        Along which the camera looks, of unit length, if they came as a list that tells it; None of organised points.
+    view : ImageView, or None
+        Of the camera, if they came as a list that tells it; None of organised points.
     """
 
     shape: tuple[int, int]
     at: NDArray[np.int64]
     order: NDArray[np.int64]
-    axis: NDArray[np.float64] | None = None
+    view: ImageView | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +179,11 @@ class CleanCloud(ShortRepr):
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lowest and highest coordinates, (3,) each."""
         return bounding_box(self.points)
+
+    @cached_property
+    def sample(self) -> NDArray[np.float64]:
+        """Some of the points, each place once, in an order as good as random, whatever the points' order."""
+        return sample(self.points)
 
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""

@@ -9,34 +9,39 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.inputs import CleanCloud, Pixels
+from pcgraph.inputs import CleanCloud, ImageView, Pixels
 from pcgraph.parallel import in_blocks, inlined, kernel
+from pcgraph.pixel_lattice import MOST_PIXELS, NARROWEST, OFF, are_whole, likely_cameras, step_between
+from pcgraph.resection import PinholeCamera
 from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.sampling import thinned
 
-_SOME, _LEAST = 4096, 2e-5  # values that are looked at first; steps below so much of all they span are rounding
-_ADJACENT = 0.1  # quantile of the steps that is one between neighbours
-_OFF = 0.1  # pixels by which a ray may be off its own
+_SOME = 4096  # values that are looked at first
 _NOTHING = -1  # to divide by
-_MOST_PIXELS = 1 << 20  # in a row or column
-_FILLED, _NARROWEST = 0.2, 8  # of an image at least, by points; and pixels, rows and columns
+_FILLED = 0.2  # of an image at least, by points
 
 
 def with_pixels(cloud: CleanCloud) -> CleanCloud:
-    """The cloud, with the pixels of its points if it is a list that a pinhole camera at the origin took.
+    """The cloud, with the pixels of its points if it is a list that a pinhole camera took.
 
-    That a list is such an image is exact: in the camera's frame x/z and y/z of all points (or those over whichever axis
-    looks forwards) are whole multiples of one over the focal length, up to a shift, as rays of pixels are; single
-    precision leaves a thousandth of a pixel of it. No two points are one pixel, and at least a fifth of the pixels in
-    rows and columns between the first and the last are points. A grid of points at one height is not said to be one, as
-    it is as even without a division.
+    That a list is such an image is exact: seen from the camera, its points lie in rows and columns, as pixels do, and
+    single precision leaves a thousandth of a pixel of it. No two points are one pixel, and at least a fifth of the
+    pixels in rows and columns between the first and the last are points. A grid of points at one height is not said to
+    be one, as it is as even without a division.
     """
     if cloud.image is not None or len(cloud.points) < MIN_POINTS:
         return cloud
+    image = _image_in_own_frame(cloud) or _image_in_any_frame(cloud)
+    return cloud if image is None else replace(cloud, image=image)
+
+
+def _image_in_own_frame(cloud: CleanCloud) -> Pixels | None:
+    """The pixels, if the camera is the origin and looks along an axis: x/z and y/z are whole multiples of one over the
+    focal length, up to a shift."""
     low, high = cloud.bounds
     forwards = [axis for axis in (2, 0, 1) if low[axis] > 0.0 or high[axis] < 0.0]
     if not forwards:
-        return cloud
+        return None
     points, some = cloud.points, thinned(cloud.points, _SOME)
     for axis in forwards:
         across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
@@ -44,8 +49,50 @@ def with_pixels(cloud: CleanCloud) -> CleanCloud:
         if rows is None or columns is None:
             continue
         if any(even_steps(points, some, i, _NOTHING) is None for i in across):
-            return _as_image(cloud, rows, columns, np.sign(low[axis]) * np.eye(3)[axis])
-    return cloud
+            return _pixels(rows, columns, ImageView(np.zeros(3), np.sign(low[axis]) * np.eye(3)[axis]))
+    return None
+
+
+def _image_in_any_frame(cloud: CleanCloud) -> Pixels | None:
+    """The pixels, if some patch of the points tells the camera."""
+    images = (_image_by(camera, cloud) for camera in likely_cameras(cloud.points, cloud.sample))
+    return next((image for image in images if image is not None), None)
+
+
+def _image_by(camera: PinholeCamera, cloud: CleanCloud) -> Pixels | None:
+    """The pixels at which a camera sees the points of a cloud; None if some are off theirs, or it has no place."""
+    (low, high), n = cloud.bounds, len(cloud.points)
+    place = camera.place(low, high)
+    if place is None:
+        return None
+    at = np.empty((2, n), np.int64)
+    ahead = np.array(in_blocks(_find_pixels, n, cloud.points, camera.matrix, at))
+    if ahead.min() < 0 or ahead.sum() not in (0, n):
+        return None
+    first, last = at.min(axis=1), at.max(axis=1)
+    rows, columns = (
+        Steps(line - start, int(end - start) + 1) for line, start, end in zip(at, first, last, strict=True)
+    )
+    return _pixels(rows, columns, ImageView(place, camera.matrix[2, :3] * (1.0 if ahead.any() else -1.0)))
+
+
+@kernel
+def _find_pixels(
+    start: int, stop: int, points: NDArray[np.float64], camera: NDArray[np.float64], at: NDArray[np.int64]
+) -> int:
+    """Set row and column, (2, n), at which a camera, (3, 4), sees points; how many lie on its positive side, -1 if any
+    is off its pixel."""
+    ahead = 0
+    for i in range(start, stop):
+        x, y, z = points[i]
+        depth = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z + camera[2, 3]
+        for line in range(2):
+            steps = (camera[line, 0] * x + camera[line, 1] * y + camera[line, 2] * z + camera[line, 3]) / depth
+            if not (abs(steps - np.rint(steps)) <= OFF and abs(steps) <= MOST_PIXELS):
+                return -1
+            at[line, i] = np.int64(np.rint(steps))
+        ahead += depth > 0.0
+    return ahead
 
 
 class Steps(NamedTuple):
@@ -63,8 +110,8 @@ def even_steps(points: NDArray[np.float64], some: NDArray[np.float64], axis: int
     n = len(points)
     with np.errstate(over="ignore", invalid="ignore"):  # of points in the camera
         values = np.sort(some[:, axis] if over == _NOTHING else some[:, axis] / some[:, over])
-        step = _step(values)
-        if step <= 0.0 or not _is_even((values - values[0]) / step):
+        step = step_between(values)
+        if step <= 0.0 or not are_whole((values - values[0]) / step):
             return None
     ends = np.array(in_blocks(_ends, n, points, axis, over))
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
@@ -98,7 +145,7 @@ def _count_steps(
     """Set how many steps from the least the coordinates of some points are; whether all are even."""
     for i in range(start, stop):
         steps = (_coordinate(points, i, axis, over) - low) / step
-        if not (abs(steps - np.rint(steps)) <= _OFF and steps <= _MOST_PIXELS):
+        if not (abs(steps - np.rint(steps)) <= OFF and steps <= MOST_PIXELS):
             return False
         at[i] = np.int64(np.rint(steps))
     return True
@@ -109,31 +156,13 @@ def _coordinate(points: NDArray[np.float64], i: int, axis: int, over: int) -> fl
     return points[i, axis] if over == _NOTHING else points[i, axis] / points[i, over]
 
 
-def _step(ascending: NDArray[np.float64]) -> float:
-    """The distance between neighbours, if values are even: the mean, once known by how many each is from the last."""
-    span = float(ascending[-1] - ascending[0]) if len(ascending) else 0.0
-    steps = np.diff(ascending)
-    steps = steps[steps > _LEAST * span]
-    if len(steps) < _NARROWEST - 1:
-        return 0.0
-    step = span / float(np.rint(steps / np.quantile(steps, _ADJACENT)).sum())
-    if not span <= _MOST_PIXELS * step:
-        return 0.0
-    return step * int(np.gcd.reduce(np.rint((ascending - ascending[0]) / step).astype(np.int64)))  # it may be a half
-
-
-def _is_even(values: NDArray[np.float64]) -> bool:
-    return bool((np.abs(values - np.rint(values)) <= _OFF).all())
-
-
-def _as_image(cloud: CleanCloud, rows: Steps, columns: Steps, axis: NDArray[np.float64]) -> CleanCloud:
-    """The cloud with its pixels; as it is if two points are in one, or few in any."""
-    shape = (rows.number, columns.number)
-    n = len(cloud.points)
-    if min(shape) < _NARROWEST or n < _FILLED * shape[0] * shape[1]:
-        return cloud
+def _pixels(rows: Steps, columns: Steps, view: ImageView) -> Pixels | None:
+    """The pixels of points in rows and columns; None if two points are in one, or few in any."""
+    shape, n = (rows.number, columns.number), len(rows.at)
+    if min(shape) < NARROWEST or n < _FILLED * shape[0] * shape[1]:
+        return None
     at = rows.at * columns.number + columns.at
     point_at = np.full(shape[0] * shape[1], -1)
     point_at[at] = np.arange(n)
     order = point_at[point_at >= 0]
-    return cloud if len(order) < n else replace(cloud, image=Pixels(shape, at, order, axis))
+    return None if len(order) < n else Pixels(shape, at, order, view)

@@ -361,7 +361,7 @@ def _view(
     """From where a cloud was seen, (3,) or (n, 3): as given, of a camera's image the origin, else as organised points
     tell; and the axis of the camera that they tell. None if nothing does."""
     if viewpoint is None and camera and cloud.image is not None:
-        return np.zeros(3), cloud.image.axis
+        return (np.zeros(3), None) if cloud.image.view is None else cloud.image.view
     if viewpoint is not None:
         given = clean_viewpoint(viewpoint, cloud)
         return given, axis_at(given, cloud) if given.ndim == 1 and not camera else None
@@ -490,13 +490,13 @@ def _scale(
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
-        law = spacing_law(cloud.points) if position is None else None
+        law = spacing_law(cloud.points, None, cloud.sample) if position is None else None
         warp = _warp(cloud, position, law, image, camera, growth)
         return _voxel_size(voxel_size, seed_size, partial(spacing, warp, None)), law, warp
     (even, rows), of_all = side_by_side(
-        partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position)
+        partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position, cloud.sample)
     )
-    law = law_on_rings(cloud.points, of_all, rows, position)
+    law = law_on_rings(cloud.points, of_all, rows, position, cloud.sample)
     growth = RANGE_GROWTH if may_grow and law.holds else growth
     warp = _warp(cloud, position, law, image, camera, growth)
     return _voxel_size(voxel_size, seed_size, partial(spacing, warp, even)), law, warp

@@ -25,6 +25,7 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
+from pcgraph import pixel_lattice, pixels
 from pcgraph.depth_image import DepthImage
 from pcgraph.features.moments import moments_of_groups
 from pcgraph.features.nodes import node_features
@@ -189,6 +190,10 @@ def _compile_pixels() -> None:
     """Compile what asks lists of points, of some size, for the pixels they are."""
     points = _step()[0].reshape(-1, 3)
     even_steps(points, thinned(points, len(points) // 2), 0, -1)  # x is even
+    pixel_lattice._find_near(0, 1, points, points[0], _SPACING)
+    pixel_lattice._sharpness(points[:_EDGE], points[:1])
+    pixel_lattice._sharpen(points[:_EDGE], np.array([0.0, 0.0, 1.0]))
+    pixels._find_pixels(0, 1, points, np.eye(3, 4), np.empty((2, 1), np.int64))
 
 
 def _step() -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -18,10 +18,9 @@ from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.directions import densest_plane, sphere_directions
 from pcgraph.voxels.eigen import AXES, plane_normal
 from pcgraph.voxels.rings import Rows, scanner_of_rings
-from pcgraph.voxels.sampling import each_place_once, order_of_draw, thinned
+from pcgraph.voxels.sampling import order_of_draw, sample
 
-_THINNED = 1 << 14  # points among which the law is looked for,
-_READINGS = 1 << 10  # and how many readings of the spacing count
+_READINGS = 1 << 10  # how many readings of the spacing count
 _MIN_READINGS = 1 << 8  # with fewer the law is not looked for
 _NEIGHBOUR = 8
 _MIN_SAMPLE = 512  # places of a block whose neighbours are sought
@@ -100,7 +99,11 @@ class SpacingLaw(ShortRepr):
         return (self.explained + self.by_range) / 2.0 >= least and self.exponent >= _MIN_EXPONENT
 
 
-def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | None = None) -> SpacingLaw:
+def spacing_law(
+    points: NDArray[np.float64],
+    viewpoint: NDArray[np.float64] | None = None,
+    of_points: NDArray[np.float64] | None = None,
+) -> SpacingLaw:
     """The power law between spacing and range that explains most, over a sample free of the points' order.
 
     Parameters
@@ -109,6 +112,8 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
         Finite, n >= 1.
     viewpoint : (3,) float64, metres, optional
         From where the cloud was seen. Default: the place that explains most, or the origin if it does as well.
+    of_points : (m, 3) float64, metres, optional
+        Their sample, if it is at hand.
 
     Notes
     -----
@@ -117,7 +122,7 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
     taken out, is regressed on log range. Places all around and within the cloud are tried, then moved by ever smaller
     steps; readings far off the line, such as noise, are left out.
     """
-    found = _readings(points, 2 * _READINGS)
+    found = _readings(sample(points) if of_points is None else of_points, 2 * _READINGS)
     if len(found.logs) < _MIN_READINGS:
         return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
     low, high = bounding_box(found.places)
@@ -153,7 +158,11 @@ def spacing_law(points: NDArray[np.float64], viewpoint: NDArray[np.float64] | No
 
 
 def law_on_rings(
-    points: NDArray[np.float64], law: SpacingLaw, rows: Rows, viewpoint: NDArray[np.float64] | None = None
+    points: NDArray[np.float64],
+    law: SpacingLaw,
+    rows: Rows,
+    viewpoint: NDArray[np.float64] | None = None,
+    of_points: NDArray[np.float64] | None = None,
 ) -> SpacingLaw:
     """The law about the place that rings of a turning scanner tell, if they do and it holds there; else as it was.
 
@@ -166,6 +175,8 @@ def law_on_rings(
         Of these points.
     viewpoint : (3,) float64, metres, optional
         From where they were seen, which stays; rings about it tell the axis alone.
+    of_points : (m, 3) float64, metres, optional
+        Their sample, if it is at hand.
     """
     middle = np.median(rows.points, axis=0) if len(rows.points) else np.zeros(3)
     starts = np.stack((law.viewpoint, np.zeros(3), middle)) if viewpoint is None else viewpoint[None]
@@ -173,7 +184,7 @@ def law_on_rings(
     if scanner is None:
         return law
     if viewpoint is None:
-        there = spacing_law(points, scanner.place)
+        there = spacing_law(points, scanner.place, of_points)
     elif _off(scanner.place, viewpoint, rows) <= _AT_VIEWPOINT:
         there = law
     else:
@@ -209,24 +220,21 @@ class _Readings(NamedTuple):
         return _Readings(*(np.ascontiguousarray(column[which]) for column in self))
 
 
-def _readings(points: NDArray[np.float64], number: int) -> _Readings:
-    """Readings at so many places in a cloud thinned by the points' hashes, in an order as good as random."""
-    chosen = thinned(points, _THINNED)
-    if len(chosen):
-        chosen = each_place_once(chosen)
+def _readings(chosen: NDArray[np.float64], number: int) -> _Readings:
+    """Readings at so many places of a sample, the first."""
     if len(chosen) <= _NEIGHBOUR:
         return _Readings(chosen[:0], chosen[:0], np.empty(0))
-    sample, tree = chosen[:number], cKDTree(chosen, 24, balanced_tree=False, compact_nodes=False)
-    of_blocks = in_blocks(partial(_spacing_and_normals, tree, sample), len(sample), smallest=_MIN_SAMPLE)
+    some, tree = chosen[:number], cKDTree(chosen, 24, balanced_tree=False, compact_nodes=False)
+    of_blocks = in_blocks(partial(_spacing_and_normals, tree, some), len(some), smallest=_MIN_SAMPLE)
     usable, spacing, normals = (np.concatenate(column) for column in zip(*of_blocks, strict=True))
-    return _Readings(sample[usable], normals, np.log(spacing))
+    return _Readings(some[usable], normals, np.log(spacing))
 
 
 def _spacing_and_normals(
-    tree: cKDTree, sample: NDArray[np.float64], start: int, stop: int
+    tree: cKDTree, some: NDArray[np.float64], start: int, stop: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
     """Whether the eighth neighbours of a block of places tell a spacing, and where they do, it and the normals."""
-    near, around = tree.query(sample[start:stop], k=_NEIGHBOUR + 1)
+    near, around = tree.query(some[start:stop], k=_NEIGHBOUR + 1)
     usable = np.isfinite(near[:, -1]) & (near[:, -1] > 0.0)
     spacing = near[usable, -1]
     normals = np.empty((len(spacing), 3))
