@@ -56,6 +56,7 @@ from pcgraph.voxels.surface import LocalPlanes, Surface
 from pcgraph.voxels.telling_places import telling_places
 from pcgraph.voxels.visibility import (
     likelier_place,
+    shown_fraction,
     sides_towards,
     sides_towards_each,
     visible_fraction,
@@ -185,7 +186,8 @@ def segment(
     outside = _outward_planes(grid, settings.method, law, place)
     seed = seed_spacing(grid) if seed_size is None else float(seed_size)
     known = outside.known or cloud.normals is not None
-    scan = Scan(cloud, outside.viewpoint, outside.places, known, grid, outside.planes, initial_labels, seed)
+    planes, moved = outside.planes, outside.moved
+    scan = Scan(cloud, outside.viewpoint, outside.places, known, grid, planes, initial_labels, seed, moved)
     result = segment_scan(scan, None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
@@ -297,6 +299,8 @@ class Scan:
     initial_labels : (v,) int32
         Supervoxels of earlier scans, -1 elsewhere.
     seed_size : float, metres
+    moved : bool
+        Whether the place about which voxels grow with range did not see all of this scan.
     """
 
     cloud: CleanCloud
@@ -307,6 +311,7 @@ class Scan:
     planes: LocalPlanes
     initial_labels: NDArray[np.int32]
     seed_size: float
+    moved: bool = False
 
 
 @dataclass(frozen=True)
@@ -396,7 +401,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     nodes = node_features(leaves)
     features = edge_features(nodes, touching)
     faces = faces_of(touching.edges, features, len(leaves))
-    seen_from = grid.warp.seen_from if earlier is None else None  # of several scans no place saw all
+    seen_from = grid.warp.seen_from if earlier is None and not scan.moved else None  # no place saw all of several scans
     near, hidden = side_by_side(
         lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, seen_from),
         lambda: continuations(surface, nodes, faces, scan.places),
@@ -519,12 +524,20 @@ def _warp(
 
 
 def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
-    """The place that spacing tells, (3,), or its mirror image; none if less than of one scan is visible from it."""
+    """The place that spacing tells, (3,), or its mirror image; none if less than of one scan is visible from it.
+
+    Spacing grows with range about the middle of a short way, too, along which a scanner moved while its scans were
+    put together. Rings about one place are not left then, and what it passed shows sides that the middle does not see.
+    """
     if not law.tells_place:
         return None
-    if law.mirrored is not None:
-        return likelier_place(grid, law.viewpoint, law.mirrored)
-    return law.viewpoint if law.holds or visible_fraction(grid, law.viewpoint) >= _OF_ONE_SCAN else None
+    if law.axis is not None:
+        return law.viewpoint
+    place = law.viewpoint if law.mirrored is None else likelier_place(grid, law.viewpoint, law.mirrored)
+    if not law.holds:
+        return place if visible_fraction(grid, place) >= _OF_ONE_SCAN else None
+    found = (place,) if law.searched is None else (place, law.searched)  # an origin may lie on the ground
+    return place if any(shown_fraction(grid, one) >= _OF_ONE_SCAN for one in found) else None
 
 
 def _without(
@@ -550,12 +563,15 @@ class Outside(NamedTuple):
     known : bool
         Whether the viewpoint was given, or told by the spacing.
     planes : LocalPlanes
+    moved : bool
+        Whether spacing grows with range from a place that does not show all, as that of a moving scanner.
     """
 
     viewpoint: NDArray[np.float64]
     places: NDArray[np.float64]
     known: bool
     planes: LocalPlanes
+    moved: bool = False
 
 
 def _outward_planes(
@@ -580,7 +596,8 @@ def _outward_planes(
         axis = None if law is None or told is None else law.axis
         sides = visible_sides(grid, planes.normals, told, telling, axis)
         planes = replace(planes, normals=sides.normals)
-        return Outside(sides.places[0], sides.places[:_LOOKED_FROM], told is not None, planes)
+        moved = told is None and law is not None and law.holds
+        return Outside(sides.places[0], sides.places[:_LOOKED_FROM], told is not None, planes, moved)
     if given.ndim == 1:
         planes = method.planes(grid, given)
         if law is not None and law.axis is not None:

@@ -71,6 +71,8 @@ class SpacingLaw(ShortRepr):
         A place on the other side of what is nearly one plane, if spacing does not tell which of the two it was.
     axis : (3,) float64, or None
         About which a scanner turned, of length 1, either way, if its rings told the place.
+    searched : (3,) float64, metres, or None
+        The place that explains most, if the frame's origin, which explains as much, counts for it.
     """
 
     viewpoint: NDArray[np.float64]
@@ -81,6 +83,7 @@ class SpacingLaw(ShortRepr):
     in_most: float
     mirrored: NDArray[np.float64] | None = None
     axis: NDArray[np.float64] | None = None
+    searched: NDArray[np.float64] | None = None
 
     @property
     def holds(self) -> bool:
@@ -128,7 +131,7 @@ def spacing_law(
     low, high = bounding_box(found.places)
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
     found = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
-    every, own, mirrored = found.some(slice(None, _READINGS)), viewpoint, None
+    every, own, mirrored, searched = found.some(slice(None, _READINGS)), viewpoint, None, None
     spread_out = found.some(_between_points_and_surface(found))
     if viewpoint is None:
         place, mirrored = _most_telling_places(spread_out)
@@ -144,6 +147,7 @@ def spacing_law(
         origin = -middle / reach
         line_of_origin = _regressions(every.some(kept), origin[None])
         if line_of_origin.explained[0] >= line.explained[0] - _OWN_ORIGIN:
+            searched = middle + reach * place
             place, line, own, mirrored = origin, line_of_origin, np.zeros(3), None
     exponent = float(line.exponents[0])
     return SpacingLaw(
@@ -154,6 +158,7 @@ def spacing_law(
         in_halves=_least_exponent(halved, place, exponent),
         in_most=_exponent_of_most(every, place) if viewpoint is None else exponent,
         mirrored=None if mirrored is None else middle + reach * mirrored,
+        searched=searched,
     )
 
 

@@ -31,6 +31,7 @@ _TOLD = 40.0  # votes of the viewpoint for one of the places
 _MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
 _SMOOTHING = 4  # rounds of votes by the voxels around
+_AROUND_ON_SURFACE = 5  # voxels around one that is joined as on a surface, at least
 _CLEAR = 0.3  # votes for a side that need no others, where all voxels are looked at
 _PATCH, _CREASE = 10, 0.5  # voxels of a patch, at least, and the cosine between normals at its edges, at most
 _OFF_PATCH = 0.7  # edge lengths between planes of touching voxels: so many, and they are two surfaces
@@ -224,10 +225,34 @@ def visible_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     return _visible_fraction(grid, place, either_normals(grid))
 
 
+def shown_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
+    """Fraction of the surface that a place, (3,) float64, metres, shows: of the voxels that are joined as on a surface,
+    those that are visible from there, or on one surface with such a one a few voxels away.
+
+    All that one scan holds is shown by its place, but for what coarse voxels hide of what lies beside them; the far
+    side of what a moving scanner passed is not.
+    """
+    normals, degrees = either_normals(grid), np.diff(grid.indptr)
+    votes, spread = _visible(grid, place, normals).astype(np.float64), np.empty(grid.n_voxels)
+    alike = np.empty(len(grid.neighbours), np.int8)
+    in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
+    np.abs(alike, out=alike)
+    for _ in range(_SMOOTHING):
+        in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, spread)
+        votes, spread = spread, votes
+    joined = degrees >= _AROUND_ON_SURFACE
+    return float(np.mean(votes[joined] > 0.0)) if joined.any() else 1.0
+
+
 def _visible_fraction(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    return float(_visible(grid, place, normals).mean())
+
+
+def _visible(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each voxel is visible from a place, (v,) bool."""
     middle, reach = unit_frame(grid, np.concatenate((grid.centroids, place[None])))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
-    return float(seen_from((place - middle)[None] / reach, centres, widths, normals).mean())
+    return seen_from((place - middle)[None] / reach, centres, widths, normals)[0]
 
 
 def likelier_place(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:

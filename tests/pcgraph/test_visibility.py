@@ -11,8 +11,11 @@ import pcgraph
 from pcgraph.metrics import segmentation_covering
 from pcgraph.voxels.depth_buffer import seen_from
 from pcgraph.voxels.directions import densest_plane
+from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.spacing_law import spacing_law
+from pcgraph.voxels.visibility import shown_fraction
+from pcgraph.voxels.warp import Warp
 
 
 def faces(low, high, spacing, sides="-x +x -y +y -z +z"):
@@ -682,3 +685,29 @@ def test_a_thin_wall_hides_what_is_behind_it_also_where_some_voxels_stand_for_ma
     assert seen[: len(near)].all()
     assert np.mean(seen[len(near) :]) < 0.05
     assert seen_from(np.zeros((1, 3)), places, widths, normals)[0].all()
+
+
+def scans_along_an_aisle(seed, places):
+    """Boxes in three rows in a hall, from each of some places, (p,) along an aisle, by 16 beams; 15 mm of noise."""
+    rng, size = np.random.default_rng(seed), np.array([22.0, 14.0, 6.5])
+    rays = rays_at(np.radians(np.linspace(-15.3, 15.1, 16)), np.radians(np.arange(0.1, 360.0, 0.5)))
+    lows = np.array([(x, y - 0.5, 0.0) for y in (3.0, 7.0, 11.0) for x in np.arange(2.5, 15.0, 1.6)])
+    highs = lows + rng.uniform((0.8, 0.8, 1.0), (1.3, 1.1, 2.8), lows.shape)
+    scans = []
+    for x in places:
+        place = np.array([x, 9.0, 0.9])
+        ranges = np.maximum(-place / rays, (size - place) / rays).min(axis=1)
+        for low, high in zip(lows, highs, strict=True):
+            ranges = ranges_with_box(ranges, rays, low - place, high - place)
+        scans.append(place + rays * (ranges + rng.normal(0.0, 0.015, len(rays)))[:, None])
+    return np.concatenate(scans)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_middle_of_a_way_does_not_show_all_that_was_passed(seed):
+    """So it is not from there that all was seen, though spacing may grow with range about it."""
+    middle = np.array([8.25, 9.0, 0.9])
+    one, many = scans_along_an_aisle(seed, [8.25]), scans_along_an_aisle(seed, np.linspace(5.0, 11.5, 24))
+    of_one, of_many = (shown_fraction(voxel_grid(points, None, 0.05, Warp()), middle) for points in (one, many))
+    assert of_one > 0.95
+    assert of_many < of_one - 0.1
