@@ -274,8 +274,7 @@ def _grown(view: _View, points: NDArray[np.float64]) -> PinholeCamera | None:
 def _of_all(camera: PinholeCamera, points: NDArray[np.float64]) -> PinholeCamera | None:
     """The pinhole camera that sees points at the pixels of another, by the two shortest steps between these; None if
     all is a plane, so that there are many, or if rows are not across columns."""
-    pixels = np.rint(camera.pixels(points)[0])
-    pinhole = resection(points, pixels, NO_PLANE) if np.isfinite(pixels).all() else None
+    pinhole = resection(points, np.rint(camera.pixels(points)[0]), NO_PLANE)
     if pinhole is None:
         return None
     across = pinhole.matrix[:2, :3] - np.outer(pinhole.matrix[:2, :3] @ pinhole.matrix[2, :3], pinhole.matrix[2, :3])

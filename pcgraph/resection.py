@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TINY = float(np.finfo(np.float64).tiny)
+_FAR_PIXEL = 2.0**40 + 0.5
+_NOWHERE = 1e-6  # of a camera whose rows are one plane, on which all points are, so that none has a depth
+_PARALLEL = 1e-9  # depths that differ by less than that fraction are the same
 FAR_OFF = 1000.0
 """Extents of what it sees: a place so far off is that of no camera."""
 NO_PLANE = 1e-4
@@ -28,10 +31,14 @@ class PinholeCamera(NamedTuple):
     matrix: NDArray[np.float64]
 
     def pixels(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Row and column, (n, 2), at which n points are seen, (n, 3) metres, and their w, (n,)."""
+        """Row and column, (n, 2), at which n points are seen, (n, 3) metres, and their w, (n,).
+
+        Of those beside the camera, at w = 0, and wherever it is more than 2**40, either is 2**40 and a half.
+        """
         seen = points @ self.matrix[:, :3].T + self.matrix[:, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return seen[:, :2] / seen[:, 2:], seen[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            at = seen[:, :2] / seen[:, 2:]
+            return np.where(np.abs(at) < _FAR_PIXEL, at, _FAR_PIXEL), seen[:, 2]
 
     def place(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Where it stands, (3,) metres; None if that is more than a thousand extents off what it sees, a box."""
@@ -46,7 +53,8 @@ class PinholeCamera(NamedTuple):
 def resection(points: NDArray[np.float64], pixels: NDArray[np.float64], least: float = 0.0) -> PinholeCamera | None:
     """The camera that sees n points, (n, 3) metres, at their rows and columns, (n, 2); n >= 6.
 
-    None if the last but one singular value is no more than so much of the largest: of a plane many cameras do so.
+    None if the last but one singular value is no more than so much of the largest, as of a plane, which many cameras see
+    so, or if what solves the equations sees no point at any depth.
 
     Notes
     -----
@@ -62,9 +70,14 @@ def resection(points: NDArray[np.float64], pixels: NDArray[np.float64], least: f
     if values[-2] <= least * values[0]:
         return None
     matrix = vectors[-1].reshape(3, 4)
+    if np.abs(places @ matrix[2]).max() <= _NOWHERE:
+        return None
+    if np.linalg.norm(matrix[2, :3]) <= _PARALLEL * abs(matrix[2, 3]):
+        matrix[2, :3] = 0.0
     matrix = np.array([[pitch, 0.0, of_pixels[0]], [0.0, pitch, of_pixels[1]], [0.0, 0.0, 1.0]]) @ matrix
     matrix = np.column_stack((matrix[:, :3] / scale, matrix[:, 3] - matrix[:, :3] @ middle / scale))
-    return PinholeCamera(matrix / max(float(np.linalg.norm(matrix[2, :3])), _TINY))
+    length = float(np.linalg.norm(matrix[2, :3]))
+    return PinholeCamera(matrix / (length if length > 0.0 else matrix[2, 3]))
 
 
 def _frame(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
