@@ -53,8 +53,8 @@ class PinholeCamera(NamedTuple):
 def resection(points: NDArray[np.float64], pixels: NDArray[np.float64], least: float = 0.0) -> PinholeCamera | None:
     """The camera that sees n points, (n, 3) metres, at their rows and columns, (n, 2); n >= 6.
 
-    None if the last but one singular value is no more than so much of the largest, as of a plane, which many cameras see
-    so, or if what solves the equations sees no point at any depth.
+    None if the last but one singular value is no more than so much of the largest, as of a plane, which many cameras
+    see so, or if what solves the equations sees no point at any depth.
 
     Notes
     -----

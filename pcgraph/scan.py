@@ -105,10 +105,10 @@ def segment(
         Where the sensor stood, for all points or for each (which is one for all, if no two are farther apart than a
         fiftieth of the range); estimated normals point to its side, and convexity depends on that. Default: of
         organised clouds the origin, if neighbours lie side by side as seen from there, as in their sensor's frame, or
-        the place of the camera that sees each point at its pixel (`pcgraph.depth_image`). Lists in a camera's own frame
-        are organised clouds, as rays tell their pixels (`pcgraph.pixels`). Any other cloud whose spacing
-        grows with range from one place (`pcgraph.voxels.spacing_law`) was seen from there; of all others, the outside
-        is found from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
+        the place of the camera that sees each point at its pixel (`pcgraph.depth_image`). So it is of lists that one
+        camera took, as their points tell which pixels they are (`pcgraph.pixels`). Any other cloud whose spacing grows
+        with range from one place that shows it (`pcgraph.voxels.spacing_law`) was seen from there; of all others, the
+        outside is found from what is visible from free places (`pcgraph.voxels.visibility.visible_sides`).
     features : points' leading shape, or that + (d,), numbers; or names of columns of the Cloud or file, optional
         What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
@@ -123,7 +123,7 @@ def segment(
         Whether voxels grow in proportion to depth from the viewpoint, being `voxel_size` at the median depth, as a
         camera's pixels do. Default: organised clouds that a camera took, unless voxels grow with range: those in front
         of the one viewpoint, with x/z and y/z in the order of columns and rows, and those of which the order of pixels
-        tells place and axis of a camera. Otherwise, and of lists, the camera looks along +z.
+        tells place and axis of a camera; and lists whose points tell them. Otherwise the camera looks along +z.
     range_growth : float, 0..1, without 1
         Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
         scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece. Default:
