@@ -20,6 +20,7 @@ from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.sampling import sample
 
 _SMALLEST = 1e-250
+_SOME_ZEROS, _ONE_IN = 100, 1000  # points of a list at (0, 0, 0), that many and one in so many, that may be measured
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow
 _SAME_PLACE = 0.02  # of the median range: viewpoints no farther from each other are one
 _SOME_RANGES = 1 << 12
@@ -234,13 +235,13 @@ def clean_cloud(
     if not len(flat):
         raise ValueError("expected at least one point, got an empty cloud")
     is_point = np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2])
-    if len(shape) == 2:
-        is_zero = (flat[:, 0] == 0) & (flat[:, 1] == 0) & (flat[:, 2] == 0)
-        if np.count_nonzero(is_zero) > 1:  # what many cameras' drivers write where they saw nothing
-            is_point &= ~is_zero
+    zeros = np.flatnonzero(flat[:, 0] == 0)
+    zeros = zeros[(flat[zeros, 1] == 0) & (flat[zeros, 2] == 0)]
+    if len(zeros) > (1 if len(shape) == 2 else max(_SOME_ZEROS, len(flat) // _ONE_IN)):
+        is_point[zeros] = False  # what many sensors' drivers write where they saw nothing
     kept = np.flatnonzero(is_point)
     if not len(kept):
-        no_points = "NaN or infinite" + (", or (0, 0, 0) as holes are" if len(shape) == 2 else "")
+        no_points = "NaN or infinite" + (", or (0, 0, 0) as holes are" if len(zeros) else "")
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are {no_points}")
     with np.errstate(over="ignore"):  # long doubles
         places = _rows(flat, kept).astype(np.float64, order="C")

@@ -409,6 +409,20 @@ def test_zeros_in_an_image_are_holes(rooms):
         pcgraph.segment(np.zeros((3, 4, 3)))
 
 
+def test_many_zeros_in_a_list_are_holes_and_few_are_points(rooms):
+    view, *_ = rooms[0]
+    points, seen = view.points.reshape(-1, 3), measured(view.points).reshape(-1)
+    with_zeros = np.where(seen[:, None], points, 0.0)
+    with_zeros[np.random.default_rng(0).random(len(points)) < 0.1] = 0.0
+    holes = (with_zeros == 0.0).all(axis=1)
+    result = pcgraph.segment(with_zeros)
+    assert result.camera
+    assert (result.labels[holes] == -1).all()
+    assert np.array_equal(result.labels[~holes], pcgraph.segment(with_zeros[~holes]).labels)
+    few = np.concatenate((points[seen], np.zeros((100, 3))))
+    assert (pcgraph.segment(few).labels[-100:] != -1).all()
+
+
 def test_height_maps_and_turning_scanners_are_no_images():
     """They may lie at z > 0 all the same, where x/z means nothing."""
     x, y = np.meshgrid(np.arange(80) * 0.5, np.arange(60) * 0.5)
