@@ -32,8 +32,9 @@ _SHARP, _VERY_SHARP = 0.7, 0.8  # the one over the other, at first, and when tur
 _BESIDE, _NOT_ACROSS = 1.25, 1.9  # distances between neighbours on a lattice, over the least
 _SINE, _ON_LATTICE = 0.5, 0.15  # between its two steps, at least; and steps by which most points are off it, at most
 # Cameras
-_MORE, _COUNTED, _ENOUGH = 1 << 13, 512, 100  # points of a sample, those that count at once, and for a pinhole camera
-_GROWTH, _FITS = 1.4, 4  # of the reach, each time, and how often a camera is fitted to the points within
+_MORE, _COUNTED, _ENOUGH = 1 << 13, 300, 100  # points of a sample, those that count, and for a pinhole camera
+_GROWTH, _FITS = 1.4, 4  # of the reach, each time, and how often a camera is fitted to the points within,
+_SETTLED = 0.02  # if so many of them count now and did not, or the other way round
 _SURE, _ON_PIXEL = 0.3, 0.1  # so many have to be off their pixels by less than that;
 _TIMES, _PRECISE, _OFF_PIXEL, _MOST = 8.0, 0.02, 0.25, 0.4  # so many times as far off is not counted, if it is not most
 _ALONG = 1e-3  # what an affine camera sees from its direction weighs, where points lie on one plane
@@ -74,7 +75,7 @@ def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> 
                 beyond = np.linalg.norm(farther - seed, axis=1) > np.linalg.norm(around[-1] - seed)
                 together = np.concatenate((around, farther[beyond]))
             grown = _grown(view, together)
-            camera = None if grown is None else _of_all(grown, more)
+            camera = None if grown is None else _of_all(grown, some)
             if camera is not None:
                 yield from _alike(camera, more, len(points))
                 grew += 1
@@ -258,13 +259,13 @@ def _grown(view: _View, points: NDArray[np.float64]) -> PinholeCamera | None:
             at, depths = camera.pixels(points[among])
             pixels = np.rint(at)
             off = np.abs(at - pixels).max(axis=1)
-            most = float(np.quantile(off, _SURE))
-            on = (off < np.clip(_TIMES * most, _PRECISE, _OFF_PIXEL)) & (depths * np.median(depths) > 0.0)
+            most = float(np.partition(off, int(_SURE * len(off)))[int(_SURE * len(off))])
+            on = (off < min(max(_TIMES * most, _PRECISE), _OFF_PIXEL)) & (depths * depths[0] > 0.0)
             if not most < _ON_PIXEL or np.mean(on) < _MOST:
                 return None
-            if (on == counted).all():
+            if np.mean(on != counted) < _SETTLED:
                 break
-            camera, counted = _fitted(points[among[on]], pixels[on], view.direction), on
+            camera, counted = _fitted(camera, points[among[on]], pixels[on], view.direction), on
         if known == len(points):
             return camera
         reach = max(reach * _GROWTH, float(far[known]))
@@ -349,15 +350,17 @@ def are_whole(values: NDArray[np.float64]) -> bool:
     return bool((np.abs(values - np.rint(values)) <= OFF).all())
 
 
-def _fitted(points: NDArray[np.float64], pixels: NDArray[np.float64], direction: NDArray[np.float64]) -> PinholeCamera:
-    """The affine camera that sees points at pixels, or if that is better and they are many, the pinhole camera."""
-    affine = _affine(points, pixels, direction)
+def _fitted(
+    before: PinholeCamera, points: NDArray[np.float64], pixels: NDArray[np.float64], direction: NDArray[np.float64]
+) -> PinholeCamera:
+    """The affine camera that sees points at pixels, or if that is better and they are many, or if it was before, the
+    pinhole camera."""
     pinhole = resection(points, pixels) if len(points) >= _ENOUGH else None
-    return (
-        affine
-        if pinhole is None or not _misses(pinhole, points, pixels) <= _BETTER * _misses(affine, points, pixels)
-        else pinhole
-    )
+    if pinhole is not None and before.matrix[2, :3].any():
+        return pinhole
+    affine = _affine(points, pixels, direction)
+    better = pinhole is not None and _misses(pinhole, points, pixels) <= _BETTER * _misses(affine, points, pixels)
+    return pinhole if pinhole is not None and better else affine
 
 
 def _misses(camera: PinholeCamera, points: NDArray[np.float64], pixels: NDArray[np.float64]) -> float:
