@@ -14,6 +14,7 @@ from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.resection import NO_PLANE, PinholeCamera, resection
 from pcgraph.voxels.directions import farthest_first, plane_basis, sphere_directions
 
+_TINY = float(np.finfo(np.float64).tiny)
 OFF = 0.1
 """Pixels by which a ray may be off its own."""
 NARROWEST, MOST_PIXELS = 8, 1 << 20
@@ -22,7 +23,7 @@ NARROWEST, MOST_PIXELS = 8, 1 << 20
 # Patches
 _SOME, _LOOKED_AT = 1 << 11, 64  # of some points of a sample, the density around so many is asked for
 _PATCHES, _PATCH, _AROUND = 6, 48, 1 << 10  # patches that are tried, their points, and those around, about
-_DULL, _GREW = 2, 3  # patches that look like no lattice, and cameras of all, after which no more are tried
+_DULL, _VIEWS, _GREW = 2, 12, 4  # patches that look like no lattice, views, cameras of all: then no more are tried
 # Directions
 _DIRECTIONS = sphere_directions(600)[:300]  # half of those all around
 _APART, _SAME, _TRIED = 0.95, 0.995, 8  # cosines between those that are looked at again, and of one; and their number
@@ -64,7 +65,7 @@ def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> 
     if len(some) < _PATCH:
         return
     nearest = min(math.ceil(_AROUND * len(some) / len(points)) + 1, len(some) - 1)
-    grew = dull = 0
+    grew = dull = views = 0
     for seed, reach in zip(*_seeds(some, nearest), strict=True):
         near = np.concatenate(in_blocks(_find_near, len(points), points, seed, reach))
         around = _by_distance(points[near], seed)
@@ -78,9 +79,11 @@ def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> 
             camera = None if grown is None else _of_all(grown, some)
             if camera is not None:
                 yield from _alike(camera, more, len(points))
-                grew += 1
+            views, grew = views + 1, grew + (grown is not None)
+            if views == _VIEWS or grew == _GREW:
+                return
         dull += together is None
-        if grew >= _GREW or dull == _DULL:
+        if dull == _DULL:
             return
 
 
@@ -274,11 +277,16 @@ def _grown(view: _View, points: NDArray[np.float64]) -> PinholeCamera | None:
 
 def _of_all(camera: PinholeCamera, points: NDArray[np.float64]) -> PinholeCamera | None:
     """The pinhole camera that sees points at the pixels of another, by the two shortest steps between these; None if
-    all is a plane, so that there are many, or if rows are not across columns."""
-    pinhole = resection(points, np.rint(camera.pixels(points)[0]), NO_PLANE)
+    all is a plane, so that there are many, if one without a place does as well, or if rows are not across columns."""
+    pixels = np.rint(camera.pixels(points)[0])
+    pinhole = resection(points, pixels, NO_PLANE)
     if pinhole is None:
         return None
+    affine = _affine(points, pixels, pinhole.matrix[2, :3])
+    if not _misses(pinhole, points, pixels) <= _BETTER * _misses(affine, points, pixels):
+        return None
     across = pinhole.matrix[:2, :3] - np.outer(pinhole.matrix[:2, :3] @ pinhole.matrix[2, :3], pinhole.matrix[2, :3])
+    across = across / max(float(np.abs(across).max()), _TINY)
     change = _to_shortest(np.linalg.pinv(across @ across.T).astype(np.float64))
     if change is None:
         return None

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -76,7 +77,7 @@ def resection(points: NDArray[np.float64], pixels: NDArray[np.float64], least: f
         matrix[2, :3] = 0.0
     matrix = np.array([[pitch, 0.0, of_pixels[0]], [0.0, pitch, of_pixels[1]], [0.0, 0.0, 1.0]]) @ matrix
     matrix = np.column_stack((matrix[:, :3] / scale, matrix[:, 3] - matrix[:, :3] @ middle / scale))
-    length = float(np.linalg.norm(matrix[2, :3]))
+    length = math.hypot(*matrix[2, :3])  # whatever the unit
     return PinholeCamera(matrix / (length if length > 0.0 else matrix[2, 3]))
 
 

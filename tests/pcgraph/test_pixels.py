@@ -122,6 +122,10 @@ def no_images():
         "one point more": np.concatenate((rays, rays[:1] + 0.003)),
         "noise across the rays": rays + rng.normal(0.0, 0.003, rays.shape),
         "a height map": np.stack((x, y, height), axis=-1).reshape(-1, 3),
+        "a low height map in millimetres": np.rint(
+            np.stack((0.506 * x, 0.506 * y, 0.0005 * rng.normal(size=x.shape)), axis=-1).reshape(-1, 3) / 0.001
+        )
+        * 0.001,
         "cells of a voxel grid": np.unique(np.rint(rays / 0.02), axis=0) * 0.02,
         "a block of cells": np.stack(np.meshgrid(*[np.arange(16.0)] * 3), axis=-1).reshape(-1, 3),
         "a sweep": (sweep * ranges[..., None]).reshape(-1, 3),
@@ -135,6 +139,19 @@ def no_images():
 @pytest.mark.parametrize("kind", no_images())
 def test_what_no_camera_took_is_a_mere_list(kind):
     points = no_images()[kind] @ Rotation.from_rotvec((0.2, -0.4, 0.9)).as_matrix().T + (3.0, -1.0, 2.0)
+    cloud = clean_cloud(points, None, None)
+    assert with_pixels(cloud) is cloud
+
+
+def test_a_lattice_far_from_its_origin_was_not_seen_from_there():
+    i, j = np.meshgrid(np.arange(100.0), np.arange(400.0), indexing="ij")
+    cloud = clean_cloud(np.stack((5e5 + i, 4.5e6 + j, 0.0 * i + 100.0), axis=-1).reshape(-1, 3), None, None)
+    assert with_pixels(cloud) is cloud
+
+
+@pytest.mark.parametrize("unit", [1e95, 1e-150, 1e-158])
+def test_no_unit_of_a_lattice_overflows(unit):
+    points = unit * np.stack(np.meshgrid(*[np.arange(12.0)] * 3), axis=-1).reshape(-1, 3)
     cloud = clean_cloud(points, None, None)
     assert with_pixels(cloud) is cloud
 
