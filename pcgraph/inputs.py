@@ -20,7 +20,7 @@ from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.sampling import sample
 
 _SMALLEST = 1e-250
-_SOME_ZEROS, _ONE_IN = 100, 1000  # points of a list at (0, 0, 0), that many and one in so many, that may be measured
+_SOME_ZEROS, _ONE_IN = 1000, 1000  # points of a list at (0, 0, 0), that many and one in so many, that may be measured
 _LARGEST = 1e100  # metres; far beyond it squares of distances overflow
 _SAME_PLACE = 0.02  # of the median range: viewpoints no farther from each other are one
 _SOME_RANGES = 1 << 12
@@ -237,11 +237,12 @@ def clean_cloud(
     is_point = np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2])
     zeros = np.flatnonzero(flat[:, 0] == 0)
     zeros = zeros[(flat[zeros, 1] == 0) & (flat[zeros, 2] == 0)]
-    if len(zeros) > (1 if len(shape) == 2 else max(_SOME_ZEROS, len(flat) // _ONE_IN)):
+    several = 1 if len(shape) == 2 else max(_SOME_ZEROS, len(flat) // _ONE_IN)
+    if len(zeros) > several and (len(shape) == 2 or len(zeros) < np.count_nonzero(is_point)):
         is_point[zeros] = False  # what many sensors' drivers write where they saw nothing
     kept = np.flatnonzero(is_point)
     if not len(kept):
-        no_points = "NaN or infinite" + (", or (0, 0, 0) as holes are" if len(zeros) else "")
+        no_points = "NaN or infinite" + (", or (0, 0, 0) as holes are" if len(shape) == 2 else "")
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are {no_points}")
     with np.errstate(over="ignore"):  # long doubles
         places = _rows(flat, kept).astype(np.float64, order="C")

@@ -419,8 +419,9 @@ def test_many_zeros_in_a_list_are_holes_and_few_are_points(rooms):
     assert result.camera
     assert (result.labels[holes] == -1).all()
     assert np.array_equal(result.labels[~holes], pcgraph.segment(with_zeros[~holes]).labels)
-    few = np.concatenate((points[seen], np.zeros((100, 3))))
-    assert (pcgraph.segment(few).labels[-100:] != -1).all()
+    few = np.concatenate((points[seen], np.zeros((1000, 3))))
+    assert (pcgraph.segment(few).labels[-1000:] != -1).all()
+    assert (pcgraph.segment(np.zeros((2000, 3))).labels == 0).all()
 
 
 def test_height_maps_and_turning_scanners_are_no_images():
