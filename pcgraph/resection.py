@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 _TINY = float(np.finfo(np.float64).tiny)
 _FAR_PIXEL = 2.0**40 + 0.5
+_BLOCK = 720  # rows: of more at once LAPACK wakes threads that keep a core busy for longer than this takes
 _NOWHERE = 1e-6  # of a camera whose rows are one plane, on which all points are, so that none has a depth
 _PARALLEL = 1e-9  # depths that differ by less than that fraction are the same
 FAR_OFF = 1000.0
@@ -36,7 +37,7 @@ class PinholeCamera(NamedTuple):
 
         Of those beside the camera, at w = 0, and wherever it is more than 2**40, either is 2**40 and a half.
         """
-        seen = points @ self.matrix[:, :3].T + self.matrix[:, 3]
+        seen = np.einsum("ij,kj->ik", points, self.matrix[:, :3]) + self.matrix[:, 3]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             at = seen[:, :2] / seen[:, 2:]
             return np.where(np.abs(at) < _FAR_PIXEL, at, _FAR_PIXEL), seen[:, 2]
@@ -67,7 +68,10 @@ def resection(points: NDArray[np.float64], pixels: NDArray[np.float64], least: f
     places = np.column_stack(((points - middle) / scale, np.ones(len(points))))
     at, none = (pixels - of_pixels) / pitch, np.zeros_like(places)
     rows = [np.hstack((*sides, -at[:, [i]] * places)) for i, sides in enumerate(((places, none), (none, places)))]
-    values, vectors = np.linalg.svd(np.linalg.qr(np.concatenate(rows), mode="r"))[1:]
+    rows.append(np.zeros((-2 * len(points) % _BLOCK, 12)))
+    blocks: NDArray[np.float64] = np.concatenate(rows).reshape(-1, _BLOCK, 12)
+    of_blocks = np.asarray(np.linalg.qr(blocks, mode="r"), np.float64).reshape(-1, 12)
+    values, vectors = np.linalg.svd(np.linalg.qr(of_blocks, mode="r"))[1:]
     if values[-2] <= least * values[0]:
         return None
     matrix = vectors[-1].reshape(3, 4)
