@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pcgraph.inputs import CleanCloud, ImageView, Pixels, unit_rows
 from pcgraph.parallel import MIN_ROWS, in_blocks, kernel, routine
-from pcgraph.resection import FAR_OFF, NO_PLANE, resection
+from pcgraph.resection import NO_PLANE, is_far_off, resection
 from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING
 from pcgraph.voxels.warp import FORWARDS, Warp, along_axis
@@ -38,8 +38,10 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
     side as seen from there, as in the frame of their sensor; else the centre of the pinhole camera that sees each point
     at its pixel, whatever frame the points are in.
     """
-    if cloud.image is None or cloud.image.view is not None:
-        return None if cloud.image is None else cloud.image.view
+    if cloud.image is None:
+        return None
+    if cloud.image.view is not None:
+        return cloud.image.view
     origin = ImageView(np.zeros(3), None)
     far_apart = _neighbours_far_apart(cloud, cloud.image)
     told = max(far_apart, default=0.0) <= _HARDLY_ANY
@@ -71,8 +73,7 @@ def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
     it; but for columns of a scanner whose beams are not evenly spread. From elsewhere those at such edges lie far
     apart.
     """
-    low, high = cloud.bounds
-    if float(np.abs(low + high).max()) / 2.0 > FAR_OFF * float((high - low).max()) > 0.0:
+    if is_far_off(*cloud.bounds):
         return [1.0, 1.0]
     some, far_apart = _some_of(image, _SOME_PAIRS), []
     for step in (1, image.shape[1]):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.resection import NO_PLANE, PinholeCamera, resection
@@ -90,8 +91,7 @@ def likely_cameras(points: NDArray[np.float64], sample: NDArray[np.float64]) -> 
 def _seeds(places: NDArray[np.float64], nearest: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Some of the first of places, (k, 3), around which these are dense, far from each other; and how far off so many
     others are, (k,)."""
-    ways = places[:_LOOKED_AT, None] - places
-    reach = np.sqrt(np.partition(np.einsum("ijk,ijk->ij", ways, ways), nearest, axis=1)[:, nearest])
+    reach = np.partition(cdist(places[:_LOOKED_AT], places), nearest, axis=1)[:, nearest]
     dense = np.argsort(reach, kind="stable")[: len(reach) // 4]
     chosen = dense[farthest_first(places[dense], 0, _PATCHES)]
     return places[chosen], reach[chosen]
@@ -172,15 +172,21 @@ def _sharpness(patch: NDArray[np.float64], directions: NDArray[np.float64]) -> N
 @routine
 def _look_from(patch: NDArray[np.float64], direction: NDArray[np.float64], seen: NDArray[np.float64]) -> None:
     """Set where points lie on the plane across a direction, (k, 2)."""
-    x, y, z = direction
-    # a basis without a pole but -z (Duff et al. 2017)
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
+    (ax, ay, az), (bx, by, bz) = _basis(direction)
     for i in range(len(patch)):
-        px, py, pz = patch[i]
-        seen[i, 0] = px * (1.0 + sign * x * x * a) + py * sign * b - pz * sign * x
-        seen[i, 1] = px * b + py * (sign + y * y * a) - pz * y
+        x, y, z = patch[i]
+        seen[i, 0], seen[i, 1] = x * ax + y * ay + z * az, x * bx + y * by + z * bz
+
+
+@routine
+def _basis(direction: NDArray[np.float64]) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Two unit vectors across a direction and each other: `plane_basis`, for kernels."""
+    least = int(np.argmin(np.abs(direction)))
+    x, y, z = direction
+    ax, ay, az = (0.0, -z, y) if least == 0 else (z, 0.0, -x) if least == 1 else (-y, x, 0.0)
+    length = math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax / length, ay / length, az / length
+    return (ax, ay, az), (y * az - z * ay, z * ax - x * az, x * ay - y * ax)
 
 
 @kernel
@@ -189,12 +195,7 @@ def _sharpen(patch: NDArray[np.float64], direction: NDArray[np.float64]) -> floa
     step, best = _FIRST_STEP, _sharpness(patch, direction.reshape(1, 3))[0]
     others = np.empty((8, 3))
     while step > _LAST_STEP:
-        least = int(np.argmin(np.abs(direction)))
-        x, y, z = direction
-        ax, ay, az = (0.0, -z, y) if least == 0 else (z, 0.0, -x) if least == 1 else (-y, x, 0.0)
-        length = math.sqrt(ax * ax + ay * ay + az * az)
-        ax, ay, az = ax / length, ay / length, az / length
-        bx, by, bz = y * az - z * ay, z * ax - x * az, x * ay - y * ax
+        (x, y, z), ((ax, ay, az), (bx, by, bz)) = direction, _basis(direction)
         for k in range(8):
             c, s = step * math.cos(k * math.pi / 4.0), step * math.sin(k * math.pi / 4.0)
             others[k, 0], others[k, 1], others[k, 2] = x + c * ax + s * bx, y + c * ay + s * by, z + c * az + s * bz

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pcgraph.inputs import CleanCloud, ImageView, Pixels
 from pcgraph.parallel import in_blocks, inlined, kernel
 from pcgraph.pixel_lattice import MOST_PIXELS, NARROWEST, OFF, are_whole, likely_cameras, step_between
-from pcgraph.resection import FAR_OFF, PinholeCamera
+from pcgraph.resection import PinholeCamera, is_far_off
 from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.sampling import thinned
 
@@ -40,7 +40,7 @@ def _image_in_own_frame(cloud: CleanCloud) -> Pixels | None:
     focal length, up to a shift."""
     low, high = cloud.bounds
     forwards = [axis for axis in (2, 0, 1) if low[axis] > 0.0 or high[axis] < 0.0]
-    if not forwards or float(np.abs(low + high).max()) / 2.0 > FAR_OFF * float((high - low).max()):
+    if not forwards or is_far_off(low, high):
         return None
     points, some = cloud.points, thinned(cloud.points, _SOME)
     for axis in forwards:

@@ -13,9 +13,8 @@ _TINY = float(np.finfo(np.float64).tiny)
 _FAR_PIXEL = 2.0**40 + 0.5
 _BLOCK = 720  # rows: of more at once LAPACK wakes threads that keep a core busy for longer than this takes
 _NOWHERE = 1e-6  # of a camera whose rows are one plane, on which all points are, so that none has a depth
+_FAR_OFF = 1000.0  # extents of what it sees: a place so far off is that of no camera
 _PARALLEL = 1e-9  # depths that differ by less than that fraction are the same
-FAR_OFF = 1000.0
-"""Extents of what it sees: a place so far off is that of no camera."""
 NO_PLANE = 1e-4
 """The last but one singular value over the largest, at least, of points that are no plane."""
 
@@ -47,7 +46,7 @@ class PinholeCamera(NamedTuple):
         middle, scale = (low + high) / 2.0, max(float((high - low).max()) / 2.0, _TINY)
         about = np.column_stack((self.matrix[:, :3] * scale, self.matrix[:, :3] @ middle + self.matrix[:, 3]))
         centre = np.linalg.svd(about / np.abs(about).max(axis=1, keepdims=True).clip(_TINY))[2][-1]
-        if not np.linalg.norm(centre[:3]) <= FAR_OFF * abs(centre[3]):
+        if not np.linalg.norm(centre[:3]) <= _FAR_OFF * abs(centre[3]):
             return None
         return middle + scale * centre[:3] / centre[3]
 
@@ -83,6 +82,11 @@ def resection(points: NDArray[np.float64], pixels: NDArray[np.float64], least: f
     matrix = np.column_stack((matrix[:, :3] / scale, matrix[:, 3] - matrix[:, :3] @ middle / scale))
     length = math.hypot(*matrix[2, :3])  # whatever the unit
     return PinholeCamera(matrix / (length if length > 0.0 else matrix[2, 3]))
+
+
+def is_far_off(low: NDArray[np.float64], high: NDArray[np.float64]) -> bool:
+    """Whether the origin lies too far off a box, lowest and highest corner (3,), to be the place of a camera."""
+    return float(np.abs(low + high).max()) / 2.0 > _FAR_OFF * float((high - low).max()) > 0.0
 
 
 def _frame(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading
-from pcgraph.voxels.grid import VoxelGrid, VoxelLists, occupied_cells, touching_counts, touching_voxels, voxel_grid
+from pcgraph.voxels.grid import (
+    AROUND_ON_SURFACE,
+    VoxelGrid,
+    VoxelLists,
+    occupied_cells,
+    touching_counts,
+    touching_voxels,
+    voxel_grid,
+)
 from pcgraph.voxels.spacing_law import SpacingLaw
 from pcgraph.voxels.surface import roughness
 
@@ -23,7 +31,6 @@ _WELL_JOINED = 0.9  # and so many of the voxels are joined
 _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 _MIN_JOINED = 0.75  # of the voxels have
 _HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have
-_AROUND_ON_SURFACE = 5  # others around them, at least
 _ENLARGEMENTS = 10
 # Voxels can be smaller by steps of a quarter of a power of two
 _REFINEMENTS = 4  # at most,
@@ -84,7 +91,7 @@ def fitting_size(
 
 def _joined(degrees: NDArray[np.int64]) -> float:
     """Fraction of the voxels that have as many others around them as on a surface."""
-    return float(np.mean(degrees >= _AROUND_ON_SURFACE))
+    return float(np.mean(degrees >= AROUND_ON_SURFACE))
 
 
 def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> float:
@@ -168,7 +175,7 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
     grid : VoxelGrid
         Its voxels are of one size.
     """
-    joined = np.diff(grid.indptr) >= _AROUND_ON_SURFACE
+    joined = np.diff(grid.indptr) >= AROUND_ON_SURFACE
     if grid.warp.of_one_scan or np.mean(joined) >= _NEARLY_ALL:
         return None
     keys, pitch = cell_keys(grid.cells / BLOCK, grid.size)
@@ -188,7 +195,7 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
         ordered, order = sorted_keys(keys)
         first = starts_of_runs(ordered)[:-1]
         cells, of_block = cells[order[first]], of_block[order[first]]
-        joined = touching_counts(ordered[first], *pitch) >= _AROUND_ON_SURFACE
+        joined = touching_counts(ordered[first], *pitch) >= AROUND_ON_SURFACE
         share, n = _joined_around(joined, of_block, around)
         whole = asked & (share >= _MIN_JOINED) & (n >= _LEAST)
         whole &= (at_first < _HALF_JOINED) | (share - at_first >= _MORE * level)

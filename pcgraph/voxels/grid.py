@@ -23,6 +23,8 @@ _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
 MAX_NEIGHBOURS = 26
 """Voxels around a voxel, at most, but of a larger one beside smaller ones."""
+AROUND_ON_SURFACE = 5
+"""Voxels around one that is joined as on a surface, at least."""
 MAX_GAP = Warp.max_gap
 """Voxel edges between the means of two voxels, at most, that a gap lies between, but in scans whose voxels grow."""
 _STRETCH = 1024  # cells in a row of which the cells around are counted,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.depth_buffer import cosines_towards, seen_from
-from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
+from pcgraph.voxels.grid import AROUND_ON_SURFACE, Neighbourhood, VoxelGrid
 from pcgraph.voxels.ground_and_rooms import bearing_plane
 from pcgraph.voxels.telling_places import (
     TellingPlaces,
@@ -31,7 +31,6 @@ _TOLD = 40.0  # votes of the viewpoint for one of the places
 _MUCH_MORE = 1.25  # times as much visible from one place as from another: enough to tell which of the two it was
 _MANY = ((100_000, 7.0), (30_000, 3.0))  # voxels: of more a seventh or a third is looked at
 _SMOOTHING = 4  # rounds of votes by the voxels around
-_AROUND_ON_SURFACE = 5  # voxels around one that is joined as on a surface, at least
 _CLEAR = 0.3  # votes for a side that need no others, where all voxels are looked at
 _PATCH, _CREASE = 10, 0.5  # voxels of a patch, at least, and the cosine between normals at its edges, at most
 _OFF_PATCH = 0.7  # edge lengths between planes of touching voxels: so many, and they are two surfaces
@@ -212,8 +211,19 @@ def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray
 
 def _smoothed_votes(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Votes for the side of each voxel's normal, (v,), overwritten, with those of the voxels around on one surface."""
-    smoothed, alike = np.empty_like(votes), np.empty(len(grid.neighbours), np.int8)
+    return _spread_votes(grid, _on_one_surface(grid, normals), votes)
+
+
+def _on_one_surface(grid: VoxelGrid, normals: NDArray[np.float64]) -> NDArray[np.int8]:
+    """Whether each voxel and each of those around it are on one surface: 1, -1 with opposite normals, or 0."""
+    alike = np.empty(len(grid.neighbours), np.int8)
     in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
+    return alike
+
+
+def _spread_votes(grid: VoxelGrid, alike: NDArray[np.int8], votes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Votes of the voxels, (v,), overwritten, with those of the voxels around that are alike."""
+    smoothed = np.empty_like(votes)
     for _ in range(_SMOOTHING):
         in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, smoothed)
         votes, smoothed = smoothed, votes
@@ -232,16 +242,10 @@ def shown_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     All that one scan holds is shown by its place, but for what coarse voxels hide of what lies beside them; the far
     side of what a moving scanner passed is not.
     """
-    normals, degrees = either_normals(grid), np.diff(grid.indptr)
-    votes, spread = _visible(grid, place, normals).astype(np.float64), np.empty(grid.n_voxels)
-    alike = np.empty(len(grid.neighbours), np.int8)
-    in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
-    np.abs(alike, out=alike)
-    for _ in range(_SMOOTHING):
-        in_blocks(_vote_along, grid.n_voxels, grid.neighbourhood, alike, votes, spread)
-        votes, spread = spread, votes
-    joined = degrees >= _AROUND_ON_SURFACE
-    return float(np.mean(votes[joined] > 0.0)) if joined.any() else 1.0
+    normals, joined = either_normals(grid), np.diff(grid.indptr) >= AROUND_ON_SURFACE
+    visible = _visible(grid, place, normals).astype(np.float64)
+    shown = _spread_votes(grid, np.abs(_on_one_surface(grid, normals)), visible) > 0.0
+    return float(np.mean(shown[joined])) if joined.any() else 1.0
 
 
 def _visible_fraction(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
