@@ -25,6 +25,7 @@ _SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps o
 _ROUNDING = 1e-6  # of the largest inverse depth, and more
 _FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step is so many voxel edges, at most, if
 # voxels need not be more than so many times as large as pixels would have them
+_OF_PITCH = 0.4  # of what rows, or columns, are apart, spacing is at least
 _STEEP, _CLEARLY = 20.0, 6.0  # pixels across, and steps of depth: what flies lies more than that before and behind,
 _WIDEST, _FLATTER = 4, 0.3  # within so many pixels the slope, of inverse depth, is so many times what it is there,
 _FEWEST_FLYING, _MOST_FLYING = 1e-4, 0.2  # if it is so many of all
@@ -149,6 +150,8 @@ class DepthImage(NamedTuple):
         From there along the axis; NaN where nothing was seen.
     step : float, 1/metres
         By which inverse depth is noisy, or goes in steps; 0 where it is so fine that it does not show.
+    pitch : (2,) float64
+        Median distance of neighbours in a row, and in a column, at a depth of 1; 0 if there are none.
     """
 
     place: NDArray[np.float64]
@@ -156,6 +159,7 @@ class DepthImage(NamedTuple):
     pixels: Pixels
     depths: NDArray[np.float64]
     step: float
+    pitch: NDArray[np.float64]
 
     @classmethod
     def of(
@@ -170,13 +174,15 @@ class DepthImage(NamedTuple):
         depths.reshape(-1)[image.at] = along
         with np.errstate(over="ignore"):  # of the tiniest depths
             steps = [_step_along(1.0 / rows[:: max(1, rows.size // _SOME_TRIPLES)]) for rows in (depths, depths.T)]
-        return cls(place, axis, image, depths, min(filter(None, steps), default=0.0))
+        pitch = np.array([_pitch(points - place, along, image, one) for one in (1, image.shape[1])])
+        return cls(place, axis, image, depths, min(filter(None, steps), default=0.0), pitch)
 
     def spacing(self, of_points: float, warp: Warp) -> float:
         """How far apart points are that the camera tells from each other, metres, in the space of a warp.
 
         It is the distance to the nearest, of most points; more, up to four times that, where depth is coarser than the
-        voxels that this makes, at the depth of what is far.
+        voxels that this makes, at the depth of what is far; and 0.4 of what rows, or columns, are apart, at least, so
+        that voxels hold more than one row of pixels that are far from square.
 
         Notes
         -----
@@ -184,12 +190,15 @@ class DepthImage(NamedTuple):
         while pixels are z apart: from some depth on a surface is a stack of sheets that touch no other.
         """
         some = self.depths[:: max(1, self.depths.size // _SOME_TRIPLES)]
-        depth = float(np.nanquantile(some, _FAR)) if np.isfinite(some).any() else 0.0
-        coarse = self.step * depth * depth / float(warp.scale((self.place + depth * self.axis)[None])[0])
-        return max(of_points, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * of_points))
+        if not np.isfinite(some).any():
+            return of_points
+        middle, far = float(np.nanmedian(some)), float(np.nanquantile(some, _FAR))
+        at_middle, at_far = (float(warp.scale((self.place + depth * self.axis)[None])[0]) for depth in (middle, far))
+        coarse, across = self.step * far * far / at_far, float(self.pitch.max()) * middle / at_middle
+        return max(of_points, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * of_points), _OF_PITCH * across)
 
-    def flying(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of its points fly, (n, 3), as (n,) bool: they lie between a surface and what it hides, on neither.
+    def flying(self) -> NDArray[np.bool_]:
+        """Which of its n points fly, (n,) bool: they lie between a surface and what it hides, on neither.
 
         Their depth is a mix of both. It rises, or falls, from one neighbour to the other in a row or column, by twenty
         times as much as pixels are apart on each side, or on one side, if nothing is seen on the other; and some pixels
@@ -198,20 +207,21 @@ class DepthImage(NamedTuple):
         which what is missing is no hole.
         """
         if self.pixels.view is not None and np.mean(np.diff(self.pixels.at[self.pixels.order]) == 1) < _WHOLE:
-            return np.zeros(len(points), np.bool_)
+            return np.zeros(len(self.pixels.at), np.bool_)
         flying = np.empty(self.depths.shape, np.bool_)
-        least = _STEEP * self._between_pixels(points)
+        least = _STEEP * float(self.pitch[0])
         in_blocks(_find_flying, len(flying), self.depths, least, _CLEARLY * self.step, flying, smallest=MIN_ROWS)
         found = flying.reshape(-1)[self.pixels.at]
         some_fly = len(found) >= MIN_POINTS and _FEWEST_FLYING <= np.mean(found) <= _MOST_FLYING
         return found if some_fly else np.zeros_like(found)
 
-    def _between_pixels(self, points: NDArray[np.float64]) -> float:
-        """Median distance of neighbours in a row, at a depth of 1; 0 if there are none."""
-        one, other = _pairs_beside(self.pixels, _some_of(self.pixels, _SOME_PAIRS), 1)
-        depths = self.depths.reshape(-1)[self.pixels.at]
-        ways = [(points[at] - self.place) / depths[at, None] for at in (one, other)]
-        return float(np.median(np.linalg.norm(ways[1] - ways[0], axis=1))) if len(one) else 0.0
+
+def _pitch(rays: NDArray[np.float64], depths: NDArray[np.float64], image: Pixels, step: int) -> float:
+    """Median distance, at a depth of 1, of pixels a step apart in the image, given their rays, (n, 3), and depths, (n,);
+    0 if there are none."""
+    one, other = _pairs_beside(image, _some_of(image, _SOME_PAIRS), step)
+    ways = rays[other] / depths[other, None] - rays[one] / depths[one, None]
+    return float(np.median(np.linalg.norm(ways, axis=1))) if len(one) else 0.0
 
 
 def _step_along(rows: NDArray[np.float64]) -> float:

@@ -357,7 +357,7 @@ def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
     """The cloud without points whose depth is a mix of two."""
     if image is None:
         return cloud
-    flying = image.flying(cloud.points)
+    flying = image.flying()
     return cloud.without(flying) if flying.any() else cloud
 
 

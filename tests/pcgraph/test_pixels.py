@@ -94,6 +94,15 @@ def test_a_list_in_a_world_frame_has_the_objects_of_its_image_in_any_order(seed)
     assert weighted_overlap(given.labels, as_list.labels) > 0.99
 
 
+@pytest.mark.parametrize(("rows", "columns"), [(4, 1), (1, 4), (6, 1), (1, 6)])
+@pytest.mark.parametrize("seed", range(6))
+def test_surfaces_are_whole_whatever_the_shape_of_pixels(seed, rows, columns):
+    points, truth = depth_image(seed, (480, 640))
+    result = pcgraph.segment(points[::rows, ::columns])
+    assert len(np.unique(result.labels)) <= 6  # wall, floor, boxes, and what flies
+    assert weighted_overlap(result.labels, truth[::rows, ::columns]) > 0.9
+
+
 @pytest.mark.parametrize("unit", [2.0**-20, 1e-3, 1000.0, 2.0**40])
 def test_no_unit_hides_a_camera(unit):
     image, _ = depth_image(0)

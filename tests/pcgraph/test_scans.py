@@ -390,7 +390,7 @@ def test_no_pixel_flies_on_a_floor_before_a_low_camera(height):
     for noise in (0.0, 1e-3):
         noisy = image * (1.0 + noise * np.random.default_rng(0).normal(size=(240, 320, 1)))
         cloud = clean_cloud(noisy, None, None)
-        assert not DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).flying(cloud.points).any()
+        assert not DepthImage.of(cloud.points, cloud.image, np.zeros(3), None).flying().any()
 
 
 def test_zeros_in_an_image_are_holes(rooms):
