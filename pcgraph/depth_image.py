@@ -217,7 +217,7 @@ class DepthImage(NamedTuple):
 
 
 def _pitch(rays: NDArray[np.float64], depths: NDArray[np.float64], image: Pixels, step: int) -> float:
-    """Median distance, at a depth of 1, of pixels a step apart in the image, given their rays, (n, 3), and depths, (n,);
+    """Median distance, at a depth of 1, of pixels a step apart in the image, of rays, (n, 3), and their depths, (n,);
     0 if there are none."""
     one, other = _pairs_beside(image, _some_of(image, _SOME_PAIRS), step)
     ways = rays[other] / depths[other, None] - rays[one] / depths[one, None]
