@@ -184,7 +184,7 @@ class CleanCloud(ShortRepr):
     @cached_property
     def sample(self) -> NDArray[np.float64]:
         """Some of the points, each place once, in an order as good as random, whatever the points' order."""
-        return sample(self.points)
+        return sample(self.points, self.bounds)
 
     def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
         """Labels of the points in the shape of what came in, -1 where it was not finite."""

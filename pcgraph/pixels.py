@@ -42,7 +42,7 @@ def _image_in_own_frame(cloud: CleanCloud) -> Pixels | None:
     forwards = [axis for axis in (2, 0, 1) if low[axis] > 0.0 or high[axis] < 0.0]
     if not forwards or is_far_off(low, high):
         return None
-    points, some = cloud.points, thinned(cloud.points, _SOME)
+    points, some = cloud.points, thinned(cloud.points, _SOME, (low, high))
     for axis in forwards:
         across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
         rows, columns = (even_steps(points, some, i, axis) for i in across)

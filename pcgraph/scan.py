@@ -62,7 +62,7 @@ from pcgraph.voxels.visibility import (
     visible_fraction,
     visible_sides,
 )
-from pcgraph.voxels.warp import Warp, choose_warp
+from pcgraph.voxels.warp import Shift, Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
 RANGE_GROWTH = 0.5
@@ -518,7 +518,7 @@ def _warp(
 ) -> Warp:
     """How voxels grow, about the place from which the cloud was seen, which a law may tell, or else the origin."""
     if not (camera or growth):
-        return Warp()
+        return Shift(cloud.bounds[0])
     if position is None:
         position = law.viewpoint if law is not None and law.holds else np.zeros(3)
     return choose_warp(cloud.points, position, camera, growth, None if image is None else image.axis)

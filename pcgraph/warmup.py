@@ -42,6 +42,7 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels import telling_places
+from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grading import Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid
 from pcgraph.voxels.outliers import outlier_voxels
@@ -189,7 +190,7 @@ def _compile_levels() -> None:
 def _compile_pixels() -> None:
     """Compile what asks lists of points, of some size, for the pixels they are."""
     points = _step()[0].reshape(-1, 3)
-    even_steps(points, thinned(points, len(points) // 2), 0, -1)  # x is even
+    even_steps(points, thinned(points, len(points) // 2, bounding_box(points)), 0, -1)  # x is even
     pixel_lattice._find_near(0, 1, points, points[0], _SPACING)
     pixel_lattice._sharpness(points[:_EDGE], points[:1])
     pixel_lattice._sharpen(points[:_EDGE], np.array([0.0, 0.0, 1.0]))

@@ -24,6 +24,7 @@ EARLY_SWEEPS = 1.8
 _REFINEMENTS = 2
 _NOISE = 0.1  # autocorrelation of a column that says nothing, at most
 _STEP, _PARALLEL = 1.0, 0.7  # voxel edges between two surfaces in one cell, and the cosine of their normals, at least
+_EQUAL = 1e-9  # squares of distances that differ by less, relatively, are the same
 _FEW = 32  # a smaller part of the voxels, touched in a sweep, is not worth a look at all of them
 
 
@@ -265,7 +266,7 @@ def _off(places: NDArray[np.float64], normals: NDArray[np.float64], slant: Slant
 
 @routine
 def _nearest_to_mean(places: NDArray[np.float64], members: NDArray[np.int64]) -> int:
-    """Member nearest to the mean of all, of equals the smallest."""
+    """Member nearest to the mean of all; of equals, as two always are, the smallest, whatever is rounded."""
     n = len(members)
     x = y = z = 0.0
     for at in range(n):
@@ -276,7 +277,7 @@ def _nearest_to_mean(places: NDArray[np.float64], members: NDArray[np.int64]) ->
     for at in range(n):
         i = members[at]
         away = (places[i, 0] - x) ** 2 + (places[i, 1] - y) ** 2 + (places[i, 2] - z) ** 2
-        if away < least or (away == least and i < nearest):
+        if away < (1.0 - _EQUAL) * least or (away <= (1.0 + _EQUAL) * least and i < nearest):
             nearest, least = i, away
     return nearest
 

@@ -232,7 +232,8 @@ def voxel_grid(
         The cloud spans so many voxels that a grid coordinate cannot be written as a whole number.
     """
     with np.errstate(over="ignore"):
-        scaled = warp.forward(points) / size
+        scaled = warp.forward(points)
+        scaled = np.divide(scaled, size, out=None if scaled is points else scaled)
     level_of_point = None if grading is None else grading.levels_of(scaled)
     if level_of_point is not None:
         scaled = scaled / enlarged(np.ones(len(scaled)), level_of_point)[:, None]

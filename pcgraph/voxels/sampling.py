@@ -14,34 +14,86 @@ BLOCKS = 32
 
 _CROWD = 1 << 16  # points of a crowd, about
 _SAMPLE = 1 << 14
+_STEPS = 2.0**18  # along the longest side of a cloud's box: rounding of single precision changes few of them
+_TIMES = 1.5  # as many, or as few, as were asked for: then steps tell points from each other
 _TINY = float(np.finfo(np.float64).tiny)
 
+Bounds = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Lowest and highest coordinates, (3,) each."""
 
-def sample(points: NDArray[np.float64]) -> NDArray[np.float64]:
+
+def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Whole numbers without a pattern, by one step of a multiplicative hash."""
+    spread = values * np.uint64(0xD6E8FEB86659FD93)
+    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
+
+
+_mix = routine(_mixed)  # of one number, for kernels
+
+
+def sample(points: NDArray[np.float64], bounds: Bounds) -> NDArray[np.float64]:
     """Some 16 000 of a cloud's points, each place once, in an order as good as random, whatever the points' order."""
-    chosen = thinned(points, _SAMPLE)
+    chosen = thinned(points, _SAMPLE, bounds)
     return each_place_once(chosen) if len(chosen) else chosen
 
 
 def each_place_once(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """One point per place, in the order of their hashes: the first are as good as random, yet the points' own."""
     hashes = np.empty(len(points), np.int64)
-    in_blocks(_hash, len(points), points, hashes)
+    in_blocks(_hash, len(points), points, *_lattice(bounding_box(points)), hashes)
     ordered, order = sorted_keys(hashes)
     return points.take(order[starts_of_runs(ordered)[:-1]], axis=0)
 
 
-@kernel
-def _hash(start: int, stop: int, points: NDArray[np.float64], hashes: NDArray[np.int64]) -> None:
-    """Set a whole number per point, 0 to 2**40 - 1, that depends on its place alone, and is hardly ever another's.
+def _lattice(bounds: Bounds) -> tuple[NDArray[np.float64], float]:
+    """Corner of the box around a cloud, and steps per metre, of which so many fit in it: both move with the cloud, and
+    grow with its unit. No steps where there is no such box."""
+    low, high = bounds
+    with np.errstate(over="ignore", divide="ignore"):
+        scale = float(_STEPS / (high - low).max())
+    return low, scale if np.isfinite(scale) else 0.0
 
-    In one of five hundred crowds two of 65 536 places share one, and count as one.
+
+@routine
+def _mixed_steps(point: NDArray[np.float64], low: NDArray[np.float64], scale: float) -> np.uint64:
+    """A whole number without a pattern, of the steps from a corner at which a point lies."""
+    h = np.uint64(0x9E3779B97F4A7C15)
+    for axis in range(3):
+        h ^= np.uint64(np.int64(np.rint((point[axis] - low[axis]) * scale)))
+        h *= np.uint64(0xD6E8FEB86659FD93)
+        h ^= h >> np.uint64(32)
+    return _mix(h)
+
+
+@routine
+def _mixed_bits(point: NDArray[np.float64]) -> np.uint64:
+    """A whole number without a pattern, of a point's place to the last bit."""
+    h = np.uint64(0x9E3779B97F4A7C15)
+    for axis in range(3):
+        h ^= np.float64(point[axis] + 0.0).view(np.uint64)  # makes one zero of the two
+        h *= np.uint64(0xD6E8FEB86659FD93)
+        h ^= h >> np.uint64(32)
+    return _mix(h)
+
+
+@kernel
+def _hash(
+    start: int,
+    stop: int,
+    points: NDArray[np.float64],
+    low: NDArray[np.float64],
+    scale: float,
+    hashes: NDArray[np.int64],
+) -> None:
+    """Set a whole number per point, 0 to 2**45 - 1, that depends on its place alone, and is hardly ever another's.
+
+    The first digits are of its place in steps, so that a cloud that is moved, or measured in another unit, has the same
+    order, whatever is rounded; the last ones part what lies in one step. Of two places in one step a millionth share a
+    hash, and count as one; of others hardly any.
     """
-    for p in range(start, stop):  # + 0.0 makes one zero of the two
-        x = _mix(np.float64(points[p, 0] + 0.0).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
-        y = _mix(np.float64(points[p, 1] + 0.0).view(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F))
-        z = _mix(np.float64(points[p, 2] + 0.0).view(np.uint64) * np.uint64(0x165667B19E3779F9))
-        hashes[p] = np.int64(_mix(x ^ (y >> np.uint64(1)) ^ (z >> np.uint64(2))) >> np.uint64(24))
+    for p in range(start, stop):
+        first, last = _mixed_steps(points[p], low, scale) >> np.uint64(39), _mixed_bits(points[p]) >> np.uint64(44)
+        hashes[p] = np.int64((first << np.uint64(20)) | last)
 
 
 def some_places(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -102,15 +154,6 @@ def _in_taken(start: int, stop: int, block: NDArray[np.int16], taken: NDArray[np
     return found[:n]
 
 
-def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Whole numbers without a pattern, by one step of a multiplicative hash."""
-    spread = values * np.uint64(0xD6E8FEB86659FD93)
-    return (spread ^ (spread >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93)
-
-
-_mix = routine(_mixed)  # of one number, for kernels
-
-
 def order_of_draw(numbers: NDArray[np.uint64], weights: NDArray[np.number]) -> NDArray[np.int64]:
     """Order in which things are drawn, each as likely the next as its weight says, by what their numbers hash to.
 
@@ -122,28 +165,29 @@ def order_of_draw(numbers: NDArray[np.uint64], weights: NDArray[np.number]) -> N
     return np.argsort(-np.log(chances) / weights, kind="stable")
 
 
-def thinned(points: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-    """About so many of some points, those of least hash, or all where they are no more."""
-    if len(points) <= number:
+def thinned(points: NDArray[np.float64], number: int, bounds: Bounds) -> NDArray[np.float64]:
+    """About so many of some points, those of least hash, or all where they are no more.
+
+    Which these are does not depend on where the cloud lies, or on its unit, unless too many lie in one step of the
+    lattice that tells them apart, as beside a stray that lies very far off.
+    """
+    n = len(points)
+    if n <= number:
         return points
-    limit = np.uint64(number / len(points) * 2.0**64)
-    return points.take(np.concatenate(in_blocks(_thin, len(points), points, limit)), axis=0)
+    limit, (low, scale) = np.uint64(number / n * 2.0**64), _lattice(bounds)
+    chosen = np.concatenate(in_blocks(_thin, n, points, low, scale, limit))
+    if not number / _TIMES <= len(chosen) <= number * _TIMES:
+        chosen = np.concatenate(in_blocks(_thin, n, points, low, 0.0, limit))
+    return points.take(chosen, axis=0)
 
 
 @kernel
-def _thin(start: int, stop: int, points: NDArray[np.float64], limit: np.uint64) -> NDArray[np.int64]:
-    """Those of some points of whose place a hash lies below a limit."""
-    bits = points.view(np.uint64)
+def _thin(
+    start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], scale: float, limit: np.uint64
+) -> NDArray[np.int64]:
+    """Those of some points of whose place a hash lies below a limit: of its steps, or where there are none, its bits."""
     found, n = np.empty(stop - start + 1, np.int64), np.int64(0)
     for p in range(start, stop):
-        h = np.uint64(0x9E3779B97F4A7C15)
-        for axis in range(3):
-            h ^= bits[p, axis] if points[p, axis] != 0.0 else np.uint64(0)
-            h *= np.uint64(0xD6E8FEB86659FD93)
-            h ^= h >> np.uint64(32)
-        h *= np.uint64(0xC2B2AE3D27D4EB4F)
-        h ^= h >> np.uint64(29)
-        h *= np.uint64(0xD6E8FEB86659FD93)
         found[n] = p
-        n += h < limit
+        n += (_mixed_steps(points[p], low, scale) if scale > 0.0 else _mixed_bits(points[p])) < limit
     return found[:n]

@@ -125,7 +125,7 @@ def spacing_law(
     taken out, is regressed on log range. Places all around and within the cloud are tried, then moved by ever smaller
     steps; readings far off the line, such as noise, are left out.
     """
-    found = _readings(sample(points) if of_points is None else of_points, 2 * _READINGS)
+    found = _readings(sample(points, bounding_box(points)) if of_points is None else of_points, 2 * _READINGS)
     if len(found.logs) < _MIN_READINGS:
         return SpacingLaw(np.zeros(3) if viewpoint is None else viewpoint, 0.0, 0.0, 0.0, 0.0, 0.0)
     low, high = bounding_box(found.places)

@@ -40,7 +40,7 @@ class Slant(NamedTuple):
 
 @dataclass(frozen=True)
 class Warp:
-    """The identity: voxels of one size everywhere.
+    """The identity: voxels of one size everywhere, counted from the origin.
 
     Attributes
     ----------
@@ -79,6 +79,26 @@ class Warp:
     def of_one_scan(self) -> bool:
         """Whether there is such a place."""
         return self.seen_from is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Shift(Warp):
+    """Voxels of one size everywhere, counted from a corner, so that a cloud that is moved has the same.
+
+    Attributes
+    ----------
+    corner : (3,) float64, metres
+    """
+
+    corner: NDArray[np.float64]
+
+    def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions, (n, 3) float64, metres, from the corner."""
+        return points - self.corner
+
+    def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points, (n, 3) float64, metres, of positions from the corner."""
+        return warped + self.corner
 
 
 @dataclass(frozen=True, eq=False)
