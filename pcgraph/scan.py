@@ -66,6 +66,7 @@ from pcgraph.voxels.warp import Shift, Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
 RANGE_GROWTH = 0.5
+_PER_OCTAVE = 16  # sizes of voxels, and no others
 _FEW_OUTLIERS = 0.95  # of the points are left
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _LOOKED_FROM = 3  # places, where the cloud was not seen from one; of viewpoints, from those of the points
@@ -493,19 +494,20 @@ def _scale(
         of_points = median_spacing(cloud.points, warp) if of_points is None else of_points
         return of_points if image is None else image.spacing(of_points, warp)
 
+    extent = float(np.ptp(cloud.bounds, axis=0).max())
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
         law = spacing_law(cloud.points, None, cloud.sample) if position is None else None
         warp = _warp(cloud, position, law, image, camera, growth)
-        return _voxel_size(voxel_size, seed_size, partial(spacing, warp, None)), law, warp
+        return _voxel_size(voxel_size, seed_size, partial(spacing, warp, None), extent), law, warp
     (even, rows), of_all = side_by_side(
         partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position, cloud.sample)
     )
     law = law_on_rings(cloud.points, of_all, rows, position, cloud.sample)
     growth = RANGE_GROWTH if may_grow and law.holds else growth
     warp = _warp(cloud, position, law, image, camera, growth)
-    return _voxel_size(voxel_size, seed_size, partial(spacing, warp, even)), law, warp
+    return _voxel_size(voxel_size, seed_size, partial(spacing, warp, even), extent), law, warp
 
 
 def _warp(
@@ -624,11 +626,20 @@ def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.f
     return grid.centroids + directions * (1e3 * grid.edge_lengths)[:, None]
 
 
-def _voxel_size(voxel_size: float | None, seed_size: float | None, spacing: Callable[[], float]) -> float:
-    """The voxel size, given or from the spacing, no larger than the seed size; both checked."""
+def _voxel_size(
+    voxel_size: float | None, seed_size: float | None, spacing: Callable[[], float], extent: float
+) -> float:
+    """The voxel size, given or from the spacing, no larger than the seed size; both checked.
+
+    From the spacing it is one of 16 per octave, counted from the extent of the cloud, so that a few points more or less
+    give the same voxels.
+    """
     seed = math.inf if seed_size is None else positive("seed_size", seed_size)
     if voxel_size is None:
-        return positive("voxel_size", min(VOXELS_PER_SPACING * spacing(), seed))
+        size = VOXELS_PER_SPACING * spacing()
+        if 0.0 < extent < math.inf and 0.0 < size < math.inf:
+            size = extent * 2.0 ** (round(_PER_OCTAVE * math.log2(size / extent)) / _PER_OCTAVE)
+        return positive("voxel_size", min(size, seed))
     voxel = positive("voxel_size", voxel_size)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
