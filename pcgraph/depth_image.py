@@ -25,6 +25,7 @@ _SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps o
 _ROUNDING = 1e-6  # of the largest inverse depth, and more
 _FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step is so many voxel edges, at most, if
 # voxels need not be more than so many times as large as pixels would have them
+_ABOUT = 1.4  # steps are read where depth is between what is far over that, and times that
 _OF_PITCH = 0.4  # of what rows, or columns, are apart, spacing is at least
 _STEEP, _CLEARLY = 20.0, 6.0  # pixels across, and steps of depth: what flies lies more than that before and behind,
 _WIDEST, _FLATTER = 4, 0.3  # within so many pixels the slope, of inverse depth, is so many times what it is there,
@@ -149,9 +150,11 @@ class DepthImage(NamedTuple):
     depths : (h, w) float64, metres
         From there along the axis; NaN where nothing was seen.
     step : float, 1/metres
-        By which inverse depth is noisy, or goes in steps; 0 where it is so fine that it does not show.
+        By which inverse depth of what is far is noisy, or goes in steps; 0 where it is so fine that it does not show.
     pitch : (2,) float64
         Median distance of neighbours in a row, and in a column, at a depth of 1; 0 if there are none.
+    middle, far : float, metres
+        Median of the depths, and what a fifth of them exceed; 0 if there are none.
     """
 
     place: NDArray[np.float64]
@@ -160,6 +163,8 @@ class DepthImage(NamedTuple):
     depths: NDArray[np.float64]
     step: float
     pitch: NDArray[np.float64]
+    middle: float
+    far: float
 
     @classmethod
     def of(
@@ -172,10 +177,13 @@ class DepthImage(NamedTuple):
         if along.min() <= 0.0:  # of a camera that was told and is none
             along[along <= 0.0] = np.nan
         depths.reshape(-1)[image.at] = along
+        some = depths[:: max(1, depths.size // _SOME_TRIPLES)]
+        seen = np.isfinite(some).any()
+        middle, far = (float(np.nanmedian(some)), float(np.nanquantile(some, _FAR))) if seen else (0.0, 0.0)
         with np.errstate(over="ignore"):  # of the tiniest depths
-            steps = [_step_along(1.0 / rows[:: max(1, rows.size // _SOME_TRIPLES)]) for rows in (depths, depths.T)]
+            steps = [_step_along(rows[:: max(1, rows.size // _SOME_TRIPLES)], far) for rows in (depths, depths.T)]
         pitch = np.array([_pitch(points - place, along, image, one) for one in (1, image.shape[1])])
-        return cls(place, axis, image, depths, min(filter(None, steps), default=0.0), pitch)
+        return cls(place, axis, image, depths, min(filter(None, steps), default=0.0), pitch, middle, far)
 
     def spacing(self, of_points: float, warp: Warp) -> float:
         """How far apart points are that the camera tells from each other, metres, in the space of a warp.
@@ -189,12 +197,11 @@ class DepthImage(NamedTuple):
         Depth by triangulation comes in steps of inverse depth, so of z^2 in depth (Khoshelham and Elberink 2012),
         while pixels are z apart: from some depth on a surface is a stack of sheets that touch no other.
         """
-        some = self.depths[:: max(1, self.depths.size // _SOME_TRIPLES)]
-        if not np.isfinite(some).any():
+        if self.far == 0.0:
             return of_points
-        middle, far = float(np.nanmedian(some)), float(np.nanquantile(some, _FAR))
-        at_middle, at_far = (float(warp.scale((self.place + depth * self.axis)[None])[0]) for depth in (middle, far))
-        coarse, across = self.step * far * far / at_far, float(self.pitch.max()) * middle / at_middle
+        depths = np.array([self.middle, self.far])
+        of_middle, of_far = (depths / warp.scale(self.place + depths[:, None] * self.axis)).tolist()
+        coarse, across = self.step * self.far * of_far, float(self.pitch.max()) * of_middle
         return max(of_points, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * of_points), _OF_PITCH * across)
 
     def flying(self) -> NDArray[np.bool_]:
@@ -224,17 +231,18 @@ def _pitch(rays: NDArray[np.float64], depths: NDArray[np.float64], image: Pixels
     return float(np.median(np.linalg.norm(ways, axis=1))) if len(one) else 0.0
 
 
-def _step_along(rows: NDArray[np.float64]) -> float:
+def _step_along(rows: NDArray[np.float64], far: float) -> float:
     """Twice what the inverse depth of a pixel differs by from the mean of its two neighbours' in a row, 1/metres.
 
-    It is the median over those where it differs at all; 0 where it hardly differs anywhere. On a plane inverse depth is
-    linear in the pixels, whatever its slant, so what is left is noise, or steps.
+    It is the median over those about as deep as what is far, where it differs at all; 0 where it hardly differs
+    anywhere. On a plane inverse depth is linear in the pixels, whatever its slant, so what is left is noise, or steps.
     """
-    differences = np.abs(rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:])
-    differences = differences[np.isfinite(differences)]
+    inverse, middle = 1.0 / rows, rows[:, 1:-1]
+    differences = np.abs(inverse[:, :-2] - 2.0 * inverse[:, 1:-1] + inverse[:, 2:])
+    differences = differences[np.isfinite(differences) & (middle > far / _ABOUT) & (middle < far * _ABOUT)]
     if not len(differences):
         return 0.0
-    differing = differences[differences > _ROUNDING * np.nanmax(rows)]
+    differing = differences[differences > _ROUNDING * np.nanmax(inverse)]
     return float(np.median(differing)) if len(differing) > _DIFFERING * len(differences) else 0.0
 
 

@@ -67,6 +67,8 @@ from pcgraph.warmup import compile_in_two_processes
 
 RANGE_GROWTH = 0.5
 _PER_OCTAVE = 16  # sizes of voxels, and no others
+_ASIDE = 0.382  # voxel edges before the first points, where cells start: what lies on a lattice, or walls a whole
+# number of voxels from each other, are on no border between cells
 _FEW_OUTLIERS = 0.95  # of the points are left
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _LOOKED_FROM = 3  # places, where the cloud was not seen from one; of viewpoints, from those of the points
@@ -500,14 +502,16 @@ def _scale(
     if camera or (position is not None and not (may_grow and position.ndim == 1)):
         law = spacing_law(cloud.points, None, cloud.sample) if position is None else None
         warp = _warp(cloud, position, law, image, camera, growth)
-        return _voxel_size(voxel_size, seed_size, partial(spacing, warp, None), extent), law, warp
+        size = _voxel_size(voxel_size, seed_size, partial(spacing, warp, None), extent)
+        return size, law, _from_corner(warp, cloud, size)
     (even, rows), of_all = side_by_side(
         partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position, cloud.sample)
     )
     law = law_on_rings(cloud.points, of_all, rows, position, cloud.sample)
     growth = RANGE_GROWTH if may_grow and law.holds else growth
     warp = _warp(cloud, position, law, image, camera, growth)
-    return _voxel_size(voxel_size, seed_size, partial(spacing, warp, even), extent), law, warp
+    size = _voxel_size(voxel_size, seed_size, partial(spacing, warp, even), extent)
+    return size, law, _from_corner(warp, cloud, size)
 
 
 def _warp(
@@ -520,10 +524,16 @@ def _warp(
 ) -> Warp:
     """How voxels grow, about the place from which the cloud was seen, which a law may tell, or else the origin."""
     if not (camera or growth):
-        return Shift(cloud.bounds[0])
+        return Warp()
     if position is None:
         position = law.viewpoint if law is not None and law.holds else np.zeros(3)
     return choose_warp(cloud.points, position, camera, growth, None if image is None else image.axis)
+
+
+def _from_corner(warp: Warp, cloud: CleanCloud, size: float) -> Warp:
+    """Voxels counted from the cloud's corner where they do not grow about a place, so that a cloud that is moved has the
+    same."""
+    return warp if warp.of_one_scan else Shift(cloud.bounds[0] - _ASIDE * size)
 
 
 def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:

@@ -429,7 +429,8 @@ def test_updates_keep_what_is_known(rng, n, shape, method, split):
 @over_clouds
 def test_the_order_of_scans_changes_no_count(rng, n, shape):
     points = cloud_of(shape, rng, n)
-    one, two = points[: len(points) // 2 + 1], points[len(points) // 2 :]
+    ends = np.stack((points.min(axis=0), points.max(axis=0)))  # voxels are counted from the corner of the first scan
+    one, two = (np.concatenate((ends, part)) for part in (points[: len(points) // 2 + 1], points[len(points) // 2 :]))
     voxel = extent(points) / 8
     forth = pcgraph.update(pcgraph.segment(one, voxel_size=voxel), two)
     back = pcgraph.update(pcgraph.segment(two, voxel_size=voxel), one)
