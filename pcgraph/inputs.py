@@ -226,7 +226,10 @@ def clean_cloud(
     """
     if not isinstance(points, (np.ndarray, Sequence)) and np.asarray(points).dtype == object:
         kinds = "an array (n, 3) or (h, w, 3), a pcgraph.Cloud or the name of a .pcd or .ply file"
-        raise ValueError(f"expected points as {kinds}, got {type(points).__name__}")
+        hint = "; pass its .points (and .colors)" if hasattr(points, "points") else ""
+        if hasattr(points, "to_point_cloud"):
+            hint = "; pass its to_point_cloud().points"
+        raise ValueError(f"expected points as {kinds}, got {type(points).__name__}{hint}")
     array = _numbers("points", points)
     if array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise ValueError(f"expected points of shape (n, 3) or (h, w, 3), got {array.shape}")
@@ -274,7 +277,7 @@ def clean_viewpoint(viewpoint: ArrayLike, cloud: CleanCloud) -> NDArray[np.float
     if position.shape not in ((3,), cloud.points.shape) or not (np.abs(position) <= _LARGEST).all():
         raise ValueError(
             f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
-            f"finite at finite points; got an array of shape {given.shape} {_excerpt(given)}"
+            f"finite at finite points; got an array of shape {given.shape}{_excerpt(given)}"
         )
     return position if position.ndim == 1 or not len(position) else _one_place(position, cloud.points)
 
@@ -290,7 +293,12 @@ def _one_place(places: NDArray[np.float64], points: NDArray[np.float64]) -> NDAr
 
 
 def _excerpt(values: NDArray[np.float64]) -> str:
-    return f"of {values.tolist()}" if values.size <= 4 else "with NaN or infinite values"
+    """What is wrong with a viewpoint."""
+    if values.size <= 4:
+        return f" of {values.tolist()}"
+    if values.shape == (4, 4):
+        return "; of a camera's pose, 4 x 4, its place is the last column: pose[:3, 3]"
+    return "" if np.isfinite(values).all() else " with NaN or infinite values"
 
 
 def positive(name: str, value: float) -> float:

@@ -170,6 +170,7 @@ def segment(
     for _ in range(2):
         voxel, law, warp = _scale(cloud, place, image, camera, range_growth, voxel_size, seed_size)
         grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
+        with_outliers = cloud, place
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
             break  # else spacing and place were those of noise, to a good part
@@ -178,8 +179,12 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
         voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
+        is_larger = voxel > grid.size
+        cloud, place = with_outliers if is_larger else (cloud, place)
         if voxel != grid.size:
             grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
+        if is_larger:  # of such voxels, what was thin may be none
+            cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if seed_size is None and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
@@ -367,15 +372,15 @@ def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
 def _view(
     viewpoint: ArrayLike | None, cloud: CleanCloud, camera: bool
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """From where a cloud was seen, (3,) or (n, 3): as given, of a camera's image the origin, else as organised points
-    tell; and the axis of the camera that they tell. None if nothing does."""
-    if viewpoint is None and camera and cloud.image is not None:
-        return (np.zeros(3), None) if cloud.image.view is None else cloud.image.view
+    """From where a cloud was seen, (3,) or (n, 3): as given, else as pixels tell, or of a camera's image the origin; and
+    the axis of the camera that they tell. None if nothing does."""
     if viewpoint is not None:
         given = clean_viewpoint(viewpoint, cloud)
-        return given, axis_at(given, cloud) if given.ndim == 1 and not camera else None
+        return given, axis_at(given, cloud) if given.ndim == 1 else None
     view = image_view(cloud)
-    return (None, None) if view is None else view
+    if view is None:
+        return (np.zeros(3) if camera and cloud.image is not None else None), None
+    return view
 
 
 def _refusal(argument: str, family: str, given: object) -> str:

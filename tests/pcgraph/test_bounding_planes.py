@@ -150,8 +150,8 @@ def test_boards_with_little_before_them_are_two():
 def test_a_gap_too_wide_for_each_piece_is_bridged_by_what_two_of_them_are_together():
     near = sheet([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     beside = sheet([0.0, 1.3, 0.0], [1.0, 0.0, 0.0], [0.0, 0.7, 0.0])
-    beyond = sheet([2.1, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.9, 0.0])
-    over = (*WALLS, sheet([1.1, 0.1, 0.7], [0.9, 0.0, 0.0], [0.0, 0.7, 0.0]))
+    beyond = sheet([1.9, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.9, 0.0])
+    over = (*WALLS, sheet([1.1, 0.1, 0.7], [0.7, 0.0, 0.0], [0.0, 0.7, 0.0]))
     bench = sheet([0.1, 1.05, 0.3], [0.8, 0.0, 0.0], [0.0, 0.2, 0.0])
     result, which = segmented(near, beyond, *over)
     assert not are_one(result, which)

@@ -147,7 +147,7 @@ def test_of_many_voxels_some_tell_the_same():
     """Of more than 30 000 every third is looked at, of more than 100 000 every seventh."""
     points, truth = room_with_a_cabinet(0, spacing=0.007)
     for voxel in (0.05, 0.025, 0.012):
-        result = pcgraph.segment(points, voxel_size=voxel, seed_size=0.25, viewpoint=(2.0, -1.0, 6.0))
+        result = pcgraph.segment(points, voxel_size=voxel, seed_size=0.25)
         assert len(objects_of(result.labels, truth, 0)) == 1
         assert len(objects_of(result.labels, truth, 1)) == 1
     assert result.surface.grid.n_voxels > 100_000

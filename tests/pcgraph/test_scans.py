@@ -157,6 +157,18 @@ def test_an_image_in_another_frame_was_seen_from_its_camera(rooms):
         assert weighted_overlap(result.labels, view.things) > 0.95
 
 
+def test_an_image_in_another_frame_that_is_said_to_be_a_cameras_is_the_one_that_is_found():
+    """It was refused, as no point of another frame need lie before the origin."""
+    image = image_of_steps()
+    turn = Rotation.random(random_state=1).as_matrix()
+    moved, place = image @ turn.T + (1.0, 2.0, 3.0), np.array([1.0, 2.0, 3.0])
+    found = pcgraph.segment(moved)
+    for settings in ({"camera": True}, {"camera": True, "viewpoint": place}):
+        told = pcgraph.segment(moved, **settings)
+        assert told.camera
+        assert np.array_equal(told.labels, found.labels)
+
+
 def test_an_image_whose_viewpoint_is_given_is_the_one_that_is_found():
     points, walls = image_of_a_hall(5.0, 1.4e-3, 2.85e-3)
     world = points[..., [0, 2, 1]] * [1.0, 1.0, -1.0] + [3.0, 2.0, 1.2]
@@ -442,7 +454,8 @@ def test_a_list_told_to_be_a_cameras_has_the_voxels_of_its_image():
     image = image_of_steps(120, 160)
     as_list = pcgraph.segment(image.reshape(-1, 3), camera=True)
     assert as_list.voxel_size == pcgraph.segment(image).voxel_size
-    assert as_list.voxel_size != pcgraph.segment(image, camera=False).voxel_size
+    assert as_list.camera
+    assert not pcgraph.segment(image, camera=False).camera
 
 
 def test_viewpoints_of_another_shape_are_refused():

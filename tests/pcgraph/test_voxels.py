@@ -28,6 +28,8 @@ def six(matrix):
     """xx, yy, zz, xy, xz, yz of a symmetric matrix."""
     return np.array([matrix[0, 0], matrix[1, 1], matrix[2, 2], matrix[0, 1], matrix[0, 2], matrix[1, 2]])
 
+RUNG = 2.0 ** (1 / 32) - 1.0  # by which sizes from the spacing are rounded, at most
+
 
 @settings(max_examples=200, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), spread=st.floats(-8.0, 0.0), scale=st.floats(-12.0, 12.0))
@@ -171,7 +173,7 @@ def test_the_spacing_of_an_image_is_that_of_its_pixels_at_the_median_depth(shape
     warp = choose_warp(points.reshape(-1, 3), np.zeros(3), camera=True)
     expected = pitch * float(np.median(points[..., 2]))
     assert median_spacing(points.reshape(-1, 3), warp) == pytest.approx(expected, rel=1e-6)
-    assert pcgraph.segment(points).surface.grid.size == pytest.approx(3.5 * expected, rel=1e-6)
+    assert pcgraph.segment(points).surface.grid.size == pytest.approx(3.5 * expected, rel=RUNG)
 
 
 def three_faces(noise: float) -> NDArray[np.float64]:
@@ -188,7 +190,7 @@ def test_voxels_are_smaller_where_points_lie_evenly_on_smooth_surfaces(noise: fl
     result, usual = pcgraph.segment(points), 3.5 * median_spacing(points)
     voxel = result.voxel_size
     assert result.labels.max() == 2
-    assert voxel < 0.8 * usual if is_smaller else voxel == pytest.approx(usual)
+    assert voxel < 0.8 * usual if is_smaller else voxel == pytest.approx(usual, rel=RUNG)
     assert pcgraph.segment(points, viewpoint=(-2.0, -2.0, -2.0)).voxel_size == voxel
     assert pcgraph.segment(points, voxel_size=0.05).voxel_size == 0.05
 
