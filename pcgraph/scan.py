@@ -372,8 +372,8 @@ def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
 def _view(
     viewpoint: ArrayLike | None, cloud: CleanCloud, camera: bool
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """From where a cloud was seen, (3,) or (n, 3): as given, else as pixels tell, or of a camera's image the origin; and
-    the axis of the camera that they tell. None if nothing does."""
+    """From where a cloud was seen, (3,) or (n, 3): as given, else as pixels tell, or of a camera's image the origin;
+    and the axis of the camera that they tell. None if nothing does."""
     if viewpoint is not None:
         given = clean_viewpoint(viewpoint, cloud)
         return given, axis_at(given, cloud) if given.ndim == 1 else None
@@ -536,8 +536,8 @@ def _warp(
 
 
 def _from_corner(warp: Warp, cloud: CleanCloud, size: float) -> Warp:
-    """Voxels counted from the cloud's corner where they do not grow about a place, so that a cloud that is moved has the
-    same."""
+    """Voxels counted from the cloud's corner, so that a cloud that is moved has the same, unless they grow about a
+    place."""
     return warp if warp.of_one_scan else Shift(cloud.bounds[0] - _ASIDE * size)
 
 

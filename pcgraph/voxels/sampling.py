@@ -185,7 +185,7 @@ def thinned(points: NDArray[np.float64], number: int, bounds: Bounds) -> NDArray
 def _thin(
     start: int, stop: int, points: NDArray[np.float64], low: NDArray[np.float64], scale: float, limit: np.uint64
 ) -> NDArray[np.int64]:
-    """Those of some points of whose place a hash lies below a limit: of its steps, or where there are none, its bits."""
+    """Those of some points of which a hash lies below a limit: of their steps or, where there are none, their bits."""
     found, n = np.empty(stop - start + 1, np.int64), np.int64(0)
     for p in range(start, stop):
         found[n] = p

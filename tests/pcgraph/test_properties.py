@@ -310,6 +310,38 @@ def test_the_unit_of_points_that_nothing_but_bridges_joins_does_not_matter(unit)
     assert np.array_equal(first.tree.altitudes, second.tree.altitudes)
 
 
+def things_on_a_floor(seed):
+    """A floor, a wall and five boxes at random, sampled at random with noise, (n, 3), metres."""
+    rng = np.random.default_rng(seed)
+    sides = [((0, 0, 0), (2, 0, 0), (0, 2, 0)), ((0, 2, 0), (2, 0, 0), (0, 0, 1))]
+    for _ in range(5):
+        (x, y), (a, b, c) = rng.uniform(0.1, 1.5, 2), rng.uniform(0.15, 0.4, 3)
+        sides += [
+            ((x, y, c), (a, 0, 0), (0, b, 0)),
+            ((x, y, 0), (a, 0, 0), (0, 0, c)),
+            ((x, y, 0), (0, b, 0), (0, 0, c)),
+        ]
+        sides += [((x, y + b, 0), (a, 0, 0), (0, 0, c)), ((x + a, y, 0), (0, b, 0), (0, 0, c))]
+    points = []
+    for corner, one, other in np.array(sides, float):
+        number = int(4000 * np.linalg.norm(np.cross(one, other)))
+        points.append(corner + rng.random((number, 1)) * one + rng.random((number, 1)) * other)
+    return np.concatenate(points) + rng.normal(0.0, 0.002, (sum(map(len, points)), 3))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_neither_unit_nor_place_nor_rounding_changes_objects(seed):
+    """Each of these was another draw of the points that tell the spacing, of cells and of seeds."""
+    points = things_on_a_floor(seed)
+    expected = pcgraph.segment(points)
+    others = {"millimetres": points * 1e3, "feet": points / 0.3048, "a map": points + [5e5, 5e6, 300.0]}
+    for name, moved in others.items():
+        assert np.array_equal(pcgraph.segment(moved).labels, expected.labels), name
+    for rounded in (points.astype(np.float32), (points + [1.2, 3.4, 5.6]).astype(np.float32)):
+        found = pcgraph.segment(rounded)
+        assert pcgraph.metrics.weighted_overlap(found.labels, expected.labels) > 0.99
+
+
 @quick
 @given(rng=rngs, steps=st.tuples(*[st.integers(-(2**9), 2**9)] * 3))
 def test_a_shift_by_whole_cells_of_both_grids_changes_ties_at_most(rng, steps):

@@ -666,3 +666,13 @@ def test_viewpoints_that_hardly_differ_are_one():
     assert each.labels.max() == pytest.approx(one.labels.max(), rel=0.1)
     apart = np.where(np.arange(len(points))[:, None] % 2 == 0, (3.0, 0.0, 0.0), (-3.0, 0.0, 0.0))
     assert pcgraph.segment(points, viewpoint=apart).viewpoint.ndim == 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_do_not_depend_on_whether_the_size_of_voxels_was_found_or_told(seed):
+    """They were those of the voxels that were tried first, half as large: 2 % of a sweep of 16 beams."""
+    points, _ = sweep_of_a_lot(16, -15.0, 15.0, [(8.0, 0.0, 0.0)], np.random.default_rng(seed))
+    stray = np.random.default_rng(seed).uniform((-40.0, -40.0, 0.0), (40.0, 40.0, 12.0), (60, 3))
+    found = pcgraph.segment(np.concatenate((points, stray)))
+    told = pcgraph.segment(np.concatenate((points, stray)), voxel_size=found.voxel_size)
+    assert np.array_equal(found.outliers, told.outliers)

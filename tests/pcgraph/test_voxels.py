@@ -28,6 +28,7 @@ def six(matrix):
     """xx, yy, zz, xy, xz, yz of a symmetric matrix."""
     return np.array([matrix[0, 0], matrix[1, 1], matrix[2, 2], matrix[0, 1], matrix[0, 2], matrix[1, 2]])
 
+
 RUNG = 2.0 ** (1 / 32) - 1.0  # by which sizes from the spacing are rounded, at most
 
 
