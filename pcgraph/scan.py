@@ -117,9 +117,10 @@ def segment(
         What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
     voxel_size : float, metres, optional
-        Their r. Default: 3.5 times the median distance between nearest points, whatever the unit; of a camera's, as if
-        all lay at the median depth; larger where surfaces would fall apart, and smaller, down to a half, where points
-        lie so evenly that surfaces stay whole, as the vertices of a mesh do.
+        Their r. Default: 3.5 times the median distance between nearest points, whatever the unit, rounded to one of 16
+        sizes per octave of the cloud's extent; of a camera's, as if all lay at the median depth; larger where surfaces
+        would fall apart, and smaller, down to a half, where points lie so evenly that surfaces stay whole, as the
+        vertices of a mesh do.
     seed_size : float, metres, optional
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
         least, where that would leave fewer than some 800 supervoxels, or 3200 on smooth surfaces.
@@ -144,7 +145,8 @@ def segment(
     Segmentation
         Every finite point but outliers has a supervoxel; the voxels that hold points of a supervoxel are connected
         (26-neighbourhood). The same points give the same supervoxels in any order, and node features up to the
-        rounding of sums; the number of threads changes nothing.
+        rounding of sums; the number of threads changes nothing. Neither do,
+        but for ties, their unit and a shift, unless the origin passed for the sensor's place.
 
     Raises
     ------

@@ -334,10 +334,10 @@ def test_neither_unit_nor_place_nor_rounding_changes_objects(seed):
     """Each of these was another draw of the points that tell the spacing, of cells and of seeds."""
     points = things_on_a_floor(seed)
     expected = pcgraph.segment(points)
-    others = {"millimetres": points * 1e3, "feet": points / 0.3048, "a map": points + [5e5, 5e6, 300.0]}
+    others = {"millimetres": points * 1e3, "feet": points / 0.3048, "a map": points + np.array((5e5, 5e6, 300.0))}
     for name, moved in others.items():
         assert np.array_equal(pcgraph.segment(moved).labels, expected.labels), name
-    for rounded in (points.astype(np.float32), (points + [1.2, 3.4, 5.6]).astype(np.float32)):
+    for rounded in (points.astype(np.float32), (points + np.array((1.2, 3.4, 5.6))).astype(np.float32)):
         found = pcgraph.segment(rounded)
         assert pcgraph.metrics.weighted_overlap(found.labels, expected.labels) > 0.99
 
