@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.disjoint_sets import connected_components
+from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.graph.bearing_image import (
@@ -33,6 +34,10 @@ _SMOOTH_RAD = 0.2  # surfaces at most this far apart in angle
 _SMOOTH_VOXELS = 2.0  # and in height may be one
 _LEAST_CROSSINGS = 2
 _SUPPORT = 2.0  # times as wide as what is hidden is the larger of the faces, at least
+_LEVEL, _EVEN = (
+    3.0,
+    0.05,
+)  # times as high as faces are uneven may they lie off each other; voxel edges they are, at least
 _OPEN = 0.5  # of the lines along which borders are hidden, at most, may find them open
 
 
@@ -132,7 +137,32 @@ def continuations(
     one_face = between[:, 0] == between[:, 1]
     areas = np.bincount(faces[surface.supervoxels], np.square(surface.grid.edge_lengths / surface.grid.size))
     wide = np.sqrt(areas[faces[found.pairs]].max(axis=1)) >= _SUPPORT * found.width / surface.grid.size
-    return found.chosen(wide & (one_face | (opened <= _OPEN * hidden))[pair])
+    return found.chosen(wide & (one_face | (opened <= _OPEN * hidden))[pair] & _are_level(surface, nodes, faces, found))
+
+
+def _are_level(
+    surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32], found: Continuations
+) -> NDArray[np.bool_]:
+    """Whether each supervoxel of a pair lies as near to the plane of the other's face as that can tell, (r,) bool.
+
+    What noise leaves open grows with the way from the middle of a face, what curvature does with the square of it.
+    Noise is the distance of points from the planes of their supervoxels, and what the face adds is curvature.
+    """
+    n_faces, scatters = int(faces.max()) + 1, nodes.size[:, None, None] * nodes.covariance
+    planes = grouped_moments(Moments(nodes.size, nodes.centroid, scatters, None), faces, n_faces)
+    edges = np.bincount(surface.supervoxels, surface.grid.edge_lengths) / np.bincount(surface.supervoxels)
+    variances = np.square(nodes.residual) + np.square(_EVEN * edges)
+    noise = np.sqrt(np.bincount(faces, nodes.size * variances, n_faces) / planes.counts)
+    level = np.ones(len(found.pairs), np.bool_)
+    for own, other in (found.pairs.T, found.pairs.T[::-1]):
+        face = faces[own]
+        spreads, across = np.linalg.eigh(planes.covariances[face])
+        ways = np.einsum("ij,ijk->ik", nodes.centroid[other] - planes.centroids[face], across)
+        reach = (np.square(ways) / np.maximum(spreads, np.square(noise[face])[:, None]))[:, 1:].sum(axis=1)
+        curvature = np.sqrt(np.maximum(spreads[:, 0] - np.square(noise[face]), 0.0))
+        uneven = noise[face] * (1.0 + np.sqrt(reach)) + curvature * (1.0 + reach) + noise[faces[other]]
+        level &= np.abs(ways[:, 0]) <= _LEVEL * uneven
+    return level
 
 
 class _Ways(NamedTuple):

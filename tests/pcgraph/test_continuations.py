@@ -83,6 +83,18 @@ def test_a_surface_that_jumps_behind_the_pillar_does_not_go_on():
     assert not objects_of(result.labels, thing, -1) & objects_of(result.labels, thing, 1)
 
 
+@pytest.mark.parametrize(("noise", "one"), [(0.0, False), (0.001, False), (0.02, True)])
+def test_a_surface_goes_on_if_it_lies_no_farther_off_behind_the_pillar_than_its_noise_leaves_open(noise, one):
+    points, thing = seen([PILLAR], 2.0)
+    depth = points[..., 2] + np.where((thing < 0) & (points[..., 0] > 0), 0.04, 0.0)  # metres, less than a voxel
+    depth += noise * np.random.default_rng(0).standard_normal(depth.shape)
+    result = pcgraph.segment(points * (depth / points[..., 2])[..., None])
+    left, right = (
+        objects_of(np.where(side, result.labels, -1), thing, -1) for side in (points[..., 0] < 0, points[..., 0] > 0)
+    )
+    assert bool(left & right) == one
+
+
 @pytest.mark.parametrize("back", [4.0, np.inf])
 def test_boards_in_one_plane_end_in_the_open_though_something_stands_before_a_part_of_the_gap(back):
     """A pole a third as high as the boards hides their borders along a few lines; the other lines see past them."""
