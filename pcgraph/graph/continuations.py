@@ -34,10 +34,8 @@ _SMOOTH_RAD = 0.2  # surfaces at most this far apart in angle
 _SMOOTH_VOXELS = 2.0  # and in height may be one
 _LEAST_CROSSINGS = 2
 _SUPPORT = 2.0  # times as wide as what is hidden is the larger of the faces, at least
-_LEVEL, _EVEN = (
-    3.0,
-    0.05,
-)  # times as high as faces are uneven may they lie off each other; voxel edges they are, at least
+_LEVEL = 3.0  # times what two faces are uneven by they may lie off each other's planes,
+_EVEN = 0.05  # voxel edges at least
 _OPEN = 0.5  # of the lines along which borders are hidden, at most, may find them open
 
 
