@@ -19,12 +19,13 @@ from pcgraph.parallel import in_blocks, kernel, summing_routine
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, seen_from
 from pcgraph.voxels.directions import farthest_first, sphere_directions
-from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
+from pcgraph.voxels.grid import AROUND_ON_SURFACE, Neighbourhood, VoxelGrid, voxel_grid
 from pcgraph.voxels.ground_and_rooms import LEVEL, bearing_plane, is_scanned_room
 from pcgraph.voxels.surface import fitted_windows
 from pcgraph.voxels.warp import Warp
 
 _CELLS = 5000  # of the coarse grid on which places are compared, about
+_MOSTLY_SURFACES = 0.5  # of the voxels are joined as on a surface, at least
 _OUTSIDE = 42  # places around the cloud, and
 _DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
 _INSIDE = 64  # free places within the bounding box, of a lattice of
@@ -515,8 +516,8 @@ class CoarseGrid(NamedTuple):
 
 
 def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: int = _CELLS) -> CoarseGrid:
-    """Voxels in larger ones, as few as still show their shape, in the frame of `unit_frame`; the outermost surfaces
-    amid a layer of them."""
+    """Voxels on surfaces in larger ones, as few as still show their shape, in the frame of `unit_frame`; the outermost
+    surfaces amid a layer of them."""
     places, points, width = _places_on_surfaces(grid)
     centres, width = (places - middle) / reach, width / reach
     size = width * max(1.0, math.sqrt(np.minimum(points, 1.0).sum() / (1.5 * cells)))  # as many as a surface would have
@@ -532,13 +533,21 @@ def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cell
 
 def _places_on_surfaces(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Places about as far from each other as voxels of level 0 are, (n, 3), the points for which each stands, (n,), and
-    that distance: voxels' means, and of larger voxels as many as these cover on their planes."""
+    that distance: voxels' means, and of larger voxels as many as these cover on their planes.
+
+    Voxels that are not joined as on a surface have no sides to be seen, and ghosts far off would stretch the box in
+    which places are tried: they do not count, unless most are such.
+    """
     points, edges = np.diff(grid.starts).astype(np.float64), grid.edge_lengths
+    counts = np.diff(grid.indptr) >= AROUND_ON_SURFACE
+    if np.mean(counts) < _MOSTLY_SURFACES:
+        counts[:] = True
     if grid.levels is None:
-        return grid.centroids, points, float(edges[0] if edges.min() == edges.max() else np.median(edges))
+        size = float(edges[0] if edges.min() == edges.max() else np.median(edges))
+        return grid.centroids[counts], points[counts], size
     normals, places, held = either_normals(grid), [], []
     for level in np.unique(grid.levels):
-        some, across = np.flatnonzero(grid.levels == level), 1 << int(level)
+        some, across = np.flatnonzero((grid.levels == level) & counts), 1 << int(level)
         ones, others = _along_planes(normals[some])
         steps = ((np.arange(across) + 0.5) / across - 0.5) * math.ldexp(grid.size, int(level))
         for one in steps:

@@ -357,6 +357,17 @@ def test_a_thinned_image_of_a_table_is_seen_from_above_it_however_turned(seed):
     assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.97
 
 
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_late_echoes_behind_a_thinned_image_of_a_table_do_not_turn_it_inside_out(seed):
+    """Each in a cube of its own, so that thinning leaves nearly all: they are no surface, and stretch no box."""
+    rng, image = np.random.default_rng(seed), image_of_a_table(seed)
+    late = rng.random(len(image)) < 0.09
+    ranges = np.where(late, 1.0 + rng.exponential(0.6, len(image)), 1.0)
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    points = thinned(image * ranges[:, None], 0.008) @ turn.T + 100.0
+    assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.95
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_wooded_ground_above_an_origin_in_its_middle_is_seen_from_above(seed):
     """Seen from the air, x and y centred and the elevation kept: as before a camera, but the ground hides trees."""
