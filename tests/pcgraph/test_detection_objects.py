@@ -32,7 +32,7 @@ def test_objects_on_the_ground_stand_in_their_boxes(boxes):
 
 def test_a_scan_of_bare_table_takes_no_object_away():
     """Two boxes that touch, of different height; only `Segmentation.objects` knows them after a scan without them."""
-    low, high = box(0.4, 0.3, 0.2), box(0.6, 0.3, 0.2) * [1, 1, 1.5]
+    low, high = box(0.4, 0.3, 0.2), box(0.6, 0.3, 0.2) * [1, 1, 2.0] + [0, 0.08, 0]
     table = patch((0, 0, 0), (1.2, 0, 0), (0, 0.8, 0))
     table = table[~((table[:, 0] > 0.39) & (table[:, 0] < 0.81) & (table[:, 1] > 0.29))]
     first = pcgraph.segment(np.vstack((table, low, high)), viewpoint=VIEWPOINT, voxel_size=3.5 * SPACING)

@@ -134,9 +134,9 @@ def test_shape_features_of_a_line_a_square_and_a_cloud():
 
 def test_given_normals_keep_their_direction():
     points = patch((0, 0, 1), (0.3, 0, 0), (0, 0.3, 0))
-    ridge = np.where(points[:, :1] < 0.15, (-0.6, 0.0, -0.8), (0.6, 0.0, -0.8))
+    ridge = np.where(points[:, :1] < 0.1523, (-0.6, 0.0, -0.8), (0.6, 0.0, -0.8))
     result = pcgraph.segment(points, normals=ridge, seed_size=0.1, voxel_size=0.02)
-    sides = points[:, 0] < 0.15
+    sides = points[:, 0] < 0.1523  # a border between cells
     mixed = [len(np.unique(sides[result.supervoxels == s])) == 2 for s in range(result.graph.n_nodes)]
     assert np.mean(mixed) < 0.3
     assert result.graph.edge_features.contact_convexity.max() > 1.0

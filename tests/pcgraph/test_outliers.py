@@ -63,6 +63,7 @@ def test_few_points_are_never_outliers():
     assert not outlier_voxels(voxel_grid(points, None, 0.02, Warp())).any()
 
 
+@pytest.mark.filterwarnings("ignore:expected points on surfaces")
 def test_a_cloud_without_any_surface_is_not_all_outliers():
     points = np.random.default_rng(0).uniform(0, 1, (5000, 3))
     assert (pcgraph.segment(points).labels >= 0).mean() > 1 / 3
