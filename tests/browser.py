@@ -67,7 +67,7 @@ class Page:
         self.call("Page.navigate", url="about:blank")  # a change of the state alone would load nothing
         self.said.clear()
         self.call("Page.navigate", url=f"{path.resolve().as_uri()}#{state}")
-        self.wait_for("document.documentElement?.dataset.ready === 'yes'")
+        self.wait_for("document.readyState === 'complete' && document.documentElement.dataset.ready === 'yes'")
 
     def wait_for(self, condition: str, seconds: float = 30.0) -> None:
         """Return when a JavaScript expression is true."""
