@@ -182,7 +182,7 @@ class DepthImage(NamedTuple):
         middle, far = (float(np.nanmedian(some)), float(np.nanquantile(some, _FAR))) if seen else (0.0, 0.0)
         with np.errstate(over="ignore"):  # of the tiniest depths
             steps = [_step_along(rows[:: max(1, rows.size // _SOME_TRIPLES)], far) for rows in (depths, depths.T)]
-        pitch = np.array([_pitch(points - place, along, image, one) for one in (1, image.shape[1])])
+        pitch = np.array([_pitch(points, place, along, image, one) for one in (1, image.shape[1])])
         return cls(place, axis, image, depths, min(filter(None, steps), default=0.0), pitch, middle, far)
 
     def spacing(self, of_points: float, warp: Warp) -> float:
@@ -223,12 +223,14 @@ class DepthImage(NamedTuple):
         return found if some_fly else np.zeros_like(found)
 
 
-def _pitch(rays: NDArray[np.float64], depths: NDArray[np.float64], image: Pixels, step: int) -> float:
-    """Median distance, at a depth of 1, of pixels a step apart in the image, of rays, (n, 3), and their depths, (n,);
-    0 if there are none."""
-    one, other = _pairs_beside(image, _some_of(image, _SOME_PAIRS), step)
-    ways = rays[other] / depths[other, None] - rays[one] / depths[one, None]
-    return float(np.median(np.linalg.norm(ways, axis=1))) if len(one) else 0.0
+def _pitch(
+    points: NDArray[np.float64], place: NDArray[np.float64], depths: NDArray[np.float64], image: Pixels, step: int
+) -> float:
+    """Median distance, as seen at a depth of 1 from a place, of pixels so many apart; 0 if there are none."""
+    one, other = (
+        (points[at] - place) / depths[at, None] for at in _pairs_beside(image, _some_of(image, _SOME_PAIRS), step)
+    )
+    return float(np.median(np.linalg.norm(other - one, axis=1))) if len(one) else 0.0
 
 
 def _step_along(rows: NDArray[np.float64], far: float) -> float:

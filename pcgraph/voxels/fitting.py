@@ -34,7 +34,7 @@ _HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them 
 _ENLARGEMENTS = 10
 # Voxels can be smaller by steps of a quarter of a power of two
 _REFINEMENTS = 4  # at most,
-_FEW_VOXELS, _MANY_VOXELS = 120_000, 320_000  # and at most to about the latter, for the time's sake,
+_FEW_VOXELS, _MANY_VOXELS = 120_000, 300_000  # and at most to about the latter, for the time's sake,
 _ALL_JOINED = 0.93  # and of them,
 _STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
 _JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
