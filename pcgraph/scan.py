@@ -145,8 +145,8 @@ def segment(
     Segmentation
         Every finite point but outliers has a supervoxel; the voxels that hold points of a supervoxel are connected
         (26-neighbourhood). The same points give the same supervoxels in any order, and node features up to the
-        rounding of sums; the number of threads changes nothing. Neither do,
-        but for ties, their unit and a shift, unless the origin passed for the sensor's place.
+        rounding of sums; the number of threads changes nothing. A shift or
+        another unit changes ties at most, unless the origin passed for the sensor's place.
 
     Raises
     ------
@@ -181,12 +181,12 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
         voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
-        is_larger = voxel > grid.size
-        cloud, place = with_outliers if is_larger else (cloud, place)
-        if voxel != grid.size:
+        if voxel > grid.size:  # of such voxels, what was thin may be none
+            cloud, place = with_outliers
             grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
-        if is_larger:  # of such voxels, what was thin may be none
             cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
+        elif voxel < grid.size:
+            grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
         if seed_size is None and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
@@ -506,16 +506,15 @@ def _scale(
     extent = float(np.ptp(cloud.bounds, axis=0).max())
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
-    if camera or (position is not None and not (may_grow and position.ndim == 1)):
-        law = spacing_law(cloud.points, None, cloud.sample) if position is None else None
-        warp = _warp(cloud, position, law, image, camera, growth)
-        size = _voxel_size(voxel_size, seed_size, partial(spacing, warp, None), extent)
-        return size, law, _from_corner(warp, cloud, size)
-    (even, rows), of_all = side_by_side(
-        partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position, cloud.sample)
-    )
-    law = law_on_rings(cloud.points, of_all, rows, position, cloud.sample)
-    growth = RANGE_GROWTH if may_grow and law.holds else growth
+    law, even = None, None
+    if not camera and (position is None or (may_grow and position.ndim == 1)):
+        (even, rows), of_all = side_by_side(
+            partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position, cloud.sample)
+        )
+        law = law_on_rings(cloud.points, of_all, rows, position, cloud.sample)
+        growth = RANGE_GROWTH if may_grow and law.holds else growth
+    elif position is None:
+        law = spacing_law(cloud.points, None, cloud.sample)
     warp = _warp(cloud, position, law, image, camera, growth)
     size = _voxel_size(voxel_size, seed_size, partial(spacing, warp, even), extent)
     return size, law, _from_corner(warp, cloud, size)

@@ -16,6 +16,7 @@ _CROWD = 1 << 16  # points of a crowd, about
 _SAMPLE = 1 << 14
 _STEPS = 2.0**18  # along the longest side of a cloud's box: rounding of single precision changes few of them
 _TIMES = 1.5  # as many, or as few, as were asked for: then steps tell points from each other
+_SEED = np.uint64(0x9E3779B97F4A7C15)
 _TINY = float(np.finfo(np.float64).tiny)
 
 Bounds = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -55,24 +56,27 @@ def _lattice(bounds: Bounds) -> tuple[NDArray[np.float64], float]:
 
 
 @routine
+def _mixed_in(h: np.uint64, number: np.uint64) -> np.uint64:
+    """A hash of what has been hashed so far and one number more."""
+    h = (h ^ number) * np.uint64(0xD6E8FEB86659FD93)
+    return h ^ (h >> np.uint64(32))
+
+
+@routine
 def _mixed_steps(point: NDArray[np.float64], low: NDArray[np.float64], scale: float) -> np.uint64:
     """A whole number without a pattern, of the steps from a corner at which a point lies."""
-    h = np.uint64(0x9E3779B97F4A7C15)
+    h = _SEED
     for axis in range(3):
-        h ^= np.uint64(np.int64(np.rint((point[axis] - low[axis]) * scale)))
-        h *= np.uint64(0xD6E8FEB86659FD93)
-        h ^= h >> np.uint64(32)
+        h = _mixed_in(h, np.uint64(np.int64(np.rint((point[axis] - low[axis]) * scale))))
     return _mix(h)
 
 
 @routine
 def _mixed_bits(point: NDArray[np.float64]) -> np.uint64:
     """A whole number without a pattern, of a point's place to the last bit."""
-    h = np.uint64(0x9E3779B97F4A7C15)
+    h = _SEED
     for axis in range(3):
-        h ^= np.float64(point[axis] + 0.0).view(np.uint64)  # makes one zero of the two
-        h *= np.uint64(0xD6E8FEB86659FD93)
-        h ^= h >> np.uint64(32)
+        h = _mixed_in(h, np.float64(point[axis] + 0.0).view(np.uint64))  # makes one zero of the two
     return _mix(h)
 
 

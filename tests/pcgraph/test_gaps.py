@@ -10,7 +10,7 @@ import pytest
 
 import pcgraph
 from pcgraph.graph.bearing_image import Squares, seen_through, view_from
-from pcgraph.graph.gaps import _ends_of_surfaces, gaps
+from pcgraph.graph.gaps import gaps
 from pcgraph.voxels.grid import Neighbourhood
 
 VOXEL = 0.05
@@ -84,11 +84,10 @@ def test_gaps_are_those_of_a_search_of_all_pairs():
     grid, labels = result.surface.grid, result.surface.supervoxels
     found = gaps(grid, result.surface.normals, labels, result.graph.node_features, result.graph.edges)
     touching = {tuple(pair) for pair in result.graph.edges.tolist()}
-    ends = np.zeros(grid.n_voxels, bool)
-    ends[_ends_of_surfaces(grid, labels, result.graph.edges, result.graph.n_nodes)] = True
+    degree = np.diff(grid.indptr)
     a, b = np.tril_indices(grid.n_voxels, -1)
     widths = np.linalg.norm(grid.warped[a] - grid.warped[b], axis=1) / grid.size
-    near = (widths <= 3.0 + 1e-9) & (labels[a] != labels[b]) & ends[a] & ends[b]
+    near = (widths <= 3.0 + 1e-9) & (labels[a] != labels[b]) & (np.maximum(degree[a], degree[b]) < 8)
     expected: dict[tuple[int, int], float] = {}
     for i, j, width in zip(labels[a[near]].tolist(), labels[b[near]].tolist(), widths[near].tolist(), strict=True):
         pair = min(i, j), max(i, j)
@@ -163,7 +162,7 @@ def scan_of_cartons(seed, apart):
     return (rays * (ranges + rng.normal(0.0, 0.003, len(ranges)))[:, None])[near], truth[near]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.xfail(reason="11 of 14 draws are right")), 1, 2, 3])
 def test_equal_cartons_in_a_row_are_objects(seed):
     """Their tops lie in one plane, and merged across 15 cm at any price: all six were one object."""
     points, truth = scan_of_cartons(seed, 0.15)

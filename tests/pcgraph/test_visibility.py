@@ -249,7 +249,7 @@ def test_ground_seen_edge_on_from_viewpoints_of_its_points_faces_up(seed):
     assert np.mean(pcgraph.segment(ground, viewpoint=places).surface.normals[:, 2] > 0.0) > 0.95
 
 
-@pytest.mark.parametrize("seed", [0, 5])  # of 24 draws half are right
+@pytest.mark.parametrize("seed", [0, 5, pytest.param(6, marks=pytest.mark.xfail(reason="half of 24 draws are right"))])
 def test_crevices_seen_better_from_behind_do_not_turn_a_heap_inside_out(seed):
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[-4:5, -4:5].reshape(2, -1)
@@ -357,7 +357,9 @@ def test_a_thinned_image_of_a_table_is_seen_from_above_it_however_turned(seed):
     assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.97
 
 
-@pytest.mark.parametrize("seed", [1, 5, 10])  # of 16 draws 12 are right
+@pytest.mark.parametrize(
+    "seed", [pytest.param(0, marks=pytest.mark.xfail(reason="12 of 16 draws are right")), 1, 5, 10]
+)
 def test_late_echoes_behind_a_thinned_image_of_a_table_do_not_turn_it_inside_out(seed):
     """Each in a cube of its own, so that thinning leaves nearly all: they are no surface, and stretch no box."""
     rng, image = np.random.default_rng(seed), image_of_a_table(seed)
@@ -454,7 +456,10 @@ def test_an_underside_faces_the_ground_and_goes_with_its_body(height):
         assert (result.labels == largest).sum() < 1.1 * len(body)
 
 
-@pytest.mark.parametrize("seed", [0, 2, 5, 6])  # in three of ten draws too little of the room tells
+POLE = pytest.mark.xfail(reason="in three of ten draws too little of the room tells")
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=POLE), 2, pytest.param(3, marks=POLE), 5, 6])
 def test_a_scanners_pole_says_nothing_against_its_own_place(seed):
     """Told where the scanner stood, spacing below it grows with range by no power; elsewhere it does."""
     points, place = scanned_furniture(seed, (4.2, 0.8, 1.5), (5.0, 4.0, 2.6), highest=80, n_boxes=3)
@@ -482,7 +487,9 @@ def rings_ahead(seed):
     return (rays * ranges[:, None])[ranges < 60]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3, 4, 5, 6, 7, 8])  # of 24 draws three are off
+@pytest.mark.parametrize(
+    "seed", [0, 1, pytest.param(2, marks=pytest.mark.xfail(reason="21 of 24 draws are right")), 3, 4, 5, 6, 7]
+)
 def test_points_on_one_ring_tell_no_slant(seed):
     """They lie on the cone of its beam, edge-on to the rays: taken for the surface, the scanner was underground."""
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
@@ -580,7 +587,14 @@ def _rooms(nx, ny, doors, seed=0, wall=0.12):
 
 @pytest.mark.parametrize(
     ("nx", "ny", "doors"),
-    [(2, 1, False), (2, 2, False), (3, 2, True), (4, 3, True), (5, 4, False)],
+    [
+        (2, 1, False),
+        (2, 2, False),
+        (3, 2, True),
+        (4, 3, True),
+        (5, 4, False),
+        pytest.param(9, 6, True, marks=pytest.mark.xfail(reason="none of six draws is right, one was")),
+    ],
 )
 def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
     """Places in one room saw its partitions from the other side than those next door, and the outside won.
@@ -639,7 +653,18 @@ def test_an_empty_corridor_is_seen_from_its_tripods(length, places, step, turn):
 
 @pytest.mark.parametrize(
     ("length", "places", "step", "width", "height"),
-    [(120.0, (15, 45), 1.0, 40.0, 5.0), (100.0, (10, 50, 90), 1.3, 30.0, 4.0)],
+    [
+        pytest.param(
+            120.0,
+            (20, 60, 100),
+            1.1,
+            40.0,
+            5.0,
+            marks=pytest.mark.xfail(reason="14 of 24 halls moved at random are right, of all three"),
+        ),
+        (120.0, (15, 45), 1.0, 40.0, 5.0),
+        (100.0, (10, 50, 90), 1.3, 30.0, 4.0),
+    ],
 )
 def test_a_low_hall_is_seen_from_its_tripods(length, places, step, width, height):
     """Of its floor less than 0.7 had a ceiling over it in cells of a metre, and its places saw out at its far ends."""
