@@ -20,7 +20,10 @@ def test_every_method_covers_and_connects(method, name):
     assert_covered_and_connected(DEGENERATE[name], pcgraph.segment(DEGENERATE[name], method=method))
 
 
-def test_supervoxels_keep_to_the_edges_of_a_step():
+@pytest.mark.parametrize(
+    "edge", [3.4, pytest.param(3.7, marks=pytest.mark.xfail(reason="where cells start now, a row of points is wrong"))]
+)
+def test_supervoxels_keep_to_the_edges_of_a_step(edge):
     """A floor and a block's front and top: every point on the right side, to within a point, though voxels straddle."""
     faces = [
         patch((0, 0, 0), (0.6, 0, 0), (0, 0.3, 0)),
@@ -29,7 +32,7 @@ def test_supervoxels_keep_to_the_edges_of_a_step():
     ]
     points, truth = np.vstack(faces), np.repeat([0, 1, 2], [len(face) for face in faces])
     on_an_edge = (abs(points[:, 1] - 0.3) < 1e-9) & ((abs(points[:, 2]) < 1e-9) | (abs(points[:, 2] - 0.2) < 1e-9))
-    settings = {"voxel_size": 3.4 * SPACING, "seed_size": 0.15, "viewpoint": (0.3, -3, 2)}
+    settings = {"voxel_size": edge * SPACING, "seed_size": 0.15, "viewpoint": (0.3, -3, 2)}
     surface = pcgraph.segment(points, **settings).supervoxels
     vccs = pcgraph.segment(points, **settings, method=pcgraph.Vccs()).supervoxels
     error = undersegmentation_error(surface[~on_an_edge], truth[~on_an_edge])
