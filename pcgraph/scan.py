@@ -48,7 +48,7 @@ from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.directions import farthest_first
 from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.fitting import fitting_grading, fitting_size, seed_spacing
-from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means
+from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means, with_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
@@ -171,7 +171,7 @@ def segment(
     n_points = len(cloud.points)
     for _ in range(2):
         voxel, law, warp = _scale(cloud, place, image, camera, range_growth, voxel_size, seed_size)
-        grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
+        grid = voxel_grid(cloud.points, None, voxel, warp)
         with_outliers = cloud, place
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
@@ -183,13 +183,14 @@ def segment(
         voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
         if voxel > grid.size:  # of such voxels, what was thin may be none
             cloud, place = with_outliers
-            grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
+            grid = voxel_grid(cloud.points, None, voxel, warp)
             cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         elif voxel < grid.size:
-            grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features)
+            grid = voxel_grid(cloud.points, None, voxel, warp)
         if seed_size is None and (grading := fitting_grading(grid)) is not None:
-            grid = voxel_grid(cloud.points, cloud.colors, voxel, warp, cloud.features, grading)
+            grid = voxel_grid(cloud.points, None, voxel, warp, None, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
+    grid = with_means(grid, cloud.colors, cloud.features)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
     warn_of_volume(grid)
     if place is not None and place.ndim == 1 and viewpoint is not None:

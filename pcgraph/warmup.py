@@ -51,7 +51,7 @@ from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
-from pcgraph.voxels.warp import CameraWarp, Warp
+from pcgraph.voxels.warp import CameraWarp, Shift, Warp
 
 _EDGE = 24  # points along the cloud's edges
 _SPACING = 0.01  # metres between neighbouring points
@@ -120,6 +120,7 @@ def compile_in_two_processes() -> None:
 def compile_voxels() -> None:
     """Compile what it takes from points to supervoxels, and half of the orientation."""
     points, grid = _step_in_voxels()
+    Shift(points[0]).in_voxels(points, _SPACING)
     some_blocks(points)
     median_spacing(points)
     spacing_law(points)

@@ -108,7 +108,7 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
         if size > largest:
             break
         # After two steps eight cells are one, so that only the first step needs the points.
-        scaled = cells[0] / 2.0 if step > 1 else grid.warp.forward(points) / size
+        scaled = cells[0] / 2.0 if step > 1 else grid.warp.in_voxels(points, size)
         larger, degrees = occupied_cells(scaled, size)
         if len(larger) < _MIN_VOXELS:
             break

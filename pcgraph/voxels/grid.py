@@ -231,9 +231,7 @@ def voxel_grid(
     ValueError
         The cloud spans so many voxels that a grid coordinate cannot be written as a whole number.
     """
-    with np.errstate(over="ignore"):
-        scaled = warp.forward(points)
-        scaled = np.divide(scaled, size, out=None if scaled is points else scaled)
+    scaled = warp.in_voxels(points, size)
     level_of_point = None if grading is None else grading.levels_of(scaled)
     if level_of_point is not None:
         scaled = scaled / enlarged(np.ones(len(scaled)), level_of_point)[:, None]
@@ -246,10 +244,8 @@ def voxel_grid(
     in_blocks(_gather, n_voxels, starts, order, scaled, voxel_of_point, cells, warped)
     warped *= size if levels is None else enlarged(np.full(n_voxels, size), levels)[:, None]
     centroids = warp.backward(warped)
-    if colors is not None:
-        colors = _sorted_means(colors, starts, order, _COLOR_STEPS)
     indptr, neighbours = _touching(ordered[starts[:-1]], pitch, cells, levels)
-    return VoxelGrid(
+    grid = VoxelGrid(
         size=size,
         warp=warp,
         cells=cells,
@@ -260,12 +256,23 @@ def voxel_grid(
         warped=warped,
         centroids=centroids,
         edge_lengths=enlarged(size * warp.scale(centroids), levels),
-        colors=colors,
+        colors=None,
         indptr=indptr,
         neighbours=neighbours,
-        features=None if features is None else group_means(features, voxel_of_point, n_voxels),
         levels=levels,
         grading=grading,
+    )
+    return with_means(grid, colors, features)
+
+
+def with_means(
+    grid: VoxelGrid, colors: NDArray[np.float64] | None, features: NDArray[np.float32] | None
+) -> VoxelGrid:
+    """The grid with the mean colours and features of its points; both as for `voxel_grid`."""
+    return replace(
+        grid,
+        colors=None if colors is None else _sorted_means(colors, grid.starts, grid.order, _COLOR_STEPS),
+        features=None if features is None else group_means(features, grid.voxel_of_point, grid.n_voxels),
     )
 
 

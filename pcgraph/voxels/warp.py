@@ -57,6 +57,12 @@ class Warp:
         """Warped positions, (n, 3) float64, metres, of points (n, 3) in metres."""
         return points
 
+    def in_voxels(self, points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+        """Warped positions, (n, 3) float64, in edges of voxels of a size, metres; infinite beyond all numbers."""
+        warped = self.forward(points)
+        with np.errstate(over="ignore"):
+            return np.divide(warped, size, out=None if warped is points else warped)
+
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of warped positions."""
         return warped
@@ -95,6 +101,12 @@ class Shift(Warp):
     def forward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Positions, (n, 3) float64, metres, from the corner."""
         return points - self.corner
+
+    def in_voxels(self, points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+        """Positions, (n, 3) float64, from the corner, in edges of voxels; as `forward`, then divided."""
+        counted = np.empty((len(points), 3))
+        in_blocks(_count_from, len(points), points, self.corner, size, counted)
+        return counted
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of positions from the corner."""
@@ -266,6 +278,21 @@ def _measure(
     """Set ranges of points."""
     for p in range(start, stop):
         _, _, _, ranges[p] = _ray(points, p, viewpoint)
+
+
+@kernel
+def _count_from(
+    start: int,
+    stop: int,
+    points: NDArray[np.float64],
+    corner: NDArray[np.float64],
+    size: float,
+    counted: NDArray[np.float64],
+) -> None:
+    """Set positions from a corner, in edges of voxels."""
+    for p in range(start, stop):
+        for axis in range(3):
+            counted[p, axis] = (points[p, axis] - corner[axis]) / size
 
 
 @kernel
