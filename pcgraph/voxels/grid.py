@@ -265,9 +265,7 @@ def voxel_grid(
     return with_means(grid, colors, features)
 
 
-def with_means(
-    grid: VoxelGrid, colors: NDArray[np.float64] | None, features: NDArray[np.float32] | None
-) -> VoxelGrid:
+def with_means(grid: VoxelGrid, colors: NDArray[np.float64] | None, features: NDArray[np.float32] | None) -> VoxelGrid:
     """The grid with the mean colours and features of its points; both as for `voxel_grid`."""
     return replace(
         grid,
