@@ -21,7 +21,7 @@ from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, seen_from
 from pcgraph.voxels.directions import farthest_first, sphere_directions
 from pcgraph.voxels.grid import AROUND_ON_SURFACE, Neighbourhood, VoxelGrid, voxel_grid
 from pcgraph.voxels.ground_and_rooms import LEVEL, bearing_plane, is_scanned_room
-from pcgraph.voxels.surface import fitted_windows
+from pcgraph.voxels.surface import Windows, fitted_windows
 from pcgraph.voxels.warp import Warp
 
 _CELLS = 5000  # of the coarse grid on which places are compared, about
@@ -42,6 +42,8 @@ _ROUNDS = 12  # of agreement between places and orientations
 _HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, in rooms,
 _LEADERS = 6  # single places
 _WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
+_FLAT, _LEFT_OPEN = 0.1, 0.02  # cells off its plane is a cell with those around, at most; and of what the places of an
+# agreement see, as much may be planes from behind as cells are coarse, noise thick and things thin
 _CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
 _BOTH_SIDES = 0.2  # cosine under which places closed in see either side of a partition, at least
 _FINER = 1, 2, 4  # times as many cells and places, if some are closed in, until one agreement shows
@@ -95,9 +97,14 @@ def unit_frame(grid: VoxelGrid, places: NDArray[np.float64]) -> tuple[NDArray[np
 
 def either_normals(grid: VoxelGrid) -> NDArray[np.float64]:
     """Unit normals of the surface at each voxel, (v, 3), towards either side."""
+    return _windows(grid).normals
+
+
+def _windows(grid: VoxelGrid) -> Windows:
+    """Planes through each voxel and those around it, their normals towards either side."""
     upwards = np.zeros((grid.n_voxels, 3))
     upwards[:, 2] = 1.0
-    return fitted_windows(grid, upwards).normals
+    return fitted_windows(grid, upwards)
 
 
 def lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -122,7 +129,8 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
     """The places, with so many times as many cells, and whether more of them would hardly show more."""
     middle, reach = unit_frame(grid, grid.centroids)
     coarse, points = coarse_grid(grid, middle, reach, finer * _CELLS)
-    normals = either_normals(coarse)
+    windows = _windows(coarse)
+    normals, is_flat = windows.normals, windows.residuals <= (_FLAT * coarse.size) ** 2
     viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
     tried, part_of_cell = _places_to_try(coarse, points, normals, -middle / reach, viewpoint, finer)
     seen = seen_from(tried.places, coarse.centroids, coarse.edge_lengths, normals)
@@ -136,7 +144,7 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
         seen, sides, voting = (np.where(asked, every[of_place], every.dtype.type(0)) for every in (seen, sides, voting))
     found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
     from_outside, likely, closed = of_place < _OUTSIDE, tried.likely[of_place], tried.closed[of_place]
-    looks = _Looks(sides, from_outside, likely, closed, of_part, part_of_cell)
+    looks = _Looks(sides, from_outside, likely, closed, of_part, part_of_cell, is_flat)
     room_counts, has_rooms = np.zeros(int(part_of_cell.max()) + 1), np.count_nonzero(in_rooms) >= _FEW
     for part in range(len(room_counts) if has_rooms else 0):
         cells = part_of_cell == part
@@ -225,6 +233,8 @@ class _Looks(NamedTuple):
     of_part : (k,) int64
         The part at which each is.
     part_of_cell : (n,) int64
+    is_flat : (n,) bool
+        Whether cells lie on planes with those around. Places beyond an edge see what is on it from its back.
     """
 
     sides: NDArray[np.float32]
@@ -233,6 +243,7 @@ class _Looks(NamedTuple):
     closed: NDArray[np.float64]
     of_part: NDArray[np.int64]
     part_of_cell: NDArray[np.int64]
+    is_flat: NDArray[np.bool_]
 
 
 def _looks_at_parts(
@@ -430,12 +441,12 @@ def _most_telling(
     every, closed = of_looks @ of_parts, of_looks @ (of_parts * looks.closed[:, None])
     is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
     rooms_count = ((closed >= _NEARLY_CLOSED * every) & (every > 0.0)) @ room_counts
-    shown = np.empty(len(different))
-    in_blocks(_show, len(different), different, looks.sides, found, around, is_closed, shown, smallest=1)
+    shown, contradicted = np.empty(len(different)), np.empty(len(different))
+    in_blocks(_show, len(different), different, looks, found, around, is_closed, shown, contradicted, smallest=1)
     most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
-    for s, fraction, of_rooms in zip(different, shown, rooms_count, strict=True):
+    for s, fraction, of_rooms, against in zip(different, shown, rooms_count, contradicted, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
-        score = min(float(fraction), most_shown - _AS_MUCH) + float(of_rooms)
+        score = min(float(fraction), most_shown - _AS_MUCH) + float(of_rooms) - max(float(against) - _LEFT_OPEN, 0.0)
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
         score += _DECIDED * float(decided[visible > 0.0].mean())
         for some, counts in ((looks.from_outside, _OUTSIDE_IN), (looks.likely, likely_counts)):
@@ -450,27 +461,36 @@ def _show(
     start: int,
     stop: int,
     different: NDArray[np.int64],
-    sides: NDArray[np.float32],
+    looks: _Looks,
     found: _Agreements,
     around: Neighbourhood,
     is_closed: NDArray[np.bool_],
     shown: NDArray[np.float64],
+    contradicted: NDArray[np.float64],
 ) -> None:
-    """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in.
+    """Set the fraction of the cells that each of some agreements shows, or shows beside them unless closed in; and how
+    much of what its places see are planes from behind.
 
     Of partitions, on which no place has a vote, either side counts.
     """
+    sides, is_flat = looks.sides, looks.is_flat
     n_places, n = sides.shape
     of_cells, nothing = np.empty(n, np.float32), np.float32(0.0)
     for d in range(start, stop):
         weights, outward = found.weights[different[d]], found.outward[different[d]]
         for i in range(n):
             of_cells[i] = nothing
+        seen = against = nothing
         for k in range(n_places):
             if weights[k] > 0.0:
+                of_place = against_it = nothing
                 for i in range(n):
                     value = sides[k, i] * outward[i] if outward[i] != nothing else abs(sides[k, i])
                     of_cells[i] += weights[k] * max(value, nothing)
+                    of_place += abs(value)
+                    against_it += max(-value, nothing) if is_flat[i] else nothing
+                seen, against = seen + weights[k] * of_place, against + weights[k] * against_it
+        contradicted[d] = against / max(seen, np.float32(_TINY))
         total = 0.0
         for i in range(n):
             most = of_cells[i]

@@ -82,8 +82,9 @@ def visible_sides(
     by a depth buffer over directions. A place counts as far as it agrees with others which side of what it sees is the
     outside; so if those above the floor are right, one under it, which sees it from below, counts nothing. There are
     several such agreements: within a room, around it, above it, below. All that was measured was seen from somewhere,
-    so the right one is that whose places see all of the surface, where others have furniture hidden by walls. Where
-    two show as much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
+    so the right one is that whose places see all of the surface, where others have furniture hidden by walls, and no
+    plane from behind, as those within a hall see the walls that others take for the sides of a box. Where two show as
+    much, as of a hollow shell, or of things on a table from below, what counts is that no place sees both
     sides, then how much of what is seen from outside has its outside there, and how much of what is seen from those of
     these places before the plane that bears most, as the ground or a table does, on which things stand (above it, if it
     is level); or from the origin, if that lies there and all before it, as before a camera that looks along z. Where a
