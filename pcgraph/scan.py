@@ -182,10 +182,12 @@ def segment(
         warn_of_duplicates(cloud, spacing)
         voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
         if voxel > grid.size:  # of such voxels, what was thin may be none
+            warp = _from_corner(warp, with_outliers[0], voxel)
             cloud, place = with_outliers
             grid = voxel_grid(cloud.points, None, voxel, warp)
             cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         elif voxel < grid.size:
+            warp = _from_corner(warp, with_outliers[0], voxel)
             grid = voxel_grid(cloud.points, None, voxel, warp)
         if seed_size is None and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, None, voxel, warp, None, grading)

@@ -196,6 +196,15 @@ def test_voxels_are_smaller_where_points_lie_evenly_on_smooth_surfaces(noise: fl
     assert pcgraph.segment(points, voxel_size=0.05).voxel_size == 0.05
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.5])
+def test_the_sizes_of_a_result_give_its_voxels_again(noise: float) -> None:
+    """Cells were counted from a corner that kept a margin of the size before it was made to fit."""
+    points = three_faces(noise)
+    found = pcgraph.segment(points)
+    again = pcgraph.segment(points, voxel_size=found.voxel_size, seed_size=found.seed_size)
+    assert np.array_equal(found.supervoxels, again.supervoxels)
+
+
 @pytest.mark.filterwarnings("ignore:expected far fewer objects")
 def test_voxels_of_an_image_do_not_depend_on_what_flies_before_it() -> None:
     """Small pieces all over the depth, as seen through glass, are joined to nothing at any size."""
