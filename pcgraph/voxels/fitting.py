@@ -175,7 +175,7 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
     grid : VoxelGrid
         Its voxels are of one size.
     """
-    joined = np.diff(grid.indptr) >= AROUND_ON_SURFACE
+    joined = grid.joined
     if grid.warp.of_one_scan or np.mean(joined) >= _NEARLY_ALL:
         return None
     keys, pitch = cell_keys(grid.cells / BLOCK, grid.size)

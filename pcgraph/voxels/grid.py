@@ -141,6 +141,11 @@ class VoxelGrid(ShortRepr):
             size = math.ldexp(self.size, int(level))
             yield of_level, replace(grid_without(self, ~of_level), size=size, levels=None, grading=None)
 
+    @property
+    def joined(self) -> NDArray[np.bool_]:
+        """Whether each voxel has as many others around it as on a surface, (v,) bool."""
+        return np.diff(self.indptr) >= AROUND_ON_SURFACE
+
     def touching_pairs(self) -> NDArray[np.int64]:
         """Pairs of voxels that touch, (m, 2), each in both orders."""
         source = np.repeat(np.arange(self.n_voxels), np.diff(self.indptr))

@@ -19,7 +19,7 @@ from pcgraph.parallel import in_blocks, kernel, summing_routine
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, seen_from
 from pcgraph.voxels.directions import farthest_first, sphere_directions
-from pcgraph.voxels.grid import AROUND_ON_SURFACE, Neighbourhood, VoxelGrid, voxel_grid
+from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
 from pcgraph.voxels.ground_and_rooms import LEVEL, bearing_plane, is_scanned_room
 from pcgraph.voxels.surface import Windows, fitted_windows
 from pcgraph.voxels.warp import Warp
@@ -56,8 +56,8 @@ _ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least;
 _FROM_CAMERA = 0.93  # of what is visible from the other side of a pit, or table, is from a camera over it, at least
-_VIEWS, _MOST_VIEWS = 12, 48  # places that the voxels themselves are looked at from; and more, each of which
-_NEWS = 0.005  # of all cells is seen by first
+_VIEWS, _MOST_VIEWS = 12, 128  # places that the voxels themselves are looked at from; and more, each of which
+_NEWS = 0.005  # of all cells is seen by first, or four times as much by second
 _TINY = 1e-12
 
 
@@ -504,7 +504,7 @@ def _show(
 def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.int64]:
     """Some of the places, by weight and by how much each sees, (k, n) bool, that those before see seldom or never.
 
-    So each of many rooms has one.
+    So each of many rooms has one, also where its neighbours have places that see much of it through doors.
     """
     places = np.flatnonzero(weights > 0.0)
     left, sees = weights[places], seen[places].astype(np.float32)
@@ -512,7 +512,7 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
     chosen: list[int] = []
     while len(chosen) < _MOST_VIEWS and left.any():
         best = int(np.argmax(left * np.einsum("kn,n->k", sees, interest)))
-        if len(chosen) >= _VIEWS and (sees[best] @ (interest == 1.0)) < _NEWS * len(interest):
+        if len(chosen) >= _VIEWS and sees[best] @ interest < _NEWS * len(interest):
             break
         chosen.append(best)
         interest[sees[best] > 0.0] *= np.float32(0.25)
@@ -559,7 +559,7 @@ def _places_on_surfaces(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[n
     which places are tried: they do not count, unless most are such.
     """
     points, edges = np.diff(grid.starts).astype(np.float64), grid.edge_lengths
-    counts = np.diff(grid.indptr) >= AROUND_ON_SURFACE
+    counts = grid.joined
     if np.mean(counts) < _MOSTLY_SURFACES:
         counts[:] = True
     if grid.levels is None:

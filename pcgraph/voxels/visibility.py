@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.depth_buffer import cosines_towards, seen_from
-from pcgraph.voxels.grid import AROUND_ON_SURFACE, Neighbourhood, VoxelGrid
+from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
 from pcgraph.voxels.ground_and_rooms import bearing_plane
 from pcgraph.voxels.telling_places import (
     TellingPlaces,
@@ -243,7 +243,7 @@ def shown_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     All that one scan holds is shown by its place, but for what coarse voxels hide of what lies beside them; the far
     side of what a moving scanner passed is not.
     """
-    normals, joined = either_normals(grid), np.diff(grid.indptr) >= AROUND_ON_SURFACE
+    normals, joined = either_normals(grid), grid.joined
     visible = _visible(grid, place, normals).astype(np.float64)
     shown = _spread_votes(grid, np.abs(_on_one_surface(grid, normals)), visible) > 0.0
     return float(np.mean(shown[joined])) if joined.any() else 1.0
