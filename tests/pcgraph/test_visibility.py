@@ -594,7 +594,6 @@ def _rooms(nx, ny, doors, seed=0, wall=0.12):
         (4, 3, True),
         (5, 4, False),
         (9, 6, True),
-        (9, 6, False),
     ],
 )
 def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
