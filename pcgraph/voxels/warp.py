@@ -59,8 +59,8 @@ class Warp:
 
     def in_voxels(self, points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
         """Warped positions, (n, 3) float64, in edges of voxels of a size, metres; infinite beyond all numbers."""
-        warped = self.forward(points)
         with np.errstate(over="ignore"):
+            warped = self.forward(points)
             return np.divide(warped, size, out=None if warped is points else warped)
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
