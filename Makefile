@@ -17,8 +17,9 @@ demo: $(VENV)/.installed ## set up if needed, run the comparison on the tabletop
 	$(BIN)/rangesim run $(DEMO_SCENE) --out $(DEMO_OUT)
 	@echo "Report: $(CURDIR)/$(DEMO_OUT)/report.html"
 
-# Each worker traces with all cores for a part of its time: more than four workers gain nothing.
-PARALLEL := -n auto --maxprocesses=4 --dist loadfile
+# Each worker traces with all cores for a part of its time: more than four workers gain nothing. Files go in the order
+# of tests/conftest.py, as those of most tests are not those that take longest.
+PARALLEL := -n auto --maxprocesses=4 --dist loadfile --no-loadscope-reorder
 test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run every test
 	$(BIN)/python -m pytest $(PARALLEL)
 

@@ -29,6 +29,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.disable()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The file that takes longest, which runs all examples, first: else one worker ends minutes after the others."""
+    items.sort(key=lambda item: item.path.name != "test_readme.py")
+
+
 def pytest_collection_finish() -> None:
     """From here on garbage is collected, but what is there by now is not looked through again and again."""
     gc.freeze()
