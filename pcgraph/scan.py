@@ -145,8 +145,8 @@ def segment(
     Segmentation
         Every finite point but outliers has a supervoxel; the voxels that hold points of a supervoxel are connected
         (26-neighbourhood). The same points give the same supervoxels in any order, and node features up to the
-        rounding of sums; the number of threads changes nothing. A shift or
-        another unit changes ties at most, unless the origin passed for the sensor's place.
+        rounding of sums; the number of threads changes nothing. A shift or another unit changes ties at most, unless
+        the origin passed for the sensor's place.
 
     Raises
     ------
@@ -270,11 +270,12 @@ def update(
     size, warp, grading = before.grid.size, before.grid.warp, before.grid.grading
     image = _depth_image(cloud, place, axis, _is_camera(cloud, place, axis, None))
     cloud = _without_flying(cloud, image)
-    seen = voxel_grid(cloud.points, cloud.colors, size, warp, cloud.features)
+    seen = voxel_grid(cloud.points, None, size, warp)
     cloud, seen, place = _without(outlier_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
     if grading is not None:
-        seen = voxel_grid(cloud.points, cloud.colors, size, warp, cloud.features, grading)
+        seen = voxel_grid(cloud.points, None, size, warp, None, grading)
     cloud, seen, place = _without(detached_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
+    seen = with_means(seen, cloud.colors, cloud.features)
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, seen)
     union = grid_union(before.grid, seen)
