@@ -171,7 +171,7 @@ def segment(
     n_points = len(cloud.points)
     for _ in range(2):
         voxel, law, warp = _scale(cloud, place, image, camera, range_growth, voxel_size, seed_size)
-        grid = voxel_grid(cloud.points, None, voxel, warp)
+        grid = voxel_grid(cloud.points, voxel, warp)
         with_outliers = cloud, place
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
@@ -181,16 +181,15 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
         voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
-        if voxel > grid.size:  # of such voxels, what was thin may be none
-            warp = _from_corner(warp, with_outliers[0], voxel)
-            cloud, place = with_outliers
-            grid = voxel_grid(cloud.points, None, voxel, warp)
-            cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        elif voxel < grid.size:
-            warp = _from_corner(warp, with_outliers[0], voxel)
-            grid = voxel_grid(cloud.points, None, voxel, warp)
+        if voxel != grid.size:
+            warp, is_larger = _from_corner(warp, with_outliers[0], voxel), voxel > grid.size
+            if is_larger:  # of such voxels, what was thin may be none
+                cloud, place = with_outliers
+            grid = voxel_grid(cloud.points, voxel, warp)
+            if is_larger:
+                cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if seed_size is None and (grading := fitting_grading(grid)) is not None:
-            grid = voxel_grid(cloud.points, None, voxel, warp, None, grading)
+            grid = voxel_grid(cloud.points, voxel, warp, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     grid = with_means(grid, cloud.colors, cloud.features)
     initial_labels = np.full(grid.n_voxels, -1, np.int32)
@@ -270,10 +269,10 @@ def update(
     size, warp, grading = before.grid.size, before.grid.warp, before.grid.grading
     image = _depth_image(cloud, place, axis, _is_camera(cloud, place, axis, None))
     cloud = _without_flying(cloud, image)
-    seen = voxel_grid(cloud.points, None, size, warp)
+    seen = voxel_grid(cloud.points, size, warp)
     cloud, seen, place = _without(outlier_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
     if grading is not None:
-        seen = voxel_grid(cloud.points, None, size, warp, None, grading)
+        seen = voxel_grid(cloud.points, size, warp, grading)
     cloud, seen, place = _without(detached_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
     seen = with_means(seen, cloud.colors, cloud.features)
     if place is not None and place.ndim == 1 and viewpoint is not None:
@@ -643,7 +642,9 @@ def _some_viewpoints(given: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.
 
 def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Places a thousand voxel edges off the voxels in some directions, (3,) or (v, 3): from there they are seen."""
-    return grid.centroids + directions * (1e3 * grid.edge_lengths)[:, None]
+    places = directions * (1e3 * grid.edge_lengths)[:, None]
+    places += grid.centroids
+    return places
 
 
 def _voxel_size(

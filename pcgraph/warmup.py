@@ -44,14 +44,14 @@ from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels import telling_places
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grading import Grading
-from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid
+from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid, with_means
 from pcgraph.voxels.outliers import outlier_voxels
 from pcgraph.voxels.sampling import some_blocks, thinned
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.surface import Surface
 from pcgraph.voxels.visibility import visible_fraction, visible_sides
-from pcgraph.voxels.warp import CameraWarp, Shift, Warp
+from pcgraph.voxels.warp import CameraWarp, Warp
 
 _EDGE = 24  # points along the cloud's edges
 _SPACING = 0.01  # metres between neighbouring points
@@ -120,7 +120,6 @@ def compile_in_two_processes() -> None:
 def compile_voxels() -> None:
     """Compile what it takes from points to supervoxels, and half of the orientation."""
     points, grid = _step_in_voxels()
-    Shift(points[0]).in_voxels(points, _SPACING)
     some_blocks(points)
     median_spacing(points)
     spacing_law(points)
@@ -184,7 +183,7 @@ def _compile_graph_and_tree() -> None:
 def _compile_levels() -> None:
     """Compile what voxels of several sizes take beside."""
     everywhere = Grading(np.array(list(np.ndindex(3, 3, 3))) - 1.0, np.ones(27, np.int8))
-    grid = voxel_grid(_step()[0].reshape(-1, 3), None, 3.5 * _SPACING, Warp(), None, everywhere)
+    grid = voxel_grid(_step()[0].reshape(-1, 3), 3.5 * _SPACING, Warp(), everywhere)
     at_ends(grid, np.zeros(1, np.int64))
 
 
@@ -210,7 +209,7 @@ def _step_in_voxels() -> tuple[NDArray[np.float64], VoxelGrid]:
     """The same as a list of points, and their voxels."""
     points = _step()[0].reshape(-1, 3)
     warp = CameraWarp(np.zeros(3), 1.0)
-    return points, voxel_grid(points, np.full(points.shape, 0.5), 3.5 * _SPACING, warp)
+    return points, with_means(voxel_grid(points, 3.5 * _SPACING, warp), np.full(points.shape, 0.5))
 
 
 @contextmanager

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,15 +39,40 @@ def _bounds(start: int, stop: int, points: NDArray[np.float64]) -> NDArray[np.fl
     return np.array(((low_x, low_y, low_z), (high_x, high_y, high_z)))
 
 
+class Lattice(NamedTuple):
+    """A lattice of cubic cells: a place lies (place - corner) / edge cells off its corner, along each axis.
+
+    Kernels compute that where they need it, as it takes less time than to read it again.
+
+    Attributes
+    ----------
+    corner : (3,) float64
+    edge : float
+    """
+
+    corner: NDArray[np.float64]
+    edge: float
+
+    def in_cells(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Places, (n, 3), in edges of cells off the corner; infinite beyond all numbers."""
+        counted = np.empty((len(places), 3))
+        in_blocks(_count_from, len(places), places, *self, counted)
+        return counted
+
+
+UNIT_CELLS = Lattice(np.zeros(3), 1.0)
+"""That of places which are in edges of cells already."""
+
+
 def cell_keys(
-    scaled: NDArray[np.float64], size: float, spare: int = 2, rooms: int = 1
+    places: NDArray[np.float64], size: float, spare: int = 2, rooms: int = 1, lattice: Lattice = UNIT_CELLS
 ) -> tuple[NDArray[np.int64], tuple[int, int]]:
     """One whole number per place that sorts like its cell (x, y, z), and what a step in x and in y adds to it.
 
     Parameters
     ----------
-    scaled : (n, 3) float64
-        Places in units of a cell; cells are the unit cubes.
+    places : (n, 3) float64
+        On the lattice, n >= 1.
     size : float, metres
         Edge length of a cell, for the message.
     spare : int, >= 2
@@ -54,38 +80,43 @@ def cell_keys(
         none is taken for one of the next row.
     rooms : int
         How many times as many numbers there have to be.
+    lattice : Lattice
+        Default: places are in edges of cells.
 
     Raises
     ------
     ValueError
         The places span so many cells that the numbers do not fit.
     """
-    cells = scaled
-    low, high = np.floor(bounding_box(scaled))
+    with np.errstate(over="ignore"):
+        low, high = (np.floor((end - lattice.corner) / lattice.edge) for end in bounding_box(places))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
     if not _fits(high - low, spare, rooms):
-        cells = np.stack([_without_gaps(np.floor(scaled[:, axis])) for axis in range(3)], axis=1)
-        low, high = bounding_box(cells)
+        cells = np.floor(lattice.in_cells(places))
+        places, lattice = np.stack([_without_gaps(along) for along in cells.T], axis=1), UNIT_CELLS
+        low, high = bounding_box(places)
         if not _fits(high - low, spare, rooms):
             raise ValueError(f"the cloud spans too many voxels of {size:g} m; expected a larger voxel_size")
     extent = (high - low).astype(np.int64) + 1 + spare
     pitch = (int(extent[1] * extent[2]), int(extent[2]))
-    keys = np.empty(len(cells), np.int64)
-    in_blocks(_number_cells, len(cells), cells, low, *pitch, keys)
+    keys = np.empty(len(places), np.int64)
+    in_blocks(_number_cells, len(places), places, *lattice, low, pitch, keys)
     return keys, pitch
 
 
 def sorted_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys, none negative, in ascending order, and where each was; equal ones stay in their order.
 
+    The array that holds them is used up.
     By their digits, the last first: keys span few bits, so this is four to seven times as fast as comparing them.
     """
     place_bits, key_bits = len(keys).bit_length(), int(keys.max()).bit_length()
     low_bits = _BITS - place_bits
     if key_bits <= low_bits:
         n_digits = max(-(-key_bits // (_DIGIT if len(keys) > _FEW else _DIGIT_OF_FEW)), 1)
-        return _sort_by_digits(keys, place_bits, n_digits, max(-(-key_bits // n_digits), 1))
+        room = np.empty(len(keys), np.int64)  # here, as NumPy asks for huge pages and kernels do not
+        return _sort_by_digits(keys, room, place_bits, n_digits, max(-(-key_bits // n_digits), 1))
     order = sorted_keys(keys & ((1 << low_bits) - 1))[1]
     order = order[sorted_keys(keys[order] >> low_bits)[1]]
     return keys[order], order
@@ -139,32 +170,40 @@ def fetch_batch(
 
 @kernel
 def _sort_by_digits(
-    keys: NDArray[np.int64], place_bits: int, n_digits: int, digit_bits: int
+    keys: NDArray[np.int64], room: NDArray[np.int64], place_bits: int, n_digits: int, digit_bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5).
 
-    A key and its place, of so many bits, are moved as one number.
+    A key and its place, of so many bits, are moved as one number, from the first move on, to and fro between the array
+    and a room for as many.
     """
     n, mask = len(keys), (1 << digit_bits) - 1
     starts = np.zeros((n_digits, 1 << digit_bits), np.int64)
-    ordered, room = np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
-        ordered[i] = keys[i] << place_bits | i
         for digit in range(n_digits):
             starts[digit, (keys[i] >> (digit * digit_bits)) & mask] += 1
+    ordered, n_moves = keys, 0
     for digit in range(n_digits):
-        start, shift = starts[digit], place_bits + digit * digit_bits
-        if start.max() == n:
+        start, shift = starts[digit], digit * digit_bits
+        if start.max() == n and (n_moves > 0 or digit < n_digits - 1):
             continue  # all have the same
         total = 0
         for value in range(len(start)):
             start[value], total = total, total + start[value]
-        for i in range(n):
-            value = (ordered[i] >> shift) & mask
-            at = start[value]
-            start[value] = at + 1
-            room[at] = ordered[i]
-        ordered, room = room, ordered
+        if n_moves == 0:
+            for i in range(n):
+                value = (ordered[i] >> shift) & mask
+                at = start[value]
+                start[value] = at + 1
+                room[at] = ordered[i] << place_bits | i
+        else:
+            shift += place_bits
+            for i in range(n):
+                value = (ordered[i] >> shift) & mask
+                at = start[value]
+                start[value] = at + 1
+                room[at] = ordered[i]
+        ordered, room, n_moves = room, ordered, n_moves + 1
     order = room
     for i in range(n):
         order[i] = ordered[i] & ((1 << place_bits) - 1)
@@ -173,19 +212,36 @@ def _sort_by_digits(
 
 
 @kernel
+def _count_from(
+    start: int,
+    stop: int,
+    places: NDArray[np.float64],
+    corner: NDArray[np.float64],
+    edge: float,
+    counted: NDArray[np.float64],
+) -> None:
+    """Set places in edges of cells off the corner."""
+    for p in range(start, stop):
+        for axis in range(3):
+            counted[p, axis] = (places[p, axis] - corner[axis]) / edge
+
+
+@kernel
 def _number_cells(
     start: int,
     stop: int,
-    cells: NDArray[np.float64],
+    places: NDArray[np.float64],
+    corner: NDArray[np.float64],
+    edge: float,
     low: NDArray[np.float64],
-    pitch_x: int,
-    pitch_y: int,
+    pitch: tuple[int, int],
     keys: NDArray[np.int64],
 ) -> None:
-    """Keys of cells, given by their coordinates or by places in them."""
+    """Set the keys of the places' cells, counted from the lowest."""
     for p in range(start, stop):
-        x, y = np.int64(np.floor(cells[p, 0]) - low[0]), np.int64(np.floor(cells[p, 1]) - low[1])
-        keys[p] = x * pitch_x + y * pitch_y + np.int64(np.floor(cells[p, 2]) - low[2])
+        x = np.int64(np.floor((places[p, 0] - corner[0]) / edge) - low[0])
+        y = np.int64(np.floor((places[p, 1] - corner[1]) / edge) - low[1])
+        keys[p] = x * pitch[0] + y * pitch[1] + np.int64(np.floor((places[p, 2] - corner[2]) / edge) - low[2])
 
 
 def _fits(span: NDArray[np.float64], spare: int, rooms: int) -> bool:

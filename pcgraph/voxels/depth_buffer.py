@@ -182,9 +182,13 @@ def _look(
         np.empty(n, np.float32),
         np.empty(n, np.float32),
     )
+    most_bins = 0
+    for k in range(start, stop):
+        most_bins = max(most_bins, bins_of[k])
+    nearest = np.empty(most_bins * most_bins, np.int64)
     for k in range(start, stop):
         bins, last = bins_of[k], bins_of[k] - 1
-        nearest = np.full(bins * bins, _NOTHING)
+        nearest[: bins * bins] = _NOTHING
         _view(places[k], bins, squares, views)
         for i in range(n):
             at[i] = 0

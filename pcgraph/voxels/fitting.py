@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
+from pcgraph.voxels.cells import UNIT_CELLS, cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import (
     AROUND_ON_SURFACE,
@@ -108,8 +108,8 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
         if size > largest:
             break
         # After two steps eight cells are one, so that only the first step needs the points.
-        scaled = cells[0] / 2.0 if step > 1 else grid.warp.in_voxels(points, size)
-        larger, degrees = occupied_cells(scaled, size)
+        on_lattice = grid.warp.on_lattice(points, size) if step == 1 else (cells[0] / 2.0, UNIT_CELLS)
+        larger, degrees = occupied_cells(on_lattice[0], size, on_lattice[1])
         if len(larger) < _MIN_VOXELS:
             break
         cells, before, joined = [cells[1], larger], joined, _joined(degrees)
@@ -155,7 +155,7 @@ def _with_detail(
         return size
     some = points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, steps + 1):
-        finer = voxel_grid(some, None, grid.size / 2.0 ** (step / 4.0), grid.warp)
+        finer = voxel_grid(some, grid.size / 2.0 ** (step / 4.0), grid.warp)
         joined = _joined(np.diff(finer.indptr))
         if joined < least:
             break

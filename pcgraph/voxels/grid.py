@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.cells import cell_keys, gallop, sorted_keys, starts_of_runs
+from pcgraph.voxels.cells import UNIT_CELLS, Lattice, cell_keys, gallop, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading, enlarged
 from pcgraph.voxels.warp import Warp
 
@@ -30,6 +30,7 @@ MAX_GAP = Warp.max_gap
 _STRETCH = 1024  # cells in a row of which the cells around are counted,
 _COUNTED = 1 << 16  # and of how many they are, about
 _END = np.iinfo(np.int64).max
+_NO_ROOM = np.empty(0, np.int32)  # where lists are not wanted
 _AMID = 8  # voxels around one amid a surface
 _OF_SURFACE = 6  # of eight places beside one, seen from the front of a surface that is as steep as may be
 
@@ -208,26 +209,17 @@ def _kept_neighbours(
     return found[:n]
 
 
-def voxel_grid(
-    points: NDArray[np.float64],
-    colors: NDArray[np.float64] | None,
-    size: float,
-    warp: Warp,
-    features: NDArray[np.float32] | None = None,
-    grading: Grading | None = None,
-) -> VoxelGrid:
-    """Voxel grid over finite points.
+def voxel_grid(points: NDArray[np.float64], size: float, warp: Warp, grading: Grading | None = None) -> VoxelGrid:
+    """Voxel grid over finite points, without colours and features (`with_means`).
 
     Parameters
     ----------
     points : (n, 3) float64, metres
         Finite, n >= 1.
-    colors : (n, 3) float64, 0..1, or None
     size : float, metres
         Voxel edge length, > 0.
     warp : Warp
         To the space in which voxels are cubes of this size.
-    features : (n, d) float32, scaled, or None
     grading : Grading, optional
         Where voxels are larger.
 
@@ -236,21 +228,22 @@ def voxel_grid(
     ValueError
         The cloud spans so many voxels that a grid coordinate cannot be written as a whole number.
     """
-    scaled = warp.in_voxels(points, size)
-    level_of_point = None if grading is None else grading.levels_of(scaled)
-    if level_of_point is not None:
-        scaled = scaled / enlarged(np.ones(len(scaled)), level_of_point)[:, None]
-    keys, pitch = _keys_of_levels(scaled, level_of_point, size)
+    (places, lattice), level_of_point = warp.on_lattice(points, size), None
+    if grading is not None:
+        places, lattice = lattice.in_cells(places), UNIT_CELLS
+        level_of_point = grading.levels_of(places)
+        places /= enlarged(np.ones(len(places)), level_of_point)[:, None]
+    keys, pitch = _keys_of_levels(places, level_of_point, size, lattice)
     ordered, order = sorted_keys(keys)
     starts = starts_of_runs(ordered)
     n_voxels = len(starts) - 1
     levels = None if level_of_point is None else level_of_point[order[starts[:-1]]]
-    voxel_of_point, cells, warped = np.empty(len(points), np.int32), np.empty((n_voxels, 3)), np.empty((n_voxels, 3))
-    in_blocks(_gather, n_voxels, starts, order, scaled, voxel_of_point, cells, warped)
+    voxel_of_point, (cells, warped) = np.empty(len(points), np.int32), np.empty((2, n_voxels, 3))
+    in_blocks(_gather, n_voxels, starts, order, places, *lattice, voxel_of_point, cells, warped)
     warped *= size if levels is None else enlarged(np.full(n_voxels, size), levels)[:, None]
     centroids = warp.backward(warped)
     indptr, neighbours = _touching(ordered[starts[:-1]], pitch, cells, levels)
-    grid = VoxelGrid(
+    return VoxelGrid(
         size=size,
         warp=warp,
         cells=cells,
@@ -267,11 +260,12 @@ def voxel_grid(
         levels=levels,
         grading=grading,
     )
-    return with_means(grid, colors, features)
 
 
-def with_means(grid: VoxelGrid, colors: NDArray[np.float64] | None, features: NDArray[np.float32] | None) -> VoxelGrid:
-    """The grid with the mean colours and features of its points; both as for `voxel_grid`."""
+def with_means(
+    grid: VoxelGrid, colors: NDArray[np.float64] | None, features: NDArray[np.float32] | None = None
+) -> VoxelGrid:
+    """The grid with the mean colours, of (n, 3) float64, 0..1, and features, (n, d) float32, scaled, of its points."""
     return replace(
         grid,
         colors=None if colors is None else _sorted_means(colors, grid.starts, grid.order, _COLOR_STEPS),
@@ -298,7 +292,9 @@ def _gather(
     stop: int,
     starts: NDArray[np.int64],
     order: NDArray[np.int64],
-    scaled: NDArray[np.float64],
+    places: NDArray[np.float64],
+    corner: NDArray[np.float64],
+    edge: float,
     voxel_of_point: NDArray[np.int32],
     cells: NDArray[np.float64],
     warped: NDArray[np.float64],
@@ -307,17 +303,19 @@ def _gather(
 
     Sums are of whole numbers, exact as long as a voxel has less than 2**32 points, so that their order does not count.
     """
+    low_x, low_y, low_z = corner
     for v in range(start, stop):
         x = y = z = 0.0
         p = order[starts[v]]
-        cell_x, cell_y, cell_z = np.floor(scaled[p, 0]), np.floor(scaled[p, 1]), np.floor(scaled[p, 2])
+        cell_x, cell_y = np.floor((places[p, 0] - low_x) / edge), np.floor((places[p, 1] - low_y) / edge)
+        cell_z = np.floor((places[p, 2] - low_z) / edge)
         cells[v, 0], cells[v, 1], cells[v, 2] = cell_x, cell_y, cell_z
         for at in range(starts[v], starts[v + 1]):
             p = order[at]
             voxel_of_point[p] = v
-            x += np.rint((scaled[p, 0] - cell_x) * _STEPS_PER_VOXEL)
-            y += np.rint((scaled[p, 1] - cell_y) * _STEPS_PER_VOXEL)
-            z += np.rint((scaled[p, 2] - cell_z) * _STEPS_PER_VOXEL)
+            x += np.rint(((places[p, 0] - low_x) / edge - cell_x) * _STEPS_PER_VOXEL)
+            y += np.rint(((places[p, 1] - low_y) / edge - cell_y) * _STEPS_PER_VOXEL)
+            z += np.rint(((places[p, 2] - low_z) / edge - cell_z) * _STEPS_PER_VOXEL)
         total = (starts[v + 1] - starts[v]) * _STEPS_PER_VOXEL
         warped[v, 0], warped[v, 1], warped[v, 2] = cell_x + x / total, cell_y + y / total, cell_z + z / total
 
@@ -357,9 +355,10 @@ def _average(
 
 
 def _keys_of_levels(
-    cells: NDArray[np.float64], levels: NDArray[np.int8] | None, size: float
+    places: NDArray[np.float64], levels: NDArray[np.int8] | None, size: float, lattice: Lattice = UNIT_CELLS
 ) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """`cell_keys` of places in edges of their own voxels, which sort by level first; (n,) levels, or None if all are 0.
+    """`cell_keys` of places on a lattice, or, if they have levels, (n,), of such in edges of their own voxels, which
+    sort by level first.
 
     Cells of each level count from the first block: coordinates of a map, in cells of all levels, span all of it.
 
@@ -369,9 +368,9 @@ def _keys_of_levels(
         The places span so many cells that the numbers do not fit.
     """
     if levels is None:
-        return cell_keys(cells, size)
-    per_block = BLOCK / enlarged(np.ones(len(cells)), levels)[:, None]
-    whole = np.floor(cells)
+        return cell_keys(places, size, lattice=lattice)
+    per_block = BLOCK / enlarged(np.ones(len(places)), levels)[:, None]
+    whole = np.floor(places)
     whole -= per_block * np.floor(whole / per_block).min(axis=0)
     keys, pitch = cell_keys(whole, size, rooms=2 * (int(levels.max()) + 1))
     of_level = keys.max() + 2 * pitch[0]  # cells of two levels never lie beside each other
@@ -441,33 +440,37 @@ def _beside_blocks(blocks: NDArray[np.float64], others: NDArray[np.float64]) -> 
     return np.isin(keys[len(around) :], keys[: len(around)])
 
 
-def occupied_cells(scaled: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def occupied_cells(
+    places: NDArray[np.float64], size: float, lattice: Lattice = UNIT_CELLS
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Cells that hold places, (v, 3) float64, ascending, and how many of the 26 around some of them do, int64.
 
     Of many cells these are those of some stretches, evenly spread.
 
     Parameters
     ----------
-    scaled : (n, 3) float64
-        Places in units of a cell.
+    places : (n, 3) float64
+        On the lattice.
     size : float, metres
         Edge length of a cell, for the message.
+    lattice : Lattice
+        Default: places are in edges of cells.
 
     Raises
     ------
     ValueError
         The places span so many cells that a grid coordinate cannot be written as a whole number.
     """
-    keys, pitch = cell_keys(scaled, size)
+    keys, pitch = cell_keys(places, size, lattice=lattice)
     ordered, order = sorted_keys(keys)
     first = starts_of_runs(ordered)[:-1]
     occupied, degrees = ordered[first], np.empty(len(first), np.int64)
     step = _STRETCH * max(1, len(first) // _COUNTED)
     stretches = [slice(at, min(at + _STRETCH, len(first))) for at in range(0, len(first), step)]
     for stretch in stretches:
-        _walk(stretch.start, stretch.stop, occupied, *pitch, degrees, False)
+        _walk(stretch.start, stretch.stop, occupied, *pitch, degrees, _NO_ROOM)
     counted = np.concatenate([degrees[stretch] for stretch in stretches])
-    return np.floor(scaled.take(order[first], axis=0)), counted
+    return np.floor(lattice.in_cells(places.take(order[first], axis=0))), counted
 
 
 def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> VoxelLists:
@@ -481,7 +484,8 @@ def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Voxe
         What a step in x and in y adds to a key.
     """
     counts = np.empty(len(keys), np.int64)
-    lists = in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, True)
+    room = np.empty(len(keys) * MAX_NEIGHBOURS, np.int32)  # most is never touched; here, as for `sorted_keys`
+    lists = in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, room)
     neighbours = lists[0] if len(lists) == 1 else np.concatenate(lists)
     return VoxelLists(np.concatenate((np.zeros(1, np.int64), np.cumsum(counts))), neighbours)
 
@@ -489,7 +493,7 @@ def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Voxe
 def touching_counts(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> NDArray[np.int64]:
     """How many of the 26 around each of some voxels are occupied, (v,); arguments as for `touching_voxels`."""
     counts = np.empty(len(keys), np.int64)
-    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, False)
+    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, _NO_ROOM)
     return counts
 
 
@@ -501,11 +505,11 @@ def _walk(
     pitch_x: int,
     pitch_y: int,
     counts: NDArray[np.int64],
-    with_lists: bool,
+    room: NDArray[np.int32],
 ) -> NDArray[np.int32]:
-    """The lists, one after the other, if wanted, and how long each is, in `counts`: nine pointers walk the sorted keys,
-    each along one row of three voxels around. They are unsigned for the same reason as `Neighbourhood`."""
-    found, n_found = np.empty((stop - start) * MAX_NEIGHBOURS if with_lists else 0, np.int32), 0
+    """The lists, one after the other, if there is room for any, and how long each is, in `counts`: nine pointers walk
+    the sorted keys, each along one row of three voxels around. They are unsigned as those of `Neighbourhood` are."""
+    with_lists, found, n_found = len(room) > 0, room[start * MAX_NEIGHBOURS :], 0
     pointers, end, one = np.empty(9, np.uint64), np.uint64(len(keys)), np.uint64(1)
     shifts = np.empty(9, np.int64)
     for row in range(9):

@@ -119,7 +119,7 @@ def _bound_a_room(
         return False
     flat = np.zeros_like(centres)
     flat[:, :2] = np.einsum("ij,kj->ik", centres, plane_basis(axis))
-    columns = voxel_grid(flat, None, _COLUMN * size, Warp())
+    columns = voxel_grid(flat, _COLUMN * size, Warp())
     of_cell = columns.voxel_of_point
     n_floor, n_ceiling = (np.bincount(of_cell, on, columns.n_voxels) for on in (on_floor, on_ceiling))
     has_either, has_both = (n_floor > 0.0) | (n_ceiling > 0.0), (n_floor > 0.0) & (n_ceiling > 0.0)

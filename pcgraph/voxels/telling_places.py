@@ -8,21 +8,20 @@ tried: those from which much of it is visible, always from the same side, tell w
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.disjoint_sets import connected_components
-from pcgraph.parallel import in_blocks, kernel, summing_routine
+from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, seen_from
 from pcgraph.voxels.directions import farthest_first, sphere_directions
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
 from pcgraph.voxels.ground_and_rooms import LEVEL, bearing_plane, is_scanned_room
 from pcgraph.voxels.surface import Windows, fitted_windows
-from pcgraph.voxels.warp import Warp
+from pcgraph.voxels.warp import Shift
 
 _CELLS = 5000  # of the coarse grid on which places are compared, about
 _MOSTLY_SURFACES = 0.5  # of the voxels are joined as on a surface, at least
@@ -59,6 +58,7 @@ _FROM_CAMERA = 0.93  # of what is visible from the other side of a pit, or table
 _VIEWS, _MOST_VIEWS = 12, 128  # places that the voxels themselves are looked at from; and more, each of which
 _NEWS = 0.005  # of all cells is seen by first, or four times as much by second
 _TINY = 1e-12
+_SCATTER, _MASK = 40503, 0xFFFF  # for checksums of sides
 
 
 class TellingPlaces(NamedTuple):
@@ -387,29 +387,84 @@ def _balance(sides: NDArray[np.float32], outward: NDArray[np.float32]) -> tuple[
     return net, known
 
 
+class _Paths(NamedTuple):
+    """What s first opinions came to about n cells, round by round, until each stood or met the path of one before it.
+
+    Attributes
+    ----------
+    outward : (s, _ROUNDS, n) int8
+    sums : (s, _ROUNDS) int64
+        By which two that differ are told apart soon.
+    told : (s,) int64
+        How many of the rounds are here.
+    rounds : (s,) int64
+        The round in which nothing changed any more; 0 if there was none.
+    """
+
+    outward: NDArray[np.int8]
+    sums: NDArray[np.int64]
+    told: NDArray[np.int64]
+    rounds: NDArray[np.int64]
+
+
+@routine
+def _path_met(paths: _Paths, s: int, this_round: int) -> int:
+    """Which opinion before one came by what this one comes to in a round, so that both end alike; -1 if none did.
+
+    Rounds that are left have to be enough: else it depended on the others what is found.
+    """
+    outward, sums, told, rounds = paths
+    for other in range(s):
+        for its_round in range(told[other]):
+            stands = this_round + rounds[other] - its_round
+            if rounds[other] > 0 and stands < _ROUNDS and sums[other, its_round] == sums[s, this_round]:
+                same = True
+                for i in range(outward.shape[2]):
+                    same = same and outward[other, its_round, i] == outward[s, this_round, i]
+                if same:
+                    rounds[s] = stands
+                    return other
+    return -1
+
+
 @kernel
 def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements) -> None:
     """Places that agree decide where the outside lies, and those that see it there count, by turns until it stands."""
     n_places, n = sides.shape
     total = np.empty(n, np.float32)
+    paths = _Paths(
+        np.empty((stop - start, _ROUNDS, n), np.int8),
+        np.zeros((stop - start, _ROUNDS), np.int64),
+        np.zeros(stop - start, np.int64),
+        np.zeros(stop - start, np.int64),
+    )
     for s in range(start, stop):
         weights, outward = found.weights[s], found.outward[s]
         for i in range(n):
             outward[i] = 0.0
-        for _ in range(_ROUNDS):
+        for this_round in range(_ROUNDS):
             for i in range(n):
                 total[i] = 0.0
             for k in range(n_places):
                 if weights[k] > 0.0:
                     for i in range(n):
                         total[i] += weights[k] * sides[k, i]
-            changed = False
+            changed, checksum = False, np.int64(0)
             for i in range(n):
-                side = np.float32(1.0 if total[i] > 0.0 else (-1.0 if total[i] < 0.0 else 0.0))
-                changed = changed or side != outward[i]
-                outward[i] = side
+                side = np.int8(total[i] > 0.0) - np.int8(total[i] < 0.0)
+                changed |= side != outward[i]
+                outward[i] = paths.outward[s - start, this_round, i] = side
+                checksum += side * (i * _SCATTER & _MASK)
+            paths.sums[s - start, this_round] = checksum
             if not changed:
+                paths.rounds[s - start] = this_round
                 break
+            other = _path_met(paths, s - start, this_round)
+            if other >= 0:
+                found.weights[s], found.outward[s] = found.weights[start + other], found.outward[start + other]
+                found.agreed[s], found.known[s] = found.agreed[start + other], found.known[start + other]
+                break
+            paths.told[s - start] = this_round + 1
             largest = np.float32(_TINY)
             for k in range(n_places):
                 net, known = _balance(sides[k], outward)
@@ -543,11 +598,9 @@ def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cell
     size = width * max(1.0, math.sqrt(np.minimum(points, 1.0).sum() / (1.5 * cells)))  # as many as a surface would have
     low = bounding_box(centres)[0]
     while True:
-        shift = 0.5 * size - low
-        coarse = voxel_grid(centres + shift, None, size, Warp())
+        coarse = voxel_grid(centres, size, Shift(low - 0.5 * size))
         if coarse.n_voxels <= 2 * cells:
-            held = np.bincount(coarse.voxel_of_point, points, coarse.n_voxels).astype(np.float64)
-            return CoarseGrid(replace(coarse, centroids=coarse.centroids - shift), held)
+            return CoarseGrid(coarse, np.bincount(coarse.voxel_of_point, points, coarse.n_voxels).astype(np.float64))
         size *= 1.4
 
 
@@ -563,8 +616,8 @@ def _places_on_surfaces(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[n
     if np.mean(counts) < _MOSTLY_SURFACES:
         counts[:] = True
     if grid.levels is None:
-        size = float(edges[0] if edges.min() == edges.max() else np.median(edges))
-        return grid.centroids[counts], points[counts], size
+        size, some = float(edges[0] if edges.min() == edges.max() else np.median(edges)), np.flatnonzero(counts)
+        return grid.centroids.take(some, axis=0), points[some], size
     normals, places, held = either_normals(grid), [], []
     for level in np.unique(grid.levels):
         some, across = np.flatnonzero((grid.levels == level) & counts), 1 << int(level)
@@ -601,7 +654,7 @@ def _parts(
     boxes: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     if not length > 0.0:
         return part_of_cell, boxes
-    blocks = voxel_grid(centres - low, None, length / _BLOCKS, Warp())
+    blocks = voxel_grid(centres, length / _BLOCKS, Shift(low))
     piece = connected_components(blocks.touching_pairs(), blocks.n_voxels)[blocks.voxel_of_point]
     counts, part = np.bincount(piece), 0
     for number in np.argsort(-counts, kind="stable")[:_PARTS]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
+from pcgraph.voxels.cells import Lattice
 
 _SOME = 2048  # values
 _MIN_LENGTH = 1e-150  # metres; squares below it are zero, and powers of it are still finite
@@ -57,11 +58,9 @@ class Warp:
         """Warped positions, (n, 3) float64, metres, of points (n, 3) in metres."""
         return points
 
-    def in_voxels(self, points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-        """Warped positions, (n, 3) float64, in edges of voxels of a size, metres; infinite beyond all numbers."""
-        with np.errstate(over="ignore"):
-            warped = self.forward(points)
-            return np.divide(warped, size, out=None if warped is points else warped)
+    def on_lattice(self, points: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], Lattice]:
+        """Places, (n, 3) float64, metres, and the lattice on which they are in voxels of a size, metres."""
+        return self.forward(points), Lattice(np.zeros(3), size)
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of warped positions."""
@@ -102,11 +101,9 @@ class Shift(Warp):
         """Positions, (n, 3) float64, metres, from the corner."""
         return points - self.corner
 
-    def in_voxels(self, points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-        """Positions, (n, 3) float64, from the corner, in edges of voxels; as `forward`, then divided."""
-        counted = np.empty((len(points), 3))
-        in_blocks(_count_from, len(points), points, self.corner, size, counted)
-        return counted
+    def on_lattice(self, points: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], Lattice]:
+        """The points as they are: the lattice starts at the corner."""
+        return points, Lattice(self.corner, size)
 
     def backward(self, warped: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points, (n, 3) float64, metres, of positions from the corner."""
@@ -278,21 +275,6 @@ def _measure(
     """Set ranges of points."""
     for p in range(start, stop):
         _, _, _, ranges[p] = _ray(points, p, viewpoint)
-
-
-@kernel
-def _count_from(
-    start: int,
-    stop: int,
-    points: NDArray[np.float64],
-    corner: NDArray[np.float64],
-    size: float,
-    counted: NDArray[np.float64],
-) -> None:
-    """Set positions from a corner, in edges of voxels."""
-    for p in range(start, stop):
-        for axis in range(3):
-            counted[p, axis] = (points[p, axis] - corner[axis]) / size
 
 
 @kernel

@@ -65,14 +65,14 @@ def test_evidence_has_no_unit_and_no_offset():
 
 def test_without_creases_evidence_is_autocorrelation():
     square = patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0))
-    grid = voxel_grid(square, None, 0.03, Warp())
+    grid = voxel_grid(square, 0.03, Warp())
     up, x = np.tile((0.0, 0.0, 1.0), (grid.n_voxels, 1)), grid.centroids[:, :1]
     noise = RNG.standard_normal((grid.n_voxels, 1)) * 3.0 / np.sqrt(grid.counts)[:, None]  # 3 per point
     for column, about in ((np.round(x), 1.0), (noise, 0.0), (noise + x, None)):
         found = edge_evidence(column, grid, up)
         assert found == pytest.approx(autocorrelation(column, grid)[0], abs=0.1)
         assert about is None or found == pytest.approx(about, abs=0.1)
-    lone = voxel_grid(np.eye(3), None, 0.01, Warp())
+    lone = voxel_grid(np.eye(3), 0.01, Warp())
     assert edge_evidence(np.eye(3), lone, np.eye(3)) == 0.0
 
 
@@ -102,11 +102,11 @@ def test_two_colours_part_a_plane_and_one_does_not():
 
 
 def test_autocorrelation_of_noise_and_of_fields():
-    grid = voxel_grid(patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0)), None, 0.011, Warp())
+    grid = voxel_grid(patch((0, 0, 1), (0.8, 0, 0), (0, 0.8, 0)), 0.011, Warp())
     x = grid.centroids[:, 0]
     noise = np.random.default_rng(0).standard_normal(grid.n_voxels)
     columns = np.stack((noise, x, np.round(x), np.zeros_like(x), x + noise * x.std()), axis=1)
     found = autocorrelation(columns, grid)
     assert found == pytest.approx([0.0, 1.0, 1.0, 0.0, 0.5], abs=0.05)
-    lone = voxel_grid(np.eye(3), None, 0.01, Warp())
+    lone = voxel_grid(np.eye(3), 0.01, Warp())
     assert autocorrelation(np.eye(3), lone).tolist() == [0, 0, 0]

@@ -40,7 +40,7 @@ def corners(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 @given(seed=seeds, n=st.integers(1, 400), far=st.sampled_from([0.0, 7e6, -3e6]))
 def test_voxels_that_touch_are_cubes_that_share_a_point(seed: int, n: int, far: float) -> None:
     points, grading = graded(np.random.default_rng(seed), n, far)
-    grid = voxel_grid(points, None, 1.0, Warp(), None, grading)
+    grid = voxel_grid(points, 1.0, Warp(), grading)
     low, high = corners(grid)
     assert np.all((points >= low[grid.voxel_of_point]) & (points < high[grid.voxel_of_point]))
     assert np.array_equal(grid.edge_lengths, grid.warped_edges)
@@ -68,7 +68,7 @@ def _first(grid: VoxelGrid, of_point: list[int]) -> NDArray[np.int64]:
 def test_voxels_near_others_are_those_within_edges_of_the_larger_one(seed, n, later, reach):
     rng = np.random.default_rng(seed)
     points, grading = graded(rng, n)
-    grid = voxel_grid(points, None, 1.0, Warp(), None, grading)
+    grid = voxel_grid(points, 1.0, Warp(), grading)
     some, among = (np.flatnonzero(rng.random(grid.n_voxels) < 0.7) for _ in range(2))
     found = voxels_within(grid, some, reach, among, later=later)
     larger = np.maximum(grid.warped_edges[:, None], grid.warped_edges)
@@ -86,15 +86,15 @@ def test_voxels_near_others_are_those_within_edges_of_the_larger_one(seed, n, la
 def test_a_union_is_the_grid_of_all_points_and_levels_are_grids_of_their_own(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     points, grading = graded(rng, n)
-    whole = voxel_grid(points, None, 1.0, Warp(), None, grading)
-    a, b = (voxel_grid(part, None, 1.0, Warp(), None, grading) for part in (points[: n // 2], points[n // 2 :]))
+    whole = voxel_grid(points, 1.0, Warp(), grading)
+    a, b = (voxel_grid(part, 1.0, Warp(), grading) for part in (points[: n // 2], points[n // 2 :]))
     union = grid_union(a, b).grid
     for name in ("cells", "levels", "indptr", "neighbours", "counts", "edge_lengths"):
         assert np.array_equal(getattr(union, name), getattr(whole, name))
     assert union.warped == pytest.approx(whole.warped, abs=1e-4)
     for of_level, level in whole.of_levels():
         places = points[of_level[whole.voxel_of_point]]
-        alone = voxel_grid(places, None, level.size, Warp())
+        alone = voxel_grid(places, level.size, Warp())
         for name in ("cells", "indptr", "neighbours", "counts", "voxel_of_point", "order", "edge_lengths"):
             assert np.array_equal(getattr(level, name), getattr(alone, name))
     gone = rng.random(whole.n_voxels) < 0.5
@@ -103,7 +103,7 @@ def test_a_union_is_the_grid_of_all_points_and_levels_are_grids_of_their_own(see
     for v, members in enumerate(np.split(left.order, left.starts[1:-1])):
         assert np.array_equal(members, np.flatnonzero(left.voxel_of_point == v))
     left = grid_without(whole, gone)
-    again = voxel_grid(points[~gone[whole.voxel_of_point]], None, 1.0, Warp(), None, grading)
+    again = voxel_grid(points[~gone[whole.voxel_of_point]], 1.0, Warp(), grading)
     assert np.array_equal(left.neighbours, again.neighbours)
     assert np.array_equal(left.levels, again.levels)
     assert at_ends(left, np.arange(left.n_voxels)).dtype == np.bool_
@@ -159,9 +159,9 @@ def test_a_scene_of_several_densities_may_lie_in_a_map() -> None:
 
 def test_what_is_near_counts_in_edges_of_the_larger_voxel() -> None:
     everywhere = Grading(np.zeros((1, 3)), np.array([3], np.int8))
-    large = voxel_grid(np.array([[1.0, 1.0, 1.0]]), None, 1.0, Warp(), None, everywhere)
+    large = voxel_grid(np.array([[1.0, 1.0, 1.0]]), 1.0, Warp(), everywhere)
     for away, near in ((15.0, True), (23.9, True), (24.1, False)):
-        small = voxel_grid(np.array([[1.0 + away, 1.0, 1.0]]), None, 1.0, Warp(), None, everywhere)
+        small = voxel_grid(np.array([[1.0 + away, 1.0, 1.0]]), 1.0, Warp(), everywhere)
         assert is_near(small, large)[0] == is_near(large, small)[0] == near
 
 
@@ -177,8 +177,8 @@ def test_voxels_of_one_scan_grow_already() -> None:
     """With the distance, and what of it lies in rows far apart is no surface at any size."""
     points = two_densities(20.0)[0]
     scanned = choose_warp(points, np.array([2.0, 2.0, 1.0]), False, 0.5)
-    assert fitting_grading(voxel_grid(points, None, 0.05, scanned)) is None
-    assert fitting_grading(voxel_grid(points, None, 0.05, Warp())) is not None
+    assert fitting_grading(voxel_grid(points, 0.05, scanned)) is None
+    assert fitting_grading(voxel_grid(points, 0.05, Warp())) is not None
 
 
 def test_wires_and_strays_are_no_surfaces_at_any_size() -> None:
@@ -186,7 +186,7 @@ def test_wires_and_strays_are_no_surfaces_at_any_size() -> None:
     wire = np.column_stack((rng.uniform(0.0, 40.0, 3000), np.zeros(3000), np.full(3000, 6.0)))
     strays = rng.uniform(-20.0, 20.0, (1000, 3))
     floor = plain(rng, 60_000, (0.0, -3.0), (8.0, 3.0))
-    grid = voxel_grid(np.concatenate((floor, wire, strays)), None, 0.1, Warp())
+    grid = voxel_grid(np.concatenate((floor, wire, strays)), 0.1, Warp())
     assert fitting_grading(grid) is None
 
 

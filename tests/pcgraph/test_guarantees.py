@@ -31,7 +31,7 @@ def assert_covered_and_connected(points, result, outliers=0.01):
         assert np.array_equal(labels.reshape(-1) >= 0, finite)
         assert np.bincount(labels[labels >= 0]).all()  # 0, 1, 2, ... with none left out
     of_result = result.surface.grid
-    grid = voxel_grid(flat[finite], None, of_result.size, of_result.warp, None, of_result.grading)
+    grid = voxel_grid(flat[finite], of_result.size, of_result.warp, of_result.grading)
     leaf = result.supervoxels.reshape(-1)[finite]
     # Of a voxel on a boundary the points may belong to several supervoxels: each of its shares is a piece.
     owners = int(leaf.max()) + 1

@@ -8,7 +8,7 @@ import pytest
 from clouds import two_boxes_on_a_plane
 
 import pcgraph
-from pcgraph.voxels.grid import grid_without, voxel_grid
+from pcgraph.voxels.grid import grid_without, voxel_grid, with_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, outlier_voxels
 from pcgraph.voxels.warp import Warp
 
@@ -60,7 +60,7 @@ def test_surfaces_alone_have_no_outliers(clean):
 
 def test_few_points_are_never_outliers():
     points = np.random.default_rng(0).uniform(0, 1, (999, 3))
-    assert not outlier_voxels(voxel_grid(points, None, 0.02, Warp())).any()
+    assert not outlier_voxels(voxel_grid(points, 0.02, Warp())).any()
 
 
 @pytest.mark.filterwarnings("ignore:expected points on surfaces")
@@ -98,16 +98,16 @@ def test_a_scan_so_coarse_that_its_points_lie_apart_is_not_lost():
 
 def test_dust_alone_is_not_all_outliers():
     points = np.random.default_rng(0).uniform(0, 1, (2000, 3))
-    assert not detached_voxels(voxel_grid(points, None, 1e-5, Warp())).any()
+    assert not detached_voxels(voxel_grid(points, 1e-5, Warp())).any()
 
 
 def test_a_grid_without_some_voxels_is_that_of_the_other_points():
     rng = np.random.default_rng(1)
     points, colors = rng.uniform(0, 1, (3000, 3)), rng.uniform(0, 1, (3000, 3))
-    grid = voxel_grid(points, colors, 0.11, Warp())
+    grid = with_means(voxel_grid(points, 0.11, Warp()), colors)
     gone = rng.random(grid.n_voxels) < 0.3
     left = ~gone[grid.voxel_of_point]
-    thinned, expected = grid_without(grid, gone), voxel_grid(points[left], colors[left], 0.11, Warp())
+    thinned, expected = grid_without(grid, gone), with_means(voxel_grid(points[left], 0.11, Warp()), colors[left])
     for name in ("cells", "voxel_of_point", "order", "starts", "counts", "warped", "colors", "indptr", "neighbours"):
         assert np.array_equal(getattr(thinned, name), getattr(expected, name)), name
 

@@ -448,7 +448,7 @@ def test_updates_keep_what_is_known(rng, n, shape, method, split):
     assert_moments_are_direct(second.leaves, everything, leaf)
     assert_edges_are_the_contacts(second)
     assert_tree_is_nested(second)
-    grid = voxel_grid(everything, None, first.voxel_size, first.surface.grid.warp)
+    grid = voxel_grid(everything, first.voxel_size, first.surface.grid.warp)
     assert np.array_equal(second.surface.grid.cells, grid.cells)
     assert second.surface.grid.counts.tolist() == grid.counts.tolist()
     # A voxel that was known keeps its supervoxel.

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import pcgraph
 from pcgraph.metrics import segmentation_covering
+from pcgraph.voxels import telling_places
 from pcgraph.voxels.depth_buffer import seen_from
 from pcgraph.voxels.directions import densest_plane
 from pcgraph.voxels.grid import voxel_grid
@@ -741,6 +742,23 @@ def test_the_middle_of_a_way_does_not_show_all_that_was_passed(seed):
     """So it is not from there that all was seen, though spacing may grow with range about it."""
     middle = np.array([8.25, 9.0, 0.9])
     one, many = scans_along_an_aisle(seed, [8.25]), scans_along_an_aisle(seed, np.linspace(5.0, 11.5, 24))
-    of_one, of_many = (shown_fraction(voxel_grid(points, None, 0.05, Warp()), middle) for points in (one, many))
+    of_one, of_many = (shown_fraction(voxel_grid(points, 0.05, Warp()), middle) for points in (one, many))
     assert of_one > 0.95
     assert of_many < of_one - 0.1
+
+
+def test_first_opinions_that_meet_come_to_what_each_comes_to_alone():
+    """Places in a row, each of which sees a bit of what the next one does: an opinion reaches one more in each round.
+
+    That of the first four stands in the last of the rounds; that of the first alone comes by it, but has too few left.
+    """
+    cosines = np.zeros((14, 150), np.float32)
+    for place, row in enumerate(cosines):
+        row[10 * place : 10 * place + 15] = 1.0
+    places = np.arange(14)
+    starts = np.stack([places < 4, places < 1, places > 2, places > 9, places >= 0, places == 7]).astype(np.float32)
+    together = telling_places._agreements(cosines, starts)
+    alone = [telling_places._agreements(cosines, starts[s : s + 1]) for s in range(len(starts))]
+    for column, name in enumerate(together._fields):
+        np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), err_msg=name)
+    np.testing.assert_array_equal((together.outward > 0.0).sum(axis=1), [145, 125, 145, 145, 145, 145])
