@@ -14,7 +14,6 @@ from pcgraph.parallel import in_blocks, inlined, kernel
 from pcgraph.pixel_lattice import MOST_PIXELS, NARROWEST, OFF, are_whole, likely_cameras, step_between
 from pcgraph.resection import PinholeCamera, is_far_off
 from pcgraph.voxels.outliers import MIN_POINTS
-from pcgraph.voxels.sampling import thinned
 
 _SOME = 4096  # values that are looked at first
 _NOTHING = -1  # to divide by
@@ -42,7 +41,7 @@ def _image_in_own_frame(cloud: CleanCloud) -> Pixels | None:
     forwards = [axis for axis in (2, 0, 1) if low[axis] > 0.0 or high[axis] < 0.0]
     if not forwards or is_far_off(low, high):
         return None
-    points, some = cloud.points, thinned(cloud.points, _SOME, (low, high))
+    points, some = cloud.points, cloud.sample[:_SOME]
     for axis in forwards:
         across = [i for i in (2, 1, 0) if i != axis]  # y, in rows, and x of one that looks along z
         rows, columns = (even_steps(points, some, i, axis) for i in across)

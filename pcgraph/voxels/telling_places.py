@@ -704,7 +704,8 @@ def _free_places(
     steps = (np.arange(lattice_side) + 0.5) / lattice_side
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.einsum("ij,jk->ik", low + lattice * (high - low), axes)
-    clearance = cKDTree(coarse.centroids).query(places)[0] / coarse.size
+    tree = cKDTree(coarse.centroids, 64, balanced_tree=False, compact_nodes=False)  # few questions
+    clearance = tree.query(places)[0] / coarse.size
     free = np.flatnonzero(clearance > _CLEARANCE)
     if not len(free):
         return places[:0]
