@@ -226,8 +226,8 @@ def test_pose_errors_do_not_depend_on_the_world() -> None:
 
 @pytest.mark.parametrize(
     ("mesh", "n", "sweep"),
-    [(ball(0.04), 3, 60.0), (block((0.08, 0.08, 0.05)), 2, 90.0), (part(), 2, 180.0)],
-    ids=["what slides on itself", "what is symmetric", "no overlap"],
+    [(ball(0.04), 3, 60.0), (block((0.08, 0.08, 0.05)), 2, 90.0)],
+    ids=["what slides on itself", "what is symmetric"],
 )
 def test_failure_is_said(mesh: TriangleMesh, n: int, sweep: float) -> None:
     with pytest.raises(ValueError, match=r"view 1 cannot be aligned; on view 0: expected .*|looks through"):
@@ -250,10 +250,13 @@ def test_two_views_are_warned_of_as_nothing_confirms_their_pair() -> None:
     assert pose_errors(found.poses, views.true_poses).angle_deg.max() < 0.1  # type: ignore[arg-type]
 
 
-def test_views_out_of_order_are_aligned_or_told_what_order_is_expected() -> None:
+def test_views_without_overlap_are_told_what_order_is_expected() -> None:
+    """The second of them looks from the other side."""
     views = made(part(), 4, 180.0)
     shuffled = Scan(tuple(views.images[k] for k in (0, 3, 1, 2)))
-    with pytest.raises(ValueError, match="in the order of a walk"):
+    with pytest.raises(
+        ValueError, match=r"view 1 cannot be aligned; on view 0: expected (.|\n)*in the order of a walk"
+    ):
         align(shuffled)
 
 

@@ -135,7 +135,7 @@ def test_what_cannot_be_placed_online_is_refused() -> None:
 @pytest.mark.parametrize("wrong", ["noise", "lens", "tracks"])
 def test_a_misfit_is_told(wrong: str) -> None:
     """A noise stated ten times too small, a focal length twice too long, most observations wrong."""
-    scene = around(6, 100)
+    scene = around(5, 60)
     pixels, camera = scene.tracks.pixels.copy(), scene.camera
     if wrong == "lens":
         camera = replace(camera, fx=2 * camera.fx, fy=2 * camera.fy)
@@ -143,7 +143,7 @@ def test_a_misfit_is_told(wrong: str) -> None:
         random = np.random.default_rng(0)
         bad = random.random(len(pixels)) < 0.6
         pixels[bad] = random.uniform(0, 960, (bad.sum(), 2))
-    tracks = Tracks(scene.tracks.image, scene.tracks.point, pixels, 6, 100)
+    tracks = Tracks(scene.tracks.image, scene.tracks.point, pixels, 5, 60)
     with pytest.warns(RangesimWarning, match="noise_px or the lens is another, or most tracks are wrong"):
         structure_from_motion(tracks, camera, noise_px=0.05 if wrong == "noise" else 0.5)
 
