@@ -4,10 +4,10 @@
 In the corner, light by way of the other wall arrives after the direct light, and an AMCW camera, which sees but one
 phase, reads the mean of both: too far. Under the ball the light arrives through the glass.
 
-Usage: python examples/light_over_length.py [OUT.png]
+Usage: python examples/light_over_length.py [OUT.png] [--spp 4096]
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -26,13 +26,16 @@ COLORS = ("#1b2330", "#963246", "#e97c01", "#d44197", "#c9b000")
 
 
 def main() -> None:
-    out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/light_over_length.png")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", nargs="?", type=Path, default=Path("out/light_over_length.png"))
+    parser.add_argument("--spp", type=int, default=4096, help="paths of a pixel")
+    args = parser.parse_args()
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
     for axis, (name, (row, column)) in zip(axes, PIXELS.items(), strict=True):
         scene, sensor = load_scene(SCENES / f"{name}.xml"), AmcwToF((20e6,))
         split = LengthSplit(start_m=0.0, width_m=0.04, bins=250)
-        signals = transport(scene, scene.rig(0.03, width=40, height=30), [sensor, split], spp=4096, max_depth=8)
+        signals = transport(scene, scene.rig(0.03, width=40, height=30), [sensor, split], spp=args.spp, max_depth=8)
         light = signals.channels[split][:, row, column].reshape(len(KINDS), split.bins)
         first = np.flatnonzero(light.sum(axis=0))[0]
         shown = slice(max(0, first - 5), first + 45)
@@ -48,8 +51,8 @@ def main() -> None:
         print(f"  AMCW camera at 20 MHz: error of range {1e3 * error:+.1f} mm")
         axis.set(title=f"{name}, pixel ({column}, {row})", xlabel="path length, m", ylabel="W/m²/sr", yscale="log")
         axis.legend(frameon=False)
-    figure.savefig(out, dpi=120)
-    print(out)
+    figure.savefig(args.out, dpi=120)
+    print(args.out)
 
 
 if __name__ == "__main__":

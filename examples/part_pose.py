@@ -6,7 +6,7 @@ the label that is glued to it give a pose from one image. That is the first gues
 the model's surface. Then the same without the label: the table is taken off and the scan registered without a guess.
 The label is 0.2 mm thick and no part of the model: that is most of what ICP leaves.
 
-Usage: python examples/part_pose.py [OUT.png] [--width 640]
+Usage: python examples/part_pose.py [OUT.png] [--width 640] [--spacing-mm 1.5]
 """
 
 from __future__ import annotations
@@ -35,8 +35,6 @@ BOXES_M = np.array(
 )
 """Least and largest x, y, z of the bracket's boxes; z up, the middle of the bottom at 0."""
 LABEL = Checkerboard(5, 4, 0.01)
-SPACING_M = 0.0015
-"""Between points of the model."""
 
 
 def label_pose() -> np.ndarray:
@@ -46,13 +44,13 @@ def label_pose() -> np.ndarray:
     return T
 
 
-def surface_points() -> np.ndarray:
+def surface_points(spacing_m: float) -> np.ndarray:
     """(n, 3) points on the bracket's surface, those where boxes touch left out."""
     points = []
     for number, (low, high) in enumerate(BOXES_M):
         for axis in range(3):
             other = [k for k in range(3) if k != axis]
-            grid = [np.arange(low[k] + SPACING_M / 2, high[k], SPACING_M) for k in other]
+            grid = [np.arange(low[k] + spacing_m / 2, high[k], spacing_m) for k in other]
             for end in (low[axis], high[axis]):
                 face = np.empty((len(grid[0]) * len(grid[1]), 3))
                 face[:, other] = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -99,10 +97,9 @@ def without_table(points: np.ndarray) -> np.ndarray:
     return points[height > 0.003]
 
 
-def errors(T_camera_part: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """Degrees of turn, and millimetres by which the surface is off (root mean square)."""
+def errors(T_camera_part: np.ndarray, true: np.ndarray, X: np.ndarray) -> tuple[float, float]:
+    """Degrees of turn, and millimetres by which the surface is off (root mean square) at its points X."""
     turn = Rotation.from_matrix(true[:3, :3].T @ T_camera_part[:3, :3]).magnitude()
-    X = surface_points()
     off = X @ (T_camera_part - true)[:3, :3].T + (T_camera_part - true)[:3, 3]
     return float(np.degrees(turn)), 1e3 * float(np.sqrt(np.square(off).sum(axis=-1).mean()))
 
@@ -111,6 +108,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", nargs="?", type=Path, default=Path("out/part_pose.png"))
     parser.add_argument("--width", type=int, default=640, help="of the camera's images")
+    parser.add_argument("--spacing-mm", type=float, default=1.5, help="between points of the model")
     args = parser.parse_args()
 
     T_world_part = np.eye(4)
@@ -131,7 +129,7 @@ def main() -> None:
 
     scan = rangesim.decode(capture).to_point_cloud().points.reshape(-1, 3).astype(np.float64)
     scan = scan[np.isfinite(scan).all(axis=1)]
-    model = surface_points()
+    model = surface_points(args.spacing_mm * 1e-3)
     guess = np.linalg.inv(by_label.T_camera_object)
     in_part = scan @ guess[:3, :3].T + guess[:3, 3]
     near = ((in_part > BOXES_M[:, 0].min(axis=0) - 0.004) & (in_part < BOXES_M[:, 1].max(axis=0) + 0.004)).all(axis=1)
@@ -145,7 +143,7 @@ def main() -> None:
     }
     print(f"{'':30s}{'turned by':>12s}{'surface off by':>16s}")
     for name, found in poses.items():
-        degrees, off_mm = errors(found, true)
+        degrees, off_mm = errors(found, true, model)
         print(f"{name:30s}{degrees:10.3f} °{off_mm:13.3f} mm")
     draw(args.out, capture.frames[WHITE], rig.camera, poses["label, then ICP of the scan"], scan[near], true)
     print(args.out)

@@ -6,6 +6,7 @@ how much of surface and volume the scan saw, and writes a page with a section th
 know of space, and the CT on the same voxels.
 
 Usage: python examples/sparse_against_dense.py [OUT.html] [--views 8] [--width 240] [--voxel-mm 1.5]
+       [--things opaque hollow glass]
 """
 
 from __future__ import annotations
@@ -86,12 +87,14 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--width", type=int, default=240, help="of the camera's images")
     parser.add_argument("--voxel-mm", type=float, default=1.5)
+    parser.add_argument("--things", nargs="+", choices=THINGS, default=list(THINGS))
     args = parser.parse_args()
     load_scene("plane")  # chooses the renderer's variant, which transforms are made in
 
     rows, columns = [], []
     print(f"{'':8s}{'surface seen':>14s}{'volume known':>14s}{'called free':>13s}{'unseen':>9s}{'CT error, 1/m':>15s}")
-    for name, parts in THINGS.items():
+    for name in args.things:
+        parts = THINGS[name]
         found, solids = scanned(parts, args.views, args.width)
         grid = VoxelGrid.around(solids[0].mesh.vertices, args.voxel_mm * 1e-3, 0.01)
         seen = occupancy(found.images, {solid.name: solid.mesh for solid in solids}, grid)

@@ -34,7 +34,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
 def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     (block,) = [b for b in re.findall(r"```sh\n(.*?)```", README, re.DOTALL) if "rangesim run" in b]
-    for line in block.replace("--out out/compare", "--out out/compare --width 160 --height 120 --spp 8").splitlines():
+    for line in block.replace("--out out/compare", "--out out/compare --width 96 --height 72 --spp 2").splitlines():
         program, *arguments = line.split("#")[0].split()
         run([str(Path(sys.executable).parent / program), *arguments], tmp_path)
     assert (tmp_path / "out" / "decoded" / "cloud.ply").exists()
@@ -42,15 +42,19 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 
 
 ARGUMENTS = {
-    "calibration": ["calibration.png", "--width", "400", "--poses", "4"],
-    "part_pose": ["part.png", "--width", "400"],
-    "rendered_motion": ["rendered_motion.png", "--views", "3", "--width", "320"],
-    "rectification": ["rectification.png", "--width", "160"],
-    "scan": ["--views", "4", "--width", "96", "--out", "out/scan.ply"],
-    "segmentation": ["--width", "320"],
-    "sparse_against_dense": ["page.html", "--views", "2", "--width", "64", "--voxel-mm", "4"],
-    "structure_from_motion": ["structure_from_motion.png", "--views", "10", "--points", "300"],
-    "tof_calibration": ["tof.png", "--targets", "14", "--width", "120"],
+    "calibration": ["calibration.png", "--width", "320", "--poses", "3"],
+    "light_over_length": ["light_over_length.png", "--spp", "64"],
+    "motion": ["motion", "--width", "80", "--speeds", "0", "1"],
+    "part_pose": ["part.png", "--width", "280", "--spacing-mm", "3"],
+    "rendered_motion": ["rendered_motion.png", "--views", "3", "--width", "160"],
+    "rectification": ["rectification.png", "--width", "80"],
+    "scan": ["--views", "3", "--width", "48", "--out", "out/scan.ply"],
+    "segmentation": ["--width", "160"],
+    "sparse_against_dense": [
+        *("page.html", "--views", "2", "--width", "32", "--voxel-mm", "8", "--things", "opaque", "glass")
+    ],
+    "structure_from_motion": ["structure_from_motion.png", "--views", "6", "--points", "100"],
+    "tof_calibration": ["tof.png", "--targets", "8", "--width", "120"],
     "two_cameras": ["--width", "80"],
 }
 """Of the examples that can be had smaller."""
