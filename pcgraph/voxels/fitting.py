@@ -108,8 +108,8 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
         if size > largest:
             break
         # After two steps eight cells are one, so that only the first step needs the points.
-        on_lattice = grid.warp.on_lattice(points, size) if step == 1 else (cells[0] / 2.0, UNIT_CELLS)
-        larger, degrees = occupied_cells(on_lattice[0], size, on_lattice[1])
+        places, lattice = grid.warp.on_lattice(points, size) if step == 1 else (cells[0] / 2.0, UNIT_CELLS)
+        larger, degrees = occupied_cells(places, size, lattice)
         if len(larger) < _MIN_VOXELS:
             break
         cells, before, joined = [cells[1], larger], joined, _joined(degrees)

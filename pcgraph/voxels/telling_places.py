@@ -454,7 +454,7 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
                 side = np.int8(total[i] > 0.0) - np.int8(total[i] < 0.0)
                 changed |= side != outward[i]
                 outward[i] = paths.outward[s - start, this_round, i] = side
-                checksum += side * (i * _SCATTER & _MASK)
+                checksum += np.int64(side) * (i * _SCATTER & _MASK)
             paths.sums[s - start, this_round] = checksum
             if not changed:
                 paths.rounds[s - start] = this_round
@@ -704,7 +704,7 @@ def _free_places(
     steps = (np.arange(lattice_side) + 0.5) / lattice_side
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.einsum("ij,jk->ik", low + lattice * (high - low), axes)
-    tree = cKDTree(coarse.centroids, 64, balanced_tree=False, compact_nodes=False)  # few questions
+    tree = cKDTree(coarse.centroids, 64, balanced_tree=False, compact_nodes=False)  # for few places
     clearance = tree.query(places)[0] / coarse.size
     free = np.flatnonzero(clearance > _CLEARANCE)
     if not len(free):
