@@ -174,36 +174,28 @@ def _sort_by_digits(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys in ascending order, and where each was (radix sort; Knuth, The Art of Computer Programming 3, 5.2.5).
 
-    A key and its place, of so many bits, are moved as one number, from the first move on, to and fro between the array
-    and a room for as many.
+    A key and its place, of so many bits, are moved as one number, to and fro between the array and a room for as many.
     """
     n, mask = len(keys), (1 << digit_bits) - 1
     starts = np.zeros((n_digits, 1 << digit_bits), np.int64)
     for i in range(n):
         for digit in range(n_digits):
             starts[digit, (keys[i] >> (digit * digit_bits)) & mask] += 1
-    ordered, n_moves = keys, 0
+        keys[i] = keys[i] << place_bits | i
+    ordered = keys
     for digit in range(n_digits):
-        start, shift = starts[digit], digit * digit_bits
-        if start.max() == n and (n_moves > 0 or digit < n_digits - 1):
+        start, shift = starts[digit], place_bits + digit * digit_bits
+        if start.max() == n:
             continue  # all have the same
         total = 0
         for value in range(len(start)):
             start[value], total = total, total + start[value]
-        if n_moves == 0:
-            for i in range(n):
-                value = (ordered[i] >> shift) & mask
-                at = start[value]
-                start[value] = at + 1
-                room[at] = ordered[i] << place_bits | i
-        else:
-            shift += place_bits
-            for i in range(n):
-                value = (ordered[i] >> shift) & mask
-                at = start[value]
-                start[value] = at + 1
-                room[at] = ordered[i]
-        ordered, room, n_moves = room, ordered, n_moves + 1
+        for i in range(n):
+            value = (ordered[i] >> shift) & mask
+            at = start[value]
+            start[value] = at + 1
+            room[at] = ordered[i]
+        ordered, room = room, ordered
     order = room
     for i in range(n):
         order[i] = ordered[i] & ((1 << place_bits) - 1)

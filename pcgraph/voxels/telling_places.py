@@ -58,7 +58,6 @@ _FROM_CAMERA = 0.93  # of what is visible from the other side of a pit, or table
 _VIEWS, _MOST_VIEWS = 12, 128  # places that the voxels themselves are looked at from; and more, each of which
 _NEWS = 0.005  # of all cells is seen by first, or four times as much by second
 _TINY = 1e-12
-_SCATTER, _MASK = 40503, 0xFFFF  # for checksums of sides
 
 
 class TellingPlaces(NamedTuple):
@@ -393,8 +392,6 @@ class _Paths(NamedTuple):
     Attributes
     ----------
     outward : (s, _ROUNDS, n) int8
-    sums : (s, _ROUNDS) int64
-        By which two that differ are told apart soon.
     told : (s,) int64
         How many of the rounds are here.
     rounds : (s,) int64
@@ -402,7 +399,6 @@ class _Paths(NamedTuple):
     """
 
     outward: NDArray[np.int8]
-    sums: NDArray[np.int64]
     told: NDArray[np.int64]
     rounds: NDArray[np.int64]
 
@@ -413,15 +409,16 @@ def _path_met(paths: _Paths, s: int, this_round: int) -> int:
 
     Rounds that are left have to be enough: else it depended on the others what is found.
     """
-    outward, sums, told, rounds = paths
+    outward, told, rounds = paths
+    n = outward.shape[2]
     for other in range(s):
         for its_round in range(told[other]):
             stands = this_round + rounds[other] - its_round
-            if rounds[other] > 0 and stands < _ROUNDS and sums[other, its_round] == sums[s, this_round]:
-                same = True
-                for i in range(outward.shape[2]):
-                    same = same and outward[other, its_round, i] == outward[s, this_round, i]
-                if same:
+            if rounds[other] > 0 and stands < _ROUNDS:
+                i = 0
+                while i < n and outward[other, its_round, i] == outward[s, this_round, i]:
+                    i += 1
+                if i == n:
                     rounds[s] = stands
                     return other
     return -1
@@ -434,7 +431,6 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
     total = np.empty(n, np.float32)
     paths = _Paths(
         np.empty((stop - start, _ROUNDS, n), np.int8),
-        np.zeros((stop - start, _ROUNDS), np.int64),
         np.zeros(stop - start, np.int64),
         np.zeros(stop - start, np.int64),
     )
@@ -449,13 +445,11 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
                 if weights[k] > 0.0:
                     for i in range(n):
                         total[i] += weights[k] * sides[k, i]
-            changed, checksum = False, np.int64(0)
+            changed = False
             for i in range(n):
                 side = np.int8(total[i] > 0.0) - np.int8(total[i] < 0.0)
                 changed |= side != outward[i]
                 outward[i] = paths.outward[s - start, this_round, i] = side
-                checksum += np.int64(side) * (i * _SCATTER & _MASK)
-            paths.sums[s - start, this_round] = checksum
             if not changed:
                 paths.rounds[s - start] = this_round
                 break
