@@ -82,6 +82,17 @@ class Sample:
         """Whether the points lie on an image lattice."""
         return self.points.ndim == 3
 
+    def turned(self, turns: int) -> list[Sample]:
+        """This cloud and, if it is a list of points, copies of it turned about z and shifted; so many in all."""
+        turned = [self]
+        for seed in range(1, 1 if self.organised else turns):
+            random = np.random.default_rng(seed)
+            turn = Rotation.from_euler("z", random.uniform(0.0, 360.0), degrees=True).as_matrix()
+            shift = random.uniform(0.0, 0.1, 3)
+            viewpoint = None if self.viewpoint is None else self.viewpoint @ turn.T + shift
+            turned.append(replace(self, points=self.points @ turn.T + shift, viewpoint=viewpoint))
+        return turned
+
 
 @dataclass(frozen=True)
 class Domain:

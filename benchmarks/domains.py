@@ -51,7 +51,6 @@ import itertools
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +60,6 @@ from domain_clouds import NOISE, Domain, MissingDataError, Sample, domains
 from numpy.typing import NDArray
 from peers import PclSetting, pcl_driver, run_pcl
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from scores import Row, completed, largest, mean_overlap, voted
 
 import pcgraph
@@ -98,7 +96,7 @@ def main() -> None:
             print(f"\n{domain.name}: left out, {missing}")
             continue
         if len(samples) == 1:
-            samples = _turned(samples[0], args.turns)
+            samples = samples[0].turned(args.turns)
         report[domain.name], settings[domain.name] = _measure(domain, samples, with_best=not args.quick)
     if not args.quick:
         _one_for_all(report, settings)
@@ -123,18 +121,6 @@ def _chosen(every: list[Domain], names: str | None, quick: bool) -> list[Domain]
         if not any(domain.name.startswith(beginning) for domain in every):
             raise SystemExit(f"no domain {beginning!r}; there are: {', '.join(domain.name for domain in every)}")
     return [domain for domain in every if domain.name.startswith(tuple(beginnings))]
-
-
-def _turned(sample: Sample, turns: int) -> list[Sample]:
-    """A cloud that is a list of points, and copies of it turned about z and shifted."""
-    turned = [sample]
-    for seed in range(1, 1 if sample.organised else turns):
-        random = np.random.default_rng(seed)
-        turn = Rotation.from_euler("z", random.uniform(0.0, 360.0), degrees=True).as_matrix()
-        shift = random.uniform(0.0, 0.1, 3)
-        viewpoint = None if sample.viewpoint is None else sample.viewpoint @ turn.T + shift
-        turned.append(replace(sample, points=sample.points @ turn.T + shift, viewpoint=viewpoint))
-    return turned
 
 
 def _warm_up() -> None:

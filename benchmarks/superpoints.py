@@ -2,7 +2,7 @@
 """Cuts of the default tree against the superpoints of Superpoint Transformer, at as many segments.
 
     python -m venv spt && spt/bin/pip install "numpy<2" scipy pgeof pycut-pursuit
-    python benchmarks/superpoints.py --python spt/bin/python [--domains "room1,simulated room A"]
+    python benchmarks/superpoints.py --python spt/bin/python [--domains "room1,simulated room A"] [--turns 4]
 
 Superpoints as its authors make them for S3DIS and ScanNet (Robert et al. 2023; Landrieu and Simonovsky 2018): points
 thinned to the means of 3 or 2 cm cubes; linearity, planarity, scattering and verticality of the 45 nearest (`pgeof`,
@@ -13,8 +13,9 @@ of fewer than 10 cubes. `pycut-pursuit` (GPL) wants an older NumPy than we do, h
 
 Every segment takes its most frequent true label: purity, and mean IoU of the true things; of superpoints, of the cut
 into as many segments, and of that into as many of which none has fewer points than the smallest superpoint
-(`min_size`). Seconds are those of features and partition, and of the whole of `pcgraph.segment`. The last line is JSON:
-cloud -> cube -> one row per level.
+(`min_size`). Seconds are those of features and partition, and of the whole of `pcgraph.segment`. Figures are means over
+so many turns of each cloud, the first as it comes: one turn more or less decides as much as a tenth. The last line is
+JSON: cloud -> cube -> one row per level.
 """
 
 from __future__ import annotations
@@ -24,11 +25,15 @@ import json
 import subprocess
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from domain_clouds import Sample
 
 ROOMS = (
     *("room1", "simulated room A", "simulated room B", "room1 thinned", "room A thinned", "room B thinned"),
@@ -50,13 +55,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--python", type=Path, help="interpreter of the environment that has pycut-pursuit and pgeof")
     parser.add_argument("--domains", default=",".join(ROOMS), help="names, comma-separated")
+    parser.add_argument("--turns", type=int, default=4, help="of each cloud, both alike; default %(default)s")
     parser.add_argument("--partition", type=Path, metavar="FOLDER", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.partition:
         for path in sorted(arguments.partition.glob("*.cloud.npz")):
             partition(path)
     elif arguments.python:
-        compare(arguments.python, arguments.domains.split(","))
+        compare(arguments.python, arguments.domains.split(","), arguments.turns)
     else:
         parser.error("expected --python, the interpreter of an environment that has pycut-pursuit and pgeof")
 
@@ -64,46 +70,89 @@ def main() -> None:
 # --- in our environment -----------------------------------------------------------------------------------------------
 
 
-def compare(python: Path, names: list[str]) -> None:
+Rows = list[dict[str, Any]]
+
+
+def compare(python: Path, names: list[str], turns: int) -> None:
     """Print superpoints and cuts of the default tree side by side."""
     from domain_clouds import domains
-    from scores import voted
-
-    import pcgraph
 
     every = {domain.name: domain for domain in domains()}
     if unknown := [name for name in names if name not in every]:
         raise SystemExit(f"no domain {unknown[0]!r}; there are: {', '.join(every)}")
-    samples = {name: every[name].samples()[0] for name in names}
-    report: dict[str, Any] = {}
+    samples = {name: every[name].samples()[0].turned(turns) for name in names}
+    report: dict[str, dict[str, Rows]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, sample in samples.items():
-            colors = np.empty((0, 3), np.uint8) if sample.colors is None else sample.colors
-            np.savez(Path(folder, f"{name}.cloud.npz"), points=sample.points.astype(np.float64), colors=colors)
+        for name, turned in samples.items():
+            for turn, sample in enumerate(turned):
+                colors = np.empty((0, 3), np.uint8) if sample.colors is None else sample.colors
+                path = Path(folder, f"{name}.{turn}.cloud.npz")
+                np.savez(path, points=sample.points.astype(np.float64), colors=colors)
         subprocess.run([str(python), __file__, "--partition", folder], check=True)
         print(f"{'cloud':18s} cube segments least" + "".join(f"{which:>22s}" for which in WHICH))
         print(" " * 37 + "   purity   mIoU     s" * 3)
-        for name, sample in samples.items():
-            seconds = []
-            for _ in range(2):  # the first compiles
-                start = time.perf_counter()
-                result = pcgraph.segment(sample.points, sample.colors)
-                seconds.append(time.perf_counter() - start)
-            for cube in CUBES:
-                with np.load(Path(folder, f"{name}.{cube:g}.npz")) as found:
-                    levels, taken = found["levels"], float(found["seconds"])
-                for level in levels:
-                    sizes = np.bincount(level)
-                    n, least = len(sizes), int(sizes.min())
-                    most = int(result.cut(altitude=-1.0, min_size=least).max()) + 1
-                    ours = result.cut(n=min(n, result.tree.n_leaves)), result.cut(n=min(n, most), min_size=least)
-                    rows = [voted(sample.truth, level) | {"s": taken}]
-                    rows += [voted(sample.truth, cut) | {"s": seconds[1]} for cut in ours]
-                    row = {"segments": n, "least": least} | dict(zip(WHICH, rows, strict=True))
-                    report.setdefault(name, {}).setdefault(f"{cube:g}", []).append(row)
-                    shown = "".join("{purity:9.3f}{mIoU:7.3f}{s:6.1f}".format(**scores) for scores in rows)
-                    print(f"{name:18s}{cube:5g}{n:9d}{least:6d}{shown}", flush=True)
+        for name, turned in samples.items():
+            of_turns = [_of_turn(sample, Path(folder, f"{name}.{turn}")) for turn, sample in enumerate(turned)]
+            report[name] = {
+                cube: [_mean(levels) for levels in zip(*(rows[cube] for rows in of_turns), strict=True)]
+                for cube in of_turns[0]
+            }
+            for cube, rows in report[name].items():
+                for row in rows:
+                    shown = "".join("{purity:9.3f}{mIoU:7.3f}{s:6.1f}".format(**row[which]) for which in WHICH)
+                    print(f"{name:18s}{cube:>5s}{row['segments']:9.0f}{row['least']:6.0f}{shown}", flush=True)
+    print(_summary([row for of_cloud in report.values() for rows in of_cloud.values() for row in rows]))
     print(json.dumps(report))
+
+
+def _of_turn(sample: Sample, stem: Path) -> dict[str, Rows]:
+    """By size of cubes, a row per level of the superpoints that lie beside a stem."""
+    from scores import voted
+
+    import pcgraph
+
+    seconds = []
+    for _ in range(2):  # the first compiles
+        start = time.perf_counter()
+        result = pcgraph.segment(sample.points, sample.colors)
+        seconds.append(time.perf_counter() - start)
+    rows: dict[str, Rows] = {}
+    for cube in CUBES:
+        with np.load(f"{stem}.{cube:g}.npz") as found:
+            levels, taken = found["levels"], float(found["seconds"])
+        for level in levels:
+            sizes = np.bincount(level)
+            n, least = len(sizes), int(sizes.min())
+            most = int(result.cut(altitude=-1.0, min_size=least).max()) + 1
+            ours = result.cut(n=min(n, result.tree.n_leaves)), result.cut(n=min(n, most), min_size=least)
+            scores = [voted(sample.truth, level) | {"s": taken}]
+            scores += [voted(sample.truth, cut) | {"s": seconds[1]} for cut in ours]
+            row = {"segments": n, "least": least} | dict(zip(WHICH, scores, strict=True))
+            rows.setdefault(f"{cube:g}", []).append(row)
+    return rows
+
+
+def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Means of the numbers in rows of one shape."""
+    means: dict[str, Any] = {}
+    for key, first in rows[0].items():
+        values = [row[key] for row in rows]
+        means[key] = _mean(values) if isinstance(first, dict) else float(np.mean(values))
+    return means
+
+
+def _summary(rows: Rows) -> str:
+    """How many of the figures of the cuts reach those of the superpoints, in a line per kind of cut."""
+    lines = []
+    for which in WHICH[1:]:
+        short = {key: np.array([row[WHICH[0]][key] - row[which][key] for row in rows]) for key in ("purity", "mIoU")}
+        every = np.concatenate(list(short.values()))
+        lines.append(
+            f"{which}: as good in {np.count_nonzero(every <= 0.0)} of {every.size} figures (purity in "
+            f"{np.count_nonzero(short['purity'] <= 0.0)} of {len(rows)}), within 0.01 in "
+            f"{np.count_nonzero(every <= 0.01)}; at most {every.max():.4f} less"
+        )
+    return "\n".join(lines)
 
 
 # --- in the other one -------------------------------------------------------------------------------------------------

@@ -37,6 +37,7 @@ _BLOCKS, _OF_PART = 16, 0.05  # along the box of all, by which parts are told; o
 _PARTS_OF_ANY, _PARTS = 3, 8  # at most, and if they are rooms
 _NEARLY_WHOLE, _SMALL = (0.05, 0.95), 0.5  # quantiles of a part's cells; and how long their box is, of that of all
 _SPREAD = 0.75  # of the free places lie far from each other, the others far from surfaces
+_BLOCK = 512  # cells: of many rooms a place sees a few such blocks of them
 _ROUNDS = 12  # of agreement between places and orientations
 _HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, in rooms,
 _LEADERS = 6  # single places
@@ -117,21 +118,29 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
     Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
     and where floors and ceilings lie near to each other for cells of that size, so that hardly a place is in a room.
     """
+    middle, reach = unit_frame(grid, grid.centroids)
+    surfaces = _surfaces(grid, middle, reach)
+    origin, viewpoint = -middle / reach, None if viewpoint is None else (viewpoint - middle) / reach
     for finer in _FINER:
-        telling, shows_most = _telling_places(grid, viewpoint, finer)
-        if shows_most:
+        coarse, points = _in_cells(surfaces, finer * _CELLS)
+        may_be_finer = finer < _FINER[-1] and coarse.n_voxels <= grid.n_voxels // 2
+        windows = _windows(coarse)
+        tried, part_of_cell = _places_to_try(coarse, points, windows.normals, origin, viewpoint, finer)
+        is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(tried.closed >= _CLOSED)
+        if may_be_finer and is_layered and n_in_rooms < _FEW:
+            continue  # low rooms have few places at first, and the outside of all of them shows much
+        telling, shown = _telling_places(coarse, points, windows, tried, part_of_cell)
+        shows_most = shown >= (_SHOWS_NEARLY_ALL if is_layered else _SHOWS_MOST) or not (is_layered or n_in_rooms)
+        if shows_most or not may_be_finer:
             break
     return telling
 
 
-def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, finer: int) -> tuple[TellingPlaces, bool]:
-    """The places, with so many times as many cells, and whether more of them would hardly show more."""
-    middle, reach = unit_frame(grid, grid.centroids)
-    coarse, points = coarse_grid(grid, middle, reach, finer * _CELLS)
-    windows = _windows(coarse)
+def _telling_places(
+    coarse: VoxelGrid, points: NDArray[np.float64], windows: Windows, tried: _Tried, part_of_cell: NDArray[np.int64]
+) -> tuple[TellingPlaces, float]:
+    """The most telling of places that were tried, and how much of the surface any agreement of them shows."""
     normals, is_flat = windows.normals, windows.residuals <= (_FLAT * coarse.size) ** 2
-    viewpoint = None if viewpoint is None else (viewpoint - middle) / reach
-    tried, part_of_cell = _places_to_try(coarse, points, normals, -middle / reach, viewpoint, finer)
     seen = seen_from(tried.places, coarse.centroids, coarse.edge_lengths, normals)
     sides = facing_cosines(tried.places, coarse.centroids, normals, seen)
     in_rooms = tried.closed >= _CLOSED
@@ -150,14 +159,8 @@ def _telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None, fine
         room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
     weights, shown = _most_telling(found, looks, coarse.neighbourhood, tried.likely_counts, room_counts)
     chosen = _spread_choice(seen, weights)
-    if _is_layered(coarse):  # low rooms have few places at first, and the outside of all of them shows much
-        shows_most = has_rooms and shown >= _SHOWS_NEARLY_ALL
-    else:
-        shows_most = shown >= _SHOWS_MOST or not in_rooms.any()
-    telling = TellingPlaces(
-        tried.places[of_place[chosen]], weights[chosen], of_part[chosen], coarse.centroids, part_of_cell
-    )
-    return telling, bool(shows_most or coarse.n_voxels > grid.n_voxels // 2)
+    places = tried.places[of_place[chosen]]
+    return TellingPlaces(places, weights[chosen], of_part[chosen], coarse.centroids, part_of_cell), shown
 
 
 class _Tried(NamedTuple):
@@ -344,6 +347,25 @@ def _tell_news(
         news[k] = _news(sides[k], unseen)
 
 
+@kernel
+def _see_blocks(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray[np.bool_]) -> None:
+    """Set whether each place sees any cell of each block."""
+    n, nothing = sides.shape[1], np.float32(0.0)
+    for k in range(start, stop):
+        for block in range(sees.shape[1]):
+            some = False
+            for i in range(block * _BLOCK, min((block + 1) * _BLOCK, n)):
+                some |= sides[k, i] != nothing
+            sees[k, block] = some
+
+
+def _seen_blocks(sides: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether k places, whose sides of n cells are 0 where hidden, (k, n), see any cell of each block, (k, b)."""
+    sees = np.empty((len(sides), -(-sides.shape[1] // _BLOCK)), np.bool_)
+    in_blocks(_see_blocks, len(sides), sides, sees, smallest=1)
+    return sees
+
+
 class _Agreements(NamedTuple):
     """What s first opinions come to, of k places about the sides of n cells.
 
@@ -371,8 +393,15 @@ def _agreements(sides: NDArray[np.float32], starts: NDArray[np.float32]) -> _Agr
     """
     outward = np.empty((len(starts), sides.shape[1]), np.float32)
     found = _Agreements(starts.copy(), outward, np.zeros_like(starts), np.zeros_like(starts))
-    in_blocks(_agree, len(starts), sides, found, smallest=1)
+    in_blocks(_agree, len(starts), sides, _seen_blocks(sides), found, smallest=1)
     return found
+
+
+@routine
+def _add(weight: np.float32, sides: NDArray[np.float32], total: NDArray[np.float32]) -> None:
+    """Add the sides that a place sees, so many times, to a sum of them."""
+    for i in range(len(sides)):
+        total[i] += weight * sides[i]
 
 
 @summing_routine
@@ -425,9 +454,9 @@ def _path_met(paths: _Paths, s: int, this_round: int) -> int:
 
 
 @kernel
-def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements) -> None:
+def _agree(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray[np.bool_], found: _Agreements) -> None:
     """Places that agree decide where the outside lies, and those that see it there count, by turns until it stands."""
-    n_places, n = sides.shape
+    (n_places, n), n_blocks = sides.shape, sees.shape[1]
     total = np.empty(n, np.float32)
     paths = _Paths(
         np.empty((stop - start, _ROUNDS, n), np.int8),
@@ -443,8 +472,10 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
                 total[i] = 0.0
             for k in range(n_places):
                 if weights[k] > 0.0:
-                    for i in range(n):
-                        total[i] += weights[k] * sides[k, i]
+                    for block in range(n_blocks):
+                        if sees[k, block]:
+                            of_block = slice(block * _BLOCK, (block + 1) * _BLOCK)
+                            _add(weights[k], sides[k, of_block], total[of_block])
             changed = False
             for i in range(n):
                 side = np.int8(total[i] > 0.0) - np.int8(total[i] < 0.0)
@@ -461,7 +492,12 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], found: _Agreements
             paths.told[s - start] = this_round + 1
             largest = np.float32(_TINY)
             for k in range(n_places):
-                net, known = _balance(sides[k], outward)
+                net = known = np.float32(0.0)
+                for block in range(n_blocks):
+                    if sees[k, block]:
+                        of_block = slice(block * _BLOCK, (block + 1) * _BLOCK)
+                        more, more_known = _balance(sides[k, of_block], outward[of_block])
+                        net, known = net + more, known + more_known
                 found.agreed[s, k], found.known[s, k] = (net + known) / 2.0, known
                 net = max(net, np.float32(0.0))
                 weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
@@ -491,7 +527,8 @@ def _most_telling(
     is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
     rooms_count = ((closed >= _NEARLY_CLOSED * every) & (every > 0.0)) @ room_counts
     shown, contradicted = np.empty(len(different)), np.empty(len(different))
-    in_blocks(_show, len(different), different, looks, found, around, is_closed, shown, contradicted, smallest=1)
+    sees = _seen_blocks(looks.sides)
+    in_blocks(_show, len(different), different, looks, sees, found, around, is_closed, shown, contradicted, smallest=1)
     most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
     for s, fraction, of_rooms, against in zip(different, shown, rooms_count, contradicted, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
@@ -505,12 +542,32 @@ def _most_telling(
     return best.astype(np.float64), most_shown
 
 
+@summing_routine
+def _add_shown(
+    weight: np.float32,
+    sides: NDArray[np.float32],
+    outward: NDArray[np.float32],
+    is_flat: NDArray[np.bool_],
+    shown: NDArray[np.float32],
+) -> tuple[np.float32, np.float32]:
+    """Add what a place sees of cells from their outer side, so many times, to a sum of that; and sums of what it sees,
+    and of planes from behind."""
+    seen = against = nothing = np.float32(0.0)
+    for i in range(len(sides)):
+        value = sides[i] * outward[i] if outward[i] != nothing else abs(sides[i])
+        shown[i] += weight * max(value, nothing)
+        seen += abs(value)
+        against += max(-value, nothing) if is_flat[i] else nothing
+    return seen, against
+
+
 @kernel
 def _show(
     start: int,
     stop: int,
     different: NDArray[np.int64],
     looks: _Looks,
+    sees: NDArray[np.bool_],
     found: _Agreements,
     around: Neighbourhood,
     is_closed: NDArray[np.bool_],
@@ -532,13 +589,13 @@ def _show(
         seen = against = nothing
         for k in range(n_places):
             if weights[k] > 0.0:
-                of_place = against_it = nothing
-                for i in range(n):
-                    value = sides[k, i] * outward[i] if outward[i] != nothing else abs(sides[k, i])
-                    of_cells[i] += weights[k] * max(value, nothing)
-                    of_place += abs(value)
-                    against_it += max(-value, nothing) if is_flat[i] else nothing
-                seen, against = seen + weights[k] * of_place, against + weights[k] * against_it
+                for block in range(sees.shape[1]):
+                    if sees[k, block]:
+                        of_block = slice(block * _BLOCK, (block + 1) * _BLOCK)
+                        of_place, against_it = _add_shown(
+                            weights[k], sides[k, of_block], outward[of_block], is_flat[of_block], of_cells[of_block]
+                        )
+                        seen, against = seen + weights[k] * of_place, against + weights[k] * against_it
         contradicted[d] = against / max(seen, np.float32(_TINY))
         total = 0.0
         for i in range(n):
@@ -584,23 +641,42 @@ class CoarseGrid(NamedTuple):
     points: NDArray[np.float64]
 
 
-def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float, cells: int = _CELLS) -> CoarseGrid:
-    """Voxels on surfaces in larger ones, as few as still show their shape, in the frame of `unit_frame`; the outermost
-    surfaces amid a layer of them."""
-    places, points, width = _places_on_surfaces(grid)
-    centres, width = (places - middle) / reach, width / reach
+def coarse_grid(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> CoarseGrid:
+    """Voxels on surfaces in larger ones, as few as still show their shape, in the frame of `unit_frame`."""
+    return _in_cells(_surfaces(grid, middle, reach), _CELLS)
+
+
+class _Surfaces(NamedTuple):
+    """Places on surfaces, about as far from each other as voxels of level 0 are.
+
+    Attributes
+    ----------
+    places : (n, 3) float64, in the frame of `unit_frame`
+    points : (n,) float64
+        For how many each stands.
+    width : float
+        Edge of a voxel of level 0.
+    """
+
+    places: NDArray[np.float64]
+    points: NDArray[np.float64]
+    width: float
+
+
+def _in_cells(surfaces: _Surfaces, cells: int) -> CoarseGrid:
+    """Places on surfaces in about so many cells, twice as many at most, the outermost surfaces amid a layer of them."""
+    places, points, width = surfaces
     size = width * max(1.0, math.sqrt(np.minimum(points, 1.0).sum() / (1.5 * cells)))  # as many as a surface would have
-    low = bounding_box(centres)[0]
+    low = bounding_box(places)[0]
     while True:
-        coarse = voxel_grid(centres, size, Shift(low - 0.5 * size))
+        coarse = voxel_grid(places, size, Shift(low - 0.5 * size))
         if coarse.n_voxels <= 2 * cells:
             return CoarseGrid(coarse, np.bincount(coarse.voxel_of_point, points, coarse.n_voxels).astype(np.float64))
         size *= 1.4
 
 
-def _places_on_surfaces(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Places about as far from each other as voxels of level 0 are, (n, 3), the points for which each stands, (n,), and
-    that distance: voxels' means, and of larger voxels as many as these cover on their planes.
+def _surfaces(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> _Surfaces:
+    """Means of voxels, and of larger ones as many places as these cover on their planes.
 
     Voxels that are not joined as on a surface have no sides to be seen, and ghosts far off would stretch the box in
     which places are tried: they do not count, unless most are such.
@@ -611,7 +687,7 @@ def _places_on_surfaces(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[n
         counts[:] = True
     if grid.levels is None:
         size, some = float(edges[0] if edges.min() == edges.max() else np.median(edges)), np.flatnonzero(counts)
-        return grid.centroids.take(some, axis=0), points[some], size
+        return _Surfaces((grid.centroids.take(some, axis=0) - middle) / reach, points[some], size / reach)
     normals, places, held = either_normals(grid), [], []
     for level in np.unique(grid.levels):
         some, across = np.flatnonzero((grid.levels == level) & counts), 1 << int(level)
@@ -621,7 +697,7 @@ def _places_on_surfaces(grid: VoxelGrid) -> tuple[NDArray[np.float64], NDArray[n
             for other in steps:
                 places.append(grid.centroids[some] + one * ones + other * others)
                 held.append(points[some] / across**2)
-    return np.concatenate(places), np.concatenate(held), grid.size
+    return _Surfaces((np.concatenate(places) - middle) / reach, np.concatenate(held), grid.size / reach)
 
 
 def _along_planes(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
