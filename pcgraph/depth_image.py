@@ -86,16 +86,16 @@ def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
     return far_apart
 
 
-def _pairs_beside(image: Pixels, some: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pairs_beside(image: Pixels, some: NDArray[np.int32], step: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Those of some points that have a neighbour in their row (a step of 1) or column (of a row's width),
     and these."""
-    sought, width = image.at[some] + step, image.shape[1]
-    beside = image.order[np.minimum(np.searchsorted(image.at, sought, sorter=image.order), len(image.order) - 1)]
-    pairs = (image.at[beside] == sought) & ((step != 1) | (sought % width > 0))
+    sought, (h, w) = image.at[some] + step, image.shape
+    beside = image.point_at[np.minimum(sought, h * w - 1)]
+    pairs = (beside >= 0) & (sought < h * w) & ((step != 1) | (sought % w > 0))
     return some[pairs], beside[pairs]
 
 
-def _some_of(image: Pixels, number: int) -> NDArray[np.int64]:
+def _some_of(image: Pixels, number: int) -> NDArray[np.int32]:
     """Numbers of so many points, some perhaps twice; always the same, whatever their order."""
     return image.order[np.random.default_rng(0).integers(len(image.order), size=number)]
 

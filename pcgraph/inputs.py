@@ -122,8 +122,9 @@ class ImageView(NamedTuple):
     axis: NDArray[np.float64] | None
 
 
-class Pixels(NamedTuple):
-    """Which pixels n points are.
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Which pixels n points are, no two the same one.
 
     Attributes
     ----------
@@ -131,16 +132,25 @@ class Pixels(NamedTuple):
         Rows and columns of their image.
     at : (n,) int64
         Flat index of each point's pixel.
-    order : (n,) int64
-        The points in the order of their pixels.
     view : ImageView, or None
         Of the camera, if they came as a list that tells it; None of organised points.
     """
 
     shape: tuple[int, int]
     at: NDArray[np.int64]
-    order: NDArray[np.int64]
     view: ImageView | None = None
+
+    @cached_property
+    def point_at(self) -> NDArray[np.int32]:
+        """The point of each pixel, (h * w,), -1 of those that are none."""
+        points = np.full(self.shape[0] * self.shape[1], -1, np.int32)
+        points[self.at] = np.arange(len(self.at), dtype=np.int32)
+        return points
+
+    @cached_property
+    def order(self) -> NDArray[np.int32]:
+        """The points in the order of their pixels, (n,)."""
+        return self.point_at[self.point_at >= 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +262,7 @@ def clean_cloud(
     none = np.empty(0, np.int64)
     clean = CleanCloud(places, _colors(colors, shape, kept), _normals(normals, shape, kept), shape, kept, none)
     if len(shape) == 2:
-        clean = replace(clean, image=Pixels(shape, kept, np.arange(len(kept))))
+        clean = replace(clean, image=Pixels(shape, kept))
     largest = float(np.abs(clean.bounds).max())
     if largest > _LARGEST:
         raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")

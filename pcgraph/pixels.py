@@ -160,8 +160,5 @@ def _pixels(rows: Steps, columns: Steps, view: ImageView) -> Pixels | None:
     shape, n = (rows.number, columns.number), len(rows.at)
     if min(shape) < NARROWEST or n < _FILLED * shape[0] * shape[1]:
         return None
-    at = rows.at * columns.number + columns.at
-    point_at = np.full(shape[0] * shape[1], -1)
-    point_at[at] = np.arange(n)
-    order = point_at[point_at >= 0]
-    return None if len(order) < n else Pixels(shape, at, order, view)
+    pixels = Pixels(shape, rows.at * columns.number + columns.at, view)
+    return None if len(pixels.order) < n else pixels

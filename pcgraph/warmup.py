@@ -132,7 +132,7 @@ def compile_voxels() -> None:
     method.supervoxel_of_point(points, grid, planes, supervoxels)
     seen = clean_cloud(_step()[0], None, None).points
     every = np.arange(len(seen))
-    DepthImage.of(seen, Pixels((len(seen), 1), every, every), np.zeros(3), None).flying()
+    DepthImage.of(seen, Pixels((len(seen), 1), every), np.zeros(3), None).flying()
     _compile_pixels()
     telling_places._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
 

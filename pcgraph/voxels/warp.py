@@ -236,7 +236,9 @@ def _median(values: NDArray[np.float64]) -> float:
 
 def along_axis(points: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coordinates of points, (n, 3), along an axis, (n,)."""
-    return np.einsum("ij,j->i", points, axis)
+    along = np.empty(len(points))
+    in_blocks(_multiply, len(points), points, axis, along)
+    return along
 
 
 def _ranges(points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -266,6 +268,15 @@ def warped_normal(
     along = x * u + y * v + z * w
     turn = slant.depth * (a * (x - along * u) + b * (y - along * v) + c * (z - along * w))
     return a + turn * u, b + turn * v, c + turn * w
+
+
+@kernel
+def _multiply(
+    start: int, stop: int, points: NDArray[np.float64], axis: NDArray[np.float64], along: NDArray[np.float64]
+) -> None:
+    """Set coordinates of points along an axis."""
+    for p in range(start, stop):
+        along[p] = points[p, 0] * axis[0] + points[p, 2] * axis[2] + points[p, 1] * axis[1]  # as NumPy adds them
 
 
 @kernel
