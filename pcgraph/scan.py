@@ -24,6 +24,7 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.contacts import contacts, edge_features
 from pcgraph.graph.continuations import continuations, faces_of
 from pcgraph.graph.gaps import gaps
+from pcgraph.graph.terrain import terrain
 from pcgraph.inputs import (
     CleanCloud,
     Features,
@@ -420,7 +421,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, seen_from),
         lambda: continuations(surface, nodes, faces, scan.places),
     )
-    hidden = hidden.with_others(bounding_planes(surface, nodes, faces))
+    hidden = hidden.with_others(bounding_planes(surface, nodes, faces)).with_others(terrain(surface, nodes, faces))
     hidden = hidden.without(touching.edges).without(near.edges)
     graph = AdjacencyGraph(
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=scan.sides_known

@@ -136,7 +136,8 @@ class AdjacencyGraph(ShortRepr):
     gaps : Gaps, optional
         Supervoxels that nearly touch. They are no edges, but a linkage may merge across them.
     continuations : Continuations, optional
-        Flat surfaces that go on behind what hides them, and pieces of one bounding plane. They are no edges either.
+        Flat surfaces that go on behind what hides them, and pieces of one bounding plane or terrain. They are no edges
+        either.
     bridges : Bridges, optional
         Ways from specks to what is around them. They are no edges either.
     color_evidence : float, 0..1

@@ -26,7 +26,7 @@ _ENOUGH = 20_000  # supervoxels tell that
 _PARALLEL, _OFFSET = 0.98, 1.0  # cosine, and voxel edges, between two pieces of one plane, at least and at most
 _GAP = 0.75  # times the width of the larger one lies between them, at most
 _FACING = 2.0  # times as far apart as where they are nearest are borders that face each other, at most
-_HIDDEN = 0.5  # of the ways between such borders lead past something before the plane, at least,
+HIDDEN = 0.5  # of the ways between such borders lead past something before the plane, at least,
 _HEIGHT = 2.0  # that lies no more times as high as the way is long,
 _ALONG = 0.5  # and along the plane, by the cosine between normals, at least
 _AROUND = 8  # voxels of its own piece that a voxel amid it has around it
@@ -61,7 +61,7 @@ def bounding_planes(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int
     scene = _scene(surface, nodes)
     pieces = _bounding_pieces(scene, nodes, faces)
     planes = list(_on_one_plane(pieces))
-    borders = _borders(surface, pieces.of_supervoxel, planes)
+    borders = borders_of(surface, pieces.of_supervoxel, planes)
     ways = [_hidden_ways(surface, scene, pieces, some[0], border) for some, border in zip(planes, borders, strict=True)]
     hidings = np.concatenate((np.empty((0, 2), np.int64), *ways))
     ends = surface.grid.warped[hidings]
@@ -179,14 +179,23 @@ def _offset(planes: NodeFeatures, ones: NDArray[np.int64], others: NDArray[np.in
     return np.sqrt(shift * shift + np.maximum(spread, 0.0))
 
 
-def _borders(
-    surface: Surface, of_supervoxel: NDArray[np.int64], planes: list[NDArray[np.int64]]
+def borders_of(
+    surface: Surface, of_supervoxel: NDArray[np.int64], groups: list[NDArray[np.int64]]
 ) -> list[NDArray[np.int64]]:
-    """Voxels of the pieces on each plane that have fewer than eight of the same piece around them."""
-    if not planes:
+    """Voxels of the pieces of each group that have fewer than eight of the same piece around them.
+
+    Parameters
+    ----------
+    surface : Surface
+    of_supervoxel : (k,) int64
+        Piece of each supervoxel, -1 of those on none.
+    groups : list of (p,) int64
+        Pieces.
+    """
+    if not groups:
         return []
     grid, on = surface.grid, np.full(int(of_supervoxel.max()) + 2, -1)  # the last is of what lies on no piece
-    for number, some in enumerate(planes):
+    for number, some in enumerate(groups):
         on[some] = number
     piece = of_supervoxel[surface.supervoxels]
     voxels = np.flatnonzero(on[piece] >= 0)
@@ -196,8 +205,49 @@ def _borders(
     around = np.bincount(row, piece[grid.neighbours[at]] == piece[voxels[row]], len(voxels))
     voxels = voxels[around < _AROUND]
     order = np.argsort(on[piece[voxels]], kind="stable")
-    counts = np.bincount(on[piece[voxels]], minlength=len(planes))
+    counts = np.bincount(on[piece[voxels]], minlength=len(groups))
     return np.split(voxels[order], np.cumsum(counts)[:-1])
+
+
+class FacingWays(NamedTuple):
+    """Ways between borders of pieces that face each other: edges of the Delaunay triangulation of all borders.
+
+    Attributes
+    ----------
+    ends : (c, 2) int64
+        Numbers of the places on two borders.
+    lengths : (c,) float64, metres
+    pair : (c,) int64
+        The pair of pieces of each.
+    pairs : (q, 2) int32
+        Pieces, the smaller number first.
+    widths : (q,) float64, metres
+        Least length of their ways.
+    """
+
+    ends: NDArray[np.int64]
+    lengths: NDArray[np.float64]
+    pair: NDArray[np.int64]
+    pairs: NDArray[np.int32]
+    widths: NDArray[np.float64]
+
+
+def facing_ways(places: NDArray[np.float64], feet: NDArray[np.float64], piece: NDArray[np.int64]) -> FacingWays:
+    """Ways between places on borders, (b, 3) metres, whose feet on a plane, (b, 2) in voxel edges, are triangulated,
+    and which are on a piece each, (b,)."""
+    triangles = np.empty((0, 3), np.int32)
+    if len(places) >= _LEAST_FOR_TRIANGLES:
+        triangles = Delaunay(
+            feet, qhull_options="QJ"
+        ).simplices  # joggled, as places on a lattice or a line are no error
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
+    lengths = np.linalg.norm(places[ends[:, 1]] - places[ends[:, 0]], axis=1)
+    pairs, pair = distinct_pairs(*np.sort(piece[ends], axis=1).T)
+    widths = np.full(len(pairs), np.inf)
+    np.minimum.at(widths, pair, lengths)
+    facing = lengths <= _FACING * widths[pair]
+    return FacingWays(ends[facing], lengths[facing], pair[facing], pairs, widths)
 
 
 def _hidden_ways(
@@ -210,28 +260,17 @@ def _hidden_ways(
     piece = pieces.of_supervoxel[surface.supervoxels[border]]
     places = surface.grid.centroids[border]
     normal = pieces.planes.normal[first]
-    plane = _Plane(pieces.planes.centroid[first], normal, plane_basis(normal))
-    if len(border) < _LEAST_FOR_TRIANGLES:
-        return np.empty((0, 2), np.int64)
-    feet = plane.feet(places) / pieces.edges[first]  # no unit is too small
-    triangles = Delaunay(feet, qhull_options="QJ").simplices  # joggled, as places on a lattice or a line are no error
-    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
-    lengths = np.linalg.norm(places[ends[:, 1]] - places[ends[:, 0]], axis=1)
-    pairs, pair = distinct_pairs(*np.sort(piece[ends], axis=1).T)
-    widths = np.full(len(pairs), np.inf)
-    np.minimum.at(widths, pair, lengths)
-    facing = lengths <= _FACING * widths[pair]
-    ends, lengths, pair = ends[facing], lengths[facing], pair[facing]
-    middles, larger = plane.feet(places[ends].mean(axis=1)), pieces.areas[pairs].max(axis=1)[pair]
-    heights = plane.heights(scene.places)
-    hidden = np.bincount(pair, _is_hidden(scene, plane, heights, middles, lengths, larger), len(pairs))
-    opened = np.bincount(pair, _is_open(scene, plane, heights, middles, lengths), len(pairs))
-    may_join = (hidden >= _HIDDEN * np.bincount(pair, minlength=len(pairs))) & (opened == 0)
-    return border[ends[_joining(pairs, widths, may_join, pieces.areas)[pair]]]
+    plane = Plane(pieces.planes.centroid[first], normal, plane_basis(normal))
+    ways = facing_ways(places, plane.feet(places) / pieces.edges[first], piece)  # no unit is too small
+    middles, larger = plane.feet(places[ways.ends].mean(axis=1)), pieces.areas[ways.pairs].max(axis=1)[ways.pair]
+    heights, n_pairs = plane.heights(scene.places), len(ways.pairs)
+    hidden = np.bincount(ways.pair, _is_hidden(scene, plane, heights, middles, ways.lengths, larger), n_pairs)
+    opened = np.bincount(ways.pair, _is_open(scene, plane, heights, middles, ways.lengths), n_pairs)
+    may_join = (hidden >= HIDDEN * np.bincount(ways.pair, minlength=n_pairs)) & (opened == 0)
+    return border[ways.ends[joining(ways, may_join, pieces.areas)[ways.pair]]]
 
 
-class _Plane(NamedTuple):
+class Plane(NamedTuple):
     """A plane: a place on it, its unit normal, and two directions along it, (2, 3)."""
 
     origin: NDArray[np.float64]
@@ -249,7 +288,7 @@ class _Plane(NamedTuple):
 
 def _is_hidden(
     scene: _Scene,
-    plane: _Plane,
+    plane: Plane,
     heights: NDArray[np.float64],
     middles: NDArray[np.float64],
     lengths: NDArray[np.float64],
@@ -279,7 +318,7 @@ def _is_hidden(
 
 def _is_open(
     scene: _Scene,
-    plane: _Plane,
+    plane: Plane,
     heights: NDArray[np.float64],
     middles: NDArray[np.float64],
     lengths: NDArray[np.float64],
@@ -291,10 +330,10 @@ def _is_open(
     return cKDTree(plane.feet(behind)).query(middles)[0] <= 0.5 * lengths
 
 
-def _joining(
-    pairs: NDArray[np.int32], widths: NDArray[np.float64], may_join: NDArray[np.bool_], areas: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Which pairs join pieces that are not one yet: as what is one grows, wider gaps are bridged."""
+def joining(ways: FacingWays, may_join: NDArray[np.bool_], areas: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which pairs, (q,) bool, join pieces, of so many square metres, that are not one yet: of those that may, the
+    nearest first; as what is one grows, wider gaps are bridged."""
+    pairs, widths = ways.pairs, ways.widths
     whole, areas = np.arange(len(areas)), areas.copy()
     joins, order, joined = np.zeros(len(pairs), np.bool_), np.argsort(widths, kind="stable"), True
     order = order[may_join[order]]

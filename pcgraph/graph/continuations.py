@@ -59,7 +59,8 @@ class Continuations(ShortRepr):
         Distance of mean colours; 0 if the cloud has none.
     coplanar : (r,) bool
         Whether the two could be one flat surface: angle of at most 0.2 rad, and offset of at most two voxels or a
-        tenth of the width; or they lie on one bounding plane (`pcgraph.graph.bounding_planes.bounding_planes`).
+        tenth of the width; or they lie on one bounding plane (`pcgraph.graph.bounding_planes.bounding_planes`). Those
+        that are not are pieces of one terrain (`pcgraph.graph.terrain.terrain`).
     """
 
     pairs: NDArray[np.int32]

@@ -66,6 +66,7 @@ class RegionLinkage(Linkage):
     (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of
     objects, at their mean cost times m / (m + 1); but bridges between specks of a few points that lie about as near to
     each other as to anything count as contacts at 3 rad, so that a surface sampled too thinly for voxels is no dust.
+    Two that nothing but one terrain joins (`pcgraph.graph.terrain.terrain`) merge at the altitude of objects.
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
     one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
@@ -110,18 +111,19 @@ class RegionLinkage(Linkage):
             price = self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap
             costs = np.concatenate((costs, self.cost(gaps.edge_features) + price * (gaps.widths - 1.0)))
             weights = np.concatenate((weights, gaps.weights))
+        is_bridge = np.zeros(len(costs), np.bool_)
         if (hidden := graph.continuations) is not None:
             costs = np.concatenate((costs, np.zeros(len(hidden.pairs))))
-            weights = np.concatenate((weights, 2.0 * hidden.crossings))
-        n_bridges = 0
+            weights = np.concatenate((weights, np.where(hidden.coplanar, 2.0 * hidden.crossings, _BRIDGE_VOXELS)))
+            is_bridge = np.concatenate((is_bridge, ~hidden.coplanar))
         if (bridges := graph.bridges) is not None:
             of_bridges = np.where(bridges.between_specks, _BETWEEN_SPECKS, self.bridge * bridges.widths)
-            order = np.argsort(~bridges.between_specks, kind="stable")
-            edges, costs = np.concatenate((edges, bridges.edges[order])), np.concatenate((costs, of_bridges[order]))
+            edges, costs = np.concatenate((edges, bridges.edges)), np.concatenate((costs, of_bridges))
             weights = np.concatenate((weights, np.full(len(bridges.edges), _BRIDGE_VOXELS)))
-            n_bridges = int(np.count_nonzero(~bridges.between_specks))
+            is_bridge = np.concatenate((is_bridge, ~bridges.between_specks))
+        order, n_bridges = np.argsort(is_bridge, kind="stable"), int(np.count_nonzero(is_bridge))
         color = self.color * graph.color_evidence
-        return region_linkage(graph, leaves, edges, costs, weights, color, n_bridges, self.relief)
+        return region_linkage(graph, leaves, edges[order], costs[order], weights[order], color, n_bridges, self.relief)
 
 
 _STEPS = float(1 << 20)
@@ -329,7 +331,8 @@ def _altitude(
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
     smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
     if len(sums) > 3 and sums[3, edge] == sums[1, edge]:  # nothing but bridges
-        return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), round(shape.objects * _STEPS) + 1) / _STEPS
+        least = round(shape.objects * _STEPS) + (cost > 0.0)
+        return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), least) / _STEPS
     uneven = state.residuals[a if state.masses[a] == larger else b] / larger - shape.q0
     contrast = squared_distance(state.values, a, b)
     increase = max(energy_increase(state, a, b, contrast), shape.e1 * smaller * uneven, 0.0)

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From far above, the ground is one object, though what stands on it parts it; what only lies low is none of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pcgraph
+from pcgraph.graph.continuations import faces_of
+from pcgraph.graph.terrain import terrain
+from pcgraph.tree.tree import segmentation_tree
+
+SIDE = 120.0  # metres, along x and y
+STREET, COURT, ROOF, SHED, WALL = range(5)
+
+
+def block(court=0.0, roof=15.0, shed=None, walls=False, seed=0):
+    """A street around a block of four wings, 20 m wide, about a court of 40 m, from an aircraft: points (n, 3), metres,
+    and what each is on, (n,).
+
+    A shed of 14 m stands in the court, so many metres above it.
+    """
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0.0, SIDE, (2, 12_000))
+    off = np.maximum(np.abs(x - SIDE / 2), np.abs(y - SIDE / 2))  # of squares around the middle
+    on = np.where(off > 40.0, STREET, np.where(off > 20.0, ROOF, COURT))
+    z = np.choose(on, [0.0, court, roof])
+    if shed is not None:
+        on[off < 7.0], z[off < 7.0] = SHED, court + shed
+    points = np.stack((x, y, z + rng.normal(0.0, 0.05, len(x))), axis=1)
+    if walls:
+        along, height = rng.uniform(20.0, 100.0, 3000), rng.uniform(0.0, roof, 3000)
+        front = np.stack((along, np.full(3000, 20.0), height), axis=1)
+        points, on = np.concatenate((points, front, front[:, [1, 0, 2]])), np.concatenate((on, np.full(6000, WALL)))
+    return points, on
+
+
+def main_object(labels, on, what):
+    names, counts = np.unique(labels[(on == what) & (labels >= 0)], return_counts=True)
+    assert counts.max() > 0.9 * counts.sum()
+    return names[counts.argmax()]
+
+
+def found_in(result):
+    graph = result.graph
+    return terrain(result.surface, graph.node_features, faces_of(graph.edges, graph.edge_features, graph.n_nodes))
+
+
+@pytest.mark.parametrize("court", [0.0, 3.0, -3.0])
+@pytest.mark.parametrize("tilted", [False, True])
+def test_a_court_is_one_with_the_street_around_the_block(court, tilted):
+    """In whatever frame, and though it lies higher or lower; the roof is another."""
+    points, on = block(court)
+    if tilted:
+        points = points @ np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] + 1000.0
+    result = pcgraph.segment(points)
+    street, court, roof = (main_object(result.labels, on, what) for what in (STREET, COURT, ROOF))
+    assert street == court != roof
+    pairs = found_in(result)
+    assert len(pairs.pairs)
+    assert not pairs.coplanar.any()
+
+
+def test_it_joins_no_sooner_than_objects_are_cut():
+    """Below that the tree is as without: which pieces are one ground says nothing of their own parts."""
+    result = pcgraph.segment(block(3.0)[0])
+    hidden = result.graph.continuations
+    without = replace(result.graph, continuations=hidden.chosen(hidden.coplanar))
+    tree = segmentation_tree(result.linkage.merges(without, result.leaves), result.leaves)
+    below = np.nextafter(np.round(result.object_altitude * 2**20) / 2**20, 0.0)
+    np.testing.assert_array_equal(result.cut(altitude=below), result.on_points(tree.cut(altitude=below)))
+    assert result.objects.max() == tree.cut(altitude=result.object_altitude).max() - 1
+
+
+@pytest.mark.parametrize("shed", [3.5, 6.0])
+def test_a_flat_roof_in_the_court_is_not_ground(shed):
+    """From its border it goes down, however low it is beside what stands around."""
+    points, on = block(shed=shed)
+    labels = pcgraph.segment(points).labels
+    street, court, shed = (main_object(labels, on, what) for what in (STREET, COURT, SHED))
+    assert street == court != shed
+
+
+def test_a_terrace_nearly_as_high_as_what_stands_around_is_another():
+    points, on = block(court=9.0)
+    labels = pcgraph.segment(points).labels
+    assert main_object(labels, on, STREET) != main_object(labels, on, COURT)
+
+
+def test_where_walls_are_seen_it_was_not_from_far_above():
+    """Then what is one is known from what touches."""
+    result = pcgraph.segment(block(walls=True)[0])
+    assert not len(found_in(result).pairs)
+
+
+def test_a_scanner_over_the_court_knows_what_it_did_not_see():
+    """Its own range tells how voxels grow: what one scanner took is not asked."""
+    points, _ = block()
+    result = pcgraph.segment(points, viewpoint=(60.0, 60.0, 100.0), range_growth=0.5)
+    assert not len(found_in(result).pairs)
