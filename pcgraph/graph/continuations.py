@@ -85,8 +85,7 @@ class Continuations(ShortRepr):
 
     def without(self, pairs: NDArray[np.int32]) -> Continuations:
         """Those that are not among these pairs, (m, 2) int32, the smaller first, in ascending order."""
-        keys, others = (_keys(*both.T) for both in (self.pairs, pairs))
-        return self.chosen(np.searchsorted(others, keys, "left") == np.searchsorted(others, keys, "right"))
+        return self.chosen(are_apart(self.pairs, pairs))
 
 
 def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArray[np.int32]:
@@ -245,6 +244,12 @@ def distinct_pairs(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple
     """Distinct pairs in ascending order, (q, 2) int32, and the pair of each row."""
     keys, inverse = np.unique(_keys(first, second), return_inverse=True)
     return np.stack((keys >> 32, keys & 0xFFFFFFFF), axis=1).astype(np.int32), inverse
+
+
+def are_apart(pairs: NDArray[np.int32], others: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which of some pairs, (r, 2), are not among others, (m, 2), the smaller first, in ascending order."""
+    keys, known = _keys(*pairs.T), _keys(*others.T)
+    return np.searchsorted(known, keys, "left") == np.searchsorted(known, keys, "right")
 
 
 def _keys(first: NDArray[np.int32], second: NDArray[np.int32]) -> NDArray[np.int64]:

@@ -20,7 +20,9 @@ _STEEP, _HARDLY = 0.3, 0.05  # of what is across that, hardly any is seen from f
 _LEAST_VOXELS = 20  # of a piece, some supervoxel
 _COLUMN, _BESIDE, _REACH = 1.5, 8, 4  # voxel edges; columns beside one, and how many of them away at most
 _STEP = 2.5  # voxel edges by which one lies below another
-_DOWNWARDS = 0.1  # of the steps at the border of the ground, at most, lead downwards
+_UPWARD_STEPS = 10  # at the border of the ground, at least;
+_DOWNWARDS = 0.1  # and of all there, at most, lead downwards
+_LEVEL = 0.7  # cosine between its normals and upwards, on average
 _LEVELS = 0.35  # times as far as what stands between rises above both may one lie above the other
 _NEAR = 8  # supervoxels beside a way that are looked at
 
@@ -29,10 +31,10 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
     """Supervoxels on the borders that pieces of the ground turn to each other, under what stands between.
 
     From far above, as from an aircraft, roofs are seen, and streets, but no walls: the ground of a courtyard touches
-    nothing, and may lie lower than the street. A face is ground if from its border it goes up and hardly ever down.
-    Two pieces are one if on at least half of the ways between their borders something stands that rises above the
-    higher of them by some three times as much as that lies above the other. As with bounding planes, between them lies
-    at most three quarters of the width of the larger one.
+    nothing, and may lie lower than the street. A face is ground if it is about level, and from its border it goes up
+    and hardly ever down. Two pieces are one if they touch, as at a bank; or if on at least half of the ways between
+    their borders something stands that rises above the higher of them by some three times as much as that lies above
+    the other. As with bounding planes, between them lies at most three quarters of the width of the larger one.
 
     Parameters
     ----------
@@ -44,14 +46,17 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
     Returns
     -------
     Continuations
-        None coplanar. There are none unless nearly all normals point to one side, from which no single scanner took the
-        cloud: then what is hidden is known from its place.
+        None coplanar; some may touch. There are none unless nearly all normals point to one side, from which no single
+        scanner took the cloud: then what is hidden is known from its place.
     """
     upwards = _seen_from_far_above(surface)
     ground = np.zeros(int(faces.max()) + 1, np.bool_) if upwards is None else _ground(surface, faces, upwards)
     if upwards is None or np.count_nonzero(ground) < 2:
         return continuations_of(surface, nodes, np.empty((0, 2), np.int64))
     of_supervoxel = np.where(ground, np.cumsum(ground) - 1, -1)[faces]
+    touching = surface.grid.touching_pairs()
+    sides = of_supervoxel[surface.supervoxels[touching]]
+    touching = touching[(sides >= 0).all(axis=1) & (sides[:, 0] < sides[:, 1])]
     border = borders_of(surface, of_supervoxel, [np.arange(np.count_nonzero(ground))])[0]
     places, plane = surface.grid.centroids[border], Plane(surface.grid.centroids[0], upwards, plane_basis(upwards))
     ways = facing_ways(places, plane.feet(places) / surface.grid.size, of_supervoxel[surface.supervoxels[border]])
@@ -67,7 +72,7 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
     n_ways, n_hidden = (np.bincount(ways.pair, counts, len(ways.pairs)) for counts in (None, hidden))
     areas = np.bincount(of_supervoxel[surface.supervoxels] + 1, np.square(surface.grid.edge_lengths))[1:]
     joins = joining(ways, n_hidden >= HIDDEN * n_ways, areas.astype(np.float64))
-    found = continuations_of(surface, nodes, border[ways.ends[joins[ways.pair]]])
+    found = continuations_of(surface, nodes, np.concatenate((touching, border[ways.ends[joins[ways.pair]]])))
     return replace(found, coplanar=np.zeros(len(found.pairs), np.bool_))
 
 
@@ -97,4 +102,7 @@ def _ground(surface: Surface, faces: NDArray[np.int32], upwards: NDArray[np.floa
     above, below = tops[one], tops[beside[one, way]]
     steps = (heights[above] - heights[below] > _STEP * edge) & (face[above] != face[below])
     down, up = (np.bincount(face[ends[steps]], minlength=n_faces) for ends in (above, below))
-    return np.asarray((down <= _DOWNWARDS * (down + up)) & (np.bincount(face, minlength=n_faces) >= _LEAST_VOXELS))
+    voxels = np.bincount(face, minlength=n_faces)
+    is_level = np.bincount(face, np.einsum("ij,j->i", surface.normals, upwards), n_faces) >= _LEVEL * voxels
+    is_lowest = (up >= _UPWARD_STEPS) & (down <= _DOWNWARDS * (down + up))
+    return np.asarray(is_level & is_lowest & (voxels >= _LEAST_VOXELS))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
+from pcgraph.graph.continuations import are_apart
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, squared_distance, unite
@@ -66,7 +67,7 @@ class RegionLinkage(Linkage):
     (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of
     objects, at their mean cost times m / (m + 1); but bridges between specks of a few points that lie about as near to
     each other as to anything count as contacts at 3 rad, so that a surface sampled too thinly for voxels is no dust.
-    Two that nothing but one terrain joins (`pcgraph.graph.terrain.terrain`) merge at the altitude of objects.
+    Two of one terrain (`pcgraph.graph.terrain.terrain`) merge at the altitude of objects, if they do no sooner.
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
     one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
@@ -105,25 +106,57 @@ class RegionLinkage(Linkage):
 
     def merges(self, graph: AdjacencyGraph, leaves: Moments) -> Merges:
         """Merges, the least altitude first."""
-        edges, costs = graph.joined, self.cost(graph.edge_features)
-        weights = graph.edge_features.contact_voxels.astype(np.float64)
+        color = self.color * graph.color_evidence
+        return region_linkage(graph, leaves, self._ways(graph), color, self.relief)
+
+    def _ways(self, graph: AdjacencyGraph) -> Ways:
+        """All along which regions merge: contacts, gaps, continuations, terrain, and bridges."""
+        ways = [Ways.of(graph.edges, self.cost(graph.edge_features), graph.edge_features.contact_voxels)]
         if (gaps := graph.gaps) is not None:
             price = self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap
-            costs = np.concatenate((costs, self.cost(gaps.edge_features) + price * (gaps.widths - 1.0)))
-            weights = np.concatenate((weights, gaps.weights))
-        is_bridge = np.zeros(len(costs), np.bool_)
+            ways.append(Ways.of(gaps.edges, self.cost(gaps.edge_features) + price * (gaps.widths - 1.0), gaps.weights))
         if (hidden := graph.continuations) is not None:
-            costs = np.concatenate((costs, np.zeros(len(hidden.pairs))))
-            weights = np.concatenate((weights, np.where(hidden.coplanar, 2.0 * hidden.crossings, _BRIDGE_VOXELS)))
-            is_bridge = np.concatenate((is_bridge, ~hidden.coplanar))
+            behind, ground = hidden.chosen(hidden.coplanar), hidden.chosen(~hidden.coplanar)
+            ways.append(Ways.of(behind.pairs, np.zeros(len(behind.pairs)), 2.0 * behind.crossings))
+            if len(ground.pairs):
+                ways = [some._replace(terrain=~are_apart(some.edges, ground.pairs)) for some in ways]
+                for some in ways:
+                    ground = ground.without(some.edges)
+                n, every = len(ground.pairs), np.ones(len(ground.pairs), np.bool_)
+                ways.append(Ways(ground.pairs, np.zeros(n), np.full(n, _BRIDGE_VOXELS), every, every))
         if (bridges := graph.bridges) is not None:
-            of_bridges = np.where(bridges.between_specks, _BETWEEN_SPECKS, self.bridge * bridges.widths)
-            edges, costs = np.concatenate((edges, bridges.edges)), np.concatenate((costs, of_bridges))
-            weights = np.concatenate((weights, np.full(len(bridges.edges), _BRIDGE_VOXELS)))
-            is_bridge = np.concatenate((is_bridge, ~bridges.between_specks))
-        order, n_bridges = np.argsort(is_bridge, kind="stable"), int(np.count_nonzero(is_bridge))
-        color = self.color * graph.color_evidence
-        return region_linkage(graph, leaves, edges[order], costs[order], weights[order], color, n_bridges, self.relief)
+            order = np.argsort(~bridges.between_specks, kind="stable")
+            costs = np.where(bridges.between_specks, _BETWEEN_SPECKS, self.bridge * bridges.widths)
+            of_bridges = Ways.of(bridges.edges[order], costs[order], np.full(len(order), _BRIDGE_VOXELS))
+            ways.append(of_bridges._replace(bridges=~bridges.between_specks[order]))
+        return Ways(*(np.concatenate(columns) for columns in zip(*ways, strict=True)))
+
+
+class Ways(NamedTuple):
+    """Along which regions merge.
+
+    Attributes
+    ----------
+    edges : (m, 2) int32
+        Pairs of distinct regions, each pair once.
+    costs : (m,) float64, radians, >= 0
+    weights : (m,) float64, > 0
+        Contacts in voxels, of both sides.
+    bridges, terrain : (m,) bool
+        Which are no contacts, and which lead from ground to ground.
+    """
+
+    edges: NDArray[np.int32]
+    costs: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    bridges: NDArray[np.bool_]
+    terrain: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, edges: NDArray[np.int32], costs: NDArray[np.float64], weights: NDArray[np.number]) -> Ways:
+        """Contacts, neither bridges nor terrain."""
+        none = np.zeros(len(edges), np.bool_)
+        return cls(edges, costs, weights.astype(np.float64), none, none)
 
 
 _STEPS = float(1 << 20)
@@ -205,14 +238,7 @@ class _Outlines(NamedTuple):
 
 
 def region_linkage(
-    graph: AdjacencyGraph,
-    leaves: Moments,
-    edges: NDArray[np.int32],
-    costs: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    color: float = 0.0,
-    n_bridges: int = 0,
-    relief: float = 0.0,
+    graph: AdjacencyGraph, leaves: Moments, ways: Ways, color: float = 0.0, relief: float = 0.0
 ) -> Merges:
     """Merges of regions along edges, the least altitude of `RegionLinkage` first.
 
@@ -221,15 +247,9 @@ def region_linkage(
     graph : AdjacencyGraph of k nodes
         Its contacts give the unit of length, a voxel edge.
     leaves : Moments of k regions
-    edges : (m, 2) int32
-        Pairs of distinct regions, each pair once.
-    costs : (m,) float64, radians, >= 0
-    weights : (m,) float64, > 0
-        Contacts in voxels, of both sides.
+    ways : Ways
     color : float, voxel edges, >= 0
         What colours count, if there are any.
-    n_bridges : int
-        So many of the last edges are bridges.
     relief : float, radians, >= 0
         What a region costs that stands in relief.
 
@@ -239,9 +259,12 @@ def region_linkage(
         Altitudes are made not to decrease: a merge below the altitude of an earlier one takes that. Of equal ones the
         first edge merges first.
     """
+    edges, costs, weights, bridges, terrain = ways
     state = RegionState.of(regions_of(graph, leaves, 0.0, 0.0, color, 1.0))
-    sums = np.stack((costs * weights, weights, _smoothness(leaves, edges) * weights, weights)[: 4 if n_bridges else 3])
-    sums[3:, : len(edges) - n_bridges] = 0.0  # what is left are the bridges' weights
+    sums: NDArray[np.float64] = np.stack(
+        (costs * weights, weights, _smoothness(leaves, edges) * weights, bridges * weights, terrain)
+    )
+    sums = sums[: 5 if terrain.any() else 4 if bridges.any() else 3]
     set_residuals(state)
     altitudes = np.empty(len(edges))
     in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
@@ -330,9 +353,11 @@ def _altitude(
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
     cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
     smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
+    objects, is_terrain = round(shape.objects * _STEPS), len(sums) > 4 and sums[4, edge] > 0.0
     if len(sums) > 3 and sums[3, edge] == sums[1, edge]:  # nothing but bridges
-        least = round(shape.objects * _STEPS) + (cost > 0.0)
-        return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), least) / _STEPS
+        if is_terrain:
+            return objects / _STEPS
+        return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), objects + 1) / _STEPS
     uneven = state.residuals[a if state.masses[a] == larger else b] / larger - shape.q0
     contrast = squared_distance(state.values, a, b)
     increase = max(energy_increase(state, a, b, contrast), shape.e1 * smaller * uneven, 0.0)
@@ -346,7 +371,8 @@ def _altitude(
     evidence += shape.k1 * cost * (1.0 - shortness) * contrast / (1.0 + contrast) * smaller / (smaller + shape.m2)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(math.sqrt(1.0 + larger / (shape.r * smaller))) * smaller / (smaller + shape.m0)
-    return round(evidence * _STEPS) / _STEPS
+    altitude = round(evidence * _STEPS)
+    return (min(altitude, objects) if is_terrain else altitude) / _STEPS
 
 
 @routine

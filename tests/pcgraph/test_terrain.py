@@ -101,3 +101,38 @@ def test_a_scanner_over_the_court_knows_what_it_did_not_see():
     points, _ = block()
     result = pcgraph.segment(points, viewpoint=(60.0, 60.0, 100.0), range_growth=0.5)
     assert not len(found_in(result).pairs)
+
+
+def banked(houses, seed=0):
+    """Two levels of ground, parted by a bank of 3 m at 45 degrees; houses of 12 m by 12 m on both, 9 m high, or none."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0.0, SIDE, (2, 16_000))
+    z = np.clip(x - SIDE / 2, 0.0, 3.0)
+    on = np.where(x > SIDE / 2, COURT, STREET)
+    for east in (20.0, 90.0) if houses else ():
+        for north in (20.0, 60.0, 100.0):
+            house = (np.abs(x - east) < 6.0) & (np.abs(y - north) < 6.0)
+            on[house], z[house] = ROOF, 9.0 + 3.0 * (east > SIDE / 2)
+    return np.stack((x, y, z + rng.normal(0.0, 0.05, len(x))), axis=1), on
+
+
+def test_ground_that_touches_ground_at_a_bank_is_one_with_it():
+    """Things stand on both; of bare levels one may stand on the other, as a bale of hay does on a field."""
+    points, on = banked(True)
+    result = pcgraph.segment(points)
+    pairs = {tuple(pair) for pair in found_in(result).pairs.tolist()}
+    assert pairs & {tuple(pair) for pair in result.graph.edges.tolist()}
+    street, court = (main_object(result.labels, on, what) for what in (STREET, COURT))
+    assert street == court
+    assert not np.isin(street, result.labels[on == ROOF])
+    points, on = banked(False)
+    labels = pcgraph.segment(points).labels
+    assert main_object(labels, on, STREET) != main_object(labels, on, COURT)
+
+
+@pytest.mark.parametrize("scene", [block, lambda seed: banked(True, seed)])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_it_joins_is_in_one_object(scene, seed):
+    result = pcgraph.segment(scene(seed=seed)[0])
+    one, other = result.objects[found_in(result).pairs].T
+    np.testing.assert_array_equal(one, other)
