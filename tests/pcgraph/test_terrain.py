@@ -104,7 +104,7 @@ def test_a_scanner_over_the_court_knows_what_it_did_not_see():
 
 
 def banked(houses, seed=0):
-    """Two levels of ground, parted by a bank of 3 m at 45 degrees; houses of 12 m by 12 m on both, 9 m high, or none."""
+    """Two levels of ground, parted by a bank of 3 m at 45 degrees; houses on both, 9 m high, or none."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0.0, SIDE, (2, 16_000))
     z = np.clip(x - SIDE / 2, 0.0, 3.0)
