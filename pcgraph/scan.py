@@ -421,8 +421,10 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, seen_from),
         lambda: continuations(surface, nodes, faces, scan.places),
     )
-    hidden = hidden.with_others(bounding_planes(surface, nodes, faces)).without(touching.edges).without(near.edges)
-    hidden = hidden.with_others(terrain(surface, nodes, faces))
+    of_planes, of_ground = side_by_side(
+        lambda: bounding_planes(surface, nodes, faces), lambda: terrain(surface, nodes, faces)
+    )
+    hidden = hidden.with_others(of_planes).without(touching.edges).without(near.edges).with_others(of_ground)
     graph = AdjacencyGraph(
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=scan.sides_known
     )

@@ -199,10 +199,8 @@ def borders_of(
         on[some] = number
     piece = of_supervoxel[surface.supervoxels]
     voxels = np.flatnonzero(on[piece] >= 0)
-    degrees = np.diff(grid.indptr)[voxels]
-    row = np.repeat(np.arange(len(voxels)), degrees)
-    at = np.arange(len(row)) + np.repeat(grid.indptr[voxels] - np.cumsum(degrees) + degrees, degrees)
-    around = np.bincount(row, piece[grid.neighbours[at]] == piece[voxels[row]], len(voxels))
+    row, neighbours = grid.around(voxels)
+    around = np.bincount(row, piece[neighbours] == piece[voxels[row]], len(voxels))
     voxels = voxels[around < _AROUND]
     order = np.argsort(on[piece[voxels]], kind="stable")
     counts = np.bincount(on[piece[voxels]], minlength=len(groups))

@@ -13,17 +13,22 @@ from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.bounding_planes import HIDDEN, Plane, borders_of, facing_ways, joining
 from pcgraph.graph.continuations import Continuations, continuations_of
 from pcgraph.voxels.directions import plane_basis
+from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.surface import Surface
+from pcgraph.voxels.warp import Warp
 
-_UPWARDS, _MOSTLY = 0.5, 0.93  # cosine between a normal and their mean, and of so many at least; and
+_SOME = 20_000  # voxels that are asked whether all was seen from far above:
+_LEVEL, _MOSTLY = 0.5, 0.93  # cosine of normals to one axis, and of so many at least; and
 _STEEP, _HARDLY = 0.3, 0.05  # of what is across that, hardly any is seen from far above
-_LEAST_VOXELS = 20  # of a piece, some supervoxel
-_COLUMN, _BESIDE, _REACH = 1.5, 8, 4  # voxel edges; columns beside one, and how many of them away at most
-_STEP = 2.5  # voxel edges by which one lies below another
-_UPWARD_STEPS = 10  # at the border of the ground, at least;
+_LEAST_VOXELS = 20  # of a piece, some supervoxel,
+_ON_AVERAGE = 0.7  # whose normals have such a cosine to that axis
+_COLUMN = 1.5  # voxel edges: of columns that are compared with those beside them
+_STEP = 2.0  # voxel edges by which one lies below another, at least
+_UPWARD_STEPS = 5  # at the border of the ground, at least;
 _DOWNWARDS = 0.1  # and of all there, at most, lead downwards
-_LEVEL = 0.7  # cosine between its normals and upwards, on average
-_LEVELS = 0.35  # times as far as what stands between rises above both may one lie above the other
+_THINNED = 3.0  # voxel edges: of cells that have one place on the border of each piece
+_WIDE, _HIGH = 6.0, 2.5  # voxel edges, at least, is what stands between two pieces,
+_LEVELS = 0.25  # and so many times as far as it rises above both may one lie above the other
 _NEAR = 8  # supervoxels beside a way that are looked at
 
 
@@ -32,9 +37,13 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
 
     From far above, as from an aircraft, roofs are seen, and streets, but no walls: the ground of a courtyard touches
     nothing, and may lie lower than the street. A face is ground if it is about level, and from its border it goes up
-    and hardly ever down. Two pieces are one if they touch, as at a bank; or if on at least half of the ways between
-    their borders something stands that rises above the higher of them by some three times as much as that lies above
-    the other. As with bounding planes, between them lies at most three quarters of the width of the larger one.
+    and hardly ever down; and so does the largest face of all, else the cloud stands on its head, or is a plateau. Two
+    pieces are one if they touch, as at a bank; or if on at least half of the ways between their borders something
+    stands that rises above the higher of them by four times as much as that lies above the other. As with bounding
+    planes, between them lies at most three quarters of the width of the larger one.
+
+    What is walled in on all sides, and low beside what walls it in, as a roof in a court, looks as the ground there
+    does, and is taken for it.
 
     Parameters
     ----------
@@ -46,63 +55,100 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
     Returns
     -------
     Continuations
-        None coplanar; some may touch. There are none unless nearly all normals point to one side, from which no single
+        None coplanar; some may touch. There are none unless nearly all normals lie along one axis, and no single
         scanner took the cloud: then what is hidden is known from its place.
     """
-    upwards = _seen_from_far_above(surface)
-    ground = np.zeros(int(faces.max()) + 1, np.bool_) if upwards is None else _ground(surface, faces, upwards)
-    if upwards is None or np.count_nonzero(ground) < 2:
+    found = _ground_from_far_above(surface, faces)
+    if found is None:
         return continuations_of(surface, nodes, np.empty((0, 2), np.int64))
+    upwards, ground = found
     of_supervoxel = np.where(ground, np.cumsum(ground) - 1, -1)[faces]
-    touching = surface.grid.touching_pairs()
-    sides = of_supervoxel[surface.supervoxels[touching]]
-    touching = touching[(sides >= 0).all(axis=1) & (sides[:, 0] < sides[:, 1])]
+    piece = of_supervoxel[surface.supervoxels]
     border = borders_of(surface, of_supervoxel, [np.arange(np.count_nonzero(ground))])[0]
-    places, plane = surface.grid.centroids[border], Plane(surface.grid.centroids[0], upwards, plane_basis(upwards))
-    ways = facing_ways(places, plane.feet(places) / surface.grid.size, of_supervoxel[surface.supervoxels[border]])
+    hidings = np.concatenate(
+        (_touching(surface, piece, border), _under(surface, nodes, of_supervoxel, border, upwards))
+    )
+    terrain = continuations_of(surface, nodes, hidings)
+    return replace(terrain, coplanar=np.zeros(len(terrain.pairs), np.bool_))
+
+
+def _ground_from_far_above(
+    surface: Surface, faces: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
+    """The direction from which all was seen, (3,) of length 1, and which faces are ground from there, (f,); None if it
+    was not seen from far off on one side, or two pieces of ground are not there.
+
+    Nothing that touches nothing tells the others' sides, so normals may point either way.
+    """
+    if surface.grid.warp.of_one_scan:
+        return None
+    some = surface.normals[:: max(1, surface.grid.n_voxels // _SOME)]
+    axis = np.linalg.eigh(np.einsum("ij,ik->jk", some, some))[1][:, 2]
+    cosines = np.einsum("ij,j->i", some, axis)
+    if np.mean(np.abs(cosines) > _LEVEL) < _MOSTLY or np.mean(np.abs(cosines) < _STEEP) > _HARDLY:
+        return None
+    cosines = np.einsum("ij,j->i", surface.normals, axis)
+    axis = axis * (1.0 if cosines.sum() >= 0.0 else -1.0)
+    face, n_faces = faces[surface.supervoxels], int(faces.max()) + 1
+    voxels = np.bincount(face, minlength=n_faces)
+    level = np.bincount(face, np.abs(cosines), n_faces) >= _ON_AVERAGE * voxels
+    down, up = _steps(surface, face, axis)
+    for upwards, to_lower, to_higher in ((axis, down, up), (-axis, up, down)):
+        ground = level & (to_higher >= _UPWARD_STEPS) & (to_lower <= _DOWNWARDS * (to_lower + to_higher))
+        if ground[np.argmax(voxels)]:
+            ground &= voxels >= _LEAST_VOXELS
+            return (upwards, ground) if np.count_nonzero(ground) > 1 else None
+    return None
+
+
+def _steps(
+    surface: Surface, face: NDArray[np.int32], axis: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """How many steps at the border of each face, between tops of columns beside each other along an axis, lead down
+    and up, (f,) each."""
+    plane, edge = Plane(surface.grid.centroids[0], axis, plane_basis(axis)), surface.grid.size
+    heights, flat = plane.heights(surface.grid.centroids), np.zeros((surface.grid.n_voxels, 3))
+    flat[:, :2] = plane.feet(surface.grid.centroids)
+    columns = voxel_grid(flat, _COLUMN * edge, Warp())
+    order = np.lexsort((heights, columns.voxel_of_point))
+    tops = order[np.cumsum(np.bincount(columns.voxel_of_point)) - 1]
+    above, below = tops[columns.touching_pairs()].T
+    steps = (heights[above] - heights[below] > _STEP * edge) & (face[above] != face[below])
+    down, up = (np.bincount(face[ends[steps]], minlength=int(face.max()) + 1) for ends in (above, below))
+    return down, up
+
+
+def _touching(surface: Surface, piece: NDArray[np.int64], border: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Voxels of two pieces that touch, (t, 2)."""
+    row, neighbours = surface.grid.around(border)
+    others = np.flatnonzero(piece[neighbours] > piece[border][row])
+    return np.stack((border[row[others]], neighbours[others]), axis=1)
+
+
+def _under(
+    surface: Surface,
+    nodes: NodeFeatures,
+    of_supervoxel: NDArray[np.int64],
+    border: NDArray[np.int64],
+    upwards: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Voxels at both ends of the ways, (c, 2), under what stands between pieces that are one."""
+    edge, plane = surface.grid.size, Plane(surface.grid.centroids[0], upwards, plane_basis(upwards))
+    piece, feet = of_supervoxel[surface.supervoxels[border]], plane.feet(surface.grid.centroids[border])
+    cells = voxel_grid(np.column_stack((feet / (_THINNED * edge), piece)), 1.0, Warp())
+    some = np.sort(cells.order[cells.starts[:-1]])
+    border, feet, piece = border[some], feet[some], piece[some]
+    places, others = surface.grid.centroids[border], nodes.centroid[of_supervoxel < 0]
+    ways = facing_ways(places, feet / edge, piece)
     ends = plane.heights(places)[ways.ends]
-    others, edge = nodes.centroid[of_supervoxel < 0], surface.grid.size
     hidden = np.zeros(len(ways.ends), np.bool_)
-    if len(others):
+    if len(others) and len(ways.ends):
         some = np.arange(1, min(_NEAR, len(others)) + 1)
-        distance, near = cKDTree(plane.feet(others)).query(plane.feet(places[ways.ends].mean(axis=1)), k=some)
-        over = distance <= np.maximum(0.5 * ways.lengths, _STEP * edge)[:, None]
+        distance, near = cKDTree(plane.feet(others)).query(feet[ways.ends].mean(axis=1), k=some)
+        over = distance <= np.maximum(0.5 * ways.lengths, _HIGH * edge)[:, None]
         rise = plane.heights(others)[near] - ends.max(axis=1)[:, None]
-        hidden = (over & (rise > _STEP * edge) & (np.ptp(ends, axis=1)[:, None] < _LEVELS * rise)).any(axis=1)
+        hidden = (over & (rise > _HIGH * edge) & (np.ptp(ends, axis=1)[:, None] < _LEVELS * rise)).any(axis=1)
     n_ways, n_hidden = (np.bincount(ways.pair, counts, len(ways.pairs)) for counts in (None, hidden))
     areas = np.bincount(of_supervoxel[surface.supervoxels] + 1, np.square(surface.grid.edge_lengths))[1:]
-    joins = joining(ways, n_hidden >= HIDDEN * n_ways, areas.astype(np.float64))
-    found = continuations_of(surface, nodes, np.concatenate((touching, border[ways.ends[joins[ways.pair]]])))
-    return replace(found, coplanar=np.zeros(len(found.pairs), np.bool_))
-
-
-def _seen_from_far_above(surface: Surface) -> NDArray[np.float64] | None:
-    """The direction from which all was seen, (3,) of length 1; None if it was not from far off on one side."""
-    mean = surface.normals.mean(axis=0)
-    length = float(np.linalg.norm(mean))
-    if surface.grid.warp.of_one_scan or not length > _UPWARDS:
-        return None
-    cosines = np.einsum("ij,j->i", surface.normals, mean / length)
-    is_above = np.mean(cosines > _UPWARDS) >= _MOSTLY and np.mean(np.abs(cosines) < _STEEP) <= _HARDLY
-    return mean / length if is_above else None
-
-
-def _ground(surface: Surface, faces: NDArray[np.int32], upwards: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which faces are ground, (f,) bool: of the steps between the tops of columns beside each other, hardly any lead
-    down from one of theirs."""
-    edge, face = surface.grid.size, faces[surface.supervoxels]
-    n_faces = int(faces.max()) + 1
-    plane = Plane(surface.grid.centroids[0], upwards, plane_basis(upwards))
-    heights, feet = plane.heights(surface.grid.centroids), plane.feet(surface.grid.centroids)
-    columns, of_column = np.unique(np.floor(feet / (_COLUMN * edge)), axis=0, return_inverse=True)
-    order = np.lexsort((heights, of_column))
-    tops = order[np.flatnonzero(np.diff(of_column[order], append=-1))]
-    _, beside = cKDTree(columns).query(columns, np.arange(2, _BESIDE + 2), distance_upper_bound=_REACH + 0.01)
-    one, way = np.nonzero(beside < len(columns))
-    above, below = tops[one], tops[beside[one, way]]
-    steps = (heights[above] - heights[below] > _STEP * edge) & (face[above] != face[below])
-    down, up = (np.bincount(face[ends[steps]], minlength=n_faces) for ends in (above, below))
-    voxels = np.bincount(face, minlength=n_faces)
-    is_level = np.bincount(face, np.einsum("ij,j->i", surface.normals, upwards), n_faces) >= _LEVEL * voxels
-    is_lowest = (up >= _UPWARD_STEPS) & (down <= _DOWNWARDS * (down + up))
-    return np.asarray(is_level & is_lowest & (voxels >= _LEAST_VOXELS))
+    may_join = (n_hidden >= HIDDEN * n_ways) & (ways.widths >= _WIDE * edge)
+    return border[ways.ends[joining(ways, may_join, areas.astype(np.float64))[ways.pair]]]

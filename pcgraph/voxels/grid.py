@@ -147,6 +147,13 @@ class VoxelGrid(ShortRepr):
         """Whether each voxel has as many others around it as on a surface, (v,) bool."""
         return np.diff(self.indptr) >= AROUND_ON_SURFACE
 
+    def around(self, voxels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """The voxels that touch some, (t,): the row of the one in `voxels`, (s,), and the other."""
+        degrees = np.diff(self.indptr)[voxels]
+        row = np.repeat(np.arange(len(voxels)), degrees)
+        at = np.arange(len(row)) + np.repeat(self.indptr[voxels] - np.cumsum(degrees) + degrees, degrees)
+        return row, self.neighbours[at]
+
     def touching_pairs(self) -> NDArray[np.int64]:
         """Pairs of voxels that touch, (m, 2), each in both orders."""
         source = np.repeat(np.arange(self.n_voxels), np.diff(self.indptr))

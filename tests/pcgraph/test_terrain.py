@@ -50,11 +50,13 @@ def found_in(result):
 
 
 @pytest.mark.parametrize("court", [0.0, 3.0, -3.0])
-@pytest.mark.parametrize("tilted", [False, True])
-def test_a_court_is_one_with_the_street_around_the_block(court, tilted):
-    """In whatever frame, and though it lies higher or lower; the roof is another."""
+@pytest.mark.parametrize("frame", ["level", "down", "tilted"])
+def test_a_court_is_one_with_the_street_around_the_block(court, frame):
+    """In whatever frame, z down too, and though it lies higher or lower; the roof is another."""
     points, on = block(court)
-    if tilted:
+    if frame == "down":
+        points = points[:, [1, 0, 2]] * (1.0, 1.0, -1.0)
+    if frame == "tilted":
         points = points @ np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] + 1000.0
     result = pcgraph.segment(points)
     street, court, roof = (main_object(result.labels, on, what) for what in (STREET, COURT, ROOF))
@@ -136,3 +138,25 @@ def test_what_it_joins_is_in_one_object(scene, seed):
     result = pcgraph.segment(scene(seed=seed)[0])
     one, other = result.objects[found_in(result).pairs].T
     np.testing.assert_array_equal(one, other)
+
+
+def test_a_crate_on_a_table_from_above_is_not_the_table():
+    """Its rim is too narrow to be what ground is hidden under: a floor 5 mm above the table is the crate's."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0.0, 0.8, (2, 70_000))
+    off = np.maximum(np.abs(x - 0.4), np.abs(y - 0.4))
+    on = np.where(off > 0.15, STREET, np.where(off > 0.13, ROOF, COURT))
+    z = np.choose(on, [0.0, 0.005, 0.06]) + rng.normal(0.0, 3e-4, len(x))
+    labels = pcgraph.segment(np.stack((x, y, z), axis=1)).labels
+    assert main_object(labels, on, STREET) != main_object(labels, on, COURT)
+
+
+def test_valleys_in_a_plateau_are_valleys():
+    """What stands between them is the land itself, the largest face of all, from which it goes down."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0.0, SIDE, (2, 12_000))
+    on = np.where((np.abs(x - 30.0) < 12.0) & (np.abs(y - 60.0) < 40.0), STREET, ROOF)
+    on[(np.abs(x - 90.0) < 12.0) & (np.abs(y - 60.0) < 40.0)] = COURT
+    z = np.where(on == ROOF, 15.0, 0.0) + rng.normal(0.0, 0.05, len(x))
+    result = pcgraph.segment(np.stack((x, y, z), axis=1))
+    assert not len(found_in(result).pairs)
