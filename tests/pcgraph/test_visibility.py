@@ -746,18 +746,19 @@ def test_the_middle_of_a_way_does_not_show_all_that_was_passed(seed):
     assert of_many < of_one - 0.1
 
 
-def test_first_opinions_that_meet_come_to_what_each_comes_to_alone():
+@pytest.mark.parametrize("many", [1, 10])  # cells in one block, and in three
+def test_first_opinions_that_meet_come_to_what_each_comes_to_alone(many):
     """Places in a row, each of which sees a bit of what the next one does: an opinion reaches one more in each round.
 
     That of the first four stands in the last of the rounds; that of the first alone comes by it, but has too few left.
     """
-    cosines = np.zeros((14, 150), np.float32)
+    cosines = np.zeros((14, 150 * many), np.float32)
     for place, row in enumerate(cosines):
-        row[10 * place : 10 * place + 15] = 1.0
+        row[10 * many * place : 10 * many * place + 15 * many] = 1.0
     places = np.arange(14)
     starts = np.stack([places < 4, places < 1, places > 2, places > 9, places >= 0, places == 7]).astype(np.float32)
     together = telling_places._agreements(cosines, starts)
     alone = [telling_places._agreements(cosines, starts[s : s + 1]) for s in range(len(starts))]
     for column, name in enumerate(together._fields):
         np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), err_msg=name)
-    np.testing.assert_array_equal((together.outward > 0.0).sum(axis=1), [145, 125, 145, 145, 145, 145])
+    np.testing.assert_array_equal((together.outward > 0.0).sum(axis=1), many * np.array([145, 125, 145, 145, 145, 145]))
