@@ -232,12 +232,13 @@ class FacingWays(NamedTuple):
 
 def facing_ways(places: NDArray[np.float64], feet: NDArray[np.float64], piece: NDArray[np.int64]) -> FacingWays:
     """Ways between places on borders, (b, 3) metres, whose feet on a plane, (b, 2) in voxel edges, are triangulated,
-    and which are on a piece each, (b,)."""
+    and which are on a piece each, (b,).
+
+    The feet are joggled, so that places on a lattice or a line are no error.
+    """
     triangles = np.empty((0, 3), np.int32)
     if len(places) >= _LEAST_FOR_TRIANGLES:
-        triangles = Delaunay(
-            feet, qhull_options="QJ"
-        ).simplices  # joggled, as places on a lattice or a line are no error
+        triangles = Delaunay(feet, qhull_options="QJ").simplices
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
     lengths = np.linalg.norm(places[ends[:, 1]] - places[ends[:, 0]], axis=1)

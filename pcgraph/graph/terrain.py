@@ -63,10 +63,9 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
         return continuations_of(surface, nodes, np.empty((0, 2), np.int64))
     upwards, ground = found
     of_supervoxel = np.where(ground, np.cumsum(ground) - 1, -1)[faces]
-    piece = of_supervoxel[surface.supervoxels]
     border = borders_of(surface, of_supervoxel, [np.arange(np.count_nonzero(ground))])[0]
     hidings = np.concatenate(
-        (_touching(surface, piece, border), _under(surface, nodes, of_supervoxel, border, upwards))
+        (_touching(surface, of_supervoxel, border), _under(surface, nodes, of_supervoxel, border, upwards))
     )
     terrain = continuations_of(surface, nodes, hidings)
     return replace(terrain, coplanar=np.zeros(len(terrain.pairs), np.bool_))
@@ -92,7 +91,7 @@ def _ground_from_far_above(
     face, n_faces = faces[surface.supervoxels], int(faces.max()) + 1
     voxels = np.bincount(face, minlength=n_faces)
     level = np.bincount(face, np.abs(cosines), n_faces) >= _ON_AVERAGE * voxels
-    down, up = _steps(surface, face, axis)
+    down, up = _steps(surface, face, axis)  # the other way along it but for columns of several layers
     for upwards, to_lower, to_higher in ((axis, down, up), (-axis, up, down)):
         ground = level & (to_higher >= _UPWARD_STEPS) & (to_lower <= _DOWNWARDS * (to_lower + to_higher))
         if ground[np.argmax(voxels)]:
@@ -118,8 +117,9 @@ def _steps(
     return down, up
 
 
-def _touching(surface: Surface, piece: NDArray[np.int64], border: NDArray[np.int64]) -> NDArray[np.int64]:
+def _touching(surface: Surface, of_supervoxel: NDArray[np.int64], border: NDArray[np.int64]) -> NDArray[np.int64]:
     """Voxels of two pieces that touch, (t, 2)."""
+    piece = of_supervoxel[surface.supervoxels]
     row, neighbours = surface.grid.around(border)
     others = np.flatnonzero(piece[neighbours] > piece[border][row])
     return np.stack((border[row[others]], neighbours[others]), axis=1)
