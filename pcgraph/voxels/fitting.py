@@ -46,6 +46,7 @@ _MIN_VOXELS = 500
 _LEVELS = 3  # by so many powers of two at most,
 _APART = 0.6  # where fewer of them are joined
 _LEAST, _MORE = 20, 0.2  # and of so many larger ones at least _MIN_JOINED, and so many more by each power of two,
+_FEWER, _OF_SURFACE = 0.65, 0.4  # unless larger voxels are so many times fewer and fewer of them joined: lines
 _NEARLY_ALL, _HARDLY_ANY = 0.98, 0.003  # if fewer of all are joined, and more of all lie there
 
 
@@ -168,7 +169,9 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
     """Blocks in which voxels are larger by powers of two, as points lie too far apart there; None if there are few.
 
     So it is far from the tripods of several scans, near one of which spacing was read. Whether surfaces fall apart is
-    asked of each block and the 26 around it. Voxels of one scan grow with range already.
+    asked of each block and the 26 around it. Voxels of one scan grow with range already. Lines, as wires, fall apart at
+    any size until they touch each other and are one: twice the edge leaves half of their voxels, and as few joined. Of
+    a surface at least three quarters of the voxels are left as long as so few are joined.
 
     Parameters
     ----------
@@ -184,7 +187,7 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
     block = np.empty(grid.n_voxels, np.int64)
     block[order] = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     around, blocks = touching_voxels(ordered[starts[:-1]], *pitch), np.floor(grid.cells[order[starts[:-1]]] / BLOCK)
-    at_first, _ = _joined_around(joined, block, around)
+    at_first, before = _joined_around(joined, block, around)
     levels, asked = np.zeros(len(at_first), np.int8), at_first < _APART
     cells, of_block = grid.cells, block
     for level in range(1, _LEVELS + 1):
@@ -197,6 +200,8 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
         cells, of_block = cells[order[first]], of_block[order[first]]
         joined = touching_counts(ordered[first], *pitch) >= AROUND_ON_SURFACE
         share, n = _joined_around(joined, of_block, around)
+        asked &= (n > _FEWER * before) | (share >= _OF_SURFACE)
+        before = n
         whole = asked & (share >= _MIN_JOINED) & (n >= _LEAST)
         whole &= (at_first < _HALF_JOINED) | (share - at_first >= _MORE * level)
         levels[whole] = level

@@ -190,6 +190,20 @@ def test_wires_and_strays_are_no_surfaces_at_any_size() -> None:
     assert fitting_grading(grid) is None
 
 
+@pytest.mark.parametrize("apart", [0.5, 0.9, 1.4])
+def test_wires_that_larger_voxels_would_join_are_no_surface(apart: float) -> None:
+    rng = np.random.default_rng(0)
+    wires = [
+        np.column_stack((rng.uniform(0.0, 40.0, 3000), np.full(3000, apart * i), np.full(3000, 6.0))) for i in range(5)
+    ]
+    floor = plain(rng, 120_000, (0.0, -3.0), (16.0, 3.0))
+    points, wire = np.concatenate((floor, *wires)), np.repeat(np.arange(-1, 5), [len(floor), *map(len, wires)])
+    assert fitting_grading(voxel_grid(points, 0.1, Warp())) is None
+    supervoxels = pcgraph.segment(points).supervoxels
+    pairs = np.unique(np.column_stack((supervoxels, wire))[wire >= 0], axis=0)
+    assert len(pairs) == len(np.unique(pairs[:, 0]))
+
+
 @pytest.mark.parametrize("method", [pcgraph.SurfaceGrowth(), pcgraph.Vccs()])
 def test_neither_the_order_of_points_nor_the_unit_counts(method: pcgraph.SupervoxelMethod) -> None:
     points, truth = two_densities(20.0)
