@@ -30,7 +30,8 @@ _SMOOTH = 0.1  # smooth, in voxel edges of roughness at most,
 _WELL_JOINED = 0.9  # and so many of the voxels are joined
 _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 _MIN_JOINED = 0.75  # of the voxels have
-_HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have
+_HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have,
+_MUCH_GAIN = 0.15  # or where fewer have, of several scans; else half is enough
 _ENLARGEMENTS = 10
 # Voxels can be smaller by steps of a quarter of a power of two
 _REFINEMENTS = 4  # at most,
@@ -100,10 +101,11 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
 
     What is no surface at any size, as a line, stays. So does the size where half of it is joined and larger voxels
     hardly join more, as they do not far rings of a sweep. Where less than half of one scan is joined at first, as of a
-    sweep of few beams, half is enough, unless larger voxels join much more.
+    sweep of few beams, half is enough, unless larger voxels join much more. So it is where less than half of several
+    such scans is, unless each step to three quarters joins much more.
     """
     cells, size, joined, joined_at_first = [grid.cells, grid.cells], grid.size, 0.0, _joined(degrees)
-    few_beams, best = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size
+    few_beams, best, half = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size, math.inf
     for step in range(1, _ENLARGEMENTS + 1):
         size *= math.sqrt(2.0)
         if size > largest:
@@ -118,9 +120,13 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
             if before >= _HALF_JOINED and joined - before < _MIN_GAIN:
                 break
             best = size
+        half = min(half, size) if joined >= _HALF_JOINED else half
         if joined >= _MIN_JOINED:
-            if joined_at_first < _HALF_JOINED or joined - joined_at_first >= _MIN_GAIN * step:
-                best = size
+            gain = (joined - joined_at_first) / step
+            if joined_at_first >= _HALF_JOINED:
+                best = size if gain >= _MIN_GAIN else best
+            else:
+                best = size if few_beams or gain >= _MUCH_GAIN else half
             break
     return best
 

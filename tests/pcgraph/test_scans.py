@@ -6,7 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from clouds import patch, same_partition, two_boxes_on_a_plane
+from scanned_scenes import scan, sphere_of_rays
+from scanned_streets import CAR, street
 from scipy.spatial.transform import Rotation
+from scores import mean_overlap
 from test_guarantees import assert_covered_and_connected
 
 import pcgraph
@@ -643,6 +646,21 @@ def test_cars_in_a_sweep_of_few_beams_are_objects(beams, lowest, highest, seed):
         cars.append((away * np.cos(angle), away * np.sin(angle), rng.uniform(0.0, 3.0)))
     points, car = sweep_of_a_lot(beams, lowest, highest, cars, rng)
     assert np.mean(overlaps(pcgraph.segment(points).labels, car)) > 0.65
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_cars_in_a_few_sweeps_of_few_beams_are_objects(seed):
+    """Voxels grew until three quarters of them touched five others, to a metre, though each step joined few more."""
+    rng, made = np.random.default_rng(seed), street(seed, half_length=60.0)
+    places = np.array([made.on_ground(x, -1.75) + np.array((0.0, 0.0, 2.0)) for x in (-15.0, 0.0, 15.0)])
+    rays = [
+        sphere_of_rays(np.arange(0.0, 360.0, 0.2) + turn, np.linspace(-15.0, 15.0, 16)) for turn in rng.uniform(size=3)
+    ]
+    seen = scan(made.scene, places, rays, 0.02, rng, reach=80.0)
+    found = pcgraph.segment(seen.points)
+    cars = [car for car in made.scene.numbers(CAR) if np.count_nonzero(seen.things == car) >= 50]
+    assert found.surface.grid.size < 0.3
+    assert mean_overlap(found.labels, seen.things, np.array(cars)) > 0.65
 
 
 @pytest.mark.parametrize("seed", range(4))
