@@ -132,8 +132,9 @@ def segment(
         tells place and axis of a camera; and lists whose points tell them. Otherwise the camera looks along +z.
     range_growth : float, 0..1, without 1
         Power of the range from the viewpoint with which voxels grow, being `voxel_size` at the median range; for
-        scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece. Default:
-        0.5 where the spacing grows with range from the one viewpoint, given or found, and `camera` is not in use.
+        scanners, whose points thin out with range. 0.5 keeps near detail and far surfaces in one piece; 0: one size.
+        Default: 0.5 where the spacing grows with range from the one viewpoint, given or found, and `camera` is not in
+        use.
     method : SupervoxelMethod, optional
         How voxels become supervoxels; default `SurfaceGrowth()`.
     linkage : Linkage, optional
@@ -189,7 +190,8 @@ def segment(
             grid = voxel_grid(cloud.points, voxel, warp)
             if is_larger:
                 cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        if seed_size is None and (grading := fitting_grading(grid)) is not None:
+        even = seed_size is not None or range_growth is not None
+        if not even and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, voxel, warp, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     grid = with_means(grid, cloud.colors, cloud.features)
