@@ -190,8 +190,7 @@ def segment(
             grid = voxel_grid(cloud.points, voxel, warp)
             if is_larger:
                 cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        even = seed_size is not None or range_growth is not None
-        if not even and (grading := fitting_grading(grid)) is not None:
+        if seed_size is None and range_growth is None and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, voxel, warp, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     grid = with_means(grid, cloud.colors, cloud.features)

@@ -105,7 +105,8 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
     such scans is, unless each step to three quarters joins much more.
     """
     cells, size, joined, joined_at_first = [grid.cells, grid.cells], grid.size, 0.0, _joined(degrees)
-    few_beams, best, half = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size, math.inf
+    few_beams, best = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size
+    least, much = (math.inf, _MUCH_GAIN) if joined_at_first < _HALF_JOINED else (grid.size, _MIN_GAIN)
     for step in range(1, _ENLARGEMENTS + 1):
         size *= math.sqrt(2.0)
         if size > largest:
@@ -120,13 +121,10 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
             if before >= _HALF_JOINED and joined - before < _MIN_GAIN:
                 break
             best = size
-        half = min(half, size) if joined >= _HALF_JOINED else half
+        least = min(least, size) if joined >= _HALF_JOINED else least
         if joined >= _MIN_JOINED:
-            gain = (joined - joined_at_first) / step
-            if joined_at_first >= _HALF_JOINED:
-                best = size if gain >= _MIN_GAIN else best
-            else:
-                best = size if few_beams or gain >= _MUCH_GAIN else half
+            if not few_beams:
+                best = size if joined - joined_at_first >= much * step else least
             break
     return best
 
