@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test coverage test-quick fuzz lint format constraints audit clean system
+.PHONY: help demo test coverage test-quick fuzz kernels lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -20,8 +20,12 @@ demo: $(VENV)/.installed ## set up if needed, run the comparison on the tabletop
 # Each worker traces with all cores for a part of its time: more than four workers gain nothing. Files go in the order
 # of tests/conftest.py, as those of most tests are not those that take longest.
 PARALLEL := -n auto --maxprocesses=4 --dist loadfile --no-loadscope-reorder
-test: $(VENV)/.installed-test lint ## set up if needed, lint, check types, run every test
+test: $(VENV)/.installed-test ## set up if needed, lint, check types, run every test
+	@$(MAKE) --no-print-directory -j 2 lint kernels
 	$(BIN)/python -m pytest $(PARALLEL)
+
+kernels: $(VENV)/.installed-test # compiled once beside mypy, which leaves a core; else by each worker of the tests
+	@$(BIN)/python -c "from pcgraph.warmup import compile_kernels; compile_kernels()"
 
 coverage: $(VENV)/.installed-test ## every test, and which lines none reaches; takes a third longer
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term
