@@ -41,6 +41,8 @@ _STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
 _JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
 _THINNED = 0.7  # whose spacing grows by a smaller power of range, near or far,
 _PRICE_OF_ROUGHNESS = 0.25, 0.4  # less so much of their roughness, where voxels were few or not, stay joined,
+_FEWEST, _ENOUGH = 750, 40_000  # or, from the latter down to so few, fewer and fewer,
+_OF_FEWEST, _PRICE_OF_FEWEST = 0.5, 1.0  # to this,
 _SLAB = 1 << 14  # as so many in the middle tell
 _MIN_VOXELS = 500
 # Voxels can be larger in some blocks
@@ -87,8 +89,20 @@ def fitting_size(
     largest : float, metres
     """
     degrees = np.diff(grid.indptr)
-    larger = _without_dust(points, grid, degrees, largest) if _joined(degrees) < _MIN_JOINED else grid.size
+    is_dust = _joined(degrees) < min(_MIN_JOINED, _of_few(grid)[0])
+    larger = _without_dust(points, grid, degrees, largest) if is_dust else grid.size
     return _with_detail(points, grid, law, degrees) if larger == grid.size else larger
+
+
+def _of_few(grid: VoxelGrid) -> tuple[float, float]:
+    """Fraction of the voxels that have to be joined, however few there are, and the price of their roughness.
+
+    The fewer voxels there are, the fewer each thing has, and the less it matters how many are joined.
+    """
+    usual = 1.0 if grid.warp.of_one_scan else _ALL_JOINED, _PRICE_OF_ROUGHNESS[0]
+    few = 1.0 - math.log(max(grid.n_voxels, _FEWEST) / _FEWEST) / math.log(_ENOUGH / _FEWEST)
+    joined, price = np.add(usual, max(few, 0.0) * np.subtract((_OF_FEWEST, _PRICE_OF_FEWEST), usual))
+    return float(joined), float(price)
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
@@ -143,10 +157,10 @@ def _with_detail(
     the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
     n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
-    if of_one_scan and (law is None or law.in_halves >= _THINNED):
+    are_few, joined = n < _ENOUGH, _joined(degrees)
+    if of_one_scan and not are_few and (law is None or law.in_halves >= _THINNED or joined >= _ALL_JOINED):
         return size
-    joined = _joined(degrees)
-    if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
+    if joined < _HALF_JOINED:
         return size
     steps = min(_REFINEMENTS, int(2.0 * math.log2(_MANY_VOXELS / n)))  # to as many voxels as a surface would have
     if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
@@ -156,6 +170,9 @@ def _with_detail(
     of_slab = _joined(degrees[slab])
     least = _ALL_JOINED if of_slab >= _MIN_JOINED else _STILL_JOINED * of_slab
     least = _JOINED_OF_SCAN * of_slab if of_one_scan else least
+    if are_few:
+        enough, price = _of_few(grid)
+        least = min(least, enough)
     if joined < least and not of_one_scan:
         return size
     some = points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
