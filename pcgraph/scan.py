@@ -183,6 +183,7 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
         voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
+        is_smaller = voxel < grid.size
         if voxel != grid.size:
             warp, is_larger = _from_corner(warp, with_outliers[0], voxel), voxel > grid.size
             if is_larger:  # of such voxels, what was thin may be none
@@ -190,7 +191,8 @@ def segment(
             grid = voxel_grid(cloud.points, voxel, warp)
             if is_larger:
                 cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        if seed_size is None and range_growth is None and (grading := fitting_grading(grid)) is not None:
+        may_grade = seed_size is None and range_growth is None and not is_smaller
+        if may_grade and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, voxel, warp, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
     grid = with_means(grid, cloud.colors, cloud.features)

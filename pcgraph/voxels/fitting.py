@@ -25,8 +25,8 @@ from pcgraph.voxels.surface import roughness
 VOXELS_PER_SEED = 5.0  # voxel edges between seeds, at most,
 _MIN_VOXELS_PER_SEED = 3.0  # and at least
 _MANY_SUPERVOXELS = 800
-_MANY_ON_SMOOTH = 3200  # where surfaces are
-_SMOOTH = 0.1  # smooth, in voxel edges of roughness at most,
+_MANY_ON_SMOOTH = 6000  # where surfaces are
+_SMOOTH = 0.14  # smooth, in voxel edges of roughness at most,
 _WELL_JOINED = 0.9  # and so many of the voxels are joined
 _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 _MIN_JOINED = 0.75  # of the voxels have
@@ -41,8 +41,7 @@ _STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
 _JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
 _THINNED = 0.7  # whose spacing grows by a smaller power of range, near or far,
 _PRICE_OF_ROUGHNESS = 0.25, 0.4  # less so much of their roughness, where voxels were few or not, stay joined,
-_FEWEST, _ENOUGH = 750, 40_000  # or, from the latter down to so few, fewer and fewer,
-_OF_FEWEST, _PRICE_OF_FEWEST = 0.5, 1.0  # to this,
+_FEWEST, _ENOUGH, _OF_FEWEST = 750, 40_000, 0.5  # or, of the latter down to so few, fewer, to this, less all of it,
 _SLAB = 1 << 14  # as so many in the middle tell
 _MIN_VOXELS = 500
 # Voxels can be larger in some blocks
@@ -89,20 +88,23 @@ def fitting_size(
     largest : float, metres
     """
     degrees = np.diff(grid.indptr)
-    is_dust = _joined(degrees) < min(_MIN_JOINED, _of_few(grid)[0])
+    of_few = _enough_of_few(grid, law)
+    is_dust = _joined(degrees) < min(_MIN_JOINED, of_few)
     larger = _without_dust(points, grid, degrees, largest) if is_dust else grid.size
-    return _with_detail(points, grid, law, degrees) if larger == grid.size else larger
+    return _with_detail(points, grid, law, degrees, of_few) if larger == grid.size else larger
 
 
-def _of_few(grid: VoxelGrid) -> tuple[float, float]:
-    """Fraction of the voxels that have to be joined, however few there are, and the price of their roughness.
+def _enough_of_few(grid: VoxelGrid, law: SpacingLaw | None) -> float:
+    """Fraction of the voxels, less their roughness, that have to be joined, as they are few; infinite if they are not.
 
-    The fewer voxels there are, the fewer each thing has, and the less it matters how many are joined.
+    The fewer there are, the fewer each thing has, and the more it needs them smaller, were it so that hardly more than
+    half of them are joined. An image has its pixels where it has them, and their spacing along rows may be another.
     """
-    usual = 1.0 if grid.warp.of_one_scan else _ALL_JOINED, _PRICE_OF_ROUGHNESS[0]
-    few = 1.0 - math.log(max(grid.n_voxels, _FEWEST) / _FEWEST) / math.log(_ENOUGH / _FEWEST)
-    joined, price = np.add(usual, max(few, 0.0) * np.subtract((_OF_FEWEST, _PRICE_OF_FEWEST), usual))
-    return float(joined), float(price)
+    n, of_one_scan = grid.n_voxels, grid.warp.of_one_scan
+    if n >= _ENOUGH or (of_one_scan and law is None):
+        return math.inf
+    share = math.log(max(n, _FEWEST) / _FEWEST) / math.log(_ENOUGH / _FEWEST)
+    return _OF_FEWEST + share * ((1.0 if of_one_scan else _ALL_JOINED) - _OF_FEWEST)
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
@@ -144,7 +146,7 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
 
 
 def _with_detail(
-    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]
+    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64], of_few: float
 ) -> float:
     """The size, or one smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
@@ -153,12 +155,15 @@ def _with_detail(
     nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
     read off a slab in the middle, which may be the dense part of several scans: so all together have to be joined as
     well. Points of one scan lie less densely where surfaces slant, and its rows far apart, so its grid stays as it is;
-    unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly as many stay joined. For
-    the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
+    unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly as many stay joined. Of
+    few voxels fewer have to be joined, `of_few`, unless some places have far fewer points than others and get larger
+    ones. For the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
-    n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
-    are_few, joined = n < _ENOUGH, _joined(degrees)
-    if of_one_scan and not are_few and (law is None or law.in_halves >= _THINNED or joined >= _ALL_JOINED):
+    n, size, of_one_scan, joined = grid.n_voxels, grid.size, grid.warp.of_one_scan, _joined(degrees)
+    if of_few < math.inf and fitting_grading(grid) is not None:
+        of_few = math.inf
+    is_thinned = law is not None and law.in_halves < _THINNED and joined < _ALL_JOINED
+    if of_one_scan and of_few == math.inf and not is_thinned:
         return size
     if joined < _HALF_JOINED:
         return size
@@ -170,18 +175,16 @@ def _with_detail(
     of_slab = _joined(degrees[slab])
     least = _ALL_JOINED if of_slab >= _MIN_JOINED else _STILL_JOINED * of_slab
     least = _JOINED_OF_SCAN * of_slab if of_one_scan else least
-    if are_few:
-        enough, price = _of_few(grid)
-        least = min(least, enough)
-    if joined < least and not of_one_scan:
+    if joined < min(least, of_few) and not of_one_scan:
         return size
     some = points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, steps + 1):
         finer = voxel_grid(some, grid.size / 2.0 ** (step / 4.0), grid.warp)
         joined = _joined(np.diff(finer.indptr))
-        if joined < least:
+        if joined < min(least, of_few):
             break
-        if joined - price * roughness(finer) >= least:
+        rough = roughness(finer)
+        if joined >= min(least + price * rough, of_few + rough):
             size = finer.size
     return size
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scores import mean_overlap
 
 import pcgraph
 from pcgraph.parallel import in_blocks
@@ -194,6 +195,37 @@ def test_voxels_are_smaller_where_points_lie_evenly_on_smooth_surfaces(noise: fl
     assert voxel < 0.8 * usual if is_smaller else voxel == pytest.approx(usual, rel=RUNG)
     assert pcgraph.segment(points, viewpoint=(-2.0, -2.0, -2.0)).voxel_size == voxel
     assert pcgraph.segment(points, voxel_size=0.05).voxel_size == 0.05
+
+
+def boxes_on_a_table(n: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """About n points at random on a table and sixteen boxes, all that can be seen of them, and which each is on."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(*2 * (np.linspace(-0.45, 0.45, 4),))
+    middles, (width, depth), high = np.stack((x, y)).reshape(2, -1).T, rng.uniform(0.05, 0.08, (2, 16)), 0.08
+    per_area = n / (1.2**2 + (8.0 * high * (width + depth)).sum())
+    table = rng.uniform(-0.6, 0.6, (round(1.2**2 * per_area), 2))
+    under = (np.abs(table[:, None] - middles) < np.stack((width, depth), axis=1)).all(axis=2).any(axis=1)
+    clouds, on = [np.column_stack((table[~under], np.zeros(np.count_nonzero(~under))))], [0]
+    for i, (w, d) in enumerate(zip(width, depth, strict=True)):
+        for along in (w, d, high):  # pairs of opposite sides; of the last the upper one
+            half = np.array((w, d, high))
+            number = round(per_area * (4.0 if along == high else 8.0) * half.prod() / along)
+            side = rng.uniform(-1.0, 1.0, (number, 3))
+            axis = int(np.flatnonzero(half == along)[0])
+            side[:, axis] = 1.0 if along == high else np.sign(side[:, axis])
+            clouds.append(side * half + (*middles[i], high))
+            on.append(i + 1)
+    truth = np.repeat(on, [len(cloud) for cloud in clouds])
+    points = np.concatenate(clouds)
+    return points + rng.normal(0.0, 0.001, points.shape), truth
+
+
+@pytest.mark.parametrize(("n", "least"), [(1500, 0.65), (3000, 0.8), (6000, 0.9)])
+@pytest.mark.parametrize("seed", range(2))
+def test_few_points_are_enough_for_many_things(n: int, least: float, seed: int) -> None:
+    """Of 1500, 100 on each box of 10 to 16 cm, it found none: IoU 0.1, of 3000 0.6, when 0.93 had to be joined."""
+    points, truth = boxes_on_a_table(n, seed)
+    assert mean_overlap(pcgraph.segment(points).labels, truth.astype(np.int32), np.arange(1, 17)) > least
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.5])
