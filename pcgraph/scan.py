@@ -182,8 +182,8 @@ def segment(
     warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
-        voxel = fitting_size(cloud.points, grid, law, math.inf if seed_size is None else float(seed_size))
-        is_smaller = voxel < grid.size
+        largest = math.inf if seed_size is None else float(seed_size)
+        voxel, may_grade = fitting_size(cloud.points, grid, law, largest)
         if voxel != grid.size:
             warp, is_larger = _from_corner(warp, with_outliers[0], voxel), voxel > grid.size
             if is_larger:  # of such voxels, what was thin may be none
@@ -191,7 +191,7 @@ def segment(
             grid = voxel_grid(cloud.points, voxel, warp)
             if is_larger:
                 cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        may_grade = seed_size is None and range_growth is None and not is_smaller
+        may_grade &= seed_size is None and range_growth is None
         if may_grade and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, voxel, warp, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)

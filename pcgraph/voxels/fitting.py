@@ -72,10 +72,11 @@ def _edges_per_seed(grid: VoxelGrid, many: int) -> float:
 
 def fitting_size(
     points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, largest: float = math.inf
-) -> float:
+) -> tuple[float, bool]:
     """The size of the voxels, or a larger one where surfaces fall apart, or a smaller one where they would stay whole.
 
-    On a surface most voxels have at least five others around them.
+    On a surface most voxels have at least five others around them. Also whether some blocks may need larger ones
+    (`fitting_grading`): not where few voxels are made smaller, all over the cloud, though fewer of them are joined.
 
     Parameters
     ----------
@@ -91,7 +92,12 @@ def fitting_size(
     of_few = _enough_of_few(grid, law)
     is_dust = _joined(degrees) < min(_MIN_JOINED, of_few)
     larger = _without_dust(points, grid, degrees, largest) if is_dust else grid.size
-    return _with_detail(points, grid, law, degrees, of_few) if larger == grid.size else larger
+    if larger > grid.size:
+        return larger, True
+    if of_few < math.inf and fitting_grading(grid) is not None:
+        of_few = math.inf
+    size = _with_detail(points, grid, law, degrees, of_few)
+    return size, size == grid.size or of_few == math.inf
 
 
 def _enough_of_few(grid: VoxelGrid, law: SpacingLaw | None) -> float:
@@ -160,8 +166,6 @@ def _with_detail(
     ones. For the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
     n, size, of_one_scan, joined = grid.n_voxels, grid.size, grid.warp.of_one_scan, _joined(degrees)
-    if of_few < math.inf and fitting_grading(grid) is not None:
-        of_few = math.inf
     is_thinned = law is not None and law.in_halves < _THINNED and joined < _ALL_JOINED
     if of_one_scan and of_few == math.inf and not is_thinned:
         return size
