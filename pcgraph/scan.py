@@ -121,10 +121,10 @@ def segment(
         Their r. Default: 3.5 times the median distance between nearest points, whatever the unit, rounded to one of 16
         sizes per octave of the cloud's extent; of a camera's, as if all lay at the median depth; larger where surfaces
         would fall apart, and smaller, down to a half, where points lie so evenly that surfaces stay whole, as the
-        vertices of a mesh do.
+        vertices of a mesh do, or where voxels are few, so that things have too few of them.
     seed_size : float, metres, optional
         Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
-        least, where that would leave fewer than some 800 supervoxels, or 3200 on smooth surfaces.
+        least, where that would leave fewer than some 800 supervoxels, or 6000 on smooth surfaces.
     camera : bool, optional
         Whether voxels grow in proportion to depth from the viewpoint, being `voxel_size` at the median depth, as a
         camera's pixels do. Default: organised clouds that a camera took, unless voxels grow with range: those in front
