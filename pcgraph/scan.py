@@ -70,6 +70,7 @@ RANGE_GROWTH = 0.5
 _PER_OCTAVE = 16  # sizes of voxels, and no others
 _ASIDE = 0.382  # voxel edges before the first points, where cells start: what lies on a lattice, or walls a whole
 # number of voxels from each other, are on no border between cells
+_PLAINLY = 0.5  # cosine to the other side
 _FEW_OUTLIERS = 0.95  # of the points are left
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _LOOKED_FROM = 3  # places, where the cloud was not seen from one; of viewpoints, from those of the points
@@ -178,12 +179,13 @@ def segment(
         cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
         if len(cloud.points) >= _FEW_OUTLIERS * n_points:
             break  # else spacing and place were those of noise, to a good part
+    usual = voxel
     spacing = voxel / VOXELS_PER_SPACING if voxel_size is None else None
     warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
     if spacing is not None:
         warn_of_duplicates(cloud, spacing)
         largest = math.inf if seed_size is None else float(seed_size)
-        voxel, may_grade = fitting_size(cloud.points, grid, law, largest)
+        voxel, usual = fitting_size(cloud.points, grid, law, largest)
         if voxel != grid.size:
             warp, is_larger = _from_corner(warp, with_outliers[0], voxel), voxel > grid.size
             if is_larger:  # of such voxels, what was thin may be none
@@ -191,7 +193,7 @@ def segment(
             grid = voxel_grid(cloud.points, voxel, warp)
             if is_larger:
                 cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        may_grade &= seed_size is None and range_growth is None
+        may_grade = seed_size is None and range_growth is None and voxel == usual
         if may_grade and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, voxel, warp, grading)
     cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
@@ -201,6 +203,10 @@ def segment(
     if place is not None and place.ndim == 1 and viewpoint is not None:
         warn_of_viewpoint(place, grid)
     outside = _outward_planes(grid, settings.method, law, place)
+    if usual > voxel and place is None:
+        larger = voxel_grid(cloud.points, usual, _from_corner(warp, cloud, usual))
+        of_larger = _outward_planes(larger, settings.method, law, None)
+        outside = outside._replace(planes=_with_sides_of(larger, of_larger, grid, outside.planes))
     seed = seed_spacing(grid) if seed_size is None else float(seed_size)
     known = outside.known or cloud.normals is not None
     planes, moved = outside.planes, outside.moved
@@ -637,6 +643,16 @@ def _outward_planes(
     planes = method.planes(grid, _far_along(grid, upwards))
     planes = replace(planes, normals=sides_towards_each(grid, planes.normals, place_of_voxel))
     return Outside(given, _some_viewpoints(given, grid), True, planes)
+
+
+def _with_sides_of(usual: VoxelGrid, outside: Outside, grid: VoxelGrid, planes: LocalPlanes) -> LocalPlanes:
+    """Planes of voxels, with the outer side of larger ones wherever that is plainly the other one.
+
+    Places look between small voxels of which few are joined, into what is closed.
+    """
+    normals = voxel_means(outside.planes.normals[usual.voxel_of_point], grid)
+    is_other = np.einsum("ij,ij->i", normals, planes.normals) < -_PLAINLY
+    return replace(planes, normals=np.where(is_other[:, None], -planes.normals, planes.normals))
 
 
 def _some_viewpoints(given: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:

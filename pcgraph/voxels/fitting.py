@@ -72,11 +72,12 @@ def _edges_per_seed(grid: VoxelGrid, many: int) -> float:
 
 def fitting_size(
     points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, largest: float = math.inf
-) -> tuple[float, bool]:
+) -> tuple[float, float]:
     """The size of the voxels, or a larger one where surfaces fall apart, or a smaller one where they would stay whole.
 
-    On a surface most voxels have at least five others around them. Also whether some blocks may need larger ones
-    (`fitting_grading`): not where few voxels are made smaller, all over the cloud, though fewer of them are joined.
+    On a surface most voxels have at least five others around them. The second is the size that it would be were voxels
+    not few. They are made smaller for that where points lie so evenly that no blocks need larger ones
+    (`fitting_grading`), and not so evenly that all get smaller ones anyway.
 
     Parameters
     ----------
@@ -92,12 +93,10 @@ def fitting_size(
     of_few = _enough_of_few(grid, law)
     is_dust = _joined(degrees) < min(_MIN_JOINED, of_few)
     larger = _without_dust(points, grid, degrees, largest) if is_dust else grid.size
-    if larger > grid.size:
-        return larger, True
-    if of_few < math.inf and fitting_grading(grid) is not None:
-        of_few = math.inf
-    size = _with_detail(points, grid, law, degrees, of_few)
-    return size, size == grid.size or of_few == math.inf
+    usual = _with_detail(points, grid, law, degrees) if larger == grid.size else larger
+    if usual == grid.size and _joined(degrees) >= of_few and fitting_grading(grid) is None:
+        return _finest(points, grid, slice(0, grid.n_voxels), _REFINEMENTS, of_few, 1.0), usual
+    return usual, usual
 
 
 def _enough_of_few(grid: VoxelGrid, law: SpacingLaw | None) -> float:
@@ -152,7 +151,7 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
 
 
 def _with_detail(
-    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64], of_few: float
+    points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]
 ) -> float:
     """The size, or one smaller by quarters of a power of two, down to a half, where nearly all stay joined.
 
@@ -161,34 +160,36 @@ def _with_detail(
     nearly as many have to stay so. The rougher the surface, the more have to: noise needs larger voxels. All this is
     read off a slab in the middle, which may be the dense part of several scans: so all together have to be joined as
     well. Points of one scan lie less densely where surfaces slant, and its rows far apart, so its grid stays as it is;
-    unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly as many stay joined. Of
-    few voxels fewer have to be joined, `of_few`, unless some places have far fewer points than others and get larger
-    ones. For the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
+    unless it was thinned, too, so that its spacing hardly grows with range nearby, and nearly as many stay joined. For
+    the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
-    n, size, of_one_scan, joined = grid.n_voxels, grid.size, grid.warp.of_one_scan, _joined(degrees)
-    is_thinned = law is not None and law.in_halves < _THINNED and joined < _ALL_JOINED
-    if of_one_scan and of_few == math.inf and not is_thinned:
+    n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
+    if of_one_scan and (law is None or law.in_halves >= _THINNED):
         return size
-    if joined < _HALF_JOINED:
+    joined = _joined(degrees)
+    if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
         return size
     steps = min(_REFINEMENTS, int(2.0 * math.log2(_MANY_VOXELS / n)))  # to as many voxels as a surface would have
     if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
         return size
-    price = _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS]
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
     of_slab = _joined(degrees[slab])
     least = _ALL_JOINED if of_slab >= _MIN_JOINED else _STILL_JOINED * of_slab
     least = _JOINED_OF_SCAN * of_slab if of_one_scan else least
-    if joined < min(least, of_few) and not of_one_scan:
+    if joined < least and not of_one_scan:
         return size
-    some = points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
+    return _finest(points, grid, slab, steps, least, _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS])
+
+
+def _finest(points: NDArray[np.float64], grid: VoxelGrid, slab: slice, steps: int, least: float, price: float) -> float:
+    """The size, or the smallest of some steps at which so many of the voxels in a slab, less a price, are joined."""
+    size, some = grid.size, points[grid.order[grid.starts[slab.start] : grid.starts[slab.stop]]]
     for step in range(1, steps + 1):
         finer = voxel_grid(some, grid.size / 2.0 ** (step / 4.0), grid.warp)
         joined = _joined(np.diff(finer.indptr))
-        if joined < min(least, of_few):
+        if joined < least:
             break
-        rough = roughness(finer)
-        if joined >= min(least + price * rough, of_few + rough):
+        if joined - price * roughness(finer) >= least:
             size = finer.size
     return size
 

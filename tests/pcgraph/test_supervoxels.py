@@ -89,6 +89,7 @@ def test_colour_weight_makes_supervoxels_keep_to_colours():
     assert error < 0.6 * undersegmentation_error(blind.supervoxels, truth)
 
 
+@pytest.mark.filterwarnings("ignore:expected points on surfaces")
 def test_the_number_of_threads_changes_no_byte(monkeypatch):
     points, _, viewpoint = two_boxes_on_a_plane()
     points = np.vstack([points + np.array([0.0, 0.0, 0.002 * k]) for k in range(4)])
