@@ -90,11 +90,11 @@ def fitting_size(
     largest : float, metres
     """
     degrees = np.diff(grid.indptr)
-    of_few = _enough_of_few(grid, law)
-    is_dust = _joined(degrees) < min(_MIN_JOINED, of_few)
+    joined, of_few = _joined(degrees), _enough_of_few(grid, law)
+    is_dust = joined < min(_MIN_JOINED, of_few)
     larger = _without_dust(points, grid, degrees, largest) if is_dust else grid.size
     usual = _with_detail(points, grid, law, degrees) if larger == grid.size else larger
-    if usual == grid.size and _joined(degrees) >= of_few and fitting_grading(grid) is None:
+    if usual == grid.size and joined >= of_few and fitting_grading(grid) is None:
         return _finest(points, grid, slice(0, grid.n_voxels), _REFINEMENTS, of_few, 1.0), usual
     return usual, usual
 

@@ -267,7 +267,7 @@ def test_a_valley_along_which_colours_change_parts_objects_however_long(degrees)
 
 
 @pytest.mark.parametrize(
-    ("degrees", "colors"), [(22, (_WHITE, _WHITE)), (-25, (_WHITE, _BROWN)), (0, (_WHITE, _BROWN))]
+    ("degrees", "colors"), [(25, (_WHITE, _WHITE)), (-25, (_WHITE, _BROWN)), (0, (_WHITE, _BROWN))]
 )
 def test_without_a_valley_or_without_a_change_of_colour_one_thing_stays_one(degrees, colors):
     points, colors, _ = _wedge(degrees, colors)

@@ -223,7 +223,7 @@ def boxes_on_a_table(n: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np
 @pytest.mark.parametrize(("n", "least"), [(1500, 0.65), (3000, 0.72)])
 @pytest.mark.parametrize("seed", range(2))
 def test_few_points_are_enough_for_many_things(n: int, least: float, seed: int) -> None:
-    """Of 1500, 100 on each box of 10 to 16 cm, it found none: IoU 0.1, of 3000 0.6, when 0.93 had to be joined."""
+    """By 1500, some 55 on each box of 10 to 16 cm, none was found: IoU 0.04, by 3000 0.68 and 0.69."""
     points, truth = boxes_on_a_table(n, seed)
     assert mean_overlap(pcgraph.segment(points).labels, truth.astype(np.int32), np.arange(1, 17)) > least
 
