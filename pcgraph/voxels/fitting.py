@@ -46,7 +46,8 @@ _SLAB = 1 << 14  # as so many in the middle tell
 _MIN_VOXELS = 500
 # Voxels can be larger in some blocks
 _LEVELS = 3  # by so many powers of two at most,
-_APART = 0.6  # where fewer of them are joined
+_APART = 0.2, 0.6  # where fewer of them are joined, of at most
+_FEW_GRADED, _MANY_GRADED = 10_000, 20_000  # voxels, or at least,
 _LEAST, _MORE = 20, 0.2  # and of so many larger ones at least _MIN_JOINED, and so many more by each power of two,
 _FEWER, _OF_SURFACE = 0.65, 0.4  # unless larger voxels are so many times fewer and fewer of them joined: lines
 _NEARLY_ALL, _HARDLY_ANY = 0.98, 0.003  # if fewer of all are joined, and more of all lie there
@@ -217,7 +218,7 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
     block[order] = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     around, blocks = touching_voxels(ordered[starts[:-1]], *pitch), np.floor(grid.cells[order[starts[:-1]]] / BLOCK)
     at_first, before = _joined_around(joined, block, around)
-    levels, asked = np.zeros(len(at_first), np.int8), at_first < _APART
+    levels, asked = np.zeros(len(at_first), np.int8), at_first < _apart(grid.n_voxels)
     cells, of_block = grid.cells, block
     for level in range(1, _LEVELS + 1):
         if not asked.any():
@@ -239,6 +240,16 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
     if np.mean(larger[block]) < _HARDLY_ANY:
         return None
     return Grading(blocks[larger], levels[larger])
+
+
+def _apart(n_voxels: int) -> float:
+    """Fraction of the voxels around that are joined below which larger ones are asked for.
+
+    Of few voxels, each thing has few, and needs them more than its surface needs to be whole.
+    """
+    least, most = _APART
+    share = math.log(n_voxels / _FEW_GRADED) / math.log(_MANY_GRADED / _FEW_GRADED)
+    return least + min(max(share, 0.0), 1.0) * (most - least)
 
 
 def _joined_around(
