@@ -171,14 +171,17 @@ def segment(
     camera = _is_camera(cloud, place, axis, range_growth) if camera is None else camera
     image = _depth_image(cloud, place, axis, camera)
     cloud = _without_flying(cloud, image)
-    n_points = len(cloud.points)
+    all_points = cloud, place
     for _ in range(2):
         voxel, law, warp = _scale(cloud, place, image, camera, range_growth, voxel_size, seed_size)
-        grid = voxel_grid(cloud.points, voxel, warp)
         with_outliers = cloud, place
-        cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
-        if len(cloud.points) >= _FEW_OUTLIERS * n_points:
+        cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
+        if not (is_noisy := len(cloud.points) < _FEW_OUTLIERS * len(all_points[0].points)):
             break  # else spacing and place were those of noise, to a good part
+    is_noisy = is_noisy and voxel_size is None and not warp.of_one_scan
+    if is_noisy:  # what large voxels hold beside surfaces, smaller ones tell from them; it would forbid these
+        cloud, grid, place = _without_outliers(*all_points, voxel / 2.0, _from_corner(warp, all_points[0], voxel / 2.0))
+        cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
     usual = voxel
     spacing = voxel / VOXELS_PER_SPACING if voxel_size is None else None
     warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
@@ -190,9 +193,10 @@ def segment(
             warp, is_larger = _from_corner(warp, with_outliers[0], voxel), voxel > grid.size
             if is_larger:  # of such voxels, what was thin may be none
                 cloud, place = with_outliers
-            grid = voxel_grid(cloud.points, voxel, warp)
-            if is_larger:
-                cloud, grid, place = _without(outlier_voxels(grid), cloud, grid, place)
+            if is_larger or is_noisy:
+                cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
+            else:
+                grid = voxel_grid(cloud.points, voxel, warp)
         may_grade = seed_size is None and range_growth is None and voxel == usual
         if may_grade and (grading := fitting_grading(grid)) is not None:
             grid = voxel_grid(cloud.points, voxel, warp, grading)
@@ -572,6 +576,14 @@ def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
         return place if visible_fraction(grid, place) >= _OF_ONE_SCAN else None
     found = (place,) if law.searched is None else (place, law.searched)  # an origin may lie on the ground
     return place if any(shown_fraction(grid, one) >= _OF_ONE_SCAN for one in found) else None
+
+
+def _without_outliers(
+    cloud: CleanCloud, place: NDArray[np.float64] | None, size: float, warp: Warp
+) -> tuple[CleanCloud, VoxelGrid, NDArray[np.float64] | None]:
+    """Cloud, grid and viewpoints without what voxels of a size show to be outliers."""
+    grid = voxel_grid(cloud.points, size, warp)
+    return _without(outlier_voxels(grid), cloud, grid, place)
 
 
 def _without(

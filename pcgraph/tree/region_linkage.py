@@ -113,8 +113,9 @@ class RegionLinkage(Linkage):
         """All along which regions merge: contacts, gaps, continuations, terrain, and bridges."""
         ways = [Ways.of(graph.edges, self.cost(graph.edge_features), graph.edge_features.contact_voxels)]
         if (gaps := graph.gaps) is not None:
-            price = self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap
-            ways.append(Ways.of(gaps.edges, self.cost(gaps.edge_features) + price * (gaps.widths - 1.0), gaps.weights))
+            beyond = np.maximum(gaps.widths - 1.0, 0.0)  # larger voxels' centroids can be nearer than their edge
+            price = (self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap) * beyond
+            ways.append(Ways.of(gaps.edges, self.cost(gaps.edge_features) + price, gaps.weights))
         if (hidden := graph.continuations) is not None:
             behind, ground = hidden.chosen(hidden.coplanar), hidden.chosen(~hidden.coplanar)
             ways.append(Ways.of(behind.pairs, np.zeros(len(behind.pairs)), 2.0 * behind.crossings))

@@ -26,7 +26,7 @@ VOXELS_PER_SEED = 5.0  # voxel edges between seeds, at most,
 _MIN_VOXELS_PER_SEED = 3.0  # and at least
 _MANY_SUPERVOXELS = 800
 _MANY_ON_SMOOTH = 6000  # where surfaces are
-_SMOOTH = 0.14  # smooth, in voxel edges of roughness at most,
+_SMOOTH, _ROUGH = 0.14, 0.22  # smooth, in voxel edges of roughness at most; at least as rough have no more,
 _WELL_JOINED = 0.9  # and so many of the voxels are joined
 _VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
 _MIN_JOINED = 0.75  # of the voxels have
@@ -61,11 +61,12 @@ def seed_spacing(grid: VoxelGrid) -> float:
     """
     usual, smaller = _edges_per_seed(grid, _MANY_SUPERVOXELS), _edges_per_seed(grid, _MANY_ON_SMOOTH)
     if smaller < usual and not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _WELL_JOINED:
-        usual = smaller if roughness(grid) <= _SMOOTH else usual
+        share = min(max((_ROUGH - roughness(grid)) / (_ROUGH - _SMOOTH), 0.0), 1.0)
+        usual = _edges_per_seed(grid, _MANY_SUPERVOXELS * (_MANY_ON_SMOOTH / _MANY_SUPERVOXELS) ** share)
     return grid.size * usual
 
 
-def _edges_per_seed(grid: VoxelGrid, many: int) -> float:
+def _edges_per_seed(grid: VoxelGrid, many: float) -> float:
     """Voxel edges between seeds that give so many supervoxels, within what is sensible."""
     edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * many))
     return min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
