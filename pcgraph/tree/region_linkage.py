@@ -94,7 +94,7 @@ class RegionLinkage(Linkage):
     cost: BoundaryCost = field(default_factory=BoundaryCost)
     gap: float = 0.15
     bridge: float = 0.1
-    color: float = 3.0
+    color: float = 2.5
     relief: float = 15.0
 
     default_object_altitude = 0.4
