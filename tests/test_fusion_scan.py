@@ -183,6 +183,10 @@ def test_refuses_scans_that_cannot_be(scene) -> None:  # type: ignore[no-untyped
 # ---- Poses from readings -----------------------------------------------------------------------------------------
 
 
+COARSE_M = 4e-3
+"""A spacing at which poses are as good as at the default one, 1.4 mm here, and found in a third of the time."""
+
+
 def made(mesh: TriangleMesh, n: int, sweep_deg: float, noise_m: float = 1.5e-4) -> Scan:
     """Views of a mesh whose images do not know their poses."""
     camera, random = Intrinsics.from_fov(160, 120, 25), np.random.default_rng(0)
@@ -194,7 +198,7 @@ def made(mesh: TriangleMesh, n: int, sweep_deg: float, noise_m: float = 1.5e-4) 
 
 def test_poses_are_found_from_the_readings() -> None:
     views = made(part(), 3, 60.0)
-    found = align(views)
+    found = align(views, spacing_m=COARSE_M)
     off = pose_errors(found.poses, views.true_poses)  # type: ignore[arg-type]
     assert off.angle_deg.max() < 0.05
     assert off.centre_m.max() < 3e-4
@@ -245,7 +249,7 @@ def test_views_that_hang_on_one_pair_are_found() -> None:
 def test_two_views_are_warned_of_as_nothing_confirms_their_pair() -> None:
     views = made(part(), 2, 20.0)
     with pytest.warns(AlignmentWarning, match="no loop confirms the pose of view 1"):
-        found = align(views)
+        found = align(views, spacing_m=COARSE_M)
     assert found.unchecked == (1,)
     assert pose_errors(found.poses, views.true_poses).angle_deg.max() < 0.1  # type: ignore[arg-type]
 
