@@ -41,6 +41,7 @@ class Reader:
     lists : whether a command lists what is wrong, line by line, before the line that says so.
     may_write : patterns of paths that it may leave in the folder of the input.
     mutates_arguments : whether it is the command line that is mutated, not files.
+    renames : whether the entry is given hostile names; once is enough where several readers call the same function.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Reader:
     lists: bool = False
     may_write: tuple[str, ...] = ()
     mutates_arguments: bool = False
+    renames: bool = True
 
     def made_by_hand(self, known: Mapping[str, Input]) -> Made:
         """Hostile inputs by name: the seeds themselves, those of any file, those of this kind."""
@@ -72,7 +74,7 @@ class Reader:
             made |= hostile.any_file(first, target)
             for by_hand in self.by_hand:
                 made |= by_hand(first, target)
-        return made | hostile.any_name(first)
+        return made | hostile.any_name(first) if self.renames else made
 
     def targets_of(self, one: Input) -> list[str]:
         """Files of an input that are mutated."""
@@ -539,7 +541,10 @@ READERS = {
         Reader("signals", _signals, seeds.signals_files, by_hand=(hostile.npz_files,), share=0.3),
         Reader("range-image", _range_image, seeds.range_image_files, by_hand=(hostile.npz_files,), share=0.3),
         *(
-            Reader(f"result-{part}", _result, seeds.results, targets, (_by_suffix,), share=0.3)
+            Reader(
+                f"result-{part}", _result, seeds.results, targets, (_by_suffix,), share=0.3,
+                renames=part == "settings",
+            )
             for part, targets in _RESULT_PARTS.items()
         ),
         Reader(
