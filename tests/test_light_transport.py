@@ -225,6 +225,19 @@ def test_threads_and_memory_budget_do_not_change_a_byte(tabletop: rangesim.Scene
     assert results[0] != all_bytes(transport(tabletop, rig, all_sensors(), spp=4, seed=8))
 
 
+def test_a_second_pass_compiles_nothing_wherever_its_arrays_lie(tabletop: rangesim.Scene) -> None:
+    import drjit as dr
+
+    rig, compiled = tabletop.rig(width=33, height=21), []
+    held = []  # memory of odd sizes, lest the same places come again
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for seed in range(6):
+            held += [np.empty(n, np.uint8) for n in range(16, 4000, 48 + 16 * seed)]
+            transport(tabletop, rig, [StructuredLight()], spp=4, photons=5000, seed=seed)
+            compiled.append({kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT})
+    assert all(kernels <= compiled[0] for kernels in compiled[1:])
+
+
 def test_progress_ends_at_one_and_changes_nothing(corner: rangesim.Scene) -> None:
     shares: list[float] = []
     rig = corner.rig(**SIZE)

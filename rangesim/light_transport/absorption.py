@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.scattering import Medium
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
@@ -36,7 +37,7 @@ class Absorbers:
     """
 
     def __init__(self, scene: Any, sides: np.ndarray) -> None:
-        self.table = mi.Float(table_of(scene, sides.astype(np.float32)).ravel())
+        self.table = mi.Float(aligned(table_of(scene, sides), np.float32))
 
     def transmittance(self, sigma_a: Any, distance: Any, inside: Medium | None = None) -> Any:
         """Fraction of the light left after a distance in metres; 1 in a scattering medium `inside` the absorbing body,

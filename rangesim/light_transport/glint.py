@@ -24,7 +24,7 @@ from rangesim.light_transport.accumulators import Accumulators
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.kernel_launches import Launches, min_lanes
 from rangesim.light_transport.photons import meets_delta
-from rangesim.light_transport.sampling import Continued, Seed, of_part, random_stream, stratified
+from rangesim.light_transport.sampling import Continued, Seed, aligned, of_part, random_stream, stratified
 from rangesim.light_transport.scattering import bounded
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, spawn_specular_ray, survival
@@ -192,7 +192,7 @@ class GlintLanes:
         self, view: GlintView, pixel: np.ndarray, paths: int, first_place: int = 0, first: int = 0, part: int = 0
     ) -> None:
         self.traced, seed = view
-        self.pixel, self.paths = mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, paths)
+        self.pixel, self.paths = mi.UInt32(aligned(pixel, np.uint32)), dr.opaque(mi.UInt32, paths)
         self.place = dr.arange(mi.UInt32, len(pixel)) + dr.opaque(mi.UInt32, first_place)
         rng = random_stream(seed, self.pixel ^ 0x85EBCA6B)
         self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -239,8 +239,8 @@ class LensDisc:
 
     def __init__(self, rig: Rig, projector: Device, radius_m: np.ndarray, radiance: np.ndarray) -> None:
         self.projector = projector
-        self.radius = mi.Float(np.float32(radius_m))
-        self.radiance = mi.Float(np.float32(radiance))
+        self.radius = mi.Float(aligned(radius_m, np.float32))
+        self.radiance = mi.Float(aligned(radiance, np.float32))
 
     def offset(self, ray: Any, si: Any) -> tuple[Any, Any, Any]:
         """Where the ray crosses the plane of the lens, metres from its centre; the way there; and whether it does."""

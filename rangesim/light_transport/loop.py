@@ -38,7 +38,7 @@ from rangesim.light_transport.emitters import emission, emission_through, sample
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
-from rangesim.light_transport.sampling import Continued, Seed, Stream, in_pairs, of_part, random_stream
+from rangesim.light_transport.sampling import Continued, Seed, Stream, aligned, in_pairs, of_part, random_stream
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
@@ -233,9 +233,10 @@ class Lanes:
     """
 
     def __init__(self, view: View, settings: PathSettings, allocation: SampleAllocation, places: np.ndarray) -> None:
-        self.place = mi.UInt32(places.astype(np.uint32))
-        self.pixel = mi.UInt32(allocation.pixels[places].astype(np.uint32))
-        self.samples, self.total = mi.UInt32(allocation.samples[places]), mi.UInt32(allocation.total[places])
+        self.place = mi.UInt32(aligned(places, np.uint32))
+        self.pixel = mi.UInt32(aligned(allocation.pixels[places], np.uint32))
+        self.samples = mi.UInt32(aligned(allocation.samples[places], np.uint32))
+        self.total = mi.UInt32(aligned(allocation.total[places], np.uint32))
         self.first, self.stride, self.part = (
             dr.opaque(mi.UInt32, n) for n in (allocation.first, allocation.stride, allocation.part)
         )

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.light_transport.sampling import Continued, Seed, random_stream
+from rangesim.light_transport.sampling import Continued, Seed, aligned, random_stream
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
 from rangesim.light_transport.traced_scene import TracedScene
@@ -35,12 +35,12 @@ def trace_photon_paths(
     traced: TracedScene, pixel: np.ndarray, flux: np.ndarray, number: np.ndarray, seed: int
 ) -> tuple[PhotonDeposit, tuple[Any, ...]]:
     """Landings of photons sent through projector pixels, and the parts of each that `EnergyBudget` sums up."""
-    pixel, width = mi.UInt32(pixel.astype(np.uint32)), mi.UInt32(traced.projector.size.x)
-    photon = mi.UInt32(number.astype(np.uint32))
+    pixel, width = mi.UInt32(aligned(pixel, np.uint32)), mi.UInt32(traced.projector.size.x)
+    photon = mi.UInt32(aligned(number, np.uint32))
     rng = random_stream(Seed.of(seed), photon ^ 0x9E3779B9)
     jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
     uv = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + jitter
-    power, most = mi.Float(flux.astype(np.float32)), dr.opaque(mi.UInt32, MAX_CHAIN)
+    power, most = mi.Float(aligned(flux, np.float32)), dr.opaque(mi.UInt32, MAX_CHAIN)
     return _chain(traced, uv, power, rng, most)
 
 

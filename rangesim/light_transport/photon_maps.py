@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.photons import Photons
+from rangesim.light_transport.sampling import aligned
 
 ALPHA = 2 / 3
 MAX_MAPS = 64
@@ -176,10 +177,10 @@ class PhotonMaps:
         flights = np.column_stack(columns)
 
         opaque = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731
-        self.starts = mi.UInt32(starts.astype(np.uint32))
-        self.points = mi.Float(points[order].astype(np.float32).ravel())
-        self.flights = mi.Float(flights[order].astype(np.float32).ravel())
-        self.shrinkage = mi.Float(shrinkage.astype(np.float32))
+        self.starts = mi.UInt32(aligned(starts, np.uint32))
+        self.points = mi.Float(aligned(points[order], np.float32))
+        self.flights = mi.Float(aligned(flights[order], np.float32))
+        self.shrinkage = mi.Float(aligned(shrinkage, np.float32))
         self.origin, self.projector_at, self.camera_at = (
             mi.Vector3f(*(opaque(x) for x in place)) for place in (origin, radius.projector_at, radius.camera_at)
         )

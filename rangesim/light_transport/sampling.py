@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 class Seed(NamedTuple):
@@ -94,3 +95,17 @@ def in_pairs(shift: Any, lens_shift: Any, sample: Any, samples: Any) -> tuple[An
 def _sequence(shift: Any, number: Any, steps: tuple[float, float]) -> Any:
     p = shift + mi.Point2f(*(mi.Float(number) * step for step in steps))
     return p - dr.floor(p)
+
+
+def aligned(values: np.ndarray, dtype: type[np.generic]) -> np.ndarray:
+    """A flat copy whose memory starts at a multiple of 64 bytes, as Dr.Jit's own arrays do.
+
+    Dr.Jit reads arrays of NumPy where they lie, and compiles a kernel anew where one of its inputs begins at another
+    alignment; NumPy's begin at multiples of 16, as it happens.
+    """
+    flat = np.ravel(np.asarray(values, dtype))
+    memory = np.empty(flat.nbytes + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    copy = memory[first : first + flat.nbytes].view(dtype)
+    copy[:] = flat
+    return copy

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.sampling import aligned
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.scene.media import is_boundary, medium_numbers
 
@@ -79,7 +80,7 @@ class Media:
         none = (0.0,) * len(fields(Medium))
         media = [medium_numbers(s.interior_medium()) if is_boundary(s) else none for s in scene.shapes()]
         table = table_of(scene, np.array(media, np.float32))
-        self.table = tuple(mi.Float(np.ascontiguousarray(column)) for column in table.T)
+        self.table = tuple(mi.Float(aligned(column, np.float32)) for column in table.T)
 
     def none(self, lanes: int) -> Medium:
         """No medium, on every lane."""

@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from rangesim.light_transport.sampling import aligned
+
 MANY = 100
 """Shapes from which on tables of them are worth making."""
 MAX_FACES = 4096
@@ -160,7 +162,7 @@ def _kind(mesh: Any) -> tuple[str, bool, bool, bool, bool]:
 
 
 def _joined(buffers: list[Any]) -> Any:
-    return mi.Float(np.concatenate([buffer.numpy() for buffer in buffers]))
+    return mi.Float(aligned(np.concatenate([buffer.numpy() for buffer in buffers]), np.float32))
 
 
 def _table(scene: Any, members: list[int], values: Any) -> np.ndarray:
