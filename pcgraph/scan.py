@@ -50,7 +50,7 @@ from pcgraph.voxels.directions import farthest_first
 from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.fitting import fitting_grading, fitting_size, seed_spacing
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means, with_means
-from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_near, outlier_voxels
+from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_full_of_noise, is_near, outlier_voxels
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface
@@ -176,12 +176,14 @@ def segment(
         voxel, law, warp = _scale(cloud, place, image, camera, range_growth, voxel_size, seed_size)
         with_outliers = cloud, place
         cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
+        may_look_closer = voxel_size is None and not warp.of_one_scan
+        if may_look_closer and is_full_of_noise(grid):
+            cloud, grid, place = _without_near_outliers(*with_outliers, voxel, warp)
         if not (is_noisy := len(cloud.points) < _FEW_OUTLIERS * len(all_points[0].points)):
             break  # else spacing and place were those of noise, to a good part
-    is_noisy = is_noisy and voxel_size is None and not warp.of_one_scan
-    if is_noisy:  # what large voxels hold beside surfaces, smaller ones tell from them; it would forbid these
-        cloud, grid, place = _without_outliers(*all_points, voxel / 2.0, _from_corner(warp, all_points[0], voxel / 2.0))
-        cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
+    is_noisy = is_noisy and may_look_closer
+    if is_noisy:
+        cloud, grid, place = _without_near_outliers(*all_points, voxel, warp)
     usual = voxel
     spacing = voxel / VOXELS_PER_SPACING if voxel_size is None else None
     warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
@@ -584,6 +586,17 @@ def _without_outliers(
     """Cloud, grid and viewpoints without what voxels of a size show to be outliers."""
     grid = voxel_grid(cloud.points, size, warp)
     return _without(outlier_voxels(grid), cloud, grid, place)
+
+
+def _without_near_outliers(
+    cloud: CleanCloud, place: NDArray[np.float64] | None, size: float, warp: Warp
+) -> tuple[CleanCloud, VoxelGrid, NDArray[np.float64] | None]:
+    """The same, but of voxels half as large first, which tell noise beside surfaces from them.
+
+    Larger ones keep it, and what is left of it would forbid that they become smaller.
+    """
+    cloud, _, place = _without_outliers(cloud, place, size / 2.0, _from_corner(warp, cloud, size / 2.0))
+    return _without_outliers(cloud, place, size, warp)
 
 
 def _without(

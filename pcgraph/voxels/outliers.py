@@ -28,6 +28,7 @@ _VOLUME_OF_REACH = 4.0 / 3.0 * np.pi * MAX_GAP**3
 _MAX_FRACTION = 2.0 / 3.0
 _PIECE = 5  # points: fewer, all alone, are no object
 _MANY_DETACHED = 0.02  # of the points
+_FEW_HELD, _SURROUNDED, _FILLED = 2, 14, 0.4  # points in a voxel, at most; voxels around it, at least; of all voxels
 _NEAREST = 16  # voxels of which
 _FLAT = 0.05  # of the variance is at most across a surface; of noise 0.2
 
@@ -78,6 +79,19 @@ def outlier_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
         outlier |= (grid.counts < _least_significant(density)) & (grid.counts < _FAINT * others / degrees)
     outlier &= ~_surfaces_among(outlier, grid)
     return outlier if grid.counts[outlier].sum() <= _MAX_FRACTION * n_points else nothing
+
+
+def is_full_of_noise(grid: VoxelGrid) -> bool:
+    """Whether noise is so dense that it hides among voxels of this size; smaller ones tell it from surfaces.
+
+    A large part of them hold a point or two then, and still have others on most sides, as no surface does.
+
+    Parameters
+    ----------
+    grid : VoxelGrid
+        Of one size.
+    """
+    return float(np.mean((np.diff(grid.indptr) >= _SURROUNDED) & (grid.counts <= _FEW_HELD))) >= _FILLED
 
 
 def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -171,6 +172,17 @@ def test_where_points_lie_evenly_voxels_have_one_size() -> None:
     assert result.surface.grid.levels is None
     assert pcgraph.segment(two_densities(20.0)[0], seed_size=0.3).surface.grid.levels is None
     assert pcgraph.segment(two_densities(20.0)[0], voxel_size=0.05).surface.grid.levels is None
+
+
+def test_few_voxels_stay_small_where_some_of_them_are_joined() -> None:
+    """Each thing has few: a sweep thinned to cubes lost a tenth of its things to larger voxels in blocks."""
+    rng = np.random.default_rng(0)
+    for n, is_graded in ((4_000, False), (40_000, True)):
+        side = 0.05 * math.sqrt(n)
+        dense, thin = plain(rng, 8 * n, (0.0, 0.0), (side, side)), plain(rng, n // 2, (side, 0.0), (2.0 * side, side))
+        grid = voxel_grid(np.concatenate((dense, thin)), 0.05, Warp())
+        assert 0.2 < np.mean(grid.joined[grid.centroids[:, 0] > side]) < 0.4
+        assert (fitting_grading(grid) is not None) == is_graded
 
 
 def test_voxels_of_one_scan_grow_already() -> None:

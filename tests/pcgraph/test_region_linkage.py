@@ -216,6 +216,22 @@ def test_concavity_parts_what_convexity_joins():
     assert pcgraph.segment(roof, viewpoint=seen_from["below"]).labels.max() == 1
 
 
+def test_a_gap_narrower_than_a_voxel_costs_nothing_beyond_its_contact():
+    """Centroids of voxels of several sizes can be nearer than the larger edge; the price was negative there, and the
+    altitudes with a high price were not finite."""
+    points, _, _ = two_boxes_on_a_plane()
+    points = points[(points[:, 0] < 0.8) | (points[:, 0] > 0.9)]
+    result = pcgraph.segment(points, voxel_size=0.03)
+    gaps = result.graph.gaps
+    assert len(gaps.widths)
+    found = [
+        RegionLinkage(gap=10.0).merges(replace(result.graph, gaps=replace(gaps, widths=widths)), result.leaves)
+        for widths in (np.full(len(gaps.widths), 0.3), np.ones(len(gaps.widths)))
+    ]
+    assert np.isfinite(found[0].altitudes).all()
+    assert np.array_equal(found[0].altitudes, found[1].altitudes)
+
+
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="gap"):
         RegionLinkage(gap=-1.0)

@@ -250,8 +250,9 @@ def test_voxels_of_an_image_do_not_depend_on_what_flies_before_it() -> None:
     assert seen == pytest.approx(clean, rel=0.1)
 
 
-@pytest.mark.parametrize(("noise", "edges"), [(0.0, 3.0), (0.1, 3.0), (0.3, 4.26)])
+@pytest.mark.parametrize(("noise", "edges"), [(0.0, 3.0), (0.1, 3.0), (0.35, 3.24), (0.4, 4.37)])
 def test_supervoxels_are_smaller_on_smooth_surfaces(noise: float, edges: float) -> None:
+    """As many as 800 on rough ones, and as many as lie between where they are neither."""
     result = pcgraph.segment(three_faces(noise))
     assert result.seed_size / result.voxel_size == pytest.approx(edges, rel=0.05)
 
