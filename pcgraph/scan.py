@@ -50,7 +50,7 @@ from pcgraph.voxels.directions import farthest_first
 from pcgraph.voxels.evidence import color_evidence
 from pcgraph.voxels.fitting import fitting_grading, fitting_size, seed_spacing
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means, with_means
-from pcgraph.voxels.outliers import OUTLIER, detached_voxels, is_full_of_noise, is_near, outlier_voxels
+from pcgraph.voxels.outliers import OUTLIER, detached_voxels, fill_the_volume, is_full_of_noise, is_near, outlier_voxels
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface
@@ -181,7 +181,7 @@ def segment(
             cloud, grid, place = _without_near_outliers(*with_outliers, voxel, warp)
         if not (is_noisy := len(cloud.points) < _FEW_OUTLIERS * len(all_points[0].points)):
             break  # else spacing and place were those of noise, to a good part
-    is_noisy = is_noisy and may_look_closer
+    is_noisy = is_noisy and may_look_closer and fill_the_volume(all_points[0].points, cloud.points)
     if is_noisy:
         cloud, grid, place = _without_near_outliers(*all_points, voxel, warp)
     usual = voxel

@@ -29,6 +29,7 @@ _MAX_FRACTION = 2.0 / 3.0
 _PIECE = 5  # points: fewer, all alone, are no object
 _MANY_DETACHED = 0.02  # of the points
 _FEW_HELD, _SURROUNDED, _FILLED = 2, 14, 0.4  # points in a voxel, at most; voxels around it, at least; of all voxels
+_PARTS, _OF_MEAN, _OF_PARTS = 4, 0.2, 0.95  # of the bounding box, along each axis; points in each; and of them
 _NEAREST = 16  # voxels of which
 _FLAT = 0.05  # of the variance is at most across a surface; of noise 0.2
 
@@ -92,6 +93,27 @@ def is_full_of_noise(grid: VoxelGrid) -> bool:
         Of one size.
     """
     return float(np.mean((np.diff(grid.indptr) >= _SURROUNDED) & (grid.counts <= _FEW_HELD))) >= _FILLED
+
+
+def fill_the_volume(points: NDArray[np.float64], left: NDArray[np.float64]) -> bool:
+    """Whether those points that are gone are noise through the whole volume, and not what is sparse in part of it.
+
+    Noise is in all parts of the bounding box, the leaves of trees are not.
+
+    Parameters
+    ----------
+    points, left : (n, 3), (m, 3) float64, metres
+        All, and those of them that are left.
+    """
+    low, high = bounding_box(points)
+    pitch = np.maximum(high - low, np.finfo(np.float64).tiny) / _PARTS
+
+    def in_each(some: NDArray[np.float64]) -> NDArray[np.int64]:
+        parts = np.minimum((some - low) / pitch, _PARTS - 1).astype(np.int64)
+        return np.bincount(parts @ np.array((_PARTS**2, _PARTS, 1)), minlength=_PARTS**3)
+
+    gone = in_each(points) - in_each(left)
+    return float(np.mean(gone >= _OF_MEAN * gone.mean())) >= _OF_PARTS
 
 
 def _surfaces_among(voxels: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.bool_]:
