@@ -71,7 +71,7 @@ _PER_OCTAVE = 16  # sizes of voxels, and no others
 _ASIDE = 0.382  # voxel edges before the first points, where cells start: what lies on a lattice, or walls a whole
 # number of voxels from each other, are on no border between cells
 _PLAINLY = 0.5  # cosine to the other side
-_FEW_OUTLIERS = 0.95  # of the points are left
+_FEW_OUTLIERS, _NOISY = 0.95, 0.9  # of the points are left, at least; or at most
 _OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
 _LOOKED_FROM = 3  # places, where the cloud was not seen from one; of viewpoints, from those of the points
 _ASKED_FOR_PLACES = 64  # in so many voxels
@@ -178,10 +178,13 @@ def segment(
         cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
         may_look_closer = voxel_size is None and not warp.of_one_scan
         if may_look_closer and is_full_of_noise(grid):
-            cloud, grid, place = _without_near_outliers(*with_outliers, voxel, warp)
-        if not (is_noisy := len(cloud.points) < _FEW_OUTLIERS * len(all_points[0].points)):
+            closer = _without_near_outliers(*with_outliers, voxel, warp)
+            if fill_the_volume(with_outliers[0].points, closer[0].points):
+                cloud, grid, place = closer
+        left = len(cloud.points) / len(all_points[0].points)
+        if left >= _FEW_OUTLIERS:
             break  # else spacing and place were those of noise, to a good part
-    is_noisy = is_noisy and may_look_closer and fill_the_volume(all_points[0].points, cloud.points)
+    is_noisy = may_look_closer and left <= _NOISY and fill_the_volume(all_points[0].points, cloud.points)
     if is_noisy:
         cloud, grid, place = _without_near_outliers(*all_points, voxel, warp)
     usual = voxel
