@@ -19,14 +19,6 @@ from rangesim.errors import EnvironmentProblem
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
 
-# Each worker of xdist, and whatever it starts, keeps to cores of its own. Threads of Dr.Jit spin, too, while they wait,
-# which costs up to a tenth where two workers with two threads each share two cores. What numba runs in parallel stays.
-if worker := os.environ.get("PYTEST_XDIST_WORKER") if hasattr(os, "sched_setaffinity") else None:
-    cores, workers = sorted(os.sched_getaffinity(0)), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(len(cores)))
-    own = int(worker.removeprefix("gw")) % workers
-    os.sched_setaffinity(0, cores[own::workers] or cores)
-
 with suppress(EnvironmentProblem):  # tests that render say it again; those of decoders need no LLVM
     ensure_llvm()
 
