@@ -110,7 +110,7 @@ def _enough_of_few(grid: VoxelGrid, law: SpacingLaw | None) -> float:
     n, of_one_scan = grid.n_voxels, grid.warp.of_one_scan
     if n >= _ENOUGH or (of_one_scan and law is None):
         return math.inf
-    share = math.log(max(n, _FEWEST) / _FEWEST) / math.log(_ENOUGH / _FEWEST)
+    share = _share_by_logarithm(n, _FEWEST, _ENOUGH)
     return _OF_FEWEST + share * ((1.0 if of_one_scan else _ALL_JOINED) - _OF_FEWEST)
 
 
@@ -249,8 +249,12 @@ def _apart(n_voxels: int) -> float:
     Of few voxels, each thing has few, and needs them more than its surface needs to be whole.
     """
     least, most = _APART
-    share = math.log(n_voxels / _FEW_GRADED) / math.log(_MANY_GRADED / _FEW_GRADED)
-    return least + min(max(share, 0.0), 1.0) * (most - least)
+    return least + _share_by_logarithm(n_voxels, _FEW_GRADED, _MANY_GRADED) * (most - least)
+
+
+def _share_by_logarithm(n: int, few: int, many: int) -> float:
+    """How far a number is from few to many, 0..1, by the logarithm."""
+    return min(max(math.log(n / few) / math.log(many / few), 0.0), 1.0)
 
 
 def _joined_around(

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 SPACING = 0.01  # metres between neighbouring points
 
 
-def patch(corner: tuple[float, ...], u: tuple[float, ...], v: tuple[float, ...]) -> NDArray[np.float64]:
+def patch(
+    corner: tuple[float, ...], u: tuple[float, ...], v: tuple[float, ...], spacing: float = SPACING
+) -> NDArray[np.float64]:
     """Regular points on the parallelogram corner + [0, 1] u + [0, 1] v, (n, 3), metres."""
     corner_, u_, v_ = (np.array(vector, float) for vector in (corner, u, v))
-    steps_u = np.linspace(0, 1, round(np.linalg.norm(u_) / SPACING) + 1)
-    steps_v = np.linspace(0, 1, round(np.linalg.norm(v_) / SPACING) + 1)
+    steps_u = np.linspace(0, 1, round(np.linalg.norm(u_) / spacing) + 1)
+    steps_v = np.linspace(0, 1, round(np.linalg.norm(v_) / spacing) + 1)
     a, b = np.meshgrid(steps_u, steps_v, indexing="ij")
     return corner_ + a.reshape(-1, 1) * u_ + b.reshape(-1, 1) * v_
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clouds import two_boxes_on_a_plane
+from clouds import patch, two_boxes_on_a_plane
 from numpy.typing import NDArray
 
 import pcgraph
 from pcgraph.voxels.grid import grid_without, voxel_grid, with_means
-from pcgraph.voxels.outliers import OUTLIER, detached_voxels, outlier_voxels
+from pcgraph.voxels.outliers import OUTLIER, detached_voxels, fill_the_volume, outlier_voxels
 from pcgraph.voxels.warp import Warp
 
 
@@ -57,27 +57,20 @@ def test_noise_through_the_volume_is_no_object(clean, fraction):
 def room_with_boxes(step: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points, nearly a lattice, on the floor and four walls of a room of 6 m and on twenty boxes; which each is on."""
     rng = np.random.default_rng(0)
-    parts = [lattice((0, 0, 0), (6, 0, 0), (0, 5, 0), step)]
+    parts = [patch((0, 0, 0), (6, 0, 0), (0, 5, 0), step)]
     for corner in ((0, 0, 0), (0, 5, 0)):
-        parts.append(lattice(corner, (6, 0, 0), (0, 0, 2.5), step))
+        parts.append(patch(corner, (6, 0, 0), (0, 0, 2.5), step))
     for corner in ((0, 0, 0), (6, 0, 0)):
-        parts.append(lattice(corner, (0, 5, 0), (0, 0, 2.5), step))
+        parts.append(patch(corner, (0, 5, 0), (0, 0, 2.5), step))
     for x in 0.5 + 1.1 * np.arange(5):
         for y in 0.5 + np.arange(4):
             s = rng.uniform(0.25, 0.4)
-            sides = [lattice((x, y, s), (s, 0, 0), (0, s, 0), step)]
-            sides += [lattice((x, other, 0), (s, 0, 0), (0, 0, s), step) for other in (y, y + s)]
-            sides += [lattice((other, y, 0), (0, s, 0), (0, 0, s), step) for other in (x, x + s)]
+            sides = [patch((x, y, s), (s, 0, 0), (0, s, 0), step)]
+            sides += [patch((x, other, 0), (s, 0, 0), (0, 0, s), step) for other in (y, y + s)]
+            sides += [patch((other, y, 0), (0, s, 0), (0, 0, s), step) for other in (x, x + s)]
             parts.append(np.concatenate(sides))
     points, on = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     return points + rng.normal(0.0, 0.1 * step, points.shape), on
-
-
-def lattice(corner, u, v, step):
-    """Points on a parallelogram, about a step from each other."""
-    a, b = (np.linspace(0.0, 1.0, round(np.linalg.norm(side) / step) + 1) for side in (u, v))
-    a, b = np.meshgrid(a, b)
-    return np.array(corner, float) + a.reshape(-1, 1) * u + b.reshape(-1, 1) * v
 
 
 @pytest.mark.parametrize(("step", "fraction"), [(0.03, 0.8), (0.05, 0.2), (0.05, 0.5), (0.05, 0.7)])
@@ -95,6 +88,19 @@ def test_noise_makes_voxels_no_larger_than_surfaces_need(step, fraction):
     assert n_objects < len(np.unique(before.labels)) + 15
     covering = pcgraph.metrics.segmentation_covering(result.labels[: len(points)], truth)
     assert covering > pcgraph.metrics.segmentation_covering(before.labels, truth) - 0.035
+
+
+@pytest.mark.parametrize(("high", "fills"), [(3.0, True), (1.5, False), (0.0, False)])
+def test_what_is_sparse_in_a_part_of_the_box_is_no_noise_through_the_volume(high, fills):
+    """As the crowns of trees are, or a plane."""
+    rng = np.random.default_rng(0)
+    floor, sparse = (
+        rng.uniform((0, 0, 0), (6.0, 5.0, 0.0), (5000, 3)),
+        rng.uniform((0, 0, 0), (6.0, 5.0, high), (2000, 3)),
+    )
+    top = [(0.0, 0.0, 3.0)] if high else []
+    left = np.concatenate((floor, np.reshape(top, (-1, 3))))
+    assert fill_the_volume(np.concatenate((left, sparse)), left) == fills
 
 
 def test_surfaces_alone_have_no_outliers(clean):
