@@ -8,6 +8,7 @@ estimation from a planar target", PAMI 2006): every pose that the noise does not
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -205,14 +206,16 @@ def _residuals(T: Array, X: Array, x: Array, camera: Intrinsics) -> tuple[Array,
 
 def _errors(T: Array, X: Array, x: Array, camera: Intrinsics) -> Array:
     """(n,) distances in pixels; infinite behind the camera."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return np.linalg.norm(_residuals(T, X, x, camera)[0].reshape(-1, 2), axis=-1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        errors = np.linalg.norm(camera.project(X @ T[:3, :3].T + T[:3, 3]) - x, axis=-1)
+    return np.nan_to_num(errors, copy=False, nan=np.inf, posinf=np.inf)
 
 
 def _is_same(T: Array, other: Array, tolerance: float = 1e-3) -> bool:
     """Whether two poses differ by less than the tolerance, in radians and relative to the distance."""
     apart = np.linalg.norm(T[:3, 3] - other[:3, 3]) / np.linalg.norm(other[:3, 3])
-    return bool(Rotation.from_matrix(T[:3, :3] @ other[:3, :3].T).magnitude() < tolerance and apart < tolerance)
+    turned = np.linalg.norm(T[:3, :3] - other[:3, :3])  # Frobenius: 2 sqrt(2) sin(angle / 2)
+    return bool(turned < math.sqrt(8) * math.sin(tolerance / 2) and apart < tolerance)
 
 
 def _starting_poses(X: Array, x: Array, camera: Intrinsics, is_planar: bool) -> list[Array]:
@@ -234,22 +237,19 @@ def _starting_poses(X: Array, x: Array, camera: Intrinsics, is_planar: bool) -> 
             R = Rotation.from_rotvec(vector.ravel()).as_matrix() @ axes
             found.append((Rotation.from_matrix(R).as_rotvec(), t.ravel() - R @ middle))
     random = np.random.default_rng(0)
-    for _ in range(TRIPLES):
-        three = random.choice(len(X), 3, replace=False)
-        extents = np.linalg.svd(X[three] - X[three].mean(axis=0), compute_uv=False)
-        if extents[1] > 1e-6 * extents[0]:
-            _, rotations, translations = cv2.solveP3P(X[three], ideal[three], K, none, flags=cv2.SOLVEPNP_P3P)
-            found += zip(rotations, translations, strict=True)
-    rated = []
-    for vector, t in found:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(np.ravel(vector)).as_matrix(), np.ravel(t)
-        error = _errors(T, X, x, camera)
-        if np.isfinite(error).all():
-            rated.append((float((error**2).sum()), T))
-    rated.sort(key=lambda pair: pair[0])
+    triples = np.array([random.choice(len(X), 3, replace=False) for _ in range(TRIPLES)])
+    extents = np.linalg.svd(X[triples] - X[triples].mean(axis=1, keepdims=True), compute_uv=False)
+    for three in triples[extents[:, 1] > 1e-6 * extents[:, 0]]:
+        _, rotations, translations = cv2.solveP3P(X[three], ideal[three], K, none, flags=cv2.SOLVEPNP_P3P)
+        found += zip(rotations, translations, strict=True)
+    poses = np.tile(np.eye(4), (len(found), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec([np.ravel(vector) for vector, _ in found]).as_matrix()
+    poses[:, :3, 3] = [np.ravel(t) for _, t in found]
+    cost = np.array([(_errors(T, X, x, camera) ** 2).sum() for T in poses])
     starts: list[Array] = []
-    for _, T in rated:
+    for T in poses[np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]]:
         if not any(_is_same(T, other, 0.03) for other in starts):
             starts.append(T)
-    return starts[:STARTS]
+        if len(starts) == STARTS:
+            break
+    return starts

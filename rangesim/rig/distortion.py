@@ -7,6 +7,7 @@ Arithmetic alone, so that NumPy and the renderer's arrays go through the same li
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +70,8 @@ NEGLIGIBLE = 1e-100
 """Coefficients below bend no ray, and their inverse is infinite."""
 
 
-def fold_radius2(coefficients: Sequence[float]) -> float:
+@lru_cache(maxsize=64)  # asked for at every step of a fit
+def fold_radius2(coefficients: tuple[float, ...]) -> float:
     """Square of the image-plane radius at which the radial polynomial folds round; infinite if it does not.
 
     d/dr r (1 + k1 r^2 + k2 r^4 + k3 r^6) = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6, and its first positive root ends the

@@ -14,6 +14,7 @@ import sys
 import types
 import typing
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -60,7 +61,7 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
         raise ValueError(f"{place}: expected a table of settings, got {type(data).__name__} {shown(data)}.")
     values = dict(data)
     cls = _concrete(cls, values, place)
-    hints = get_type_hints(cls)
+    hints = _hints(cls)  # type: ignore[arg-type]
     names = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     check_keys(values, names, place)
     missing = [n for n, f in names.items() if n not in values and _required(f)]
@@ -72,6 +73,11 @@ def from_dict(cls: type[T], data: Any, where: str = "") -> T:
         return cls(**arguments)
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
+
+
+@lru_cache(maxsize=256)  # each evaluates the annotations anew, which takes longer than all else of a table
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
 
 
 def on_top_of(default: Any, table: Any) -> Any:
