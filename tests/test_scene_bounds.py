@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -259,6 +262,14 @@ def test_textures_are_fractions_too(tmp_path: Path, value: float) -> None:
         return
     with pytest.raises(FileFormatError, match=rf"reflectance.filename t.exr to be a fraction, 0 to 1, got {value:g}"):
         load_scene(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a process of one core")
+def test_on_a_single_core_a_texture_of_openexr_is_no_endless_wait(tmp_path: Path) -> None:
+    write_grey(tmp_path / "t.exr", np.full((4, 4), 0.5, np.float32))
+    script = "import os, sys; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1]); import rangesim\n"
+    script += "rangesim.load_scene(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", script, textured(tmp_path, "t.exr")], check=True, timeout=60)
 
 
 def test_texture_bombs_are_refused_by_their_header(tmp_path: Path) -> None:

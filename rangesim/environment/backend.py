@@ -15,9 +15,13 @@ from rangesim.errors import EnvironmentProblem
 with suppress(EnvironmentProblem):  # raised again by `select_variant`, where LLVM is really needed
     ensure_llvm()
 
+import drjit as dr
 import mitsuba as mi
 
 VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
+MIN_THREADS = 2
+"""Of Dr.Jit, on a single core, too: with one, Mitsuba 3.9 waits for ever for a file of OpenEXR that it reads or writes
+(its issue 21)."""
 
 
 def select_variant(variant: str | None = None) -> str:
@@ -43,12 +47,12 @@ def select_variant(variant: str | None = None) -> str:
         ensure_llvm()
     if mi.variant() != variant:
         mi.set_variant(variant)
+    if dr.thread_count() < MIN_THREADS:
+        dr.set_thread_count(MIN_THREADS)
     mi.set_log_level(mi.LogLevel.Error)
     return variant
 
 
 def cuda_available() -> bool:
     """Whether Dr.Jit finds a CUDA device and this Mitsuba can use it."""
-    import drjit as dr
-
     return "cuda_ad_mono" in mi.variants() and bool(dr.has_backend(dr.JitBackend.CUDA))
