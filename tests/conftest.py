@@ -14,10 +14,17 @@ import pytest
 from rangesim.environment.llvm import ensure_llvm
 from rangesim.errors import EnvironmentProblem
 
-# Threads of BLAS and of OpenMP spin while they wait for work, and small products wait most of the time: a core's time
-# that other workers need. numba's threads do not spin, and stay as many as there are cores.
+# Threads that wait for work spin, those of BLAS, of OpenMP and of Dr.Jit: a core's time that other workers need. So
+# each worker has cores of its own, and Dr.Jit a thread for each of them; those of pcgraph do not spin, and stay as many
+# as there are cores, for what several of them do at once is tested, too.
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
+worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+if worker and hasattr(os, "sched_setaffinity"):
+    cores = sorted(os.sched_getaffinity(0))
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(len(cores)))
+    first = int(worker.removeprefix("gw")) % len(cores)
+    os.sched_setaffinity(0, cores[first :: int(os.environ["PYTEST_XDIST_WORKER_COUNT"])])
 
 with suppress(EnvironmentProblem):  # tests that render say it again; those of decoders need no LLVM
     ensure_llvm()
