@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from rangesim.geometry.correspondences import ROUNDING, Array
 
@@ -48,7 +48,7 @@ def usac(threshold_px: float, seed: int) -> Any:
 
 def inlier_threshold(noise_px: float, dimensions: int) -> float:
     """Pixels; error of `dimensions` coordinates with that noise that a correct correspondence exceeds once in 100."""
-    return float(noise_px * np.sqrt(stats.chi2.ppf(INLIER_PROBABILITY, dimensions)))
+    return float(noise_px * np.sqrt(special.chdtri(dimensions, 1.0 - INLIER_PROBABILITY)))
 
 
 def consistent_set(
@@ -85,9 +85,9 @@ def agree_by_chance(agreeing: int, total: int, minimal: int, probability: float)
     """
     if agreeing <= minimal:
         return True
-    choices = stats.binom(total - minimal, min(1.0, probability))
-    log_models = _log_choose(total, minimal) + choices.logsf(agreeing - minimal - 1)
-    return bool(log_models > np.log(SIGNIFICANCE))
+    more = special.bdtrc(agreeing - minimal - 1, total - minimal, min(1.0, probability))
+    with np.errstate(divide="ignore"):
+        return bool(_log_choose(total, minimal) + np.log(more) > np.log(SIGNIFICANCE))
 
 
 def _log_choose(n: int, k: int) -> float:
@@ -116,11 +116,11 @@ def simpler_model_suffices(
     if cost <= floor * freedom:
         return True
     if noise_px is not None:
-        return bool(cost / noise_px**2 <= stats.chi2.isf(SIGNIFICANCE, freedom))
+        return bool(cost / noise_px**2 <= special.chdtri(freedom, SIGNIFICANCE))
     rest, rest_freedom = full
     more = freedom - rest_freedom
     ratio = (cost - rest) / more / (max(rest, floor * rest_freedom) / rest_freedom)
-    return bool(ratio <= stats.f.isf(SIGNIFICANCE, more, rest_freedom))
+    return bool(ratio <= special.fdtri(more, rest_freedom, 1.0 - SIGNIFICANCE))
 
 
 def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
@@ -130,8 +130,8 @@ def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None
     squares are nearly independent: the test is chi^2, or F if the noise is unknown, of all degrees of freedom.
     """
     if noise_px is not None:
-        return bool(cost / noise_px**2 <= stats.chi2.isf(SIGNIFICANCE, freedom))
-    return bool(cost / max(least, rounding**2 * freedom) <= stats.f.isf(SIGNIFICANCE, freedom, freedom))
+        return bool(cost / noise_px**2 <= special.chdtri(freedom, SIGNIFICANCE))
+    return bool(cost / max(least, rounding**2 * freedom) <= special.fdtri(freedom, freedom, 1.0 - SIGNIFICANCE))
 
 
 def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
@@ -159,7 +159,7 @@ def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str)
     if noise_px is None or freedom <= 0:
         return
     excess = cost / noise_px**2
-    if excess > MAX_EXCESS**2 * freedom and excess > stats.chi2.isf(SIGNIFICANCE, freedom):
+    if excess > MAX_EXCESS**2 * freedom and excess > special.chdtri(freedom, SIGNIFICANCE):
         raise ValueError(
             f"expected pairs that {model} explains to their noise of {noise_px:.3g} px, got residuals of "
             f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (find them by the robust function), or noise_px "

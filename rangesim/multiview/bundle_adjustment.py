@@ -25,7 +25,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -465,7 +465,7 @@ def _refuse_other_relief(
         turned = again.points[known] @ similarity[:3, :3].T + similarity[:3, 3]
         apart = float(np.median(np.linalg.norm(turned - X, axis=1))) / extent
         stated = MAX_CURVED * found.shape_deviation * np.sqrt(max(rise, 1.0))
-        if rise < stats.chi2.isf(SIGNIFICANCE, 1) and apart > max(ANOTHER_SHAPE, stated):
+        if rise < special.chdtri(1, SIGNIFICANCE) and apart > max(ANOTHER_SHAPE, stated):
             raise ValueError(
                 f"expected views that determine the shape, got some that another one explains as well, its points "
                 f"off by {apart:.0%} of their extent: a flatter shape that turns more looks the same through a "
