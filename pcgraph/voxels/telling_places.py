@@ -8,6 +8,7 @@ tried: those from which much of it is visible, always from the same side, tell w
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +52,8 @@ _SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; where rooms are l
 _FEW, _LAYERS, _LOW = 16, 1.7, 8.0  # places in rooms; cells over each other on average, and in height: rooms too low
 _AS_MUCH = 0.004  # of it by which an agreement shows less than another, and yet as much
 _DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
-_OF_ROOM, _NEARLY_CLOSED = 0.2, 0.8  # counts that places are closed in, nearly, where floor and ceiling bound all
+_OF_ROOM, _NEARLY_CLOSED = 0.2, 0.8  # counts that places are closed in, nearly, where floor and ceiling bound all,
+_SEEN_WITHIN_ALONE = 0.001  # or so much of it is seen from none but such places
 _ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
 _WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
 _NARROW = 0.2  # and beyond which it sees a tenth of all, at least;
@@ -517,7 +519,9 @@ def _most_telling(
 
     Crevices between things are crests from behind, which are seen the better: what little that is decides nothing.
     A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
-    one of places closed in, as in a room: of that part all but narrow gaps is seen from within.
+    one of places closed in, as in a room: of that part all but narrow gaps is seen from within. Where that is no plain
+    room, of which floor and ceiling tell, it is a tunnel or a gallery if its places show, creases and all, what others
+    do not show: what was scanned had been seen, and whatever stands in a pipe is hidden from all who are outside.
     """
     visible = np.abs(looks.sides).sum(axis=1)
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
@@ -525,10 +529,15 @@ def _most_telling(
     of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
     every, closed = of_looks @ of_parts, of_looks @ (of_parts * looks.closed[:, None])
     is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
-    rooms_count = ((closed >= _NEARLY_CLOSED * every) & (every > 0.0)) @ room_counts
+    within = (closed >= _NEARLY_CLOSED * every) & (every > 0.0)
+    rooms_count = within @ room_counts
     shown, contradicted = np.empty(len(different)), np.empty(len(different))
-    sees = _seen_blocks(looks.sides)
-    in_blocks(_show, len(different), different, looks, sees, found, around, is_closed, shown, contradicted, smallest=1)
+    sees, show = _seen_blocks(looks.sides), partial(in_blocks, _show, len(different), different, looks, smallest=1)
+    if len(room_counts) == 1 and not room_counts.any() and np.count_nonzero(looks.closed >= _CLOSED) >= _FEW:
+        show(sees, found, around, np.zeros_like(is_closed), shown, contradicted)
+        by_places_within, by_others = (shown[some].max(initial=0.0) for some in (within[:, 0], ~within[:, 0]))
+        rooms_count = _OF_ROOM * within[:, 0] * (by_places_within > by_others + _SEEN_WITHIN_ALONE)
+    show(sees, found, around, is_closed, shown, contradicted)
     most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
     for s, fraction, of_rooms, against in zip(different, shown, rooms_count, contradicted, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]

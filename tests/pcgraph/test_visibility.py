@@ -144,6 +144,30 @@ def test_a_corridor_with_little_in_it_is_seen_from_within():
     assert fraction_outward(*joined((walls[0], -walls[1]), cupboard, post)) > 0.96
 
 
+def _tube(radius, length, spacing):
+    """Points at random on a tube around x and on its two ends, each with its normal, which points out of it."""
+    rng = np.random.default_rng(0)
+    n, n_end = int(2 * np.pi * radius * length / spacing**2), int(np.pi * radius**2 / spacing**2)
+    angle, x = (
+        rng.uniform(0, 2 * np.pi, n + 2 * n_end),
+        np.append(rng.uniform(0, length, n), np.repeat([0.0, length], n_end)),
+    )
+    reach = radius * np.append(np.ones(n), np.sqrt(rng.uniform(size=2 * n_end)))
+    across = np.column_stack((np.zeros(len(x)), np.cos(angle), np.sin(angle)))
+    normals = np.concatenate((across[:n], np.repeat([[-1.0, 0, 0], [1.0, 0, 0]], n_end, axis=0)))
+    return reach[:, None] * across + x[:, None] * [1.0, 0, 0], normals
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.3, 1.1, -0.7)])
+def test_a_tunnel_with_a_thing_in_it_is_seen_from_within_and_a_pipe_with_one_on_it_from_outside(turn):
+    """Floor and ceiling tell nothing of a round one. What stands in it was seen by nobody outside."""
+    points, normals = _tube(1.0, 16.0, 0.05)
+    thing = faces((8.0, -0.3, -0.4), (8.3, 0.0, -0.1), 0.05)
+    fin = faces((8.0, -0.15, 0.95), (8.3, 0.15, 1.4), 0.05, "-x +x -y +y +z")
+    assert fraction_outward(*turned(joined((points, -normals), thing), turn)) > 0.95
+    assert fraction_outward(*turned(joined((points, normals), fin), turn)) > 0.95
+
+
 def test_a_square_in_front_hides_one_behind():
     near, behind, beside = [0.0, 0.0, 1.0], [0.02, 0.0, 3.0], [1.0, 0.0, 3.0]
     seen = seen_from(
