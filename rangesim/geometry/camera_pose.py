@@ -242,6 +242,8 @@ def _starting_poses(X: Array, x: Array, camera: Intrinsics, is_planar: bool) -> 
     for three in triples[extents[:, 1] > 1e-6 * extents[:, 0]]:
         _, rotations, translations = cv2.solveP3P(X[three], ideal[three], K, none, flags=cv2.SOLVEPNP_P3P)
         found += zip(rotations, translations, strict=True)
+    if not found:
+        return []
     poses = np.tile(np.eye(4), (len(found), 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec([np.ravel(vector) for vector, _ in found]).as_matrix()
     poses[:, :3, 3] = [np.ravel(t) for _, t in found]
