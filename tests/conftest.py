@@ -15,8 +15,8 @@ from rangesim.environment.llvm import ensure_llvm
 from rangesim.errors import EnvironmentProblem
 
 # Threads that wait for work spin, those of BLAS, of OpenMP and of Dr.Jit: a core's time that other workers need. So
-# each worker has cores of its own, and Dr.Jit as many threads, or two; those of pcgraph do not spin, and stay as many
-# as there are cores, for what several of them do at once is tested, too.
+# each worker has cores of its own, and Dr.Jit as many threads; those of pcgraph do not spin, and stay as many as there
+# are cores, for what several of them do at once is tested, too.
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
 worker = os.environ.get("PYTEST_XDIST_WORKER", "")

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rangesim.environment.backend import select_variant
+from rangesim.environment.backend import images_can_be_read, select_variant
 from rangesim.errors import FileFormatError
 from rangesim.files.bundled_scenes import CATALOGUE, scene_file
 from rangesim.files.text_files import check_xml
@@ -119,6 +119,7 @@ def load_scene(
     )
 
 
+@images_can_be_read()
 def _instantiate(
     source: Source, material: str, unit_m: float, sensor: int, label: str, advises: bool = False
 ) -> tuple[Any, set[str], dict[str, str], np.ndarray]:
