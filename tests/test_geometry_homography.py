@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 import pytest
 from geometry_scenes import alike, cramer_rao, efficiency
+from scipy import stats
 from skimage.transform import ProjectiveTransform
 
-from rangesim.geometry import find_homography, fit_homography, homography_dlt, map_points, transfer_error
+from rangesim.geometry import consensus, find_homography, fit_homography, homography_dlt, map_points, transfer_error
 
 TRUE = np.array([[1.1, 0.1, 30], [-0.05, 0.9, 20], [1e-4, 2e-4, 1]])
 UNIT = TRUE / np.linalg.norm(TRUE)
@@ -185,3 +186,11 @@ def test_settings_are_checked(arguments: dict, message: str) -> None:  # type: i
         fit_homography(*pairs(np.random.default_rng(9), 6), **arguments)
     with pytest.raises(ValueError, match="corresponding points"):
         fit_homography(SQUARE, LINE)
+
+
+@pytest.mark.parametrize("freedom", [0, 1, 2, 7, 400])
+def test_limits_of_chance_are_those_of_scipy_s_distributions(freedom: int) -> None:
+    """Whose import takes longer than all of geometry."""
+    limits = consensus.chi2_limit(freedom), consensus._f_limit(freedom, 30)
+    distributions = stats.chi2(freedom), stats.f(freedom, 30)
+    np.testing.assert_allclose(limits, [one.isf(consensus.SIGNIFICANCE) for one in distributions], rtol=1e-9)

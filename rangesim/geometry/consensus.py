@@ -94,6 +94,17 @@ def _log_choose(n: int, k: int) -> float:
     return float(np.log(np.arange(n - k + 1, n + 1) / np.arange(1, k + 1)).sum())
 
 
+def chi2_limit(freedom: int) -> float:
+    """What chi^2 of that many degrees of freedom exceeds by chance with a probability of `SIGNIFICANCE`; NaN, below
+    which nothing is, of none."""
+    return float(special.chdtri(freedom, SIGNIFICANCE)) if freedom > 0 else np.nan
+
+
+def _f_limit(more: int, rest: int) -> float:
+    """The same of F of so many degrees of freedom, of its numerator and denominator."""
+    return float(special.fdtri(more, rest, 1.0 - SIGNIFICANCE))
+
+
 def simpler_model_suffices(
     simple: tuple[float, int], full: tuple[float, int], noise_px: float | None, rounding: float
 ) -> bool:
@@ -116,11 +127,11 @@ def simpler_model_suffices(
     if cost <= floor * freedom:
         return True
     if noise_px is not None:
-        return bool(cost / noise_px**2 <= special.chdtri(freedom, SIGNIFICANCE))
+        return bool(cost / noise_px**2 <= chi2_limit(freedom))
     rest, rest_freedom = full
     more = freedom - rest_freedom
     ratio = (cost - rest) / more / (max(rest, floor * rest_freedom) / rest_freedom)
-    return bool(ratio <= special.fdtri(more, rest_freedom, 1.0 - SIGNIFICANCE))
+    return bool(ratio <= _f_limit(more, rest_freedom))
 
 
 def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
@@ -130,8 +141,8 @@ def is_as_likely(cost: float, least: float, freedom: int, noise_px: float | None
     squares are nearly independent: the test is chi^2, or F if the noise is unknown, of all degrees of freedom.
     """
     if noise_px is not None:
-        return bool(cost / noise_px**2 <= special.chdtri(freedom, SIGNIFICANCE))
-    return bool(cost / max(least, rounding**2 * freedom) <= special.fdtri(freedom, freedom, 1.0 - SIGNIFICANCE))
+        return bool(cost / noise_px**2 <= chi2_limit(freedom))
+    return bool(cost / max(least, rounding**2 * freedom) <= _f_limit(freedom, freedom))
 
 
 def odds_are_open(cost: float, least: float, freedom: int, noise_px: float | None, rounding: float) -> bool:
@@ -159,7 +170,7 @@ def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str)
     if noise_px is None or freedom <= 0:
         return
     excess = cost / noise_px**2
-    if excess > MAX_EXCESS**2 * freedom and excess > special.chdtri(freedom, SIGNIFICANCE):
+    if excess > MAX_EXCESS**2 * freedom and excess > chi2_limit(freedom):
         raise ValueError(
             f"expected pairs that {model} explains to their noise of {noise_px:.3g} px, got residuals of "
             f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (find them by the robust function), or noise_px "

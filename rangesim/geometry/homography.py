@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import special
 from scipy.spatial.transform import Rotation
 
 from rangesim.geometry import consensus
@@ -249,7 +248,7 @@ def _refuse_collinear(name: str, points: Array, noise_px: float) -> None:
     scatter = unit.T @ unit - n / (n - 1) * unit[:, :, None] * unit[:, None, :]
     half, product = scatter[:, [0, 1], [0, 1]].sum(-1) / 2, np.linalg.det(scatter)
     least = half - np.sqrt(np.maximum(half**2 - product, 0))
-    allowed = (noise_px / size) ** 2 * special.chdtri(n - 3, consensus.SIGNIFICANCE)
+    allowed = (noise_px / size) ** 2 * consensus.chi2_limit(n - 3)
     odd = int(np.argmin(least))
     if least[odd] <= max(allowed, COLLINEAR**2 * n):
         others = np.delete(np.arange(n), odd).tolist()

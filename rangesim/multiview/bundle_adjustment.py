@@ -25,14 +25,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import special
 from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from rangesim.errors import warn
-from rangesim.geometry.consensus import SIGNIFICANCE, rounding_of, simpler_model_suffices
+from rangesim.geometry.consensus import chi2_limit, rounding_of, simpler_model_suffices
 from rangesim.geometry.correspondences import Array, check_noise, checked_array
 from rangesim.geometry.least_squares import descend
 from rangesim.geometry.registration import nearest_similarity
@@ -465,7 +464,7 @@ def _refuse_other_relief(
         turned = again.points[known] @ similarity[:3, :3].T + similarity[:3, 3]
         apart = float(np.median(np.linalg.norm(turned - X, axis=1))) / extent
         stated = MAX_CURVED * found.shape_deviation * np.sqrt(max(rise, 1.0))
-        if rise < special.chdtri(1, SIGNIFICANCE) and apart > max(ANOTHER_SHAPE, stated):
+        if rise < chi2_limit(1) and apart > max(ANOTHER_SHAPE, stated):
             raise ValueError(
                 f"expected views that determine the shape, got some that another one explains as well, its points "
                 f"off by {apart:.0%} of their extent: a flatter shape that turns more looks the same through a "
