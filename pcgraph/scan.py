@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segmentation of a scan: the whole algorithm, from points to voxels, supervoxels, graph, tree and objects.
 
-`segment` and `update` say what a first scan, and one that follows, is put into; `segment_scan` is the algorithm.
+`segment` and `update` make the voxels and planes of a first scan and of a later one; `segment_scan` goes from there to
+supervoxels, graph, tree and objects.
 """
 
 from __future__ import annotations
@@ -67,14 +68,16 @@ from pcgraph.voxels.warp import Shift, Warp, choose_warp
 from pcgraph.warmup import compile_in_two_processes
 
 RANGE_GROWTH = 0.5
-_PER_OCTAVE = 16  # sizes of voxels, and no others
-_ASIDE = 0.382  # voxel edges before the first points, where cells start: what lies on a lattice, or walls a whole
-# number of voxels from each other, are on no border between cells
-_PLAINLY = 0.5  # cosine to the other side
-_FEW_OUTLIERS, _NOISY = 0.95, 0.9  # of the points are left, at least; or at most
-_OF_ONE_SCAN = 0.8  # of the voxels, at least, are visible from where they were scanned
-_LOOKED_FROM = 3  # places, where the cloud was not seen from one; of viewpoints, from those of the points
-_ASKED_FOR_PLACES = 64  # in so many voxels
+"""Default of `range_growth` for a cloud that is one scan."""
+_SIZES_PER_OCTAVE = 16  # default voxel sizes are rounded to these
+_GRID_OFFSET = 0.382  # voxel edges from the grid's origin to the lowest corner: no simple fraction, so that points on a
+# lattice, and walls a whole number of voxels from each other, are not on a border between cells
+_FLIP_COSINE = 0.5  # a normal is flipped if its cosine with that of larger voxels is below minus this
+_FEW_OUTLIERS = 0.95  # fraction of the points left from which on scale and viewpoint are not estimated again
+_NOISY = 0.9  # fraction left up to which outliers are sought in voxels half as large, too
+_MIN_SHOWN = 0.8  # fraction of the surface that an estimated scanner position must see
+_MAX_VIEWPOINTS = 3  # from which continuations are sought, where the cloud was not seen from one
+_SAMPLED_VOXELS = 64  # whose points' viewpoints are candidates for these
 
 
 def segment(
@@ -166,60 +169,34 @@ def segment(
     method = SurfaceGrowth() if method is None else method
     settings = Settings.of(method, RegionLinkage() if linkage is None else linkage, object_altitude)
     cloud = with_pixels(clean_cloud(points, colors, normals, features))
-    place, axis = _view(viewpoint, cloud, bool(camera))
+    is_given = viewpoint is not None
+    viewpoint, axis = _viewpoint_and_axis(viewpoint, cloud, bool(camera))
     compile_in_two_processes()
-    camera = _is_camera(cloud, place, axis, range_growth) if camera is None else camera
-    image = _depth_image(cloud, place, axis, camera)
-    cloud = _without_flying(cloud, image)
-    all_points = cloud, place
-    for _ in range(2):
-        voxel, law, warp = _scale(cloud, place, image, camera, range_growth, voxel_size, seed_size)
-        with_outliers = cloud, place
-        cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
-        may_look_closer = voxel_size is None and not warp.of_one_scan
-        if may_look_closer and is_full_of_noise(grid):
-            closer = _without_near_outliers(*with_outliers, voxel, warp)
-            if fill_the_volume(with_outliers[0].points, closer[0].points):
-                cloud, grid, place = closer
-        left = len(cloud.points) / len(all_points[0].points)
-        if left >= _FEW_OUTLIERS:
-            break  # else spacing and place were those of noise, to a good part
-    is_noisy = may_look_closer and left <= _NOISY and fill_the_volume(all_points[0].points, cloud.points)
-    if is_noisy:
-        cloud, grid, place = _without_near_outliers(*all_points, voxel, warp)
-    usual = voxel
-    spacing = voxel / VOXELS_PER_SPACING if voxel_size is None else None
-    warn_of_rounding(points, cloud, spacing)  # type: ignore[arg-type]
+    camera = _grows_with_depth(cloud, viewpoint, axis, range_growth) if camera is None else camera
+    image = _depth_image(cloud, viewpoint, axis, camera)
+    asked = _Asked(image, camera, range_growth, voxel_size, seed_size)
+    found = _without_noise(_without_flying_pixels(cloud, image), viewpoint, asked)
+    spacing = found.voxelised.grid.size / VOXELS_PER_SPACING if voxel_size is None else None
+    warn_of_rounding(points, found.voxelised.cloud, spacing)  # type: ignore[arg-type]
     if spacing is not None:
-        warn_of_duplicates(cloud, spacing)
-        largest = math.inf if seed_size is None else float(seed_size)
-        voxel, usual = fitting_size(cloud.points, grid, law, largest)
-        if voxel != grid.size:
-            warp, is_larger = _from_corner(warp, with_outliers[0], voxel), voxel > grid.size
-            if is_larger:  # of such voxels, what was thin may be none
-                cloud, place = with_outliers
-            if is_larger or is_noisy:
-                cloud, grid, place = _without_outliers(cloud, place, voxel, warp)
-            else:
-                grid = voxel_grid(cloud.points, voxel, warp)
-        may_grade = seed_size is None and range_growth is None and voxel == usual
-        if may_grade and (grading := fitting_grading(grid)) is not None:
-            grid = voxel_grid(cloud.points, voxel, warp, grading)
-    cloud, grid, place = _without(detached_voxels(grid), cloud, grid, place)
+        warn_of_duplicates(found.voxelised.cloud, spacing)
+        found = _with_adapted_size(found, asked)
+    cloud, grid, viewpoint = _without(found.voxelised, detached_voxels(found.voxelised.grid))
     grid = with_means(grid, cloud.colors, cloud.features)
-    initial_labels = np.full(grid.n_voxels, -1, np.int32)
     warn_of_volume(grid)
-    if place is not None and place.ndim == 1 and viewpoint is not None:
-        warn_of_viewpoint(place, grid)
-    outside = _outward_planes(grid, settings.method, law, place)
-    if usual > voxel and place is None:
-        larger = voxel_grid(cloud.points, usual, _from_corner(warp, cloud, usual))
-        of_larger = _outward_planes(larger, settings.method, law, None)
-        outside = outside._replace(planes=_with_sides_of(larger, of_larger, grid, outside.planes))
-    seed = seed_spacing(grid) if seed_size is None else float(seed_size)
-    known = outside.known or cloud.normals is not None
-    planes, moved = outside.planes, outside.moved
-    scan = Scan(cloud, outside.viewpoint, outside.places, known, grid, planes, initial_labels, seed, moved)
+    if is_given and viewpoint is not None and viewpoint.ndim == 1:
+        warn_of_viewpoint(viewpoint, grid)
+    oriented = _oriented_planes(grid, settings.method, found.law, viewpoint)
+    if grid.size < found.orienting_size and viewpoint is None:
+        oriented = _oriented_as_larger(oriented, grid, cloud, found, settings.method)
+    scan = Scan(
+        cloud,
+        grid,
+        oriented,
+        sides_known=oriented.viewpoint_known or cloud.normals is not None,
+        initial_labels=np.full(grid.n_voxels, -1, np.int32),
+        seed_size=seed_spacing(grid) if seed_size is None else float(seed_size),
+    )
     result = segment_scan(scan, None, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
@@ -280,34 +257,48 @@ def update(
     method = earlier.method if method is None else method
     settings = Settings.of(method, earlier.linkage if linkage is None else linkage, object_altitude)
     cloud = with_pixels(clean_cloud(points, colors, normals, features, earlier.feature_scaling))
-    place, axis = _view(viewpoint, cloud, False)
+    is_given = viewpoint is not None
+    viewpoint, axis = _viewpoint_and_axis(viewpoint, cloud, False)
     compile_in_two_processes()
     warn_of_rounding(points, cloud, None)  # type: ignore[arg-type]
     before = earlier.surface
     before.grid.warp.check(cloud.points)
     size, warp, grading = before.grid.size, before.grid.warp, before.grid.grading
-    image = _depth_image(cloud, place, axis, _is_camera(cloud, place, axis, None))
-    cloud = _without_flying(cloud, image)
-    seen = voxel_grid(cloud.points, size, warp)
-    cloud, seen, place = _without(outlier_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
+    cloud = _without_flying_pixels(
+        cloud, _depth_image(cloud, viewpoint, axis, _grows_with_depth(cloud, viewpoint, axis, None))
+    )
+    grid = voxel_grid(cloud.points, size, warp)
+    cloud, grid, viewpoint = _without(
+        Voxelised(cloud, grid, viewpoint), outlier_voxels(grid) & ~is_near(grid, before.grid)
+    )
     if grading is not None:
-        seen = voxel_grid(cloud.points, size, warp, grading)
-    cloud, seen, place = _without(detached_voxels(seen) & ~is_near(seen, before.grid), cloud, seen, place)
-    seen = with_means(seen, cloud.colors, cloud.features)
-    if place is not None and place.ndim == 1 and viewpoint is not None:
-        warn_of_viewpoint(place, seen)
-    union = grid_union(before.grid, seen)
+        grid = voxel_grid(cloud.points, size, warp, grading)
+    cloud, grid, viewpoint = _without(
+        Voxelised(cloud, grid, viewpoint), detached_voxels(grid) & ~is_near(grid, before.grid)
+    )
+    grid = with_means(grid, cloud.colors, cloud.features)
+    if is_given and viewpoint is not None and viewpoint.ndim == 1:
+        warn_of_viewpoint(viewpoint, grid)
+    union = grid_union(before.grid, grid)
     labels = np.full(union.grid.n_voxels, -1, np.int32)
     labels[union.first] = before.supervoxels
-    far_off = np.empty((union.grid.n_voxels, 3))
-    outside = _outward_planes(seen, settings.method, None, place)
-    far_off[union.second] = _far_along(seen, outside.planes.normals)
-    far_off[union.first] = _far_along(before.grid, before.normals)
-    planes = settings.method.planes(union.grid, far_off)
-    earlier_place = earlier.viewpoint[None] if earlier.viewpoint.ndim == 1 else np.empty((0, 3))
-    places = np.unique(np.concatenate((outside.places, earlier_place)), axis=0)
-    known = earlier.graph.sides_known and (outside.known or cloud.normals is not None)
-    scan = Scan(cloud, outside.viewpoint, places, known, union.grid, planes, labels, earlier.seed_size)
+    oriented = _oriented_planes(grid, settings.method, None, viewpoint)
+    viewpoint_of_voxel = np.empty((union.grid.n_voxels, 3))
+    viewpoint_of_voxel[union.second] = _far_along(grid, oriented.planes.normals)
+    viewpoint_of_voxel[union.first] = _far_along(before.grid, before.normals)
+    viewpoints = oriented.viewpoints
+    if earlier.viewpoint.ndim == 1:
+        viewpoints = np.concatenate((viewpoints, earlier.viewpoint[None]))
+    scan = Scan(
+        cloud,
+        union.grid,
+        oriented._replace(
+            viewpoints=np.unique(viewpoints, axis=0), planes=settings.method.planes(union.grid, viewpoint_of_voxel)
+        ),
+        sides_known=earlier.graph.sides_known and (oriented.viewpoint_known or cloud.normals is not None),
+        initial_labels=labels,
+        seed_size=earlier.seed_size,
+    )
     result = segment_scan(scan, earlier, settings)
     warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, union.grid.size)
     return result
@@ -315,36 +306,27 @@ def update(
 
 @dataclass(frozen=True)
 class Scan:
-    """Points to be segmented, and what they lie in.
+    """Points to be segmented, their voxels and local planes.
 
     Attributes
     ----------
     cloud : CleanCloud of n points
-    viewpoint : (3,) or (n, 3) float64, metres
-    places : (p, 3) float64, metres
-        From which continuations are looked for.
-    sides_known : bool
-        As of `AdjacencyGraph`, for all that has been seen.
     grid : VoxelGrid of v voxels
-        All that has been seen; its `voxel_of_point` speaks of these points.
-    planes : LocalPlanes of v voxels
-        On which they lie; normals point outwards.
+        Of all scans so far; its `voxel_of_point` is of these points.
+    oriented : OrientedPlanes of v voxels
+    sides_known : bool
+        As of `AdjacencyGraph`, for all scans so far.
     initial_labels : (v,) int32
         Supervoxels of earlier scans, -1 elsewhere.
     seed_size : float, metres
-    moved : bool
-        Whether the place about which voxels grow with range did not see all of this scan.
     """
 
     cloud: CleanCloud
-    viewpoint: NDArray[np.float64]
-    places: NDArray[np.float64]
-    sides_known: bool
     grid: VoxelGrid
-    planes: LocalPlanes
+    oriented: OrientedPlanes
+    sides_known: bool
     initial_labels: NDArray[np.int32]
     seed_size: float
-    moved: bool = False
 
 
 @dataclass(frozen=True)
@@ -366,38 +348,14 @@ class Settings:
         return cls(method, linkage, non_negative("object_altitude", altitude))
 
 
-def _is_camera(
-    cloud: CleanCloud,
-    place: NDArray[np.float64] | None,
-    axis: NDArray[np.float64] | None,
-    range_growth: float | None,
-) -> bool:
-    """Whether a camera at the place took a cloud, along an axis that its points told or z; not if range is to count."""
-    return place is not None and not range_growth and (axis is not None or is_camera(cloud, place))
-
-
-def _depth_image(
-    cloud: CleanCloud, place: NDArray[np.float64] | None, axis: NDArray[np.float64] | None, camera: bool
-) -> DepthImage | None:
-    """The image that a camera took, along z or the axis that the points told; None if it was no camera."""
-    if place is None or place.ndim != 1 or cloud.image is None or not (camera or axis is not None):
-        return None
-    return DepthImage.of(cloud.points, cloud.image, place, axis)
-
-
-def _without_flying(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
-    """The cloud without points whose depth is a mix of two."""
-    if image is None:
-        return cloud
-    flying = image.flying()
-    return cloud.without(flying) if flying.any() else cloud
-
-
-def _view(
+def _viewpoint_and_axis(
     viewpoint: ArrayLike | None, cloud: CleanCloud, camera: bool
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """From where a cloud was seen, (3,) or (n, 3): as given, else as pixels tell, or of a camera's image the origin;
-    and the axis of the camera that they tell. None if nothing does."""
+    """Viewpoint, (3,) or (n, 3) metres, and the camera's optical axis, (3,); None where unknown.
+
+    The viewpoint is the given one, else what the pixels tell, else the origin of an image that `camera` calls a
+    camera's.
+    """
     if viewpoint is not None:
         given = clean_viewpoint(viewpoint, cloud)
         return given, axis_at(given, cloud) if given.ndim == 1 else None
@@ -407,16 +365,38 @@ def _view(
     return view
 
 
+def _grows_with_depth(
+    cloud: CleanCloud,
+    viewpoint: NDArray[np.float64] | None,
+    axis: NDArray[np.float64] | None,
+    range_growth: float | None,
+) -> bool:
+    """Whether a camera at the viewpoint took the cloud and no `range_growth` above 0 was given."""
+    return viewpoint is not None and not range_growth and (axis is not None or is_camera(cloud, viewpoint))
+
+
+def _depth_image(
+    cloud: CleanCloud, viewpoint: NDArray[np.float64] | None, axis: NDArray[np.float64] | None, camera: bool
+) -> DepthImage | None:
+    """The image that a camera took, along z or the axis that its pixels tell; None if it was no camera."""
+    if viewpoint is None or viewpoint.ndim != 1 or cloud.image is None or not (camera or axis is not None):
+        return None
+    return DepthImage.of(cloud.points, cloud.image, viewpoint, axis)
+
+
 def _refusal(argument: str, family: str, given: object) -> str:
     from pcgraph.families import refusal
 
     return refusal(argument, family, given)
 
 
+# --- from voxels to objects -------------------------------------------------------------------------------------------
+
+
 def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -> Segmentation:
     """Segmentation of a scan: the algorithm from voxels on."""
-    cloud, grid, method, linkage = scan.cloud, scan.grid, settings.method, settings.linkage
-    planes = scan.planes
+    cloud, grid, planes = scan.cloud, scan.grid, scan.oriented.planes
+    method, linkage = settings.method, settings.linkage
     normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
@@ -434,10 +414,11 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     nodes = node_features(leaves)
     features = edge_features(nodes, touching)
     faces = faces_of(touching.edges, features, len(leaves))
-    seen_from = grid.warp.seen_from if earlier is None and not scan.moved else None  # no place saw all of several scans
+    # no place saw all of several scans
+    seen_from = grid.warp.seen_from if earlier is None and not scan.oriented.scanner_moved else None
     near, hidden = side_by_side(
         lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, seen_from),
-        lambda: continuations(surface, nodes, faces, scan.places),
+        lambda: continuations(surface, nodes, faces, scan.oriented.viewpoints),
     )
     of_planes, of_ground = side_by_side(
         lambda: bounding_planes(surface, nodes, faces), lambda: terrain(surface, nodes, faces)
@@ -457,7 +438,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         tree=tree,
         surface=surface,
         seed_size=scan.seed_size,
-        viewpoint=scan.viewpoint,
+        viewpoint=scan.oriented.viewpoint,
         feature_scaling=cloud.scaling,
         **vars(settings),
     )
@@ -512,16 +493,114 @@ def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArr
     return np.where(usable, means / np.where(usable, length, 1.0), estimated)
 
 
+# --- voxels: their size, and what is left out -------------------------------------------------------------------------
+
+
+class _Asked(NamedTuple):
+    """What decides the scale beside the points: as for `segment`.
+
+    Attributes
+    ----------
+    image : DepthImage or None
+        The image that a camera took.
+    camera : bool
+        Whether voxels grow in proportion to depth.
+    range_growth, voxel_size, seed_size : float or None
+        As given.
+    """
+
+    image: DepthImage | None
+    camera: bool
+    range_growth: float | None
+    voxel_size: float | None
+    seed_size: float | None
+
+
+class Voxelised(NamedTuple):
+    """A cloud of n points, the voxels in which they lie, and their viewpoint, (3,) or (n, 3) metres, if it is known."""
+
+    cloud: CleanCloud
+    grid: VoxelGrid
+    viewpoint: NDArray[np.float64] | None
+
+
+class _Voxels(NamedTuple):
+    """What is known of a cloud once it lies in voxels.
+
+    Attributes
+    ----------
+    voxelised : Voxelised
+        Without outliers.
+    with_outliers : CleanCloud, and its viewpoint
+    law : SpacingLaw or None
+        How spacing depends on range, where viewpoint or scale ask for it.
+    warp : Warp
+        How voxels grow.
+    is_noisy : bool
+        Whether noise was sought in voxels half as large, too.
+    orienting_size : float, metres
+        Of the voxels that decide which side is outside, where these are not smaller.
+    """
+
+    voxelised: Voxelised
+    with_outliers: tuple[CleanCloud, NDArray[np.float64] | None]
+    law: SpacingLaw | None
+    warp: Warp
+    is_noisy: bool
+    orienting_size: float
+
+
+def _without_noise(cloud: CleanCloud, viewpoint: NDArray[np.float64] | None, asked: _Asked) -> _Voxels:
+    """The cloud in voxels of the size that its spacing asks for, without outliers.
+
+    Where many points are outliers, spacing and viewpoint were those of noise, and are estimated again without them.
+    """
+    noisy, n_noisy = (cloud, viewpoint), len(cloud.points)
+    for _ in range(2):
+        with_outliers = cloud, viewpoint
+        size, law, warp = _scale(cloud, viewpoint, asked)
+        voxelised = _without_outliers(cloud, viewpoint, size, warp)
+        may_look_closer = asked.voxel_size is None and not warp.of_one_scan
+        if may_look_closer and is_full_of_noise(voxelised.grid):
+            closer = _without_near_outliers(cloud, viewpoint, size, warp)
+            if fill_the_volume(cloud.points, closer.cloud.points):
+                voxelised = closer
+        cloud, _, viewpoint = voxelised
+        left = len(cloud.points) / n_noisy
+        if left >= _FEW_OUTLIERS:
+            break
+    is_noisy = may_look_closer and left <= _NOISY and fill_the_volume(noisy[0].points, cloud.points)
+    if is_noisy:
+        voxelised = _without_near_outliers(*noisy, size, warp)
+    return _Voxels(voxelised, with_outliers, law, warp, is_noisy, size)
+
+
+def _with_adapted_size(found: _Voxels, asked: _Asked) -> _Voxels:
+    """The same with larger voxels where surfaces fall apart, everywhere or in some blocks, or smaller ones where they
+    stay whole."""
+    voxelised, warp = found.voxelised, found.warp
+    largest = math.inf if asked.seed_size is None else float(asked.seed_size)
+    size, orienting_size = fitting_size(voxelised.cloud.points, voxelised.grid, found.law, largest)
+    if size != voxelised.grid.size:
+        cloud, viewpoint = voxelised.cloud, voxelised.viewpoint
+        warp, is_larger = _from_corner(warp, found.with_outliers[0], size), size > voxelised.grid.size
+        if is_larger:  # of such voxels, what was thin may be none
+            cloud, viewpoint = found.with_outliers
+        if is_larger or found.is_noisy:
+            voxelised = _without_outliers(cloud, viewpoint, size, warp)
+        else:
+            voxelised = Voxelised(cloud, voxel_grid(cloud.points, size, warp), viewpoint)
+    may_grade = asked.seed_size is None and asked.range_growth is None and size == orienting_size
+    if may_grade and (grading := fitting_grading(voxelised.grid)) is not None:
+        voxelised = voxelised._replace(grid=voxel_grid(voxelised.cloud.points, size, warp, grading))
+    return found._replace(voxelised=voxelised, warp=warp, orienting_size=orienting_size)
+
+
 def _scale(
-    cloud: CleanCloud,
-    position: NDArray[np.float64] | None,
-    image: DepthImage | None,
-    camera: bool,
-    range_growth: float | None,
-    voxel_size: float | None,
-    seed_size: float | None,
+    cloud: CleanCloud, viewpoint: NDArray[np.float64] | None, asked: _Asked
 ) -> tuple[float, SpacingLaw | None, Warp]:
-    """The voxel size; how spacing depends on range, where that counts for place or scale; and how voxels grow."""
+    """Voxel size, metres; the spacing law, None where neither viewpoint nor scale needs it; and the warp."""
+    image, camera, range_growth, voxel_size, seed_size = asked
 
     def spacing(warp: Warp, of_points: float | None) -> float:
         of_points = median_spacing(cloud.points, warp) if of_points is None else of_points
@@ -531,170 +610,39 @@ def _scale(
     growth = 0.0 if range_growth is None else fraction("range_growth", range_growth)
     may_grow = range_growth is None and not camera
     law, even = None, None
-    if not camera and (position is None or (may_grow and position.ndim == 1)):
+    if not camera and (viewpoint is None or (may_grow and viewpoint.ndim == 1)):
         (even, rows), of_all = side_by_side(
-            partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, position, cloud.sample)
+            partial(spacing_and_rows, cloud.points), partial(spacing_law, cloud.points, viewpoint, cloud.sample)
         )
-        law = law_on_rings(cloud.points, of_all, rows, position, cloud.sample)
+        law = law_on_rings(cloud.points, of_all, rows, viewpoint, cloud.sample)
         growth = RANGE_GROWTH if may_grow and law.holds else growth
-    elif position is None:
+    elif viewpoint is None:
         law = spacing_law(cloud.points, None, cloud.sample)
-    warp = _warp(cloud, position, law, image, camera, growth)
+    warp = _warp(cloud, viewpoint, law, image, camera, growth)
     size = _voxel_size(voxel_size, seed_size, partial(spacing, warp, even), extent)
     return size, law, _from_corner(warp, cloud, size)
 
 
 def _warp(
     cloud: CleanCloud,
-    position: NDArray[np.float64] | None,
+    viewpoint: NDArray[np.float64] | None,
     law: SpacingLaw | None,
     image: DepthImage | None,
     camera: bool,
     growth: float,
 ) -> Warp:
-    """How voxels grow, about the place from which the cloud was seen, which a law may tell, or else the origin."""
+    """How voxels grow about the viewpoint, which a law may tell, or else about the origin."""
     if not (camera or growth):
         return Warp()
-    if position is None:
-        position = law.viewpoint if law is not None and law.holds else np.zeros(3)
-    return choose_warp(cloud.points, position, camera, growth, None if image is None else image.axis)
+    if viewpoint is None:
+        viewpoint = law.viewpoint if law is not None and law.holds else np.zeros(3)
+    return choose_warp(cloud.points, viewpoint, camera, growth, None if image is None else image.axis)
 
 
 def _from_corner(warp: Warp, cloud: CleanCloud, size: float) -> Warp:
-    """Voxels counted from the cloud's corner, so that a cloud that is moved has the same, unless they grow about a
-    place."""
-    return warp if warp.of_one_scan else Shift(cloud.bounds[0] - _ASIDE * size)
-
-
-def _told_place(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
-    """The place that spacing tells, (3,), or its mirror image; none if less than of one scan is visible from it.
-
-    Spacing grows with range about the middle of a short way, too, along which a scanner moved while its scans were
-    put together. Rings about one place are not left then, and what it passed shows sides that the middle does not see.
-    """
-    if not law.tells_place:
-        return None
-    if law.axis is not None:
-        return law.viewpoint
-    place = law.viewpoint if law.mirrored is None else likelier_place(grid, law.viewpoint, law.mirrored)
-    if not law.holds:
-        return place if visible_fraction(grid, place) >= _OF_ONE_SCAN else None
-    found = (place,) if law.searched is None else (place, law.searched)  # an origin may lie on the ground
-    return place if any(shown_fraction(grid, one) >= _OF_ONE_SCAN for one in found) else None
-
-
-def _without_outliers(
-    cloud: CleanCloud, place: NDArray[np.float64] | None, size: float, warp: Warp
-) -> tuple[CleanCloud, VoxelGrid, NDArray[np.float64] | None]:
-    """Cloud, grid and viewpoints without what voxels of a size show to be outliers."""
-    grid = voxel_grid(cloud.points, size, warp)
-    return _without(outlier_voxels(grid), cloud, grid, place)
-
-
-def _without_near_outliers(
-    cloud: CleanCloud, place: NDArray[np.float64] | None, size: float, warp: Warp
-) -> tuple[CleanCloud, VoxelGrid, NDArray[np.float64] | None]:
-    """The same, but of voxels half as large first, which tell noise beside surfaces from them.
-
-    Larger ones keep it, and what is left of it would forbid that they become smaller.
-    """
-    cloud, _, place = _without_outliers(cloud, place, size / 2.0, _from_corner(warp, cloud, size / 2.0))
-    return _without_outliers(cloud, place, size, warp)
-
-
-def _without(
-    voxels: NDArray[np.bool_], cloud: CleanCloud, grid: VoxelGrid, place: NDArray[np.float64] | None
-) -> tuple[CleanCloud, VoxelGrid, NDArray[np.float64] | None]:
-    """Cloud, grid and viewpoints without some voxels."""
-    if not voxels.any():
-        return cloud, grid, place
-    points = voxels[grid.voxel_of_point]
-    place = place if place is None or place.ndim == 1 else place[~points]
-    return cloud.without(points), grid_without(grid, voxels), place
-
-
-class Outside(NamedTuple):
-    """From where the cloud was seen, and the planes of its v voxels, their normals on the outer side.
-
-    Attributes
-    ----------
-    viewpoint : (3,) or (n, 3) float64, metres
-        One for all n points or one for each.
-    places : (p, 3) float64, metres
-        The viewpoint, or some of them, or where none is known, some of the places from which the outside is seen.
-    known : bool
-        Whether the viewpoint was given, or told by the spacing.
-    planes : LocalPlanes
-    moved : bool
-        Whether spacing grows with range from a place that does not show all, as that of a moving scanner.
-    """
-
-    viewpoint: NDArray[np.float64]
-    places: NDArray[np.float64]
-    known: bool
-    planes: LocalPlanes
-    moved: bool = False
-
-
-def _outward_planes(
-    grid: VoxelGrid, method: SupervoxelMethod, law: SpacingLaw | None, given: NDArray[np.float64] | None
-) -> Outside:
-    """From where the cloud was seen, and the plane of each voxel, its normal on the outer side.
-
-    A viewpoint that was given counts before one that the spacing tells. Voxels of points that were seen from several
-    places take the mean of those. Of what lies alone or in a row, on no plane, the normal is the one nearest to that
-    viewpoint; where there are many or none, to the vertical: what was seen from nearby has neighbours, and the ground
-    far from a tripod, seen edge-on, has none.
-    """
-    upwards = np.array([0.0, 0.0, 1.0])
-    if given is None:
-        told = None if law is None else _told_place(law, grid)
-        if told is None:
-            planes, telling = side_by_side(
-                lambda: method.planes(grid, _far_along(grid, upwards)), lambda: telling_places(grid)
-            )
-        else:
-            planes, telling = method.planes(grid, told), None
-        axis = None if law is None or told is None else law.axis
-        sides = visible_sides(grid, planes.normals, told, telling, axis)
-        planes = replace(planes, normals=sides.normals)
-        moved = told is None and law is not None and law.holds
-        return Outside(sides.places[0], sides.places[:_LOOKED_FROM], told is not None, planes, moved)
-    if given.ndim == 1:
-        planes = method.planes(grid, given)
-        if law is not None and law.axis is not None:
-            planes = replace(planes, normals=sides_towards(grid, planes.normals, given, law.axis))
-        return Outside(given, given[None], True, planes)
-    low, high = bounding_box(given)
-    middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
-    place_of_voxel = middle + reach * voxel_means((given - middle) / reach, grid)
-    planes = method.planes(grid, _far_along(grid, upwards))
-    planes = replace(planes, normals=sides_towards_each(grid, planes.normals, place_of_voxel))
-    return Outside(given, _some_viewpoints(given, grid), True, planes)
-
-
-def _with_sides_of(usual: VoxelGrid, outside: Outside, grid: VoxelGrid, planes: LocalPlanes) -> LocalPlanes:
-    """Planes of voxels, with the outer side of larger ones wherever that is plainly the other one.
-
-    Places look between small voxels of which few are joined, into what is closed.
-    """
-    normals = voxel_means(outside.planes.normals[usual.voxel_of_point], grid)
-    is_other = np.einsum("ij,ij->i", normals, planes.normals) < -_PLAINLY
-    return replace(planes, normals=np.where(is_other[:, None], -planes.normals, planes.normals))
-
-
-def _some_viewpoints(given: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
-    """A few of the points' viewpoints, (n, 3), far from each other, whatever the points' order."""
-    voxels = np.unique(np.linspace(0, grid.n_voxels - 1, _ASKED_FOR_PLACES).astype(np.int64))
-    places = np.unique(np.concatenate([given[grid.order[grid.starts[v] : grid.starts[v + 1]]] for v in voxels]), axis=0)
-    return places[farthest_first(places, 0, _LOOKED_FROM)]
-
-
-def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places a thousand voxel edges off the voxels in some directions, (3,) or (v, 3): from there they are seen."""
-    places = directions * (1e3 * grid.edge_lengths)[:, None]
-    places += grid.centroids
-    return places
+    """The warp itself if it is about a viewpoint; else one whose grid starts at the cloud's lowest corner, so that a
+    moved cloud has the same voxels."""
+    return warp if warp.of_one_scan else Shift(cloud.bounds[0] - _GRID_OFFSET * size)
 
 
 def _voxel_size(
@@ -709,9 +657,159 @@ def _voxel_size(
     if voxel_size is None:
         size = VOXELS_PER_SPACING * spacing()
         if 0.0 < extent < math.inf and 0.0 < size < math.inf:
-            size = extent * 2.0 ** (round(_PER_OCTAVE * math.log2(size / extent)) / _PER_OCTAVE)
+            size = extent * 2.0 ** (round(_SIZES_PER_OCTAVE * math.log2(size / extent)) / _SIZES_PER_OCTAVE)
         return positive("voxel_size", min(size, seed))
     voxel = positive("voxel_size", voxel_size)
     if seed < voxel:
         raise ValueError(f"expected seed_size of at least voxel_size, got {seed:g} m < {voxel:g} m")
     return voxel
+
+
+def _without_flying_pixels(cloud: CleanCloud, image: DepthImage | None) -> CleanCloud:
+    """The cloud without points whose depth is a mix of two."""
+    if image is None:
+        return cloud
+    flying = image.flying()
+    return cloud.without(flying) if flying.any() else cloud
+
+
+def _without_outliers(cloud: CleanCloud, viewpoint: NDArray[np.float64] | None, size: float, warp: Warp) -> Voxelised:
+    """The cloud in voxels of a size, without what these show to be outliers."""
+    grid = voxel_grid(cloud.points, size, warp)
+    return _without(Voxelised(cloud, grid, viewpoint), outlier_voxels(grid))
+
+
+def _without_near_outliers(
+    cloud: CleanCloud, viewpoint: NDArray[np.float64] | None, size: float, warp: Warp
+) -> Voxelised:
+    """The same, but of voxels half as large first, which tell noise beside surfaces from them.
+
+    Larger ones keep it, and what is left of it would forbid that they become smaller.
+    """
+    closer = _without_outliers(cloud, viewpoint, size / 2.0, _from_corner(warp, cloud, size / 2.0))
+    return _without_outliers(closer.cloud, closer.viewpoint, size, warp)
+
+
+def _without(voxelised: Voxelised, voxels: NDArray[np.bool_]) -> Voxelised:
+    """Cloud, grid and viewpoints without some voxels, and the points in them."""
+    if not voxels.any():
+        return voxelised
+    cloud, grid, viewpoint = voxelised
+    points = voxels[grid.voxel_of_point]
+    viewpoint = viewpoint if viewpoint is None or viewpoint.ndim == 1 else viewpoint[~points]
+    return Voxelised(cloud.without(points), grid_without(grid, voxels), viewpoint)
+
+
+# --- planes, and on which side of them the outside is -----------------------------------------------------------------
+
+
+class OrientedPlanes(NamedTuple):
+    """Planes of v voxels, their normals towards the outside, and from where the cloud was seen.
+
+    Attributes
+    ----------
+    viewpoint : (3,) or (n, 3) float64, metres
+        Sensor position, given or estimated, of all n points or of each.
+    viewpoints : (p, 3) float64, metres
+        From which continuations are sought: the viewpoint, some of the points', or virtual ones that see the outside.
+    viewpoint_known : bool
+        Whether the viewpoint was given, or told by pixels or spacing.
+    planes : LocalPlanes
+    scanner_moved : bool
+        Whether spacing grows with range from a place that does not show all, as that of a moving scanner.
+    """
+
+    viewpoint: NDArray[np.float64]
+    viewpoints: NDArray[np.float64]
+    viewpoint_known: bool
+    planes: LocalPlanes
+    scanner_moved: bool = False
+
+
+def _scanner_position(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] | None:
+    """Scanner position estimated from the spacing, (3,) metres, or its mirror image; None if too little of the cloud is
+    visible from it.
+
+    Spacing grows with range about the middle of a short way, too, along which a scanner moved while its scans were
+    put together. Rings about one place are not left then, and what it passed shows sides that the middle does not see.
+    """
+    if not law.tells_place:
+        return None
+    if law.axis is not None:
+        return law.viewpoint
+    place = law.viewpoint if law.mirrored is None else likelier_place(grid, law.viewpoint, law.mirrored)
+    if not law.holds:
+        return place if visible_fraction(grid, place) >= _MIN_SHOWN else None
+    found = (place,) if law.searched is None else (place, law.searched)  # an origin may lie on the ground
+    return place if any(shown_fraction(grid, one) >= _MIN_SHOWN for one in found) else None
+
+
+def _oriented_planes(
+    grid: VoxelGrid, method: SupervoxelMethod, law: SpacingLaw | None, viewpoint: NDArray[np.float64] | None
+) -> OrientedPlanes:
+    """The plane of each voxel, its normal towards the outside, and from where the cloud was seen.
+
+    A viewpoint that is known counts before one that the spacing tells. Voxels of points that were seen from several
+    places take the mean of those. Of what lies alone or in a row, on no plane, the normal is the one nearest to that
+    viewpoint; where there are many or none, to the vertical: what was seen from nearby has neighbours, and the ground
+    far from a tripod, seen edge-on, has none.
+    """
+    upwards = np.array([0.0, 0.0, 1.0])
+    if viewpoint is None:
+        position = None if law is None else _scanner_position(law, grid)
+        if position is None:
+            planes, telling = side_by_side(
+                lambda: method.planes(grid, _far_along(grid, upwards)), lambda: telling_places(grid)
+            )
+        else:
+            planes, telling = method.planes(grid, position), None
+        axis = None if law is None or position is None else law.axis
+        sides = visible_sides(grid, planes.normals, position, telling, axis)
+        planes = replace(planes, normals=sides.normals)
+        scanner_moved = position is None and law is not None and law.holds
+        return OrientedPlanes(
+            sides.places[0], sides.places[:_MAX_VIEWPOINTS], position is not None, planes, scanner_moved
+        )
+    if viewpoint.ndim == 1:
+        planes = method.planes(grid, viewpoint)
+        if law is not None and law.axis is not None:
+            planes = replace(planes, normals=sides_towards(grid, planes.normals, viewpoint, law.axis))
+        return OrientedPlanes(viewpoint, viewpoint[None], True, planes)
+    low, high = bounding_box(viewpoint)
+    middle, reach = (low + high) / 2.0, max(float((high - low).max()), np.finfo(np.float64).tiny)
+    viewpoint_of_voxel = middle + reach * voxel_means((viewpoint - middle) / reach, grid)
+    planes = method.planes(grid, _far_along(grid, upwards))
+    planes = replace(planes, normals=sides_towards_each(grid, planes.normals, viewpoint_of_voxel))
+    return OrientedPlanes(viewpoint, _some_viewpoints(viewpoint, grid), True, planes)
+
+
+def _oriented_as_larger(
+    oriented: OrientedPlanes, grid: VoxelGrid, cloud: CleanCloud, found: _Voxels, method: SupervoxelMethod
+) -> OrientedPlanes:
+    """Planes of small voxels, flipped where the normals of larger voxels clearly point the other way.
+
+    Where few small voxels are joined, viewpoints see through the gaps into closed bodies.
+    """
+    size, planes = found.orienting_size, oriented.planes
+    larger = voxel_grid(cloud.points, size, _from_corner(found.warp, cloud, size))
+    of_larger = _oriented_planes(larger, method, found.law, None).planes.normals
+    normals = voxel_means(of_larger[larger.voxel_of_point], grid)
+    is_other = np.einsum("ij,ij->i", normals, planes.normals) < -_FLIP_COSINE
+    flipped = np.where(is_other[:, None], -planes.normals, planes.normals)
+    return oriented._replace(planes=replace(planes, normals=flipped))
+
+
+def _some_viewpoints(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
+    """A few of the points' viewpoints, (n, 3), far from each other, whatever the points' order."""
+    voxels = np.unique(np.linspace(0, grid.n_voxels - 1, _SAMPLED_VOXELS).astype(np.int64))
+    of_voxels = [viewpoint[grid.order[grid.starts[v] : grid.starts[v + 1]]] for v in voxels]
+    places = np.unique(np.concatenate(of_voxels), axis=0)
+    return places[farthest_first(places, 0, _MAX_VIEWPOINTS)]
+
+
+def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points a thousand voxel edges from each voxel along the directions, (3,) or (v, 3): far viewpoints that fix the
+    sign of its normal."""
+    places = directions * (1e3 * grid.edge_lengths)[:, None]
+    places += grid.centroids
+    return places
