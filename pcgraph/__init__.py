@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pcgraph import learning as learning
     from pcgraph import metrics as metrics
     from pcgraph.cloud import Cloud as Cloud
+    from pcgraph.columns import RobustScaling as RobustScaling
     from pcgraph.errors import CloudReadError as CloudReadError
     from pcgraph.errors import CloudWriteError as CloudWriteError
     from pcgraph.errors import PcgraphError as PcgraphError
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
     from pcgraph.features.primitives import Primitive as Primitive
     from pcgraph.features.primitives import Primitives as Primitives
     from pcgraph.graph.adjacency import AdjacencyGraph as AdjacencyGraph
+    from pcgraph.graph.adjacency import Bridges as Bridges
     from pcgraph.graph.adjacency import EdgeFeatures as EdgeFeatures
+    from pcgraph.graph.adjacency import Gaps as Gaps
     from pcgraph.graph.boundary import BoundaryCost as BoundaryCost
     from pcgraph.graph.boundary import BoundaryStrength as BoundaryStrength
     from pcgraph.graph.continuations import Continuations as Continuations
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from pcgraph.tree.energies import variance_energy as variance_energy
     from pcgraph.tree.felzenszwalb import FelzenszwalbLinkage as FelzenszwalbLinkage
     from pcgraph.tree.lccp import LccpLinkage as LccpLinkage
+    from pcgraph.tree.learned import EdgeModel as EdgeModel
     from pcgraph.tree.learned import LearnedLinkage as LearnedLinkage
     from pcgraph.tree.least_increase import MumfordShahLinkage as MumfordShahLinkage
     from pcgraph.tree.least_increase import WardLinkage as WardLinkage
@@ -50,7 +54,9 @@ if TYPE_CHECKING:
     from pcgraph.tree.region_linkage import RegionLinkage as RegionLinkage
     from pcgraph.tree.single_linkage import QuasiFlatLinkage as QuasiFlatLinkage
     from pcgraph.tree.tree import SegmentationTree as SegmentationTree
+    from pcgraph.voxels.grid import VoxelGrid as VoxelGrid
     from pcgraph.voxels.outliers import OUTLIER as OUTLIER
+    from pcgraph.voxels.surface import LocalPlanes as LocalPlanes
     from pcgraph.voxels.surface import Surface as Surface
 else:
     import lazy_loader
@@ -60,13 +66,15 @@ else:
         submodules={"detection", "learning", "metrics"},
         submod_attrs={
             "cloud": ["Cloud"],
+            "columns": ["RobustScaling"],
             "errors": ["CloudReadError", "CloudWriteError", "PcgraphError"],
             "features.moments": ["Moments"],
             "features.nodes": ["NodeFeatures"],
             "features.primitives": ["Primitive", "Primitives"],
-            "graph.adjacency": ["AdjacencyGraph", "EdgeFeatures"],
+            "graph.adjacency": ["AdjacencyGraph", "Bridges", "EdgeFeatures", "Gaps"],
             "graph.boundary": ["BoundaryCost", "BoundaryStrength"],
-            "graph.occlusion": ["Continuations", "Occlusions"],
+            "graph.continuations": ["Continuations"],
+            "graph.occlusion": ["Occlusions"],
             "io": ["read_cloud", "write_segmentation"],
             "plausibility": ["CloudWarning"],
             "scan": ["segment", "update"],
@@ -78,14 +86,15 @@ else:
             "tree.energies": ["plane_energy", "variance_energy"],
             "tree.felzenszwalb": ["FelzenszwalbLinkage"],
             "tree.lccp": ["LccpLinkage"],
-            "tree.learned": ["LearnedLinkage"],
+            "tree.learned": ["EdgeModel", "LearnedLinkage"],
             "tree.least_increase": ["MumfordShahLinkage", "WardLinkage"],
             "tree.linkage": ["Linkage", "Merges"],
             "tree.optimal_cut": ["Energy"],
             "tree.region_linkage": ["RegionLinkage"],
             "tree.single_linkage": ["QuasiFlatLinkage"],
             "tree.tree": ["SegmentationTree"],
+            "voxels.grid": ["VoxelGrid"],
             "voxels.outliers": ["OUTLIER"],
-            "voxels.surface": ["Surface"],
+            "voxels.surface": ["LocalPlanes", "Surface"],
         },
     )

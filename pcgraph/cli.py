@@ -54,7 +54,10 @@ def segment(
         typer.Option(help="Voxel edge in metres. Default: 3.5 x the median spacing of the points."),
     ] = None,
     seed_size: Annotated[
-        float | None, typer.Option(help="Distance of supervoxels in metres. Default: 3 to 6 x the voxel edge.")
+        float | None,
+        typer.Option(
+            help="Spacing of supervoxels in metres. Default: 5 x the voxel edge, down to 3 x where that leaves few."
+        ),
     ] = None,
     method: Annotated[
         str,
@@ -82,6 +85,13 @@ def segment(
         typer.Option(
             help="Power of the range with which voxels grow, from 0 to below 1. Default: 0.5 for what looks like one "
             "scan, else 0."
+        ),
+    ] = None,
+    camera: Annotated[
+        bool | None,
+        typer.Option(
+            "--camera/--no-camera",
+            help="Whether voxels grow in proportion to depth. Default: where a camera took the cloud.",
         ),
     ] = None,
     color: Annotated[bool, typer.Option("--color/--no-color", help="Let colour shape the supervoxels.")] = True,
@@ -114,6 +124,7 @@ def segment(
             features=features or None,
             voxel_size=voxel_size,
             seed_size=seed_size,
+            camera=camera,
             range_growth=range_growth,
             method=member("SupervoxelMethod", method),
             linkage=_linkage(linkage),
@@ -208,9 +219,9 @@ def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDAr
 
 
 def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: list[Path], seconds: float) -> None:
-    finite = int((result.supervoxels >= 0).sum())
+    segmented, outliers = int((result.supervoxels >= 0).sum()), int(result.outliers.sum())
     for name, value in (
-        ("points", f"{finite} of {result.labels.size} finite"),
+        ("points", f"{segmented} of {result.labels.size} segmented, {outliers} outliers"),
         ("voxel size", f"{result.voxel_size:.3g} m" + (" at the median depth" if result.camera else "")),
         ("seed size", f"{result.seed_size:.3g} m"),
         ("supervoxels", str(result.graph.n_nodes)),

@@ -124,7 +124,7 @@ class ImageView(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """Which pixels n points are, no two the same one.
+    """The pixel of each of n points in an image; no two points share one.
 
     Attributes
     ----------
@@ -193,11 +193,11 @@ class CleanCloud(ShortRepr):
 
     @cached_property
     def sample(self) -> NDArray[np.float64]:
-        """Some of the points, each place once, in an order as good as random, whatever the points' order."""
+        """About 16 000 of the points, without duplicates, in a pseudo-random order that does not depend on theirs."""
         return sample(self.points, self.bounds)
 
-    def spread(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
-        """Labels of the points in the shape of what came in, -1 where it was not finite."""
+    def in_input_shape(self, labels: NDArray[np.int32], of_outliers: int = -1) -> NDArray[np.int32]:
+        """Labels of the points in the input's shape: -1 where nothing was measured, `of_outliers` of outliers."""
         if len(labels) == math.prod(self.shape):
             return labels.astype(np.int32).reshape(self.shape)
         full = np.full(self.shape, -1, np.int32)

@@ -122,13 +122,15 @@ def segment(
         What else is known of each point, such as intensity, in any unit: each column counts in spreads from its
         median (`pcgraph.columns.RobustScaling`), to 4 at most. NaN, where unknown, counts as the median.
     voxel_size : float, metres, optional
-        Their r. Default: 3.5 times the median distance between nearest points, whatever the unit, rounded to one of 16
-        sizes per octave of the cloud's extent; of a camera's, as if all lay at the median depth; larger where surfaces
-        would fall apart, and smaller, down to a half, where points lie so evenly that surfaces stay whole, as the
-        vertices of a mesh do, or where voxels are few, so that things have too few of them.
+        Edge of a voxel (R_voxel of Papon et al. 2013, PCL's voxel_resolution). Default: 3.5 times the median distance
+        between nearest points, whatever the unit, rounded to one of 16 sizes per octave of the cloud's extent; of a
+        camera's, as if all lay at the median depth; larger where surfaces would fall apart, and smaller, down to a
+        half, where points lie so evenly that surfaces stay whole, as the vertices of a mesh do, or where voxels are
+        few, so that things have too few of them.
     seed_size : float, metres, optional
-        Their R_seed, spacing of supervoxels, at least `voxel_size`. Default: 5 times `voxel_size`, or less, 3 times at
-        least, where that would leave fewer than some 800 supervoxels, or 6000 on smooth surfaces.
+        Spacing of supervoxels (R_seed of Papon et al. 2013, PCL's seed_resolution), at least `voxel_size`. Default: 5
+        times `voxel_size`, or less, 3 times at least, where that would leave fewer than some 800 supervoxels, or 6000
+        on smooth surfaces.
     camera : bool, optional
         Whether voxels grow in proportion to depth from the viewpoint, being `voxel_size` at the median depth, as a
         camera's pixels do. Default: organised clouds that a camera took, unless voxels grow with range: those in front
@@ -304,7 +306,7 @@ def update(
     return result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """Points to be segmented, their voxels and local planes.
 
@@ -431,8 +433,8 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
-        labels=cloud.spread(objects[leaf_of_point], OUTLIER),
-        supervoxels=cloud.spread(leaf_of_point),
+        labels=cloud.in_input_shape(objects[leaf_of_point], OUTLIER),
+        supervoxels=cloud.in_input_shape(leaf_of_point),
         objects=objects,
         graph=graph,
         tree=tree,

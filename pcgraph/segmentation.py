@@ -32,11 +32,11 @@ class Segmentation:
     Attributes
     ----------
     labels : (n,) or (h, w) int32
-        Object of each point, the default cut of the tree; -1 where the point is not finite, -2 (`OUTLIER`) where it
-        is an outlier, which belongs to nothing.
+        Object of each point, the default cut of the tree; -1 where nothing was measured (not finite, or a
+        hole written as (0, 0, 0)), -2 (`OUTLIER`) where it is an outlier.
     supervoxels : (n,) or (h, w) int32
-        Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where the point is not
-        finite or an outlier.
+        Supervoxel of each point, that is leaf of the tree and node of the graph; -1 where nothing was measured,
+        and of outliers.
     objects : (k,) int32
         Object of each supervoxel, also of those that hold no point of the last scan.
     graph : AdjacencyGraph
@@ -44,13 +44,14 @@ class Segmentation:
     surface : Surface
         The voxels behind the points.
     seed_size : float, metres
-        What was used, given or derived.
+        Spacing of supervoxels that was used, given or derived.
     method : SupervoxelMethod
     linkage : Linkage
     object_altitude : float, the linkage's unit
-        What was used.
+        Altitude of the cut that gives `labels`.
     viewpoint : (3,) or (n, 3) float64, metres, the points' frame
-        What was used, given or derived; one per point that has a supervoxel if so given.
+        Sensor position, given or estimated: one for all points, or one row per point that has a supervoxel, if it was
+        given per point.
     feature_scaling : RobustScaling, or None
         Center and spread of each column of the features; None if none were given.
     """
@@ -99,10 +100,10 @@ class Segmentation:
 
     @property
     def groups(self) -> NDArray[np.int32]:
-        """Group of each point, in the input's shape, negative as in `labels`: what hangs together, such as a table with
-        all that stands on it.
+        """Group of each point, in the input's shape, negative as in `labels`: a connected component of objects, such as
+        a table with all that stands on it.
 
-        Each holds whole objects, and comes near no other: what contacts, gaps, continuations and objects join.
+        Objects are connected by the graph's contacts, gaps and continuations.
         """
         k = len(self.objects)
         first = np.unique(self.objects, return_index=True)[1][self.objects]
@@ -111,7 +112,7 @@ class Segmentation:
 
     @property
     def camera(self) -> bool:
-        """Whether voxels grew with depth."""
+        """Whether voxels grow in proportion to depth (the `camera` of `pcgraph.segment`)."""
         return isinstance(self.surface.grid.warp, CameraWarp)
 
     @property
@@ -132,7 +133,7 @@ class Segmentation:
 
         Returns
         -------
-        Points that are not finite, and outliers, have NaN, or -1 where the values are whole numbers, or False.
+        Points without a supervoxel have NaN, or -1 where the values are whole numbers, or False.
 
         Raises
         ------
@@ -150,14 +151,14 @@ class Segmentation:
         return np.concatenate((rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)))[self.supervoxels]
 
     def saliency(self) -> NDArray[np.float64]:
-        """Boundary strength of each point in the input's shape, the altitudes' unit; NaN where not finite.
+        """Boundary strength of each point in the input's shape, the altitudes' unit; NaN without a supervoxel.
 
         The largest altitude at which the supervoxel of the point's voxel merges with one that the voxel touches: 0
         inside supervoxels, and what is left above a level are the boundaries of the cut at that altitude.
         """
         from pcgraph.tree.saliency import point_saliency
 
-        return self._spread(point_saliency(self.tree, self.surface), np.nan)
+        return self._in_input_shape(point_saliency(self.tree, self.surface), np.nan)
 
     def occlusions(self) -> Occlusions:
         """Which supervoxels hide which from the viewpoint, and what may go on behind them.
@@ -174,7 +175,7 @@ class Segmentation:
 
         if self.viewpoint.ndim != 1:
             raise ValueError("expected one viewpoint, got one per point; call graph.occlusion.occlusions for each scan")
-        image = self._spread(self.surface.grid.voxel_of_point, -1) if self.supervoxels.ndim == 2 else None
+        image = self._in_input_shape(self.surface.grid.voxel_of_point, -1) if self.supervoxels.ndim == 2 else None
         return occlusions(self.surface, self.graph.node_features, self.viewpoint, image)
 
     def primitives(self, points: ArrayLike | None = None) -> Primitives:
@@ -182,7 +183,7 @@ class Segmentation:
 
         Parameters
         ----------
-        points : as given to `pcgraph.segment`, optional
+        points : (n, 3) or (h, w, 3) float, metres, the array given to `pcgraph.segment`, optional
             Default: the voxels' centroids, each as one point; a little less exact, but they hold all scans.
 
         Raises
@@ -210,8 +211,8 @@ class Segmentation:
         segments[self.outliers] = OUTLIER
         return segments
 
-    def _spread(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
-        """Values of the finite points in the input's shape."""
+    def _in_input_shape(self, values: NDArray[Any], missing: float) -> NDArray[Any]:
+        """Values of the points that have a supervoxel, in the input's shape."""
         full = np.full(self.supervoxels.shape, missing, values.dtype)
         full[self.supervoxels >= 0] = values
         return full

@@ -23,7 +23,7 @@ _MAX_FACETS = 64
 """The largest facets are tried; noise makes hundreds of small ones."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OrientedBox(ShortRepr):
     """A box in any pose.
 
@@ -183,7 +183,7 @@ def _volumes(hull: ConvexHull, normals: NDArray[np.float64]) -> NDArray[np.float
 # ----------------------------------------------------------------------------------- outlines and rectangles
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rectangle:
     """Rectangle in a plane.
 

@@ -32,7 +32,7 @@ MIN_CLEARANCE = 0.5
 may lift the support's own."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DetectedObject(ShortRepr):
     """One thing on a support.
 
@@ -82,7 +82,7 @@ def objects_on(
         Default: `find_planes(segmentation)`.
     support : int, optional
         Index of the plane they stand on. Default: the largest horizontal one.
-    points : the points that were segmented, optional
+    points : (n, 3) or (h, w, 3) float, metres, the array given to `pcgraph.segment`, optional
         Boxes are drawn around these; without them around the centroids of voxels, so up to half a voxel per side
         too small.
     margin : float, metres, optional
@@ -144,7 +144,7 @@ def objects_on(
 
 
 def object_labels(segmentation: Segmentation, objects: list[DetectedObject]) -> NDArray[np.int32]:
-    """Index of each point's object in the points' shape, int32; -1 where it belongs to none or is not finite."""
+    """Index of each point's object in the points' shape, int32; -1 where it belongs to none."""
     of_leaf = np.full(segmentation.tree.n_leaves, -1, np.int32)
     for i, thing in enumerate(objects):
         of_leaf[thing.supervoxels] = i
@@ -174,7 +174,7 @@ def _places(segmentation: Segmentation, points: ArrayLike | None) -> tuple[NDArr
 # -------------------------------------------------------------------------------------------------- above the support
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Support:
     """The plane on which objects stand.
 
@@ -215,7 +215,7 @@ def supervoxels_above(segmentation: Segmentation, support: _Support, margin: flo
     return inside & clear & ~support.member
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Piece:
     """Connected part of one segment above a support.
 

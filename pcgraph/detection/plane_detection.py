@@ -27,7 +27,7 @@ ROLE_ANGLE = np.radians(20.0)
 """Within this of level or upright: ramps and roofs are steeper, a camera held by hand knows `up` to some degrees."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Planes(ShortRepr):
     """p planes, the one of largest area first.
 

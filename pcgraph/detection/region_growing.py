@@ -35,7 +35,7 @@ RESIDUAL_STEPS = 16.0
 of the points, cannot change which comes first."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanarPatches:
     """Supervoxels as the search for planes sees them.
 

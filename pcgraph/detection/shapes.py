@@ -43,7 +43,7 @@ MAX_RADIUS = 100.0
 length."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shape(ShortRepr):
     """What fits points best.
 

@@ -28,7 +28,7 @@ class Primitive(IntEnum):
     CYLINDER = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Primitives(ShortRepr):
     """The best plane, sphere and cylinder of every one of k groups of points.
 
@@ -206,7 +206,7 @@ def _simplest(
 # --- moments of groups up to the fourth order ---
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PrimitiveMoments(ShortRepr):
     """Moments of k groups of points up to the fourth order, and second moments of their normals.
 

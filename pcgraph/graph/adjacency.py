@@ -85,10 +85,10 @@ class Gaps(ShortRepr):
     widths : (g,) float64, voxel edges
         Least distance between centroids of their voxels.
     weights : (g,) float64
-        What the gap counts as a contact, in voxels: e^(1 - width) for each that faces the other side.
+        Weight of the gap, comparable to `contact_voxels`: sum of e^(1 - width) over voxels that face the other side.
     of_one_scan : bool
-        Whether voxels grow with the distance from where all was seen: with the spacing of its points, so that a gap
-        says more than among scans of which one leaves gaps where another is dense.
+        Whether all was seen from one place and voxels grow with the distance from it. Voxels then follow the spacing of
+        points, so a gap is stronger evidence of a boundary than among several scans.
     """
 
     edges: NDArray[np.int32]
@@ -100,7 +100,9 @@ class Gaps(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Bridges(ShortRepr):
-    """Ways from specks, components of fewer points than a mean supervoxel, to those around; one row per pair.
+    """Edges that connect small components of the graph to the components around them; one row per edge.
+
+    A component is small (a speck) if it has fewer points than the mean supervoxel.
 
     Attributes
     ----------
@@ -139,9 +141,10 @@ class AdjacencyGraph(ShortRepr):
         Flat surfaces that go on behind what hides them, and pieces of one bounding plane or terrain. They are no edges
         either.
     bridges : Bridges, optional
-        Ways from specks to what is around them. They are no edges either.
+        Edges from specks to what is around them, for the tree alone.
     color_evidence : float, 0..1
-        How far colours change where surfaces do (`pcgraph.voxels.evidence.edge_evidence`): what they are worth.
+        How much more colours change at creases than on smooth surfaces (`pcgraph.voxels.evidence.edge_evidence`); 0
+        where colours say nothing about shape.
     sides_known : bool
         Whether normals point to where the cloud is known to have been seen from, or were given. Else the outside was
         found from what is visible, and which side of a bare sheet that is, is a guess.

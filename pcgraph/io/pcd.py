@@ -20,7 +20,7 @@ _MAX_HEADER_BYTES = 1 << 16
 _MAX_NUMBER = 10**15  # no file holds as many points, and arrays of nothing may still be that wide
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PcdHeader:
     """What a PCD header promises.
 

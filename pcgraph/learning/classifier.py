@@ -137,7 +137,8 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         return self.estimator_.predict_proba(table)
 
     def predict_proba(self, segmentation: Segmentation, up: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Probability of each class at each point, the points' leading shape + (c,); NaN where not finite.
+        """Probability of each class at each point, the points' leading shape + (c,); NaN without a
+        supervoxel.
 
         Parameters
         ----------
@@ -148,14 +149,14 @@ class NodeClassifier(ClassifierMixin, BaseEstimator):
         return unpool(segmentation, self.predict_nodes(segmentation, up))
 
     def predict(self, segmentation: Segmentation, up: ArrayLike | None = None) -> NDArray[Any]:
-        """Most probable label of each point, in the points' shape; `unlabelled` where it is not finite.
+        """Most probable label of each point, in the points' shape; `unlabelled` without a supervoxel.
 
         Parameters
         ----------
         segmentation, up : as for `predict_proba`
         """
         number = unpool(segmentation, self.predict_nodes(segmentation, up).argmax(axis=1))
-        none = np.asarray([self._none(self.classes_)])  # last, where the -1 of points that are not finite finds it
+        none = np.asarray([self._none(self.classes_)])  # last, where the -1 of points without a supervoxel finds it
         return np.concatenate((self.classes_, none))[number]
 
     def score(

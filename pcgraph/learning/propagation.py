@@ -78,7 +78,7 @@ def accumulate_points(segmentation: Segmentation, values: ArrayLike, reduce: Red
     ----------
     segmentation : Segmentation
     values : the points' leading shape, or that + (c,); bool, int or float
-        One row per point that was segmented. Points that are not finite are left out, and so is NaN.
+        One row per point that was segmented. Points without a supervoxel are left out, and so is NaN.
     reduce : "mean", "sum", "max" or "min"
         Every point counts the same.
 
@@ -124,7 +124,7 @@ def unpool(segmentation: Segmentation, values: ArrayLike, nodes: ArrayLike | Non
     Returns
     -------
     the points' leading shape + s
-        Points that are not finite have NaN, or -1 where the values are whole numbers, or False.
+        Points without a supervoxel have NaN, or -1 where the values are whole numbers, or False.
 
     Raises
     ------

@@ -233,7 +233,7 @@ def _fit_edges(graphs: list[AdjacencyGraph], tables: list[LeafTruth]) -> EdgeMod
     try:
         from sklearn.linear_model import LogisticRegression
     except ModuleNotFoundError as error:
-        raise ImportError("expected scikit-learn for LearnedLinkage.fit; install the extra `learn`") from error
+        raise ImportError("LearnedLinkage.fit needs scikit-learn; pip install 'rangesim[learn]'") from error
     evidence, answers = [], []
     for graph, table in zip(graphs, tables, strict=True):
         sides = table.majority(_PURE)[graph.edges]

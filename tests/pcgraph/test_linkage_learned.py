@@ -170,6 +170,6 @@ def test_wrong_lessons_are_refused(stack):
 def test_only_the_fit_needs_scikit_learn(monkeypatch, stack):
     result, truth = stack
     monkeypatch.setitem(sys.modules, "sklearn.linear_model", None)
-    with pytest.raises(ImportError, match="extra `learn`"):
+    with pytest.raises(ImportError, match=r"rangesim\[learn\]"):
         LearnedLinkage.fit([result], [truth])
     assert len(LearnedLinkage(MODEL).merges(result.graph, result.tree.moments).pairs) > 0
