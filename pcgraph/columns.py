@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pcgraph.short_repr import ShortRepr
 
 CLIP = 4.0
-"""Spreads from the median beyond which a value counts as one there."""
+"""Scaled values are clipped to plus and minus this many spreads from the median."""
 _STEPS = 4096.0  # of a spread: sums of whole steps do not depend on the points' order
 _RANGES = ((0.25, 0.75, 1.349), (0.05, 0.95, 3.290), (0.01, 0.99, 4.653), (0.0, 1.0, 2.0 * CLIP))
 

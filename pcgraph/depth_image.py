@@ -16,25 +16,34 @@ from pcgraph.voxels.outliers import MIN_POINTS
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING
 from pcgraph.voxels.warp import FORWARDS, Warp, along_axis
 
-_SOME_PIXELS, _IN_ORDER = 2048, 0.95  # pixels that are looked at, and how well their order on an image fits their rays
-_SOME_PAIRS, _FEW_PAIRS = 2048, 64  # neighbours of which it is asked whether they are so from the origin,
-_FAR_APART, _HARDLY_ANY = 2.5, 0.001  # or this many times as far apart as most; and how many of them may be
-_ON_PIXEL, _NEARLY_ALL = 1.0, 0.95  # pixels by which points may be off their own, and how many are not
-_SAME_PLACE = 0.02  # extents: a place that was given is the camera's
-_SOME_TRIPLES, _DIFFERING = 1 << 15, 0.1  # neighbours in a row at which steps of depth are read; and how many have one,
-_ROUNDING = 1e-6  # of the largest inverse depth, and more
-_FAR, _STEP, _MOST_TIMES = 0.8, 0.75, 4.0  # quantile of depth at which a step is so many voxel edges, at most, if
-# voxels need not be more than so many times as large as pixels would have them
-_ABOUT = 1.4  # steps are read where depth is between what is far over that, and times that
-_OF_PITCH = 0.4  # of what rows, or columns, are apart, spacing is at least
-_STEEP, _CLEARLY = 20.0, 6.0  # pixels across, and steps of depth: what flies lies more than that before and behind,
-_WIDEST, _FLATTER = 4, 0.3  # within so many pixels the slope, of inverse depth, is so many times what it is there,
-_FEWEST_FLYING, _MOST_FLYING = 1e-4, 0.2  # if it is so many of all
-_WHOLE = 0.9  # of the points of a list have one to their right, at least, if it was not thinned
+# Cameras
+_SOME_PIXELS = 2048  # pixels sampled to test for a camera, or to find it
+_MIN_RANK_CORRELATION = 0.95  # of columns and rows with x/z and y/z, in a camera's image
+_SOME_PAIRS, _MIN_PAIRS = 2048, 64  # neighbouring pixels that are compared, and needed
+_FAR_APART = 2.5  # median angles between neighbours as seen from the origin: more, and they are not neighbours there
+_MAX_FAR_APART = 0.001  # fraction of such pairs
+_MAX_RESIDUAL = 1.0  # reprojection error, pixels,
+_MIN_INLIERS = 0.95  # of this fraction of the points
+_SAME_VIEWPOINT = 0.02  # extents of the cloud between two viewpoints that are one
+# Steps of depth
+_SOME_TRIPLES, _MIN_DIFFERING = 1 << 15, 0.1  # second differences that are taken, and fraction that must not be 0
+_ROUNDING = 1e-6  # of the largest inverse depth: smaller second differences are 0
+_FAR_QUANTILE = 0.8  # of the depths
+_MAX_STEP = 0.75  # voxel edges that one step of depth may be there,
+_MAX_COARSENING = 4.0  # unless the spacing would grow by more than this factor
+_FAR_BAND = 1.4  # steps are read at depths between far / this and far * this
+_MIN_PER_PITCH = 0.4  # of what rows, or columns, are apart
+# Flying pixels
+_MIN_SLOPE = 20.0  # by how many pixels' pitches their depth differs from both neighbours',
+_MIN_STEPS = 6.0  # and by how many steps of depth
+_MAX_SLOPE_PIXELS = 4  # within so many pixels the slope on which they lie ends,
+_END_OF_SLOPE = 0.3  # that of inverse depth being less than this fraction of what it is there
+_MIN_FLYING, _MAX_FLYING = 1e-4, 0.2  # fraction of all points; else none is removed
+_MIN_WITH_NEIGHBOUR = 0.9  # fraction of a list's points that have one to their right, if it was not thinned
 
 
 def image_view(cloud: CleanCloud) -> ImageView | None:
-    """From where a cloud whose pixels are known was seen; None if it does not tell, or is a mere list of points.
+    """Viewpoint and optical axis of the sensor that took a cloud with known pixels; None if they cannot be told.
 
     That of the camera whose list of points told its pixels. Of organised points the origin, if neighbours lie side by
     side as seen from there, as in the frame of their sensor; else the centre of the pinhole camera that sees each point
@@ -46,25 +55,25 @@ def image_view(cloud: CleanCloud) -> ImageView | None:
         return cloud.image.view
     origin = ImageView(np.zeros(3), None)
     far_apart = _neighbours_far_apart(cloud, cloud.image)
-    told = max(far_apart, default=0.0) <= _HARDLY_ANY
-    if told and is_camera(cloud, origin.place):
+    told = max(far_apart, default=0.0) <= _MAX_FAR_APART
+    if told and is_camera_image(cloud, origin.place):
         return origin
     camera = _camera(cloud, cloud.image)
     if told:
         if camera is None or not _is_same_place(camera.place, origin.place, cloud):
             return origin
         return ImageView(origin.place, camera.axis)
-    return origin if camera is None and min(far_apart) <= _HARDLY_ANY else camera
+    return origin if camera is None and min(far_apart) <= _MAX_FAR_APART else camera
 
 
 def axis_at(place: NDArray[np.float64], cloud: CleanCloud) -> NDArray[np.float64] | None:
-    """The axis of the camera that took an organised cloud, if that stood at a place that was given, (3,); else None."""
+    """Optical axis, (3,), of the camera that took an organised cloud, if it stood at a given place, (3,); else None."""
     view = image_view(cloud)
     return None if view is None or not _is_same_place(view.place, place, cloud) else view.axis
 
 
 def _is_same_place(one: NDArray[np.float64], other: NDArray[np.float64], cloud: CleanCloud) -> bool:
-    return bool(np.abs(one - other).max() <= _SAME_PLACE * float(np.ptp(cloud.bounds, axis=0).max()))
+    return bool(np.abs(one - other).max() <= _SAME_VIEWPOINT * float(np.ptp(cloud.bounds, axis=0).max()))
 
 
 def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
@@ -81,7 +90,7 @@ def _neighbours_far_apart(cloud: CleanCloud, image: Pixels) -> list[float]:
     for step in (1, image.shape[1]):
         one, other = (unit_rows(cloud.points[at]) for at in _pairs_beside(image, some, step))
         angles = np.linalg.norm(one - other, axis=1)
-        if len(angles) >= _FEW_PAIRS:
+        if len(angles) >= _MIN_PAIRS:
             far_apart.append(float(np.mean(angles > _FAR_APART * np.median(angles))))
     return far_apart
 
@@ -110,7 +119,7 @@ def _camera(cloud: CleanCloud, image: Pixels) -> ImageView | None:
     seen_at, depth = camera.pixels(cloud.points[some])
     if not (depth > 0.0).all() and not (depth < 0.0).all():
         return None
-    if np.mean(np.linalg.norm(seen_at - pixels, axis=1) <= _ON_PIXEL) < _NEARLY_ALL:
+    if np.mean(np.linalg.norm(seen_at - pixels, axis=1) <= _MAX_RESIDUAL) < _MIN_INLIERS:
         return None
     place, forwards = camera.place(low, high), camera.matrix[2, :3] * np.sign(depth[0])
     if place is None or not (along_axis(cloud.points - place, forwards) > 0.0).all():
@@ -118,8 +127,8 @@ def _camera(cloud: CleanCloud, image: Pixels) -> ImageView | None:
     return ImageView(place, forwards)
 
 
-def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
-    """Whether a camera at the viewpoint may have taken this as one image: what lies to the right is in a column there.
+def is_camera_image(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
+    """Whether columns and rows of the image are in the order of x/z and y/z as seen from the viewpoint.
 
     Other organised clouds, as height maps and the rows of a turning scanner, may also lie in front of a place.
     """
@@ -133,7 +142,7 @@ def is_camera(cloud: CleanCloud, viewpoint: NDArray[np.float64]) -> bool:
         x, y = (rays[:, :2] / rays[:, 2:]).T
     row, column = np.divmod(cloud.image.at[some], cloud.image.shape[1])
     orders = ((x, column), (y, row)), ((x, row), (y, column))  # the second of an image on its side
-    return any(all(_rank_correlation(a, b) >= _IN_ORDER for a, b in order) for order in orders)
+    return any(all(_rank_correlation(a, b) >= _MIN_RANK_CORRELATION for a, b in order) for order in orders)
 
 
 class DepthImage(NamedTuple):
@@ -179,7 +188,7 @@ class DepthImage(NamedTuple):
         depths.reshape(-1)[image.at] = along
         some = depths[:: max(1, depths.size // _SOME_TRIPLES)]
         seen = np.isfinite(some).any()
-        middle, far = (float(np.nanmedian(some)), float(np.nanquantile(some, _FAR))) if seen else (0.0, 0.0)
+        middle, far = (float(np.nanmedian(some)), float(np.nanquantile(some, _FAR_QUANTILE))) if seen else (0.0, 0.0)
         with np.errstate(over="ignore"):  # of the tiniest depths
             steps = [_step_along(rows[:: max(1, rows.size // _SOME_TRIPLES)], far) for rows in (depths, depths.T)]
         pitch = np.array([_pitch(points, place, along, image, one) for one in (1, image.shape[1])])
@@ -202,7 +211,11 @@ class DepthImage(NamedTuple):
         depths = np.array([self.middle, self.far])
         of_middle, of_far = (depths / warp.scale(self.place + depths[:, None] * self.axis)).tolist()
         coarse, across = self.step * self.far * of_far, float(self.pitch.max()) * of_middle
-        return max(of_points, min(coarse / (_STEP * VOXELS_PER_SPACING), _MOST_TIMES * of_points), _OF_PITCH * across)
+        return max(
+            of_points,
+            min(coarse / (_MAX_STEP * VOXELS_PER_SPACING), _MAX_COARSENING * of_points),
+            _MIN_PER_PITCH * across,
+        )
 
     def flying(self) -> NDArray[np.bool_]:
         """Which of its n points fly, (n,) bool: they lie between a surface and what it hides, on neither.
@@ -213,13 +226,16 @@ class DepthImage(NamedTuple):
         than one in ten thousand, none does; nor in clouds of fewer than 1000 points, nor in lists that were thinned, in
         which what is missing is no hole.
         """
-        if self.pixels.view is not None and np.mean(np.diff(self.pixels.at[self.pixels.order]) == 1) < _WHOLE:
+        if (
+            self.pixels.view is not None
+            and np.mean(np.diff(self.pixels.at[self.pixels.order]) == 1) < _MIN_WITH_NEIGHBOUR
+        ):
             return np.zeros(len(self.pixels.at), np.bool_)
         flying = np.empty(self.depths.shape, np.bool_)
-        least = _STEEP * float(self.pitch[0])
-        in_blocks(_find_flying, len(flying), self.depths, least, _CLEARLY * self.step, flying, smallest=MIN_ROWS)
+        least = _MIN_SLOPE * float(self.pitch[0])
+        in_blocks(_find_flying, len(flying), self.depths, least, _MIN_STEPS * self.step, flying, smallest=MIN_ROWS)
         found = flying.reshape(-1)[self.pixels.at]
-        some_fly = len(found) >= MIN_POINTS and _FEWEST_FLYING <= np.mean(found) <= _MOST_FLYING
+        some_fly = len(found) >= MIN_POINTS and _MIN_FLYING <= np.mean(found) <= _MAX_FLYING
         return found if some_fly else np.zeros_like(found)
 
 
@@ -241,11 +257,11 @@ def _step_along(rows: NDArray[np.float64], far: float) -> float:
     """
     inverse, middle = 1.0 / rows, rows[:, 1:-1]
     differences = np.abs(inverse[:, :-2] - 2.0 * inverse[:, 1:-1] + inverse[:, 2:])
-    differences = differences[np.isfinite(differences) & (middle > far / _ABOUT) & (middle < far * _ABOUT)]
+    differences = differences[np.isfinite(differences) & (middle > far / _FAR_BAND) & (middle < far * _FAR_BAND)]
     if not len(differences):
         return 0.0
     differing = differences[differences > _ROUNDING * np.nanmax(inverse)]
-    return float(np.median(differing)) if len(differing) > _DIFFERING * len(differences) else 0.0
+    return float(np.median(differing)) if len(differing) > _MIN_DIFFERING * len(differences) else 0.0
 
 
 @kernel
@@ -283,14 +299,14 @@ def _is_mixed(line: NDArray[np.float64], at: int, limit: float) -> bool:
 def _ends(line: NDArray[np.float64], at: int, way: int) -> bool:
     """Whether a slope ends some pixels along a line, in a hole or on a surface: on a plane inverse depth goes on as it
     went, be it seen edge-on."""
-    for _ in range(_WIDEST):
+    for _ in range(_MAX_SLOPE_PIXELS):
         following = at + 2 * way
         if following < 0 or following >= len(line):
             return False
         here, there, beyond = line[at], line[at + way], line[following]
         if math.isnan(there) or math.isnan(beyond):
             return True
-        if abs(1.0 / beyond - 1.0 / there) < _FLATTER * abs(1.0 / there - 1.0 / here):
+        if abs(1.0 / beyond - 1.0 / there) < _END_OF_SLOPE * abs(1.0 / there - 1.0 / here):
             return True
         at += way
     return False

@@ -19,9 +19,9 @@ from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.sampling import sample
 
-_SMALLEST = 1e-250
-_SOME_ZEROS, _ONE_IN = 1000, 1000  # points of a list at (0, 0, 0), that many and one in so many, that may be measured
-_LARGEST = 1e100  # metres; far beyond it squares of distances overflow
+_MAX_ZEROS, _MAX_ZEROS_ONE_IN = 1000, 1000  # points of a list at (0, 0, 0), or one in so many; more are holes
+_MIN_LENGTH_M = 1e-250
+_MAX_LENGTH_M = 1e100  # metres; far beyond it squares of distances overflow
 _SAME_PLACE = 0.02  # of the median range: viewpoints no farther from each other are one
 _SOME_RANGES = 1 << 12
 
@@ -247,13 +247,7 @@ def clean_cloud(
     flat = array.reshape(-1, 3)
     if not len(flat):
         raise ValueError("expected at least one point, got an empty cloud")
-    is_point = np.isfinite(flat[:, 0]) & np.isfinite(flat[:, 1]) & np.isfinite(flat[:, 2])
-    zeros = np.flatnonzero(flat[:, 0] == 0)
-    zeros = zeros[(flat[zeros, 1] == 0) & (flat[zeros, 2] == 0)]
-    several = 1 if len(shape) == 2 else max(_SOME_ZEROS, len(flat) // _ONE_IN)
-    if len(zeros) > several and (len(shape) == 2 or len(zeros) < np.count_nonzero(is_point)):
-        is_point[zeros] = False  # what many sensors' drivers write where they saw nothing
-    kept = np.flatnonzero(is_point)
+    kept = np.flatnonzero(_is_measured(flat, organised=len(shape) == 2))
     if not len(kept):
         no_points = "NaN or infinite" + (", or (0, 0, 0) as holes are" if len(shape) == 2 else "")
         raise ValueError(f"expected at least one finite point, but all {len(flat)} points are {no_points}")
@@ -264,8 +258,8 @@ def clean_cloud(
     if len(shape) == 2:
         clean = replace(clean, image=Pixels(shape, kept))
     largest = float(np.abs(clean.bounds).max())
-    if largest > _LARGEST:
-        raise ValueError(f"expected coordinates below {_LARGEST:g} m, got {largest:g} m")
+    if largest > _MAX_LENGTH_M:
+        raise ValueError(f"expected coordinates below {_MAX_LENGTH_M:g} m, got {largest:g} m")
     if features is None:
         return clean
     numbers = _features(features, shape, kept)
@@ -276,6 +270,18 @@ def clean_cloud(
     return replace(clean, features=scaling.scaled(numbers), scaling=scaling)
 
 
+def _is_measured(points: NDArray[np.generic], organised: bool) -> NDArray[np.bool_]:
+    """Whether each of n points, (n, 3), was measured: it is finite, and not one of many at (0, 0, 0), which is what
+    drivers write for holes."""
+    is_point = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
+    zeros = np.flatnonzero(points[:, 0] == 0)
+    zeros = zeros[(points[zeros, 1] == 0) & (points[zeros, 2] == 0)]
+    several = 1 if organised else max(_MAX_ZEROS, len(points) // _MAX_ZEROS_ONE_IN)
+    if len(zeros) > several and (organised or len(zeros) < np.count_nonzero(is_point)):
+        is_point[zeros] = False
+    return is_point
+
+
 def clean_viewpoint(viewpoint: ArrayLike, cloud: CleanCloud) -> NDArray[np.float64]:
     """The viewpoint that was given, (3,) or (n, 3) float64, metres.
 
@@ -284,7 +290,7 @@ def clean_viewpoint(viewpoint: ArrayLike, cloud: CleanCloud) -> NDArray[np.float
     given = _numbers("viewpoint", viewpoint).astype(np.float64)
     per_point = given.ndim > 1 and given.shape == (*cloud.shape, 3)
     position = given.reshape(-1, 3).take(cloud.kept, axis=0) if per_point else given
-    if position.shape not in ((3,), cloud.points.shape) or not (np.abs(position) <= _LARGEST).all():
+    if position.shape not in ((3,), cloud.points.shape) or not (np.abs(position) <= _MAX_LENGTH_M).all():
         raise ValueError(
             f"expected a viewpoint of three finite coordinates in metres, or one per point, {(*cloud.shape, 3)}, "
             f"finite at finite points; got an array of shape {given.shape}{_excerpt(given)}"
@@ -314,8 +320,8 @@ def _excerpt(values: NDArray[np.float64]) -> str:
 def positive(name: str, value: float) -> float:
     """The value as float, if it is a number of metres from 1e-250 to 1e100; ValueError otherwise."""
     number = _number(value)
-    if not _SMALLEST <= number <= _LARGEST:
-        most = f"{_SMALLEST:g} to {_LARGEST:g} works"
+    if not _MIN_LENGTH_M <= number <= _MAX_LENGTH_M:
+        most = f"{_MIN_LENGTH_M:g} to {_MAX_LENGTH_M:g} works"
         raise ValueError(f"expected a finite {name} above 0 metres, got {value!r}; {most}")
     return number
 

@@ -8,23 +8,50 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from numba import config, njit
+from numba.core.caching import FunctionCache
 
-_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
-kernel = njit(**_OPTIONS)
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """Numba's cache of a compiled function; empty where it names classes that are no more, as after an update.
+
+    What was compiled is kept by function and line, and read before it is asked whether the file has changed since.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except (AttributeError, ImportError):
+            self.flush()
+            return None
+
+
+def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """A decorator of compiled functions that are kept on disk."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)(function)
+        if not config.DISABLE_JIT:
+            dispatcher._cache = _Cache(function)
+        return dispatcher
+
+    return decorate
+
+
+kernel = _compiled()
 """Decorator of a compiled function that Python calls; kernels may call it, too.
 
-What is divided by zero is infinite or NaN, as in NumPy: checks would keep loops from being done in lanes. Wrappers that
+What is divided by zero is infinite or NaN, as in NumPy: checks would keep loops from being vectorised. Wrappers that
 nobody calls are left out here and below: they would cost a third of the time that compiling takes.
 """
-routine = njit(**_OPTIONS, no_cpython_wrapper=True)
+routine = _compiled(no_cpython_wrapper=True)
 """Decorator of a compiled function that only kernels call."""
-summing_routine = njit(**_OPTIONS, no_cpython_wrapper=True, fastmath={"reassoc"})
-"""The same for one whose sums are taken in lanes, as wide as the processor's, and five times as fast.
+summing_routine = _compiled(no_cpython_wrapper=True, fastmath={"reassoc"})
+"""Decorator of a compiled function, called by kernels only, whose sums are vectorised (SIMD): five times as fast.
 
 Their last digits then depend on the kind of processor, as NumPy's own do, but not on the number of threads.
 """
-inlined = njit(**_OPTIONS, inline="always")
-"""The same for a small one of many arguments that is called often: handing them over would take as long as its work."""
+inlined = _compiled(inline="always")
+"""Decorator of a small function of many arguments, called often by kernels: it is inlined."""
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
@@ -35,14 +62,14 @@ MIN_ROWS = 16
 
 
 def in_blocks(loop: Callable[..., _A], n: int, *arguments: object, smallest: int = MIN_BLOCK) -> list[_A]:
-    """What `loop(start, stop, *arguments)` returns for blocks that cover 0..n, run at the same time, block by block.
+    """Results of `loop(start, stop, *arguments)` over contiguous blocks of 0..n, run in threads, in their order.
 
     Threads are started anew and joined: no pool outlives the call, so a process may fork at any time and
     several threads may call at once. As many run as ``NUMBA_NUM_THREADS`` says, by default one per core.
 
     Parameters
     ----------
-    loop : callable that spends its time without the interpreter's lock, such as one compiled with ``nogil=True``
+    loop : callable that spends its time with the GIL released, such as one compiled with ``nogil=True``
         Writes only what belongs to its own block, so that no result depends on the number of threads.
     n : int
     arguments
@@ -61,7 +88,7 @@ def in_blocks(loop: Callable[..., _A], n: int, *arguments: object, smallest: int
 
 
 def side_by_side(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:
-    """What two calls return that spend their time in compiled code and do not need each other."""
+    """Results of two independent calls, run in two threads; both should release the GIL."""
     if int(config.NUMBA_NUM_THREADS) < 2:
         return first(), second()
     with ThreadPoolExecutor(1) as other:

@@ -13,12 +13,13 @@ from scipy.spatial.distance import cdist
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.resection import NO_PLANE, PinholeCamera, resection
-from pcgraph.voxels.directions import farthest_first, plane_basis, sphere_directions
+from pcgraph.voxels.directions import plane_basis, sphere_directions
+from pcgraph.voxels.sampling import farthest_points
 
 _TINY = float(np.finfo(np.float64).tiny)
-OFF = 0.1
+MAX_OFF_PIXEL = 0.1
 """Pixels by which a ray may be off its own."""
-NARROWEST, MOST_PIXELS = 8, 1 << 20
+MIN_LINES, MAX_PIXELS = 8, 1 << 20
 """Rows, or columns, of an image, at least and at most."""
 
 # Patches
@@ -38,7 +39,12 @@ _MORE, _COUNTED, _ENOUGH = 1 << 13, 300, 100  # points of a sample, those that c
 _GROWTH, _FITS = 1.4, 4  # of the reach, each time, and how often a camera is fitted to the points within,
 _SETTLED = 0.02  # if so many of them count now and did not, or the other way round
 _SURE, _ON_PIXEL = 0.3, 0.1  # so many have to be off their pixels by less than that;
-_TIMES, _PRECISE, _OFF_PIXEL, _MOST = 8.0, 0.02, 0.25, 0.4  # so many times as far off is not counted, if it is not most
+_TIMES, _PRECISE, _OFF_PIXEL, _MIN_INLIERS = (
+    8.0,
+    0.02,
+    0.25,
+    0.4,
+)  # so many times as far off is not counted, if it is not most
 _ALONG = 1e-3  # what an affine camera sees from its direction weighs, where points lie on one plane
 _BETTER = 0.7  # a pinhole camera leaves that much of the squares that an affine one leaves, at most
 _SKEW, _REDUCED = 0.02, 32  # cosine between rows and columns, at most; and changes after which no shortest steps come
@@ -93,7 +99,7 @@ def _seeds(places: NDArray[np.float64], nearest: int) -> tuple[NDArray[np.float6
     others are, (k,)."""
     reach = np.partition(cdist(places[:_LOOKED_AT], places), nearest, axis=1)[:, nearest]
     dense = np.argsort(reach, kind="stable")[: len(reach) // 4]
-    chosen = dense[farthest_first(places[dense], 0, _PATCHES)]
+    chosen = dense[farthest_points(places[dense], 0, _PATCHES)]
     return places[chosen], reach[chosen]
 
 
@@ -265,7 +271,7 @@ def _grown(view: _View, points: NDArray[np.float64]) -> PinholeCamera | None:
             off = np.abs(at - pixels).max(axis=1)
             most = float(np.partition(off, int(_SURE * len(off)))[int(_SURE * len(off))])
             on = (off < min(max(_TIMES * most, _PRECISE), _OFF_PIXEL)) & (depths * depths[0] > 0.0)
-            if not most < _ON_PIXEL or np.mean(on) < _MOST:
+            if not most < _ON_PIXEL or np.mean(on) < _MIN_INLIERS:
                 return None
             if np.mean(on != counted) < _SETTLED:
                 break
@@ -334,7 +340,7 @@ def _alike(camera: PinholeCamera, points: NDArray[np.float64], n: int) -> list[P
     for best in np.argsort(areas, axis=None, kind="stable")[:_SLANTED]:
         slant = slants[np.array(np.unravel_index(best, areas.shape))]
         row, column = (pixels - steps[:, None] * slant).T
-        if len(found) < _TRIED and len(np.unique(row * (2 * MOST_PIXELS) + column)) == len(points):
+        if len(found) < _TRIED and len(np.unique(row * (2 * MAX_PIXELS) + column)) == len(points):
             matrix = camera.matrix.copy()
             matrix[:2, 3] -= slant * (np.sign(depths[0]) / step)
             found.append(PinholeCamera(matrix))
@@ -346,17 +352,17 @@ def step_between(ascending: NDArray[np.float64]) -> float:
     span = float(ascending[-1] - ascending[0]) if len(ascending) else 0.0
     steps = np.diff(ascending)
     steps = steps[steps > _LEAST * span]
-    if len(steps) < NARROWEST - 1:
+    if len(steps) < MIN_LINES - 1:
         return 0.0
     step = span / float(np.rint(steps / np.quantile(steps, _ADJACENT)).sum())
-    if not span <= MOST_PIXELS * step:
+    if not span <= MAX_PIXELS * step:
         return 0.0
     return step * int(np.gcd.reduce(np.rint((ascending - ascending[0]) / step).astype(np.int64)))  # it may be a half
 
 
 def are_whole(values: NDArray[np.float64]) -> bool:
     """Whether all of some values are whole numbers, to a tenth."""
-    return bool((np.abs(values - np.rint(values)) <= OFF).all())
+    return bool((np.abs(values - np.rint(values)) <= MAX_OFF_PIXEL).all())
 
 
 def _fitted(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pcgraph.inputs import CleanCloud, ImageView, Pixels
 from pcgraph.parallel import in_blocks, inlined, kernel
-from pcgraph.pixel_lattice import MOST_PIXELS, NARROWEST, OFF, are_whole, likely_cameras, step_between
+from pcgraph.pixel_lattice import MAX_OFF_PIXEL, MAX_PIXELS, MIN_LINES, are_whole, likely_cameras, step_between
 from pcgraph.resection import PinholeCamera, is_far_off
 from pcgraph.voxels.outliers import MIN_POINTS
 
@@ -87,7 +87,7 @@ def _find_pixels(
         depth = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z + camera[2, 3]
         for line in range(2):
             steps = (camera[line, 0] * x + camera[line, 1] * y + camera[line, 2] * z + camera[line, 3]) / depth
-            if not (abs(steps - np.rint(steps)) <= OFF and abs(steps) <= MOST_PIXELS):
+            if not (abs(steps - np.rint(steps)) <= MAX_OFF_PIXEL and abs(steps) <= MAX_PIXELS):
                 return -1
             at[line, i] = np.int64(np.rint(steps))
         ahead += depth > 0.0
@@ -144,7 +144,7 @@ def _count_steps(
     """Set how many steps from the least the coordinates of some points are; whether all are even."""
     for i in range(start, stop):
         steps = (_coordinate(points, i, axis, over) - low) / step
-        if not (abs(steps - np.rint(steps)) <= OFF and steps <= MOST_PIXELS):
+        if not (abs(steps - np.rint(steps)) <= MAX_OFF_PIXEL and steps <= MAX_PIXELS):
             return False
         at[i] = np.int64(np.rint(steps))
     return True
@@ -158,7 +158,7 @@ def _coordinate(points: NDArray[np.float64], i: int, axis: int, over: int) -> fl
 def _pixels(rows: Steps, columns: Steps, view: ImageView) -> Pixels | None:
     """The pixels of points in rows and columns; None if two points are in one, or few in any."""
     shape, n = (rows.number, columns.number), len(rows.at)
-    if min(shape) < NARROWEST or n < _FILLED * shape[0] * shape[1]:
+    if min(shape) < MIN_LINES or n < _FILLED * shape[0] * shape[1]:
         return None
     pixels = Pixels(shape, rows.at * columns.number + columns.at, view)
     return None if len(pixels.order) < n else pixels

@@ -14,12 +14,12 @@ from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.visibility import visible_fraction
 
 _STEPS_PER_SPACING = 4.0  # of floating-point numbers: fewer, and points lie on a lattice of rounding
-_LEAST_SPACING = 1e-7  # of the extent
+_MIN_SPACING = 1e-7  # of the extent
 _MIN_SUPERVOXELS = 500  # of fewer, many objects are no surprise
 _OBJECTS_PER_SUPERVOXEL = 0.1
 _MIN_VOXELS = 200
 _SOLID = 18.0  # voxels around one; on a surface some 6 to 13, on one as thick as voxels 17
-_LEAST_SEEN = 0.1  # of the voxels, from a viewpoint
+_MIN_SEEN = 0.1  # of the voxels, from a viewpoint
 
 
 class CloudWarning(UserWarning):
@@ -55,14 +55,14 @@ def warn_of_duplicates(cloud: CleanCloud, spacing: float) -> None:
     """Warn where points lie so close together, for the extent of all, that they are likely to be copies."""
     low, high = cloud.bounds
     extent = float((high - low).max())
-    if 0.0 < spacing < _LEAST_SPACING * extent:
+    if 0.0 < spacing < _MIN_SPACING * extent:
         _warn(
             f"expected points apart from each other, but most have another within {spacing:.2g} m in a cloud of "
             f"{extent:.3g} m, as copies of a scan do, or parts far off; leave copies out, or give voxel_size"
         )
 
 
-def warn_of_dust(n_objects: int, n_supervoxels: int, voxel_size: float) -> None:
+def warn_of_oversegmentation(n_objects: int, n_supervoxels: int, voxel_size: float) -> None:
     """Warn where the default cut leaves more objects than a tenth of the supervoxels."""
     if n_supervoxels >= _MIN_SUPERVOXELS and n_objects > _OBJECTS_PER_SUPERVOXEL * n_supervoxels:
         _warn(
@@ -85,7 +85,7 @@ def warn_of_viewpoint(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> None:
     if not (grid.centroids != viewpoint).any():
         return
     seen = visible_fraction(grid, viewpoint)
-    if seen < _LEAST_SEEN:
+    if seen < _MIN_SEEN:
         _warn(
             f"expected a viewpoint that sees the cloud, but from {np.round(viewpoint, 3).tolist()} m only "
             f"{100.0 * seen:.0f} % of it is visible; it may lie inside or under a surface, or be of another frame"

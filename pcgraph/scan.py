@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.depth_image import DepthImage, axis_at, image_view, is_camera
+from pcgraph.depth_image import DepthImage, axis_at, image_view, is_camera_image
 from pcgraph.features.moments import Moments, joined_moments, moments_of_groups
 from pcgraph.features.nodes import node_features
 from pcgraph.graph.adjacency import AdjacencyGraph
@@ -39,25 +39,31 @@ from pcgraph.inputs import (
 )
 from pcgraph.parallel import side_by_side
 from pcgraph.pixels import with_pixels
-from pcgraph.plausibility import warn_of_duplicates, warn_of_dust, warn_of_rounding, warn_of_viewpoint, warn_of_volume
+from pcgraph.plausibility import (
+    warn_of_duplicates,
+    warn_of_oversegmentation,
+    warn_of_rounding,
+    warn_of_viewpoint,
+    warn_of_volume,
+)
 from pcgraph.segmentation import Segmentation
 from pcgraph.supervoxels.method import SupervoxelMethod, checked_supervoxels
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
+from pcgraph.voxels.adapted_size import adapted_grading, adapted_voxel_size, seed_spacing
 from pcgraph.voxels.cells import bounding_box
-from pcgraph.voxels.directions import farthest_first
-from pcgraph.voxels.evidence import color_evidence
-from pcgraph.voxels.fitting import fitting_grading, fitting_size, seed_spacing
+from pcgraph.voxels.column_evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means, with_means
 from pcgraph.voxels.outliers import OUTLIER, detached_voxels, fill_the_volume, is_full_of_noise, is_near, outlier_voxels
+from pcgraph.voxels.sampling import farthest_points
 from pcgraph.voxels.spacing import VOXELS_PER_SPACING, median_spacing, spacing_and_rows
 from pcgraph.voxels.spacing_law import SpacingLaw, law_on_rings, spacing_law
 from pcgraph.voxels.surface import LocalPlanes, Surface
-from pcgraph.voxels.telling_places import telling_places
+from pcgraph.voxels.virtual_viewpoints import virtual_viewpoints
 from pcgraph.voxels.visibility import (
-    likelier_place,
+    likelier_viewpoint,
     shown_fraction,
     sides_towards,
     sides_towards_each,
@@ -200,7 +206,7 @@ def segment(
         seed_size=seed_spacing(grid) if seed_size is None else float(seed_size),
     )
     result = segment_scan(scan, None, settings)
-    warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
+    warn_of_oversegmentation(int(result.objects.max()) + 1, result.tree.n_leaves, grid.size)
     return result
 
 
@@ -302,7 +308,7 @@ def update(
         seed_size=earlier.seed_size,
     )
     result = segment_scan(scan, earlier, settings)
-    warn_of_dust(int(result.objects.max()) + 1, result.tree.n_leaves, union.grid.size)
+    warn_of_oversegmentation(int(result.objects.max()) + 1, result.tree.n_leaves, union.grid.size)
     return result
 
 
@@ -374,7 +380,7 @@ def _grows_with_depth(
     range_growth: float | None,
 ) -> bool:
     """Whether a camera at the viewpoint took the cloud and no `range_growth` above 0 was given."""
-    return viewpoint is not None and not range_growth and (axis is not None or is_camera(cloud, viewpoint))
+    return viewpoint is not None and not range_growth and (axis is not None or is_camera_image(cloud, viewpoint))
 
 
 def _depth_image(
@@ -411,7 +417,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
         return leaf_of_point, _leaves(cloud, surface, leaf_of_point, earlier)
 
     (leaf_of_point, leaves), (touching, evidence) = side_by_side(
-        with_points, lambda: (contacts(grid, normals, supervoxels), color_evidence(grid, normals))
+        with_points, lambda: (contacts(surface), color_evidence(grid, normals))
     )
     nodes = node_features(leaves)
     features = edge_features(nodes, touching)
@@ -419,7 +425,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     # no place saw all of several scans
     seen_from = grid.warp.seen_from if earlier is None and not scan.oriented.scanner_moved else None
     near, hidden = side_by_side(
-        lambda: gaps(grid, normals, supervoxels, nodes, touching.edges, seen_from),
+        lambda: gaps(surface, nodes, touching.edges, seen_from),
         lambda: continuations(surface, nodes, faces, scan.oriented.viewpoints),
     )
     of_planes, of_ground = side_by_side(
@@ -429,7 +435,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     graph = AdjacencyGraph(
         touching.edges, features, nodes, near, hidden, color_evidence=evidence, sides_known=scan.sides_known
     )
-    graph = replace(graph, bridges=bridges(grid, supervoxels, leaves.counts, graph.joined))
+    graph = replace(graph, bridges=bridges(surface, leaves.counts, graph.joined))
     tree = segmentation_tree(checked_merges(linkage.merges(graph, leaves), len(leaves), linkage), leaves)
     objects = tree.cut(altitude=settings.object_altitude)
     return Segmentation(
@@ -582,7 +588,7 @@ def _with_adapted_size(found: _Voxels, asked: _Asked) -> _Voxels:
     stay whole."""
     voxelised, warp = found.voxelised, found.warp
     largest = math.inf if asked.seed_size is None else float(asked.seed_size)
-    size, orienting_size = fitting_size(voxelised.cloud.points, voxelised.grid, found.law, largest)
+    size, orienting_size = adapted_voxel_size(voxelised.cloud.points, voxelised.grid, found.law, largest)
     if size != voxelised.grid.size:
         cloud, viewpoint = voxelised.cloud, voxelised.viewpoint
         warp, is_larger = _from_corner(warp, found.with_outliers[0], size), size > voxelised.grid.size
@@ -593,7 +599,7 @@ def _with_adapted_size(found: _Voxels, asked: _Asked) -> _Voxels:
         else:
             voxelised = Voxelised(cloud, voxel_grid(cloud.points, size, warp), viewpoint)
     may_grade = asked.seed_size is None and asked.range_growth is None and size == orienting_size
-    if may_grade and (grading := fitting_grading(voxelised.grid)) is not None:
+    if may_grade and (grading := adapted_grading(voxelised.grid)) is not None:
         voxelised = voxelised._replace(grid=voxel_grid(voxelised.cloud.points, size, warp, grading))
     return found._replace(voxelised=voxelised, warp=warp, orienting_size=orienting_size)
 
@@ -735,14 +741,14 @@ def _scanner_position(law: SpacingLaw, grid: VoxelGrid) -> NDArray[np.float64] |
     Spacing grows with range about the middle of a short way, too, along which a scanner moved while its scans were
     put together. Rings about one place are not left then, and what it passed shows sides that the middle does not see.
     """
-    if not law.tells_place:
+    if not law.locates_scanner:
         return None
     if law.axis is not None:
         return law.viewpoint
-    place = law.viewpoint if law.mirrored is None else likelier_place(grid, law.viewpoint, law.mirrored)
+    place = law.viewpoint if law.mirrored is None else likelier_viewpoint(grid, law.viewpoint, law.mirrored)
     if not law.holds:
         return place if visible_fraction(grid, place) >= _MIN_SHOWN else None
-    found = (place,) if law.searched is None else (place, law.searched)  # an origin may lie on the ground
+    found = (place,) if law.best_viewpoint is None else (place, law.best_viewpoint)  # an origin may lie on the ground
     return place if any(shown_fraction(grid, one) >= _MIN_SHOWN for one in found) else None
 
 
@@ -761,7 +767,7 @@ def _oriented_planes(
         position = None if law is None else _scanner_position(law, grid)
         if position is None:
             planes, telling = side_by_side(
-                lambda: method.planes(grid, _far_along(grid, upwards)), lambda: telling_places(grid)
+                lambda: method.planes(grid, _far_along(grid, upwards)), lambda: virtual_viewpoints(grid)
             )
         else:
             planes, telling = method.planes(grid, position), None
@@ -806,7 +812,7 @@ def _some_viewpoints(viewpoint: NDArray[np.float64], grid: VoxelGrid) -> NDArray
     voxels = np.unique(np.linspace(0, grid.n_voxels - 1, _SAMPLED_VOXELS).astype(np.int64))
     of_voxels = [viewpoint[grid.order[grid.starts[v] : grid.starts[v + 1]]] for v in voxels]
     places = np.unique(np.concatenate(of_voxels), axis=0)
-    return places[farthest_first(places, 0, _MAX_VIEWPOINTS)]
+    return places[farthest_points(places, 0, _MAX_VIEWPOINTS)]
 
 
 def _far_along(grid: VoxelGrid, directions: NDArray[np.float64]) -> NDArray[np.float64]:

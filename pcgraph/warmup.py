@@ -41,7 +41,7 @@ from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
-from pcgraph.voxels import telling_places
+from pcgraph.voxels import virtual_viewpoints
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.grading import Grading
 from pcgraph.voxels.grid import VoxelGrid, at_ends, voxel_grid, with_means
@@ -134,7 +134,7 @@ def compile_voxels() -> None:
     every = np.arange(len(seen))
     DepthImage.of(seen, Pixels((len(seen), 1), every), np.zeros(3), None).flying()
     _compile_pixels()
-    telling_places._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
+    virtual_viewpoints._agreements(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32))
 
 
 def compile_the_rest() -> None:
@@ -169,14 +169,14 @@ def _compile_graph_and_tree() -> None:
     )
     normals = np.tile([0.0, 0, -1], (n, 1))
     leaves = replace(moments_of_groups(places, places, labels, n), normals=normals)
-    nodes, touching = node_features(leaves), contacts.contacts(grid, normals, labels)
-    near = gaps(grid, normals, labels, nodes, touching.edges, np.zeros(3))
     surface = Surface(grid, normals, labels)
+    nodes, touching = node_features(leaves), contacts.contacts(surface)
+    near = gaps(surface, nodes, touching.edges, np.zeros(3))
     hidden = continuations(surface, nodes, labels, np.zeros((1, 3))).with_others(
         bounding_planes(surface, nodes, labels)
     )
     graph = AdjacencyGraph(touching.edges, contacts.edge_features(nodes, touching), nodes, near, hidden)
-    graph = replace(graph, bridges=bridges(grid, labels, leaves.counts, graph.joined))
+    graph = replace(graph, bridges=bridges(surface, leaves.counts, graph.joined))
     segmentation_tree(RegionLinkage().merges(graph, leaves), leaves).cut(altitude=0.5)
 
 

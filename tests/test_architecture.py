@@ -55,6 +55,7 @@ STOREYS = [
     "columns",
     "parallel",
     "disjoint_sets",
+    "pairs",
     "hierarchy",
     "voxels",
     "resection",

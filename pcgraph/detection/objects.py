@@ -288,7 +288,7 @@ def connected_pieces(segmentation: Segmentation, support: _Support, above: NDArr
 
 MIN_INSIDE = 0.5
 """Fraction of a piece within the box of a larger one above which it belongs to it: most of it."""
-MAX_GAP = 8.0
+MAX_CUP_GAP = 8.0
 """Voxel edges, across which the inside of a cup may belong to its outside: what its wall and a depth edge take. On mOSD
 from 8 to 32 nothing changes; at 4 three cups of 32 objects fall apart."""
 MAX_GAP_FRACTION = 0.5
@@ -337,7 +337,7 @@ def linked_pieces(pieces: list[Piece], edge: float) -> NDArray[np.int32]:
         cup[i] = False
         others = np.flatnonzero(cup)
         apart = np.maximum(np.maximum(low[others] - high[i], low[i] - high[others]), 0.0)
-        others = others[np.linalg.norm(apart, axis=1) <= 1.001 * MAX_GAP * edge]  # the others are too far off
+        others = others[np.linalg.norm(apart, axis=1) <= 1.001 * MAX_CUP_GAP * edge]  # the others are too far off
         gaps = [_gap(pieces[i], pieces[j], edge) for j in others]
         if gaps and np.isfinite(min(gaps)):
             links.append((int(i), int(others[int(np.argmin(gaps))])))
@@ -374,5 +374,5 @@ def _containing_pieces(pieces: list[Piece], edge: float) -> NDArray[np.int64]:
 def _gap(first: Piece, second: Piece, edge: float) -> float:
     """Distance of two pieces, metres; infinite where it is too wide for two parts of one object."""
     length = max(first.box.size[0], second.box.size[0])
-    limit = min(MAX_GAP * edge, MAX_GAP_FRACTION * length)
+    limit = min(MAX_CUP_GAP * edge, MAX_GAP_FRACTION * length)
     return float(second.neighbours.query(first.places, distance_upper_bound=limit)[0].min())

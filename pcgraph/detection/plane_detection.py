@@ -223,9 +223,7 @@ def planar_patches(segmentation: Segmentation, tolerance: float | None, angle: f
 
 def voxel_edges(segmentation: Segmentation) -> NDArray[np.float64]:
     """Mean edge of each supervoxel's voxels, (n_leaves,) float64, metres."""
-    surface, n = segmentation.surface, segmentation.tree.n_leaves
-    sums = np.bincount(surface.supervoxels, surface.grid.edge_lengths, n)
-    return sums / np.bincount(surface.supervoxels, minlength=n)
+    return segmentation.surface.mean_edge_lengths(segmentation.tree.n_leaves)
 
 
 FLAT_FRACTION = 0.25

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.columns import group_means
 from pcgraph.parallel import in_blocks, kernel, routine, side_by_side
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.eigen import AXES
+from pcgraph.voxels.eigen import SYMMETRIC_INDICES
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ def _centre(
         for axis in range(3):
             means[s, axis] = first[s, axis] + sums[s, axis] / counts[s]
         for column in range(6):
-            one, other = AXES[column]
+            one, other = SYMMETRIC_INDICES[column]
             about = sums[s, 3 + column] - sums[s, one] * sums[s, other] / counts[s]
             scatters[s, one, other] = scatters[s, other, one] = max(about, 0.0) if one == other else about
 

@@ -143,8 +143,8 @@ class AdjacencyGraph(ShortRepr):
     bridges : Bridges, optional
         Edges from specks to what is around them, for the tree alone.
     color_evidence : float, 0..1
-        How much more colours change at creases than on smooth surfaces (`pcgraph.voxels.evidence.edge_evidence`); 0
-        where colours say nothing about shape.
+        How much more colours change at creases than on smooth surfaces
+        (`pcgraph.voxels.column_evidence.crease_contrast`); 0 where colours say nothing about shape.
     sides_known : bool
         Whether normals point to where the cloud is known to have been seen from, or were given. Else the outside was
         found from what is visible, and which side of a bare sheet that is, is a guess.

@@ -13,25 +13,27 @@ from scipy.spatial import Delaunay, cKDTree
 
 from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures, node_features
-from pcgraph.graph.continuations import Continuations, continuations_of, distinct_pairs
+from pcgraph.graph.continuations import Continuations, continuations_of
+from pcgraph.pairs import distinct_pairs
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.directions import plane_basis
 from pcgraph.voxels.surface import Surface
 
-_LEAST_VOXELS = 40  # of a piece, some two supervoxels
-_FLAT = 0.7  # voxel edges, root mean square of its distances to its plane, at most
-_BEYOND = 2.5  # voxel edges off a plane lies what is behind it, or before it
-_BEHIND, _BEFORE = 0.005, 0.2  # of all voxels lie so, at most and at least
-_ENOUGH = 20_000  # supervoxels tell that
-_PARALLEL, _OFFSET = 0.98, 1.0  # cosine, and voxel edges, between two pieces of one plane, at least and at most
-_GAP = 0.75  # times the width of the larger one lies between them, at most
-_FACING = 2.0  # times as far apart as where they are nearest are borders that face each other, at most
-HIDDEN = 0.5  # of the ways between such borders lead past something before the plane, at least,
-_HEIGHT = 2.0  # that lies no more times as high as the way is long,
-_ALONG = 0.5  # and along the plane, by the cosine between normals, at least
-_AROUND = 8  # voxels of its own piece that a voxel amid it has around it
-_LEAST_FOR_TRIANGLES = 4  # voxels
-_NEAR = 8  # supervoxels before a gap that are looked at
+_MIN_VOXELS = 40  # of a piece, some two supervoxels
+_MAX_RESIDUAL = 0.7  # voxel edges, RMS distance of a piece to its plane
+_OFF_PLANE = 2.5  # voxel edges from which on something is behind or in front of a plane
+_MAX_BEHIND, _MIN_IN_FRONT = 0.005, 0.2  # fraction of all voxels, for a plane that bounds the scene
+_SAMPLED_SUPERVOXELS = 20_000  # on which that is judged
+_MIN_COSINE, _MAX_OFFSET = 0.98, 1.0  # between two pieces of one plane; the offset in voxel edges
+_MAX_GAP = 0.75  # widths of the larger piece
+_FACING = 2.0  # borders face each other where they are at most so many times as far apart as at the nearest
+MIN_HIDDEN = 0.5
+"""Fraction of the lines across a gap that must be hidden."""
+_MAX_HEIGHT = 2.0  # of what hides such a line, in lengths of the line
+_MIN_ALONG = 0.5  # cosine between the normals of plane and of what hides it, either way
+_INTERIOR_NEIGHBOURS = 8  # of the same piece, from which on a voxel is on no border
+_MIN_TRIANGULATED = 4  # places
+_NEAREST = 8  # supervoxels in front of a gap that are looked at
 
 
 def bounding_planes(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> Continuations:
@@ -63,11 +65,11 @@ def bounding_planes(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int
     planes = list(_on_one_plane(pieces))
     borders = borders_of(surface, pieces.of_supervoxel, planes)
     ways = [_hidden_ways(surface, scene, pieces, some[0], border) for some, border in zip(planes, borders, strict=True)]
-    hidings = np.concatenate((np.empty((0, 2), np.int64), *ways))
-    ends = surface.grid.warped[hidings]
-    edges = surface.grid.warped_edges[hidings].max(axis=1)
+    occluded_spans = np.concatenate((np.empty((0, 2), np.int64), *ways))
+    ends = surface.grid.warped[occluded_spans]
+    edges = surface.grid.warped_edges[occluded_spans].max(axis=1)
     far = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > surface.grid.warp.max_gap * edges
-    found = continuations_of(surface, nodes, hidings[far])
+    found = continuations_of(surface, nodes, occluded_spans[far])
     return replace(found, coplanar=np.ones(len(found.pairs), np.bool_))
 
 
@@ -104,13 +106,13 @@ class _Pieces(NamedTuple):
 def _scene(surface: Surface, nodes: NodeFeatures) -> _Scene:
     k = len(nodes.size)
     voxels = np.bincount(surface.supervoxels, minlength=k)
-    edges = np.bincount(surface.supervoxels, surface.grid.edge_lengths, k) / voxels
+    edges = surface.mean_edge_lengths(k)
     return _Scene(nodes.centroid, nodes.normal, voxels, edges, voxels * edges * edges)
 
 
 def _bounding_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32]) -> _Pieces:
     """Faces that are large and flat and bound the scene."""
-    large = np.bincount(faces, scene.voxels) >= _LEAST_VOXELS
+    large = np.bincount(faces, scene.voxels) >= _MIN_VOXELS
     on, n = np.flatnonzero(large[faces]), int(large.sum())
     face = (np.cumsum(large) - 1)[faces[on]]
     voxels = scene.voxels[on]
@@ -118,10 +120,10 @@ def _bounding_pieces(scene: _Scene, nodes: NodeFeatures, faces: NDArray[np.int32
     moments = grouped_moments(replace(parts, normals=nodes.normal[on]), face, n)
     planes = node_features(moments)
     edges = np.bincount(face, voxels * scene.edges[on], n) / planes.size
-    flat = np.flatnonzero(planes.residual <= _FLAT * edges)
+    flat = np.flatnonzero(planes.residual <= _MAX_RESIDUAL * edges)
     bounding = np.empty(len(flat), np.bool_)
-    scattered = np.random.default_rng(0).permutation(len(faces))[:_ENOUGH]  # soon seen if a plane bounds nothing
-    others = scene.places[scattered], _BEYOND * scene.edges[scattered], scene.voxels[scattered]
+    scattered = np.random.default_rng(0).permutation(len(faces))[:_SAMPLED_SUPERVOXELS]
+    others = scene.places[scattered], _OFF_PLANE * scene.edges[scattered], scene.voxels[scattered]
     in_blocks(_bound, len(flat), planes.centroid[flat], planes.normal[flat], *others, bounding)
     kept = flat[bounding]
     number, areas = np.full(n, -1), np.bincount(face, scene.areas[on], n).astype(np.float64)
@@ -152,9 +154,9 @@ def _bound(
                 height += (places[s, axis] - centroids[plane, axis]) * normals[plane, axis]
             behind += voxels[s] if height < -beyond[s] else 0
             before += voxels[s] if height > beyond[s] else 0
-            if behind > _BEHIND * total:
+            if behind > _MAX_BEHIND * total:
                 break
-        found[plane] = behind <= _BEHIND * total and before >= _BEFORE * total
+        found[plane] = behind <= _MAX_BEHIND * total and before >= _MIN_IN_FRONT * total
 
 
 def _on_one_plane(pieces: _Pieces) -> Iterator[NDArray[np.int64]]:
@@ -164,7 +166,7 @@ def _on_one_plane(pieces: _Pieces) -> Iterator[NDArray[np.int64]]:
         first = left[0]
         cosine = np.einsum("ij,j->i", planes.normal[left], planes.normal[first])
         off = np.maximum(_offset(planes, left, first), _offset(planes, first, left))
-        on_it = (cosine >= _PARALLEL) & (off <= _OFFSET * np.maximum(pieces.edges[left], pieces.edges[first]))
+        on_it = (cosine >= _MIN_COSINE) & (off <= _MAX_OFFSET * np.maximum(pieces.edges[left], pieces.edges[first]))
         on_it[0] = True
         if on_it.sum() > 1:
             yield left[on_it]
@@ -201,7 +203,7 @@ def borders_of(
     voxels = np.flatnonzero(on[piece] >= 0)
     row, neighbours = grid.around(voxels)
     around = np.bincount(row, piece[neighbours] == piece[voxels[row]], len(voxels))
-    voxels = voxels[around < _AROUND]
+    voxels = voxels[around < _INTERIOR_NEIGHBOURS]
     order = np.argsort(on[piece[voxels]], kind="stable")
     counts = np.bincount(on[piece[voxels]], minlength=len(groups))
     return np.split(voxels[order], np.cumsum(counts)[:-1])
@@ -230,15 +232,15 @@ class FacingWays(NamedTuple):
     widths: NDArray[np.float64]
 
 
-def facing_ways(places: NDArray[np.float64], feet: NDArray[np.float64], piece: NDArray[np.int64]) -> FacingWays:
-    """Ways between places on borders, (b, 3) metres, whose feet on a plane, (b, 2) in voxel edges, are triangulated,
+def facing_ways(places: NDArray[np.float64], project: NDArray[np.float64], piece: NDArray[np.int64]) -> FacingWays:
+    """Ways between places on borders, (b, 3) metres, whose project on a plane, (b, 2) in voxel edges, are triangulated,
     and which are on a piece each, (b,).
 
-    The feet are joggled, so that places on a lattice or a line are no error.
+    The project are joggled, so that places on a lattice or a line are no error.
     """
     triangles = np.empty((0, 3), np.int32)
-    if len(places) >= _LEAST_FOR_TRIANGLES:
-        triangles = Delaunay(feet, qhull_options="QJ").simplices
+    if len(places) >= _MIN_TRIANGULATED:
+        triangles = Delaunay(project, qhull_options="QJ").simplices
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
     lengths = np.linalg.norm(places[ends[:, 1]] - places[ends[:, 0]], axis=1)
@@ -260,12 +262,12 @@ def _hidden_ways(
     places = surface.grid.centroids[border]
     normal = pieces.planes.normal[first]
     plane = Plane(pieces.planes.centroid[first], normal, plane_basis(normal))
-    ways = facing_ways(places, plane.feet(places) / pieces.edges[first], piece)  # no unit is too small
-    middles, larger = plane.feet(places[ways.ends].mean(axis=1)), pieces.areas[ways.pairs].max(axis=1)[ways.pair]
+    ways = facing_ways(places, plane.project(places) / pieces.edges[first], piece)  # no unit is too small
+    middles, larger = plane.project(places[ways.ends].mean(axis=1)), pieces.areas[ways.pairs].max(axis=1)[ways.pair]
     heights, n_pairs = plane.heights(scene.places), len(ways.pairs)
     hidden = np.bincount(ways.pair, _is_hidden(scene, plane, heights, middles, ways.lengths, larger), n_pairs)
     opened = np.bincount(ways.pair, _is_open(scene, plane, heights, middles, ways.lengths), n_pairs)
-    may_join = (hidden >= HIDDEN * np.bincount(ways.pair, minlength=n_pairs)) & (opened == 0)
+    may_join = (hidden >= MIN_HIDDEN * np.bincount(ways.pair, minlength=n_pairs)) & (opened == 0)
     return border[ways.ends[joining(ways, may_join, pieces.areas)[ways.pair]]]
 
 
@@ -280,7 +282,7 @@ class Plane(NamedTuple):
         """Signed distances of places, (n, 3), to the plane, (n,)."""
         return np.einsum("ij,j->i", places - self.origin, self.normal)
 
-    def feet(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    def project(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where on the plane the places lie, (n, 2)."""
         return np.einsum("ij,kj->ik", places - self.origin, self.axes)
 
@@ -298,20 +300,20 @@ def _is_hidden(
     That is: what faces as they do, and takes more of a plane parallel to theirs than the larger one of them theirs.
     """
     cosines = np.einsum("ij,j->i", scene.normals, plane.normal)
-    before = np.flatnonzero((heights > scene.edges) & (np.abs(cosines) >= _ALONG))
+    before = np.flatnonzero((heights > scene.edges) & (np.abs(cosines) >= _MIN_ALONG))
     if not len(before):
         return np.zeros(len(middles), np.bool_)
-    parallel = np.flatnonzero(cosines >= _PARALLEL)
+    parallel = np.flatnonzero(cosines >= _MIN_COSINE)
     parallel = parallel[np.argsort(heights[parallel], kind="stable")]
     areas = np.concatenate((np.zeros(1), np.cumsum(scene.areas[parallel])))
     bands = heights[before] + np.array([[-1.0], [1.0]]) * scene.edges[before]
     low, high = areas[np.searchsorted(heights[parallel], bands)]
-    sets_in = np.where(cosines[before] >= _PARALLEL, high - low, 0.0)
-    some = np.arange(1, min(_NEAR, len(before)) + 1)
-    distance, number = cKDTree(plane.feet(scene.places[before])).query(middles, k=some)
+    sets_in = np.where(cosines[before] >= _MIN_COSINE, high - low, 0.0)
+    some = np.arange(1, min(_NEAREST, len(before)) + 1)
+    distance, number = cKDTree(plane.project(scene.places[before])).query(middles, k=some)
     nearest, ways = before[number], lengths[:, None]
-    over = distance <= np.maximum(0.5 * ways, _BEYOND * scene.edges[nearest])
-    hides = over & (heights[nearest] > _BEYOND * scene.edges[nearest]) & (heights[nearest] <= _HEIGHT * ways)
+    over = distance <= np.maximum(0.5 * ways, _OFF_PLANE * scene.edges[nearest])
+    hides = over & (heights[nearest] > _OFF_PLANE * scene.edges[nearest]) & (heights[nearest] <= _MAX_HEIGHT * ways)
     return hides.any(axis=1) & ~(over & (sets_in[number] > larger[:, None])).any(axis=1)
 
 
@@ -323,10 +325,10 @@ def _is_open(
     lengths: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Whether something shows behind the plane at the middle of each way, (c,)."""
-    behind = scene.places[heights < -_BEYOND * scene.edges]
+    behind = scene.places[heights < -_OFF_PLANE * scene.edges]
     if not len(behind):
         return np.zeros(len(middles), np.bool_)
-    return cKDTree(plane.feet(behind)).query(middles)[0] <= 0.5 * lengths
+    return cKDTree(plane.project(behind)).query(middles)[0] <= 0.5 * lengths
 
 
 def joining(ways: FacingWays, may_join: NDArray[np.bool_], areas: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -340,7 +342,7 @@ def joining(ways: FacingWays, may_join: NDArray[np.bool_], areas: NDArray[np.flo
         joined, order = False, order[whole[pairs[order, 0]] != whole[pairs[order, 1]]]
         for pair in order.tolist():
             a, b = whole[pairs[pair]]
-            if a != b and widths[pair] <= _GAP * np.sqrt(max(areas[a], areas[b])):
+            if a != b and widths[pair] <= _MAX_GAP * np.sqrt(max(areas[a], areas[b])):
                 joins[pair] = joined = True
                 areas[a] += areas[b]
                 whole[whole == b] = a

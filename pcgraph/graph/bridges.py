@@ -10,26 +10,22 @@ from scipy.spatial import cKDTree
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.graph.adjacency import Bridges
 from pcgraph.parallel import kernel, routine
-from pcgraph.voxels.grid import VoxelGrid
+from pcgraph.voxels.surface import Surface
 
 _NEAR = 8  # supervoxels around one
-_WIDEST = 1e6  # voxel edges
-_FEW, _AS_NEAR, _WIDEST_BETWEEN = 4, 2.0, 30.0  # points, times the nearest of all, voxel edges: of one thin surface
+_MAX_WIDTH = 1e6  # voxel edges
+_FEW, _AS_NEAR, _MAX_WIDTH_BETWEEN = 4, 2.0, 30.0  # points, times the nearest of all, voxel edges: of one thin surface
 
 
-def bridges(
-    grid: VoxelGrid, supervoxels: NDArray[np.int32], counts: NDArray[np.int64], joined: NDArray[np.int32]
-) -> Bridges:
-    """Ways from specks, components of fewer points than a mean supervoxel, to those around them.
+def bridges(surface: Surface, counts: NDArray[np.int64], joined: NDArray[np.int32]) -> Bridges:
+    """Edges from specks, components of fewer points than a mean supervoxel, to those around them.
 
     Around a speck are those that hold one of the eight supervoxels nearest to one of its own; the way is that
     between the two supervoxels of both nearest to each other.
 
     Parameters
     ----------
-    grid : VoxelGrid of v voxels
-    supervoxels : (v,) int32
-        Supervoxel of each voxel.
+    surface : Surface
     counts : (k,) int64
         Points of each supervoxel.
     joined : (m, 2) int32
@@ -40,7 +36,7 @@ def bridges(
     Distances are those of the warped space, in voxel edges: between means of supervoxels to find a pair, between two
     of their voxels, each the other's nearest, for its width.
     """
-    k = len(counts)
+    grid, supervoxels, k = surface.grid, surface.supervoxels, len(counts)
     component = connected_components(joined, k)
     sizes = np.bincount(component, counts)
     specks = np.flatnonzero((sizes < counts.mean())[component])
@@ -61,8 +57,8 @@ def bridges(
     starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(np.where(involved, n_voxels, 0))))
     larger = np.ones(k)
     np.maximum.at(larger, supervoxels[voxels], (grid.warped_edges / grid.size)[voxels])
-    widths = np.minimum(_widths(edges, starts, places[voxels]) / larger[edges].max(axis=1), _WIDEST)
-    edge_lengths = np.bincount(supervoxels, grid.edge_lengths, k) / n_voxels
+    widths = np.minimum(_widths(edges, starts, places[voxels]) / larger[edges].max(axis=1), _MAX_WIDTH)
+    edge_lengths = surface.mean_edge_lengths(k)
     of_few = (sizes <= _FEW)[component[edges]].all(axis=1)
     return Bridges(edges, widths, edge_lengths[edges].mean(axis=1), of_few & _are_near(component[edges], widths))
 
@@ -71,7 +67,7 @@ def _are_near(pairs: NDArray[np.int32], widths: NDArray[np.float64]) -> NDArray[
     """Whether the components of each pair, (b, 2), lie about as near to each other as one of them to any other."""
     nearest = np.full(int(pairs.max(initial=-1)) + 1, np.inf)
     np.minimum.at(nearest, pairs, widths[:, None])
-    return np.asarray(widths <= np.minimum(_AS_NEAR * nearest[pairs].max(axis=1), _WIDEST_BETWEEN))
+    return np.asarray(widths <= np.minimum(_AS_NEAR * nearest[pairs].max(axis=1), _MAX_WIDTH_BETWEEN))
 
 
 def _closest_pairs(

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
 from pcgraph.parallel import kernel, routine
-from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, most_around
+from pcgraph.voxels.grid import Neighbourhood, most_around
+from pcgraph.voxels.surface import Surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,29 +42,20 @@ class Contacts:
     lengths: NDArray[np.float64]
 
 
-def contacts(grid: VoxelGrid, normals: NDArray[np.float64], supervoxels: NDArray[np.int32]) -> Contacts:
-    """Contacts between supervoxels: one per pair with voxels in each other's 26-neighbourhood.
-
-    Parameters
-    ----------
-    grid : VoxelGrid
-    normals : (v, 3) float64
-        Unit normals of the voxels.
-    supervoxels : (v,) int32
-        Supervoxel of each voxel.
-    """
-    voxel, other, pair, keys = _boundary_voxels(grid.neighbourhood, supervoxels)
+def contacts(surface: Surface) -> Contacts:
+    """Contacts between supervoxels: one per pair with voxels in each other's 26-neighbourhood."""
+    supervoxels = surface.supervoxels
+    voxel, other, pair, keys = _boundary_voxels(surface.grid.neighbourhood, supervoxels)
     order = np.argsort(keys)
     edge_of_pair = np.empty(len(keys), np.int64)
     edge_of_pair[order] = np.arange(len(keys))
     edges = np.stack((keys[order] >> 32, keys[order] & 0xFFFFFFFF), axis=1).astype(np.int32)
     edge = edge_of_pair[pair]
-    return facing_sides(grid, normals, edges, voxel, 2 * edge + (supervoxels[voxel] > other))
+    return facing_sides(surface, edges, voxel, 2 * edge + (supervoxels[voxel] > other))
 
 
 def facing_sides(
-    grid: VoxelGrid,
-    normals: NDArray[np.float64],
+    surface: Surface,
     edges: NDArray[np.int32],
     voxel: NDArray[np.integer],
     side: NDArray[np.int64],
@@ -72,20 +64,18 @@ def facing_sides(
 
     Parameters
     ----------
-    grid : VoxelGrid of v voxels
-    normals : (v, 3) float64
-        Unit normals of the voxels.
+    surface : Surface
     edges : (m, 2) int32
     voxel : (b,) int
         A voxel that faces the other side, once per side of a contact.
     side : (b,) int64
         2 e of edge e where it lies on the side of the smaller supervoxel, else 2 e + 1.
     """
-    n_sides = 2 * len(edges)
+    grid, n_sides = surface.grid, 2 * len(edges)
     voxels, lengths = np.zeros(n_sides, np.int64), np.zeros(len(edges))
     places, directions = np.zeros((n_sides, 3)), np.zeros((n_sides, 3))
     sides = _Sides(voxels, places, directions, lengths)
-    _sum_up_sides(voxel.astype(np.int32, copy=False), side, grid.centroids, normals, grid.edge_lengths, sides)
+    _sum_up_sides(voxel.astype(np.int32, copy=False), side, grid.centroids, surface.normals, grid.edge_lengths, sides)
     x, y, z = directions.T
     norms = np.sqrt(x * x + y * y + z * z)
     return Contacts(
@@ -149,7 +139,7 @@ def _boundary_voxels(around: Neighbourhood, supervoxels: NDArray[np.int32]):  # 
     for i in range(len(supervoxels)):
         own = last = supervoxels[i]
         n_seen = 0
-        for a in range(indptr[i], indptr[i + 1]):  # without a branch, which would often be guessed wrongly
+        for a in range(indptr[i], indptr[i + 1]):  # branch-free: it would often be mispredicted
             seen[n_seen] = supervoxels[neighbours[a]]
             n_seen += (seen[n_seen] != own) & (seen[n_seen] != last)
             last = supervoxels[neighbours[a]]

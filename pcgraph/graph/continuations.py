@@ -13,26 +13,27 @@ from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.moments import Moments, grouped_moments
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import EdgeFeatures
-from pcgraph.graph.bearing_image import (
+from pcgraph.graph.contacts import angle_between
+from pcgraph.graph.spherical_image import (
     View,
     apart,
-    bearing_image,
     depth_jumps,
-    lines_of,
-    squares_along,
-    squares_of,
+    line_buffers,
+    spherical_image,
+    surfels_along,
+    surfels_of,
     view_from,
 )
-from pcgraph.graph.contacts import angle_between
+from pcgraph.pairs import distinct_pairs, not_among, pair_keys
 from pcgraph.parallel import kernel
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
 
-REACH, LEAST_GAP = 8.0, 3.0
+REACH, MIN_GAP = 8.0, 3.0
 """How wide a gap without data is looked across, and what difference of range parts surfaces, in voxels."""
 _SMOOTH_RAD = 0.2  # surfaces at most this far apart in angle
 _SMOOTH_VOXELS = 2.0  # and in height may be one
-_LEAST_CROSSINGS = 2
+_MIN_CROSSINGS = 2
 _SUPPORT = 2.0  # times as wide as what is hidden is the larger of the faces, at least
 _LEVEL = 3.0  # times what two faces are uneven by they may lie off each other's planes,
 _EVEN = 0.05  # voxel edges at least
@@ -80,12 +81,12 @@ class Continuations(ShortRepr):
         columns = self.__dataclass_fields__
         others = others.without(self.pairs)
         both = Continuations(*(np.concatenate((getattr(self, name), getattr(others, name))) for name in columns))
-        order = np.argsort(_keys(*both.pairs.T), kind="stable")
+        order = np.argsort(pair_keys(*both.pairs.T), kind="stable")
         return Continuations(*(getattr(both, name)[order] for name in columns))
 
     def without(self, pairs: NDArray[np.int32]) -> Continuations:
         """Those that are not among these pairs, (m, 2) int32, the smaller first, in ascending order."""
-        return self.chosen(are_apart(self.pairs, pairs))
+        return self.chosen(not_among(self.pairs, pairs))
 
 
 def faces_of(edges: NDArray[np.int32], features: EdgeFeatures, k: int) -> NDArray[np.int32]:
@@ -118,13 +119,13 @@ def continuations(
 
     Completion behind what hides a surface: Kellman and Shipley 1991; borders: Nakayama et al. 1989.
     """
-    squares = squares_of(surface, some=True)
+    squares = surfels_of(surface, some=True)
     views = [view_from(place, squares) for place in places]
-    images = [bearing_image(view) for view in views]
-    jumps = [depth_jumps(view, image, REACH, LEAST_GAP) for view, image in zip(views, images, strict=True)]
-    hidings = squares.voxels[np.concatenate([of_view.hidings for of_view in jumps])]
-    found = continuations_of(surface, nodes, hidings)
-    found = found.chosen(found.coplanar & (found.crossings >= _LEAST_CROSSINGS))
+    images = [spherical_image(view) for view in views]
+    jumps = [depth_jumps(view, image, REACH, MIN_GAP) for view, image in zip(views, images, strict=True)]
+    occluded_spans = squares.voxels[np.concatenate([of_view.occluded_spans for of_view in jumps])]
+    found = continuations_of(surface, nodes, occluded_spans)
+    found = found.chosen(found.coplanar & (found.crossings >= _MIN_CROSSINGS))
     sides = np.sort(faces[found.pairs], axis=1)
     between, pair = distinct_pairs(sides[:, 0], sides[:, 1])
     hidden, opened = np.bincount(pair, found.crossings, len(between)), np.zeros(len(between), np.int64)
@@ -148,7 +149,7 @@ def _are_level(
     """
     n_faces, scatters = int(faces.max()) + 1, nodes.size[:, None, None] * nodes.covariance
     planes = grouped_moments(Moments(nodes.size, nodes.centroid, scatters, None), faces, n_faces)
-    edges = np.bincount(surface.supervoxels, surface.grid.edge_lengths) / np.bincount(surface.supervoxels)
+    edges = surface.mean_edge_lengths(len(nodes.size))
     variances = np.square(nodes.residual) + np.square(_EVEN * edges)
     noise = np.sqrt(np.bincount(faces, nodes.size * variances, n_faces) / planes.counts)
     level = np.ones(len(found.pairs), np.bool_)
@@ -194,10 +195,10 @@ def _count_open(
     """
     n_faces, widths, around = len(ways.starts) - 1, view.squares.widths, image.shape[1]
     last, ends_open = np.full(n_faces, -1, np.int64), np.zeros(n_faces, np.bool_)
-    line, columns = lines_of(image)
+    line, columns = line_buffers(image)
     farthest = around // 2 if wraps else around  # the way from one to the other is no more than half a turn
     for row in range(image.shape[0]):
-        stop, lap = squares_along(image[row], wraps, line, columns)
+        stop, lap = surfels_along(image[row], wraps, line, columns)
         start = 2 * row * around
         for at in range(1, stop):
             before, i = line[at - 1], line[at]
@@ -216,20 +217,20 @@ def _count_open(
             last[here] = column
 
 
-def continuations_of(surface: Surface, nodes: NodeFeatures, hidings: NDArray[np.integer]) -> Continuations:
-    """Hidings, (c, 2) voxels, by pair of supervoxels."""
-    owners = surface.supervoxels[hidings]
+def continuations_of(surface: Surface, nodes: NodeFeatures, occluded_spans: NDArray[np.integer]) -> Continuations:
+    """Continuations from the ends of occluded spans, (c, 2) voxels, by pair of supervoxels."""
+    owners = surface.supervoxels[occluded_spans]
     swap = owners[:, 0] > owners[:, 1]
-    hidings, owners = (np.where(swap[:, None], both[:, ::-1], both) for both in (hidings, owners))
+    occluded_spans, owners = (np.where(swap[:, None], both[:, ::-1], both) for both in (occluded_spans, owners))
     pairs, pair = distinct_pairs(owners[:, 0], owners[:, 1])
     r, (i, j) = len(pairs), pairs.T
     crossings = np.bincount(pair, minlength=r)
-    ends = surface.grid.centroids[hidings]
+    ends = surface.grid.centroids[occluded_spans]
     width = np.bincount(pair, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), r) / crossings
     heights = [
         np.bincount(pair, np.abs(_heights(ends[:, 1 - side], owners[:, side], nodes)), r) / crossings for side in (0, 1)
     ]
-    edge = np.bincount(pair, surface.grid.edge_lengths[hidings].mean(axis=1), r) / crossings
+    edge = np.bincount(pair, surface.grid.edge_lengths[occluded_spans].mean(axis=1), r) / crossings
     angle, offset = angle_between(nodes.normal[i], nodes.normal[j]), np.maximum(*heights)
     contrast = np.nan_to_num(np.linalg.norm(nodes.color[j] - nodes.color[i], axis=1))
     coplanar = (angle <= _SMOOTH_RAD) & (offset <= np.maximum(_SMOOTH_VOXELS * edge, 0.1 * width))
@@ -238,20 +239,3 @@ def continuations_of(surface: Surface, nodes: NodeFeatures, hidings: NDArray[np.
 
 def _heights(points: NDArray[np.float64], owners: NDArray[np.int32], nodes: NodeFeatures) -> NDArray[np.float64]:
     return np.einsum("ij,ij->i", points - nodes.centroid[owners], nodes.normal[owners])
-
-
-def distinct_pairs(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Distinct pairs in ascending order, (q, 2) int32, and the pair of each row."""
-    keys, inverse = np.unique(_keys(first, second), return_inverse=True)
-    return np.stack((keys >> 32, keys & 0xFFFFFFFF), axis=1).astype(np.int32), inverse
-
-
-def are_apart(pairs: NDArray[np.int32], others: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Which of some pairs, (r, 2), are not among others, (m, 2), the smaller first, in ascending order."""
-    keys, known = _keys(*pairs.T), _keys(*others.T)
-    return np.searchsorted(known, keys, "left") == np.searchsorted(known, keys, "right")
-
-
-def _keys(first: NDArray[np.int32], second: NDArray[np.int32]) -> NDArray[np.int64]:
-    """One number per pair, in the order of the pairs."""
-    return (first.astype(np.int64) << 32) + second

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.features.nodes import NodeFeatures
 from pcgraph.graph.adjacency import Gaps
-from pcgraph.graph.bearing_image import seen_through, squares_of, view_from
 from pcgraph.graph.contacts import edge_features, facing_sides
+from pcgraph.graph.spherical_image import seen_through, surfels_of, view_from
 from pcgraph.parallel import in_blocks, kernel
 from pcgraph.voxels.grid import VoxelGrid, at_ends, boundary_voxels, voxels_within
 from pcgraph.voxels.surface import Surface
@@ -20,9 +20,7 @@ _SMOOTH = 0.4  # voxel edges off their planes, at most: of a crown something is 
 
 
 def gaps(
-    grid: VoxelGrid,
-    normals: NDArray[np.float64],
-    supervoxels: NDArray[np.int32],
+    surface: Surface,
     nodes: NodeFeatures,
     touching: NDArray[np.int32],
     place: NDArray[np.float64] | None = None,
@@ -34,11 +32,7 @@ def gaps(
 
     Parameters
     ----------
-    grid : VoxelGrid of v voxels
-    normals : (v, 3) float64
-        Unit normals of the voxels.
-    supervoxels : (v,) int32
-        Supervoxel of each voxel.
+    surface : Surface
     nodes : NodeFeatures of k supervoxels
     touching : (m, 2) int32
         Pairs of supervoxels that touch, the smaller first, ascending.
@@ -52,7 +46,7 @@ def gaps(
     component, those in strips. A row of points that lies on a border between cells has voxels on either side, and two
     such rows up to eleven around each: a scan whose rows lie far apart is hundreds of such strips.
     """
-    k = np.int64(len(nodes.size))
+    grid, supervoxels, k = surface.grid, surface.supervoxels, np.int64(len(nodes.size))
     boundary = _ends_of_surfaces(grid, supervoxels, touching, int(k))
     near = voxels_within(grid, boundary, grid.warp.max_gap, boundary, later=True)
     source: NDArray[np.int64] = np.repeat(boundary, np.diff(near.indptr))
@@ -66,7 +60,7 @@ def gaps(
     larger = np.maximum(larger[source], larger[target])
     width = np.linalg.norm((grid.warped[source] - grid.warped[target]) / larger[:, None], axis=1)
     if place is not None and len(source):
-        closed = ~_open_ways(grid, normals, supervoxels, nodes, place, source, target.astype(np.int64), key, width)
+        closed = ~_open_ways(surface, nodes, place, source, target.astype(np.int64), key, width)
         source, target, key, width = source[closed], target[closed], key[closed], width[closed]
     key, width = np.tile(key, 2), np.tile(width, 2)  # each side of each pair
     voxel: NDArray[np.int64] = np.concatenate((source, target))
@@ -81,7 +75,7 @@ def gaps(
     own = supervoxels[voxel]
     keys, edge = np.unique(key, return_inverse=True)
     edges = np.stack((keys // k, keys % k), axis=1).astype(np.int32)
-    facing = facing_sides(grid, normals, edges, voxel, 2 * edge + (own > other))
+    facing = facing_sides(surface, edges, voxel, 2 * edge + (own > other))
     shortest = np.full(len(edges), np.inf)
     np.minimum.at(shortest, edge, width)
     weights = np.bincount(edge, np.exp(1.0 - width), len(edges)).astype(np.float64)
@@ -89,9 +83,7 @@ def gaps(
 
 
 def _open_ways(
-    grid: VoxelGrid,
-    normals: NDArray[np.float64],
-    supervoxels: NDArray[np.int32],
+    surface: Surface,
     nodes: NodeFeatures,
     place: NDArray[np.float64],
     source: NDArray[np.int64],
@@ -108,10 +100,10 @@ def _open_ways(
     pair = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(key)))
     shortest = np.arange(len(key)) - starts[pair] < _SHORTEST
     some, of_pair = order[shortest], pair[shortest]
-    view = view_from(place, squares_of(Surface(grid, normals, supervoxels)))
+    view = view_from(place, surfels_of(surface))
     through = seen_through(view, source[some], target[some])
-    mean_edge = np.bincount(supervoxels, grid.edge_lengths) / np.bincount(supervoxels)
-    is_smooth = nodes.residual <= _SMOOTH * mean_edge
+    supervoxels = surface.supervoxels
+    is_smooth = nodes.residual <= _SMOOTH * surface.mean_edge_lengths(len(nodes.size))
     is_open = np.bincount(of_pair, through) >= _SEEN_THROUGH * np.bincount(of_pair)
     is_open &= (is_smooth[supervoxels[source]] & is_smooth[supervoxels[target]])[order[starts]]
     opened = np.empty(len(key), np.bool_)

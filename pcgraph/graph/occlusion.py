@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.features.nodes import NodeFeatures
-from pcgraph.graph.bearing_image import BearingImage, View, bearing_image, depth_jumps, squares_of, view_from
-from pcgraph.graph.continuations import LEAST_GAP, REACH, Continuations, continuations_of, distinct_pairs
+from pcgraph.graph.continuations import MIN_GAP, REACH, Continuations, continuations_of
+from pcgraph.graph.spherical_image import SphericalImage, View, depth_jumps, spherical_image, surfels_of, view_from
+from pcgraph.pairs import distinct_pairs
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.surface import Surface
 
@@ -57,7 +58,7 @@ def occlusions(
     image: ArrayLike | None = None,
     *,
     reach: float = REACH,
-    least_gap: float = LEAST_GAP,
+    least_gap: float = MIN_GAP,
 ) -> Occlusions:
     """Occlusions between supervoxels, as seen from the viewpoint.
 
@@ -91,10 +92,10 @@ def occlusions(
     for name, value in (("reach", reach), ("least_gap", least_gap)):
         if not 0.0 < value < np.inf:
             raise ValueError(f"expected {name} as a finite number of voxels above 0, got {value!r}")
-    view = view_from(position, squares_of(surface))
-    seen = bearing_image(view) if image is None else BearingImage(_checked(image, surface.grid.n_voxels))
+    view = view_from(position, surfels_of(surface))
+    seen = spherical_image(view) if image is None else SphericalImage(_checked(image, surface.grid.n_voxels))
     jumps = depth_jumps(view, seen, reach, least_gap)
-    return _collected(surface, view, jumps.edges, continuations_of(surface, nodes, jumps.hidings))
+    return _collected(surface, view, jumps.edges, continuations_of(surface, nodes, jumps.occluded_spans))
 
 
 def _checked(image: ArrayLike, n_voxels: int) -> NDArray[np.int32]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.features.nodes import NodeFeatures
-from pcgraph.graph.bounding_planes import HIDDEN, Plane, borders_of, facing_ways, joining
+from pcgraph.graph.bounding_planes import MIN_HIDDEN, Plane, borders_of, facing_ways, joining
 from pcgraph.graph.continuations import Continuations, continuations_of
 from pcgraph.voxels.directions import plane_basis
 from pcgraph.voxels.grid import voxel_grid
@@ -20,7 +20,7 @@ from pcgraph.voxels.warp import Warp
 _SOME = 20_000  # voxels that are asked whether all was seen from far above:
 _LEVEL, _MOSTLY = 0.5, 0.93  # cosine of normals to one axis, and of so many at least; and
 _STEEP, _HARDLY = 0.3, 0.05  # of what is across that, hardly any is seen from far above
-_LEAST_VOXELS = 20  # of a piece, some supervoxel,
+_MIN_VOXELS = 20  # of a piece, some supervoxel,
 _ON_AVERAGE = 0.7  # whose normals have such a cosine to that axis
 _COLUMN = 1.5  # voxel edges: of columns that are compared with those beside them
 _STEP = 2.0  # voxel edges by which one lies below another, at least
@@ -64,10 +64,10 @@ def terrain(surface: Surface, nodes: NodeFeatures, faces: NDArray[np.int32]) -> 
     upwards, ground = found
     of_supervoxel = np.where(ground, np.cumsum(ground) - 1, -1)[faces]
     border = borders_of(surface, of_supervoxel, [np.arange(np.count_nonzero(ground))])[0]
-    hidings = np.concatenate(
+    occluded_spans = np.concatenate(
         (_touching(surface, of_supervoxel, border), _under(surface, nodes, of_supervoxel, border, upwards))
     )
-    terrain = continuations_of(surface, nodes, hidings)
+    terrain = continuations_of(surface, nodes, occluded_spans)
     return replace(terrain, coplanar=np.zeros(len(terrain.pairs), np.bool_))
 
 
@@ -95,7 +95,7 @@ def _ground_from_far_above(
     for upwards, to_lower, to_higher in ((axis, down, up), (-axis, up, down)):
         ground = level & (to_higher >= _UPWARD_STEPS) & (to_lower <= _DOWNWARDS * (to_lower + to_higher))
         if ground[np.argmax(voxels)]:
-            ground &= voxels >= _LEAST_VOXELS
+            ground &= voxels >= _MIN_VOXELS
             return (upwards, ground) if np.count_nonzero(ground) > 1 else None
     return None
 
@@ -107,7 +107,7 @@ def _steps(
     and up, (f,) each."""
     plane, edge = Plane(surface.grid.centroids[0], axis, plane_basis(axis)), surface.grid.size
     heights, flat = plane.heights(surface.grid.centroids), np.zeros((surface.grid.n_voxels, 3))
-    flat[:, :2] = plane.feet(surface.grid.centroids)
+    flat[:, :2] = plane.project(surface.grid.centroids)
     columns = voxel_grid(flat, _COLUMN * edge, Warp())
     order = np.lexsort((heights, columns.voxel_of_point))
     tops = order[np.cumsum(np.bincount(columns.voxel_of_point)) - 1]
@@ -134,21 +134,21 @@ def _under(
 ) -> NDArray[np.int64]:
     """Voxels at both ends of the ways, (c, 2), under what stands between pieces that are one."""
     edge, plane = surface.grid.size, Plane(surface.grid.centroids[0], upwards, plane_basis(upwards))
-    piece, feet = of_supervoxel[surface.supervoxels[border]], plane.feet(surface.grid.centroids[border])
-    cells = voxel_grid(np.column_stack((feet / (_THINNED * edge), piece)), 1.0, Warp())
+    piece, project = of_supervoxel[surface.supervoxels[border]], plane.project(surface.grid.centroids[border])
+    cells = voxel_grid(np.column_stack((project / (_THINNED * edge), piece)), 1.0, Warp())
     some = np.sort(cells.order[cells.starts[:-1]])
-    border, feet, piece = border[some], feet[some], piece[some]
+    border, project, piece = border[some], project[some], piece[some]
     places, others = surface.grid.centroids[border], nodes.centroid[of_supervoxel < 0]
-    ways = facing_ways(places, feet / edge, piece)
+    ways = facing_ways(places, project / edge, piece)
     ends = plane.heights(places)[ways.ends]
     hidden = np.zeros(len(ways.ends), np.bool_)
     if len(others) and len(ways.ends):
         some = np.arange(1, min(_NEAR, len(others)) + 1)
-        distance, near = cKDTree(plane.feet(others)).query(feet[ways.ends].mean(axis=1), k=some)
+        distance, near = cKDTree(plane.project(others)).query(project[ways.ends].mean(axis=1), k=some)
         over = distance <= np.maximum(0.5 * ways.lengths, _HIGH * edge)[:, None]
         rise = plane.heights(others)[near] - ends.max(axis=1)[:, None]
         hidden = (over & (rise > _HIGH * edge) & (np.ptp(ends, axis=1)[:, None] < _LEVELS * rise)).any(axis=1)
     n_ways, n_hidden = (np.bincount(ways.pair, counts, len(ways.pairs)) for counts in (None, hidden))
     areas = np.bincount(of_supervoxel[surface.supervoxels] + 1, np.square(surface.grid.edge_lengths))[1:]
-    may_join = (n_hidden >= HIDDEN * n_ways) & (ways.widths >= _WIDE * edge)
+    may_join = (n_hidden >= MIN_HIDDEN * n_ways) & (ways.widths >= _WIDE * edge)
     return border[ways.ends[joining(ways, may_join, areas.astype(np.float64))[ways.pair]]]

@@ -22,7 +22,7 @@ REDUCTIONS: tuple[Reduction, ...] = get_args(Reduction)
 CANDIDATES = 8
 NEARBY = 1.0  # voxel edges beyond the nearest voxel within which another one may be the better
 BLOCK = 1 << 16  # points at a time
-_LARGEST_SUM = 2.0**62  # half of what int64 holds, so that rounding decides nothing
+_MAX_SUM = 2.0**62  # half of what int64 holds, so that rounding decides nothing
 
 
 # ---- Values ----------------------------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ def _summable(table: NDArray[Any]) -> NDArray[Any]:
     """The table as int64 if it holds whole numbers, as float64 otherwise."""
     if table.dtype.kind == "f":
         return table.astype(np.float64)
-    if (np.abs(table.astype(np.float64)).sum(axis=0) > _LARGEST_SUM).any():
+    if (np.abs(table.astype(np.float64)).sum(axis=0) > _MAX_SUM).any():
         raise ValueError(
             "expected whole numbers whose sizes add up to 2**62 at most, got larger ones; pass them as float"
         )

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import root_of
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.voxels.cells import cell_keys, sorted_keys, starts_of_runs
-from pcgraph.voxels.evidence import autocorrelation
+from pcgraph.voxels.column_evidence import autocorrelation
 from pcgraph.voxels.grid import MAX_NEIGHBOURS, VoxelGrid
-from pcgraph.voxels.warp import Slant, warped_normal
+from pcgraph.voxels.warp import NormalTransform, warped_normal
 
 EARLY_SWEEPS = 1.8
 """Times seed size over voxel size: sweeps in which PCL's supervoxels take voxels from each other."""
@@ -69,7 +69,7 @@ class VoxelGraph(NamedTuple):
     neighbours : (e,) uint32
         The voxels around each; see `pcgraph.voxels.grid.Neighbourhood`.
     metric : Metric
-    slant : Slant
+    slant : NormalTransform
         Of the warp.
     """
 
@@ -77,7 +77,7 @@ class VoxelGraph(NamedTuple):
     indptr: NDArray[np.uint64]
     neighbours: NDArray[np.uint32]
     metric: Metric
-    slant: Slant
+    slant: NormalTransform
 
 
 def voxel_graph(grid: VoxelGrid, normals: NDArray[np.float64], metric: Metric) -> VoxelGraph:
@@ -159,10 +159,10 @@ def add_features(features: NDArray[np.float64], i: int, sums: NDArray[np.float64
 
 
 @routine
-def set_means(sums: NDArray[np.float64], means: NDArray[np.float64], slant: Slant) -> None:
+def set_means(sums: NDArray[np.float64], means: NDArray[np.float64], slant: NormalTransform) -> None:
     """Set `means`, (k, 9 + d + 3), to the supervoxels' mean rows and warped normals; rows of empty ones stay.
 
-    Normals have unit length; warped ones are as of `pcgraph.voxels.warp.Slant`.
+    Normals have unit length; warped ones are as of `pcgraph.voxels.warp.NormalTransform`.
     """
     across = sums.shape[1] - 1
     for s in range(len(sums)):
@@ -214,7 +214,7 @@ def seed_voxels(grid: VoxelGrid, normals: NDArray[np.float64], seed_size: float,
 def _seeds_of_cells(
     places: NDArray[np.float64],
     normals: NDArray[np.float64],
-    slant: Slant,
+    slant: NormalTransform,
     step: float,
     order: NDArray[np.int64],
     starts: NDArray[np.int64],
@@ -247,7 +247,7 @@ def _seeds_of_cells(
 
 @inlined
 def _on_another_surface(
-    places: NDArray[np.float64], normals: NDArray[np.float64], slant: Slant, step: float, i: int, seed: int
+    places: NDArray[np.float64], normals: NDArray[np.float64], slant: NormalTransform, step: float, i: int, seed: int
 ) -> bool:
     """Whether voxel i faces away from a seed, or lies on a surface in parallel to the seed's, a step off its plane."""
     cosine = normals[i, 0] * normals[seed, 0] + normals[i, 1] * normals[seed, 1] + normals[i, 2] * normals[seed, 2]
@@ -257,7 +257,9 @@ def _on_another_surface(
 
 
 @inlined
-def _off(places: NDArray[np.float64], normals: NDArray[np.float64], slant: Slant, i: int, other: int) -> float:
+def _off(
+    places: NDArray[np.float64], normals: NDArray[np.float64], slant: NormalTransform, i: int, other: int
+) -> float:
     """Distance of another voxel from the plane of voxel i, in the warped space."""
     x, y, z = places[i, 0], places[i, 1], places[i, 2]
     a, b, c = warped_normal(slant, x, y, z, normals[i, 0], normals[i, 1], normals[i, 2])
@@ -448,7 +450,7 @@ def _choose(
         i = active[q]
         own = nearest = last = labels[i]
         n = 0
-        for a in range(indptr[i], indptr[i + 1]):  # without a branch, which would often be guessed wrongly
+        for a in range(indptr[i], indptr[i + 1]):  # branch-free: it would often be mispredicted
             around[n] = labels[neighbours[a]]
             n += (around[n] != own) & (around[n] != last)
             last = labels[neighbours[a]]

@@ -23,7 +23,7 @@ from pcgraph.supervoxels.clustering import (
 )
 from pcgraph.supervoxels.method import SupervoxelMethod
 from pcgraph.voxels.cells import fetch_batch
-from pcgraph.voxels.evidence import color_evidence
+from pcgraph.voxels.column_evidence import color_evidence
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, most_around
 from pcgraph.voxels.surface import LocalPlanes, local_planes
 
@@ -40,14 +40,15 @@ class SurfaceGrowth(SupervoxelMethod):
     color_weight, spatial_weight, normal_weight : float, >= 0
         What counts in the distance of a voxel to a supervoxel: colours in 0..1, metres over the seed size, and one
         minus the cosine of normals; w_c, w_s and w_n of Papon et al. 2013, equation 7. Colours count so much if they
-        change where surfaces do; noise and patterns count for nothing (`pcgraph.voxels.evidence.edge_evidence`).
+        change where surfaces do; noise and patterns count for nothing (`crease_contrast` of
+        `pcgraph.voxels.column_evidence`).
     plane_weight : float, >= 0
         The same for the distance h of a voxel from the plane through the supervoxel's mean, in voxel edges, by Huber's
         loss: h^2 up to half an edge, which noise may be, and h - 1/4 beyond. It parts surfaces that are parallel, a
         voxel or two from each other, of which normals do not tell.
     feature_weight : float, >= 0
         The same for the features given to `pcgraph.segment`, in robust spreads: what one spread counts, if touching
-        voxels are alike in it; noise counts for nothing (`pcgraph.voxels.evidence.autocorrelation`).
+        voxels are alike in it; noise counts for nothing (`pcgraph.voxels.column_evidence.autocorrelation`).
 
     Notes
     -----
@@ -172,7 +173,7 @@ def _assign(
             nearest = np.empty(len(places), np.int32)
         for v in range(first, last):
             own, n = supervoxels[v], 0
-            # The other surfaces around, without a branch, which would often be guessed wrongly.
+            # The other surfaces around, branch-free, as it would often be mispredicted.
             for a in range(indptr[v], indptr[v + 1]):
                 others[n], labels[n] = neighbours[a], supervoxels[neighbours[a]]
                 n += labels[n] != own

@@ -14,7 +14,7 @@ from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.parallel import inlined, kernel
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.linkage import Linkage, Merges, check_numbers
-from pcgraph.voxels.eigen import AXES, least_eigenvalue
+from pcgraph.voxels.eigen import SYMMETRIC_INDICES, least_eigenvalue
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class RegionState(NamedTuple):
     def of(cls, regions: Regions) -> RegionState:
         """The regions before they merge; residuals are not set."""
         masses, values, centroids, scatters = (np.array(column, np.float64, order="C") for column in regions[:4])
-        upper = np.stack([scatters[:, i, j] for i, j in AXES], axis=1)
+        upper = np.stack([scatters[:, i, j] for i, j in SYMMETRIC_INDICES], axis=1)
         return cls(masses, values, centroids, upper, np.zeros(len(masses)), float(regions.plane))
 
 
@@ -251,7 +251,7 @@ def unite(state: RegionState, kept: int, gone: int) -> None:
         reduced = masses[kept] * fraction
         residuals[kept] = _least_of_union(state, kept, gone, reduced)
         for column in range(6):
-            i, j = AXES[column]
+            i, j = SYMMETRIC_INDICES[column]
             shift = (centroids[kept, i] - centroids[gone, i]) * (centroids[kept, j] - centroids[gone, j])
             scatters[kept, column] += scatters[gone, column] + reduced * shift
     for i in range(values.shape[1]):

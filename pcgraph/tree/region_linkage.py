@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pcgraph.features.moments import Moments
 from pcgraph.graph.adjacency import AdjacencyGraph
 from pcgraph.graph.boundary import BoundaryCost
-from pcgraph.graph.continuations import are_apart
+from pcgraph.pairs import not_among
 from pcgraph.parallel import in_blocks, inlined, kernel, routine
 from pcgraph.tree.contraction import NONE, ContractedGraph, contract_cheapest, heap_update
 from pcgraph.tree.least_increase import RegionState, energy_increase, regions_of, set_residuals, squared_distance, unite
@@ -109,32 +109,32 @@ class RegionLinkage(Linkage):
         color = self.color * graph.color_evidence
         return region_linkage(graph, leaves, self._ways(graph), color, self.relief)
 
-    def _ways(self, graph: AdjacencyGraph) -> Ways:
-        """All along which regions merge: contacts, gaps, continuations, terrain, and bridges."""
-        ways = [Ways.of(graph.edges, self.cost(graph.edge_features), graph.edge_features.contact_voxels)]
+    def _ways(self, graph: AdjacencyGraph) -> MergeEdges:
+        """Edges along which regions merge: contacts, gaps, continuations, terrain, and bridges."""
+        ways = [MergeEdges.of(graph.edges, self.cost(graph.edge_features), graph.edge_features.contact_voxels)]
         if (gaps := graph.gaps) is not None:
             beyond = np.maximum(gaps.widths - 1.0, 0.0)  # larger voxels' centroids can be nearer than their edge
             price = (self.gap if gaps.of_one_scan else _OF_SEVERAL * self.gap) * beyond
-            ways.append(Ways.of(gaps.edges, self.cost(gaps.edge_features) + price, gaps.weights))
+            ways.append(MergeEdges.of(gaps.edges, self.cost(gaps.edge_features) + price, gaps.weights))
         if (hidden := graph.continuations) is not None:
             behind, ground = hidden.chosen(hidden.coplanar), hidden.chosen(~hidden.coplanar)
-            ways.append(Ways.of(behind.pairs, np.zeros(len(behind.pairs)), 2.0 * behind.crossings))
+            ways.append(MergeEdges.of(behind.pairs, np.zeros(len(behind.pairs)), 2.0 * behind.crossings))
             if len(ground.pairs):
-                ways = [some._replace(terrain=~are_apart(some.edges, ground.pairs)) for some in ways]
+                ways = [some._replace(terrain=~not_among(some.edges, ground.pairs)) for some in ways]
                 for some in ways:
                     ground = ground.without(some.edges)
                 n, every = len(ground.pairs), np.ones(len(ground.pairs), np.bool_)
-                ways.append(Ways(ground.pairs, np.zeros(n), np.full(n, _BRIDGE_VOXELS), every, every))
+                ways.append(MergeEdges(ground.pairs, np.zeros(n), np.full(n, _BRIDGE_VOXELS), every, every))
         if (bridges := graph.bridges) is not None:
             order = np.argsort(~bridges.between_specks, kind="stable")
             costs = np.where(bridges.between_specks, _BETWEEN_SPECKS, self.bridge * bridges.widths)
-            of_bridges = Ways.of(bridges.edges[order], costs[order], np.full(len(order), _BRIDGE_VOXELS))
+            of_bridges = MergeEdges.of(bridges.edges[order], costs[order], np.full(len(order), _BRIDGE_VOXELS))
             ways.append(of_bridges._replace(bridges=~bridges.between_specks[order]))
-        return Ways(*(np.concatenate(columns) for columns in zip(*ways, strict=True)))
+        return MergeEdges(*(np.concatenate(columns) for columns in zip(*ways, strict=True)))
 
 
-class Ways(NamedTuple):
-    """Along which regions merge.
+class MergeEdges(NamedTuple):
+    """Edges along which regions may merge.
 
     Attributes
     ----------
@@ -154,12 +154,13 @@ class Ways(NamedTuple):
     terrain: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, edges: NDArray[np.int32], costs: NDArray[np.float64], weights: NDArray[np.number]) -> Ways:
+    def of(cls, edges: NDArray[np.int32], costs: NDArray[np.float64], weights: NDArray[np.number]) -> MergeEdges:
         """Contacts, neither bridges nor terrain."""
         none = np.zeros(len(edges), np.bool_)
         return cls(edges, costs, weights.astype(np.float64), none, none)
 
 
+_COST, _WEIGHT, _SMOOTHNESS, _BRIDGE, _TERRAIN = range(5)  # rows of ContractedGraph.sums, over the merged edges
 _STEPS = float(1 << 20)
 _MANY = 40  # edges of a region
 _OF_SEVERAL = 1.0 / 3.0  # of the price of a gap, where scans lie over each other
@@ -239,7 +240,7 @@ class _Outlines(NamedTuple):
 
 
 def region_linkage(
-    graph: AdjacencyGraph, leaves: Moments, ways: Ways, color: float = 0.0, relief: float = 0.0
+    graph: AdjacencyGraph, leaves: Moments, ways: MergeEdges, color: float = 0.0, relief: float = 0.0
 ) -> Merges:
     """Merges of regions along edges, the least altitude of `RegionLinkage` first.
 
@@ -248,7 +249,7 @@ def region_linkage(
     graph : AdjacencyGraph of k nodes
         Its contacts give the unit of length, a voxel edge.
     leaves : Moments of k regions
-    ways : Ways
+    ways : MergeEdges
     color : float, voxel edges, >= 0
         What colours count, if there are any.
     relief : float, radians, >= 0
@@ -265,7 +266,7 @@ def region_linkage(
     sums: NDArray[np.float64] = np.stack(
         (costs * weights, weights, _smoothness(leaves, edges) * weights, bridges * weights, terrain)
     )
-    sums = sums[: 5 if terrain.any() else 4 if bridges.any() else 3]
+    sums = sums[: (_TERRAIN if terrain.any() else _BRIDGE if bridges.any() else _SMOOTHNESS) + 1]
     set_residuals(state)
     altitudes = np.empty(len(edges))
     in_blocks(_set_first_altitudes, len(edges), state, edges, sums, _SHAPE, altitudes)
@@ -327,7 +328,7 @@ def _merge(state: RegionState, outlines: _Outlines, relief: float, graph: Contra
             if stands_out > 0.0:
                 heap_update(heap, edge, _altitude(state, sums, edge, a, b, stands_out, shape))
                 continue
-        inside = 2.0 * sums[1, edge]
+        inside = 2.0 * sums[_WEIGHT, edge]
         kept, gone, n_parallel = contract_cheapest(graph)
         unite(state, kept, gone)
         perimeters[kept] += perimeters[gone] - inside
@@ -352,10 +353,10 @@ def _altitude(
     state: RegionState, sums: NDArray[np.float64], edge: int, a: int, b: int, stands_out: float, shape: _Shape
 ) -> float:
     """Altitude at which the two regions at an edge merge, radians, in whole steps, as energies of nothing are noise."""
-    cost, length = sums[0, edge] / sums[1, edge], 0.5 * sums[1, edge]
+    cost, length = sums[_COST, edge] / sums[_WEIGHT, edge], 0.5 * sums[_WEIGHT, edge]
     smaller, larger = min(state.masses[a], state.masses[b]), max(state.masses[a], state.masses[b])
-    objects, is_terrain = round(shape.objects * _STEPS), len(sums) > 4 and sums[4, edge] > 0.0
-    if len(sums) > 3 and sums[3, edge] == sums[1, edge]:  # nothing but bridges
+    objects, is_terrain = round(shape.objects * _STEPS), len(sums) > _TERRAIN and sums[_TERRAIN, edge] > 0.0
+    if len(sums) > _BRIDGE and sums[_BRIDGE, edge] == sums[_WEIGHT, edge]:  # nothing but bridges
         if is_terrain:
             return objects / _STEPS
         return max(round(cost * smaller / (smaller + shape.m1) * _STEPS), objects + 1) / _STEPS
@@ -368,7 +369,7 @@ def _altitude(
     shortness = math.sqrt(shortness * math.sqrt(shortness))
     evidence = (cost + stands_out + shape.c0 + shape.c1 * math.log(1.0 + scale / shape.l0)) * shortness
     if cost > shape.c2 and shortness < shape.s0:
-        evidence += (cost - shape.c2) * (shape.s0 - shortness) * sums[2, edge] / sums[1, edge]
+        evidence += (cost - shape.c2) * (shape.s0 - shortness) * sums[_SMOOTHNESS, edge] / sums[_WEIGHT, edge]
     evidence += shape.k1 * cost * (1.0 - shortness) * contrast / (1.0 + contrast) * smaller / (smaller + shape.m2)
     evidence *= increase / (increase + shape.e0) * math.sqrt(scale / (scale + shape.l0))
     evidence *= math.sqrt(math.sqrt(1.0 + larger / (shape.r * smaller))) * smaller / (smaller + shape.m0)
@@ -394,20 +395,20 @@ def _standing_out(
     """
     if state.masses[b] < state.masses[a]:
         a, b = b, a
-    smaller, larger, contact = state.masses[a], state.masses[b], sums[1, edge]
+    smaller, larger, contact = state.masses[a], state.masses[b], sums[_WEIGHT, edge]
     if shape.r1 * smaller >= larger or plane_normal(state.scatters[b], normal) < 0.0:
         return 0.0
     x, y, z = normal
     inner, outer = state.centroids[a], state.centroids[b]
     distance = x * (inner[0] - outer[0]) + y * (inner[1] - outer[1]) + z * (inner[2] - outer[2])
     outwards = x * outlines.outward[b, 0] + y * outlines.outward[b, 1] + z * outlines.outward[b, 2]
-    share, cost, heap = min(contact / outlines.perimeters[a], 1.0), sums[0, edge] / contact, 0.0
+    enclosed, cost, heap = min(contact / outlines.perimeters[a], 1.0), sums[_COST, edge] / contact, 0.0
     if cost > shape.h0 and distance * outwards >= 0.0:
-        heap = shape.h1 * (cost - shape.h0) * share**8 * sums[2, edge] / contact
+        heap = shape.h1 * (cost - shape.h0) * enclosed**8 * sums[_SMOOTHNESS, edge] / contact
     elif outlines.sides_known and distance * outwards < 0.0:
         return 0.0  # it lies behind
     width = shape.width * math.sqrt(smaller)
-    within = share * share * min(0.5 * contact / (shape.b1 * width), 1.0)
+    within = enclosed * enclosed * min(0.5 * contact / (shape.b1 * width), 1.0)
     scatter = state.scatters[a]
     spread = x * x * scatter[0] + y * y * scatter[1] + z * z * scatter[2]
     spread += 2.0 * (x * y * scatter[3] + x * z * scatter[4] + y * z * scatter[5])

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
 
-_SAME = np.float32(0.8)  # cosine between normals on one surface, and more
+SAME_SURFACE_COSINE = np.float32(0.8)
+"""Cosine between normals on one surface, at least."""
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
 _SLANTED = np.float32(8.0)  # widths between squares of one surface of which one may seem to hide the other
@@ -22,7 +23,7 @@ _NUMBER = (1 << 32) - 1
 _FAR = np.float32(np.inf)
 
 
-def seen_from(
+def visibility_from(
     places: NDArray[np.float64],
     centres: NDArray[np.float64],
     widths: NDArray[np.float64],
@@ -47,7 +48,7 @@ def seen_from(
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
-    squares = _Squares(_columns(centres), _columns(normals), widths.astype(np.float32), np.float32(1.0 / stretch))
+    squares = _Surfels(_columns(centres), _columns(normals), widths.astype(np.float32), np.float32(1.0 / stretch))
     in_blocks(_look, len(places), places.astype(np.float32), bins, squares, seen, smallest=1)
     return seen
 
@@ -80,8 +81,8 @@ def cosines_towards(
     return cosines
 
 
-class _Squares(NamedTuple):
-    """Squares that stand for a surface, in columns, as loops take them in lanes: (3, n) float32, and widths, (n,).
+class _Surfels(NamedTuple):
+    """Surfels that stand for a surface, in columns, as loops take them in lanes: (3, n) float32, and widths, (n,).
 
     They are so many times as deep as wide.
     """
@@ -164,7 +165,7 @@ def _look(
     stop: int,
     places: NDArray[np.float32],
     bins_of: NDArray[np.int64],
-    squares: _Squares,
+    squares: _Surfels,
     seen: NDArray[np.bool_],
 ) -> None:
     """Set what is seen from each place, by the least range in each bin of directions that a square may cover.
@@ -204,7 +205,7 @@ def _look(
                     bits = np.float32(views.ranges[i] + views.slopes[i] * beside).view(np.int32)
                     nearest[p * bins + q] = min(nearest[p * bins + q], np.int64(bits) << 32 | i)
         n_doubtful = 0
-        for i in range(n):  # without a branch, which would often be guessed wrongly
+        for i in range(n):  # branch-free: it would often be mispredicted
             too_far = views.limits[i] - np.int32(nearest[at[i]] >> 32).view(np.float32)
             seen[k, i] = too_far <= nothing
             doubtful[n_doubtful] = i
@@ -214,7 +215,7 @@ def _look(
 
 
 @routine
-def _view(place: NDArray[np.float32], bins: int, squares: _Squares, views: _Views) -> None:
+def _view(place: NDArray[np.float32], bins: int, squares: _Surfels, views: _Views) -> None:
     """Set how squares look from a place, on a map of bins x bins. One at the place has range 0 and is not seen."""
     centres, normals, widths, depth_of_width = squares
     px, py, pz = place
@@ -244,7 +245,7 @@ def _view(place: NDArray[np.float32], bins: int, squares: _Squares, views: _View
 
 
 @routine
-def _on_one_surface(i: int, j: int, squares: _Squares, depth: np.float32) -> bool:
+def _on_one_surface(i: int, j: int, squares: _Surfels, depth: np.float32) -> bool:
     """Whether two squares lie on each other's planes and near: at a slant one may seem to hide the other."""
     centres, normals, width = squares.centres, squares.normals, squares.widths[i]
     cosine = off = off_other = square = np.float32(0.0)
@@ -255,7 +256,7 @@ def _on_one_surface(i: int, j: int, squares: _Squares, depth: np.float32) -> boo
         off += way * normals[axis, i]
         off_other += way * normals[axis, j]
     reach, flat = _SLANTED * width, depth * width
-    return bool(abs(cosine) >= _SAME and max(abs(off), abs(off_other)) < flat and square < reach * reach)
+    return bool(abs(cosine) >= SAME_SURFACE_COSINE and max(abs(off), abs(off_other)) < flat and square < reach * reach)
 
 
 @kernel

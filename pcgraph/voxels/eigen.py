@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import kernel, routine
 
-AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Rows and columns of a symmetric matrix, in the order of the six numbers that stand for it."""
+SYMMETRIC_INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Row and column of each of the six stored elements of a symmetric matrix: xx, yy, zz, xy, xz, yz."""
 
 _MAX_ROTATIONS = 30
 _WIDE_GAP = 1e-4  # of the trace: the least eigenvalue stands this far apart, so the closed form is exact

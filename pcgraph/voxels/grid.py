@@ -22,16 +22,16 @@ from pcgraph.voxels.warp import Warp
 _STEPS_PER_VOXEL = float(1 << 20)
 _COLOR_STEPS = 65535.0
 MAX_NEIGHBOURS = 26
-"""Voxels around a voxel, at most, but of a larger one beside smaller ones."""
-AROUND_ON_SURFACE = 5
-"""Voxels around one that is joined as on a surface, at least."""
+"""Most neighbours of a voxel in a grid of one size; a larger one beside smaller ones may have more."""
+MIN_NEIGHBOURS_ON_SURFACE = 5
+"""Neighbours from which on a voxel is joined: on a surface, and not on a line or alone."""
 MAX_GAP = Warp.max_gap
-"""Voxel edges between the means of two voxels, at most, that a gap lies between, but in scans whose voxels grow."""
+"""Widest gap, in voxel edges between centroids; `RangeWarp.max_gap` is wider."""
 _STRETCH = 1024  # cells in a row of which the cells around are counted,
 _COUNTED = 1 << 16  # and of how many they are, about
 _END = np.iinfo(np.int64).max
-_NO_ROOM = np.empty(0, np.int32)  # where lists are not wanted
-_AMID = 8  # voxels around one amid a surface
+_NO_BUFFER = np.empty(0, np.int32)  # where lists are not wanted
+_INTERIOR_NEIGHBOURS = 8  # of a voxel amid a surface
 _OF_SURFACE = 6  # of eight places beside one, seen from the front of a surface that is as steep as may be
 
 
@@ -145,7 +145,7 @@ class VoxelGrid(ShortRepr):
     @property
     def joined(self) -> NDArray[np.bool_]:
         """Whether each voxel has as many others around it as on a surface, (v,) bool."""
-        return np.diff(self.indptr) >= AROUND_ON_SURFACE
+        return np.diff(self.indptr) >= MIN_NEIGHBOURS_ON_SURFACE
 
     def around(self, voxels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """The voxels that touch some, (t,): the row of the one in `voxels`, (s,), and the other."""
@@ -397,13 +397,13 @@ def _touching(
     smaller = np.bincount(coarser, minlength=n)
     indptr = np.concatenate((np.zeros(1, np.int64), np.cumsum(smaller + counts + larger)))
     neighbours = np.empty(indptr[-1], np.int32)
-    neighbours[_rows(indptr[:-1] + smaller, counts)] = same.neighbours
-    neighbours[_rows(indptr[:-1], smaller)] = finer[np.lexsort((finer, coarser))]
-    neighbours[_rows(indptr[:-1] + smaller + counts, larger)] = coarser[np.lexsort((coarser, finer))]
+    neighbours[_concatenated_ranges(indptr[:-1] + smaller, counts)] = same.neighbours
+    neighbours[_concatenated_ranges(indptr[:-1], smaller)] = finer[np.lexsort((finer, coarser))]
+    neighbours[_concatenated_ranges(indptr[:-1] + smaller + counts, larger)] = coarser[np.lexsort((coarser, finer))]
     return VoxelLists(indptr, neighbours)
 
 
-def _rows(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _concatenated_ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Places of rows of so many that start at these, one row after the other."""
     return np.arange(counts.sum()) + np.repeat(starts - np.cumsum(counts) + counts, counts)
 
@@ -475,7 +475,7 @@ def occupied_cells(
     step = _STRETCH * max(1, len(first) // _COUNTED)
     stretches = [slice(at, min(at + _STRETCH, len(first))) for at in range(0, len(first), step)]
     for stretch in stretches:
-        _walk(stretch.start, stretch.stop, occupied, *pitch, degrees, _NO_ROOM)
+        _walk(stretch.start, stretch.stop, occupied, *pitch, degrees, _NO_BUFFER)
     counted = np.concatenate([degrees[stretch] for stretch in stretches])
     return np.floor(lattice.in_cells(places.take(order[first], axis=0))), counted
 
@@ -500,7 +500,7 @@ def touching_voxels(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> Voxe
 def touching_counts(keys: NDArray[np.int64], pitch_x: int, pitch_y: int) -> NDArray[np.int64]:
     """How many of the 26 around each of some voxels are occupied, (v,); arguments as for `touching_voxels`."""
     counts = np.empty(len(keys), np.int64)
-    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, _NO_ROOM)
+    in_blocks(_walk, len(keys), keys, pitch_x, pitch_y, counts, _NO_BUFFER)
     return counts
 
 
@@ -553,7 +553,7 @@ def _walk(
 
 def boundary_voxels(grid: VoxelGrid) -> NDArray[np.bool_]:
     """Whether each voxel lies where a surface ends, with fewer than eight around it, (v,) bool."""
-    return np.diff(grid.indptr) < _AMID
+    return np.diff(grid.indptr) < _INTERIOR_NEIGHBOURS
 
 
 def at_ends(grid: VoxelGrid, voxels: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -9,10 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.disjoint_sets import connected_components
-from pcgraph.voxels.directions import densest_plane, plane_basis
+from pcgraph.voxels.directions import plane_basis
 from pcgraph.voxels.grid import VoxelGrid, voxel_grid
 from pcgraph.voxels.warp import Warp
 
+# The plane on which most lies
+_STARTS = 8  # normals from which planes are looked for
+_ALIKE, _SAME_NORMAL = 0.95, 0.99  # cosine between normals on one plane, and of those looked from once, and more
+_BAND = 0.02  # of the diagonal of the places' bounding box, within which those on one plane lie
+# Grounds and rooms
 LEVEL = 0.996  # cosine between a plane's normal and z: 5 degrees
 _OFF_PLANE, _NEARLY_ALL = 1.5, 0.8  # cells off a plane, and how much of what lies so far off is on one side of it
 _BEARS, _OF_GROUND = 0.1, 0.25  # of the cells lie on a plane that bears something, and on one that is the ground
@@ -29,8 +34,62 @@ _OVER_EACH_OTHER, _HALF_OVER = 0.7, 0.5  # of the floor has a ceiling over it; o
 _IN_ONE, _BEYOND = 0.9, 0.02  # of both are in one piece, at least; and of the cells are below or above, at most
 
 
-class BearingPlane(NamedTuple):
-    """The plane that bears most: the ground, a table, or a wall behind things.
+class DominantPlane(NamedTuple):
+    """The plane on which most of some places lie.
+
+    Attributes
+    ----------
+    normal : (3,) float64, unit
+    offset : float
+        Of the plane along its normal, in the places' unit.
+    fraction : float, 0..1
+        Of the places on it.
+    """
+
+    normal: NDArray[np.float64]
+    offset: float
+    fraction: float
+
+
+def dominant_plane(places: NDArray[np.float64], normals: NDArray[np.float64]) -> DominantPlane:
+    """The plane on which most of n places lie, (n, 3), with normals towards either side, (n, 3).
+
+    Some of the normals, and the commonest direction of all, each give way to the commonest direction near them; the
+    plane is the band across one of these that holds most places with such normals. The commonest direction of all alone
+    is turned aside by whatever else there is: by the sides of a crate on a table, 10 degrees.
+    """
+    some = normals[np.linspace(0, len(normals) - 1, _STARTS).astype(np.int64)]
+    band = _BAND * float(np.linalg.norm(places.max(axis=0) - places.min(axis=0)))
+    best, tried = DominantPlane(np.array([0.0, 0.0, 1.0]), 0.0, 0.0), np.zeros((0, 3))
+    for start in (_commonest(normals), *some):
+        if _alike(tried, start, _SAME_NORMAL).any():
+            continue
+        near = _alike(normals, start)
+        normal = _commonest(normals[near]) if near.any() else start
+        tried = np.concatenate((tried, start[None], normal[None]))
+        offsets = np.sort(np.einsum("ij,j->i", places[_alike(normals, normal)], normal))
+        if not len(offsets):
+            continue
+        within = np.searchsorted(offsets, offsets + band, "right") - np.arange(len(offsets))
+        first = int(np.argmax(within))
+        fraction = float(within[first]) / len(places)
+        if fraction > best.fraction:
+            best = DominantPlane(normal, float(np.median(offsets[first : first + within[first]])), fraction)
+    return best
+
+
+def _alike(normals: NDArray[np.float64], normal: NDArray[np.float64], least: float = _ALIKE) -> NDArray[np.bool_]:
+    return np.abs(np.einsum("ij,j->i", normals, normal)) > least
+
+
+def _commonest(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The unit direction, (3,), with the largest mean square cosine to normals, (n, 3)."""
+    direction: NDArray[np.float64] = np.linalg.eigh(np.einsum("ij,ik->jk", normals, normals))[1][:, -1]
+    return direction
+
+
+class SupportingPlane(NamedTuple):
+    """The supporting plane: the ground, a table, or a wall behind things.
 
     Attributes
     ----------
@@ -47,14 +106,14 @@ class BearingPlane(NamedTuple):
     is_ground: bool
 
 
-def bearing_plane(coarse: VoxelGrid, normals: NDArray[np.float64]) -> BearingPlane:
+def supporting_plane(coarse: VoxelGrid, normals: NDArray[np.float64]) -> SupportingPlane:
     """The plane on which most cells lie, if nearly all the rest is on one side of it."""
-    normal, offset, fraction = densest_plane(coarse.centroids, normals)
+    normal, offset, fraction = dominant_plane(coarse.centroids, normals)
     heights = np.einsum("ij,j->i", coarse.centroids, normal) - offset
     is_rest = np.abs(heights) > _OFF_PLANE * coarse.size
     above, below = heights[is_rest & (heights > 0.0)].sum(), -heights[is_rest & (heights < 0.0)].sum()
     if fraction < _BEARS or max(above, below) <= _NEARLY_ALL * (above + below):
-        return BearingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
+        return SupportingPlane(np.array([0.0, 0.0, 1.0]), -np.inf, False)
     if above < below:
         normal, offset, heights = -normal, -offset, -heights
     is_ground = (
@@ -64,7 +123,7 @@ def bearing_plane(coarse: VoxelGrid, normals: NDArray[np.float64]) -> BearingPla
         and np.mean(heights[is_rest] < 0.0) <= _ANYTHING
         and _level_area(coarse.centroids[is_rest]) < _WITHIN_GROUND * _level_area(coarse.centroids[~is_rest])
     )
-    return BearingPlane(normal, offset, bool(is_ground))
+    return SupportingPlane(normal, offset, bool(is_ground))
 
 
 def _level_area(places: NDArray[np.float64]) -> float:
@@ -89,11 +148,11 @@ def is_scanned_room(
     mean = float(points.mean())
     if points.var() - mean < _UNEVEN * mean * mean:  # not more than points at random would
         return False
-    z, densest = np.array([0.0, 0.0, 1.0]), densest_plane(centres, normals).normal
+    z, densest = np.array([0.0, 0.0, 1.0]), dominant_plane(centres, normals).normal
     aside = np.abs(np.einsum("ij,j->i", normals, densest)) < _ASIDE
     axes = [z, densest]
     if aside.any():
-        axes.append(densest_plane(centres[aside], normals[aside]).normal)
+        axes.append(dominant_plane(centres[aside], normals[aside]).normal)
     return any(_bound_a_room(centres, normals, points, size, axis) for axis in axes)
 
 

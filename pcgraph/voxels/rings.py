@@ -19,11 +19,11 @@ _MIN_ROWS, _SOME_ROWS, _MAX_ROWS = 40, 256, 512  # that are looked at: at first,
 _NOT_PARALLEL = 0.15  # of the rows' squares, along the second of their principal directions
 _COARSE, _MIDDLE, _FINE = 0.2, 0.1, 0.02  # slopes of rows against their cones, radians
 _TOO_STEEP = 0.6  # mean of g^2 / (g^2 + s^2), g being slopes and s the coarse one: no place from which to search
-_MOST_OFF = 0.3  # the same with the finer ones: no rings
-_MOST_UNCERTAIN = 0.05  # standard deviation of the place, in ranges
+_MAX_STEEPNESS = 0.3  # the same with the finer ones: no rings
+_MAX_UNCERTAINTY = 0.05  # standard deviation of the place, in ranges
 _SINGULAR = 1e4  # condition of the derivatives: with more, some line of places does as well
 _NEAR = 0.2  # median ranges
-_LEAST_COSINE = 1e-3  # of an elevation
+_MIN_COSINE = 1e-3  # of an elevation
 _STEPS = 15  # of a search
 
 
@@ -73,10 +73,10 @@ def scanner_of_rings(rows: Rows, near: NDArray[np.float64]) -> Scanner | None:
     steepness = np.array([_steepness(some, frame, start, _COARSE) for start in starts])
     for start in starts[np.argsort(steepness, kind="stable")[: np.count_nonzero(steepness <= _TOO_STEEP)]]:
         unknown = _flattest(some, frame, start, _MIDDLE)
-        if _steepness(some, frame, unknown, _MIDDLE) > _MOST_OFF:
+        if _steepness(some, frame, unknown, _MIDDLE) > _MAX_STEEPNESS:
             continue
         unknown = _flattest(rows, frame, unknown, _FINE)
-        if _steepness(rows, frame, unknown, _FINE) <= _MOST_OFF and _is_certain(rows, frame, unknown):
+        if _steepness(rows, frame, unknown, _FINE) <= _MAX_STEEPNESS and _is_certain(rows, frame, unknown):
             return Scanner(middle + reach * unknown[:3], _axis(frame, unknown)[0])
     return None
 
@@ -91,7 +91,7 @@ def _is_certain(rows: Rows, frame: NDArray[np.float64], unknown: NDArray[np.floa
     if np.linalg.cond(trusted) > _SINGULAR:
         return False
     variance = np.linalg.eigvalsh(np.linalg.inv(trusted.T @ trusted)[:3, :3])[-1]
-    return bool(_FINE * np.sqrt(variance) <= _MOST_UNCERTAIN * typical)
+    return bool(_FINE * np.sqrt(variance) <= _MAX_UNCERTAINTY * typical)
 
 
 def _flattest(rows: Rows, frame: NDArray[np.float64], start: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
@@ -117,7 +117,7 @@ def _slopes(
     ranges = np.maximum(np.linalg.norm(rays, axis=1), np.finfo(float).tiny)[:, None]
     rays = rays / ranges
     along, sines = np.einsum("ij,ij->i", rows.directions, rays)[:, None], (rays @ axis)[:, None]
-    cosines = np.sqrt(np.maximum(1.0 - sines * sines, _LEAST_COSINE**2))
+    cosines = np.sqrt(np.maximum(1.0 - sines * sines, _MIN_COSINE**2))
     across = rows.directions - along * rays
     slopes = (across @ axis)[:, None] / cosines
     by_cosine = slopes * sines / cosines**2

@@ -195,3 +195,13 @@ def _thin(
         found[n] = p
         n += (_mixed_steps(points[p], low, scale) if scale > 0.0 else _mixed_bits(points[p])) < limit
     return found[:n]
+
+
+def farthest_points(places: NDArray[np.float64], first: int, n: int) -> list[int]:
+    """Indices of at most n of k places, (k, 3), by farthest point sampling from the place `first`."""
+    chosen, nearest = [first], np.full(len(places), np.inf)
+    while len(chosen) < min(n, len(places)):
+        ways = places - places[chosen[-1]]
+        nearest = np.minimum(nearest, np.sqrt(np.einsum("ij,ij->i", ways, ways)))
+        chosen.append(int(np.argmax(nearest)))
+    return chosen

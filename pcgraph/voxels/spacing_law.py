@@ -15,8 +15,9 @@ from scipy.spatial import cKDTree
 from pcgraph.parallel import in_blocks, kernel, summing_routine
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
-from pcgraph.voxels.directions import densest_plane, sphere_directions
-from pcgraph.voxels.eigen import AXES, plane_normal
+from pcgraph.voxels.directions import sphere_directions
+from pcgraph.voxels.eigen import SYMMETRIC_INDICES, plane_normal
+from pcgraph.voxels.ground_and_rooms import dominant_plane
 from pcgraph.voxels.rings import Rows, scanner_of_rings
 from pcgraph.voxels.sampling import order_of_draw, sample
 
@@ -26,7 +27,7 @@ _NEIGHBOUR = 8
 _MIN_SAMPLE = 512  # places of a block whose neighbours are sought
 _STARTS, _APART, _FIRST_STEP = 6, 0.3, 0.1  # of the search for a place, lengths in half diagonals
 _MOVES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3), sphere_directions(8)))
-_LEAST_RANGE = 1e-3  # in half extents
+_MIN_RANGE = 1e-3  # in half extents
 _SHORT_STEP = 0.1  # in half extents: of a place that was found with readings that do not count
 _TINY, _FAR = float(np.finfo(np.float64).tiny), float(np.finfo(np.float32).max)
 _ROUNDING = 1e-12  # variance of readings that are all alike, about, as logarithms are in single precision
@@ -39,8 +40,8 @@ _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
 _MIN_EXPONENT_OF_HALF = 0.3
 _ENDS, _MIN_OF_MOST = 0.1, 0.7  # of the readings, nearest and farthest; exponent of the others, of that of all
-_ALIKE = 0.02  # explained variance: what explains less than this more is no better
-_OWN_ORIGIN = 0.05  # explained variance by which another place must beat the frame's origin
+_ALIKE = 0.02  # r_squared variance: what explains less than this more is no better
+_OWN_ORIGIN = 0.05  # r_squared variance by which another place must beat the frame's origin
 _MIN_COSINE = 0.1  # between a surface and the rays that meet it: at less a beam's spacing is that along its rows
 _ROW = 0.1  # of the variance along a row of points is at most across it
 _PRIOR = 0.1  # of the variance for a deviation of 1 from the exponent of a beam of constant angle, in search of a place
@@ -56,50 +57,54 @@ class SpacingLaw(ShortRepr):
     viewpoint : (3,) float64, metres
     exponent : float, 0..1.5
         About 1 for a beam of constant angle, more where noise grows with range as well.
-    explained : float, at most 1
+    r_squared : float, at most 1
         Fraction of the variance of the spacing's logarithm that the law explains; negative if it is worse than none.
-    by_range : float, 0..1
+    partial_r_squared : float, 0..1
         Fraction that range explains of what cosines leave. About 0 where all is far, and only the slant of the surfaces
         makes a difference, as seen from the air.
-    in_halves : float
+    min_half_exponent : float
         The lesser of the exponents in the near and in the far half of the readings, where ranges differ enough to tell;
         else `exponent`. About 0 where a fine scan of a thing lies within a coarse one of its surroundings.
-    in_most : float
+    trimmed_exponent : float
         The exponent among the readings without those nearest and farthest, a tenth each, of a place that was found;
         else `exponent`. Less where little lies far off and less densely, as a house seen from a window.
     mirrored : (3,) float64, metres, or None
         A place on the other side of what is nearly one plane, if spacing does not tell which of the two it was.
     axis : (3,) float64, or None
         About which a scanner turned, of length 1, either way, if its rings told the place.
-    searched : (3,) float64, metres, or None
+    best_viewpoint : (3,) float64, metres, or None
         The place that explains most, if the frame's origin, which explains as much, counts for it.
     """
 
     viewpoint: NDArray[np.float64]
     exponent: float
-    explained: float
-    by_range: float
-    in_halves: float
-    in_most: float
+    r_squared: float
+    partial_r_squared: float
+    min_half_exponent: float
+    trimmed_exponent: float
     mirrored: NDArray[np.float64] | None = None
     axis: NDArray[np.float64] | None = None
-    searched: NDArray[np.float64] | None = None
+    best_viewpoint: NDArray[np.float64] | None = None
 
     @property
     def holds(self) -> bool:
         """Whether the law says more than chance would, near and far; or does not gainsay what rings told."""
         least = _MIN_EXPLAINED if self.axis is None else _MIN_ON_RINGS
-        grows_everywhere = self.in_halves >= _MIN_EXPONENT_OF_HALF and self.in_most >= _MIN_OF_MOST * self.exponent
+        grows_everywhere = (
+            self.min_half_exponent >= _MIN_EXPONENT_OF_HALF and self.trimmed_exponent >= _MIN_OF_MOST * self.exponent
+        )
         return self._tells(least) and grows_everywhere
 
     @property
-    def tells_place(self) -> bool:
+    def locates_scanner(self) -> bool:
         """Whether the place is told, be it by a piece of a scan, over whose ranges spacing hardly changes."""
-        return self.holds or (self._tells(_MIN_HINT) and self.by_range >= _MIN_BY_RANGE and self.mirrored is None)
+        return self.holds or (
+            self._tells(_MIN_HINT) and self.partial_r_squared >= _MIN_BY_RANGE and self.mirrored is None
+        )
 
     def _tells(self, least: float) -> bool:
         """Whether law and range explain so much, and spacing grows with range."""
-        return (self.explained + self.by_range) / 2.0 >= least and self.exponent >= _MIN_EXPONENT
+        return (self.r_squared + self.partial_r_squared) / 2.0 >= least and self.exponent >= _MIN_EXPONENT
 
 
 def spacing_law(
@@ -131,10 +136,10 @@ def spacing_law(
     low, high = bounding_box(found.places)
     middle, reach = (low + high) / 2.0, float((high - low).max()) / 2.0
     found = _Readings((found.places - middle) / reach, found.normals, found.logs - math.log(reach))
-    every, own, mirrored, searched = found.some(slice(None, _READINGS)), viewpoint, None, None
+    every, own, mirrored, best_viewpoint = found.some(slice(None, _READINGS)), viewpoint, None, None
     spread_out = found.some(_between_points_and_surface(found))
     if viewpoint is None:
-        place, mirrored = _most_telling_places(spread_out)
+        place, mirrored = _best_scanner_positions(spread_out)
         near_line = spread_out.some(_on_line(spread_out, place))
         place = _searched(near_line.some(slice(None, None, 2)), place[None], np.array([_SHORT_STEP]), 8)[0][0]
         halved = every
@@ -146,19 +151,19 @@ def spacing_law(
     if viewpoint is None:
         origin = -middle / reach
         line_of_origin = _regressions(every.some(kept), origin[None])
-        if line_of_origin.explained[0] >= line.explained[0] - _OWN_ORIGIN:
-            searched = middle + reach * place
+        if line_of_origin.r_squared[0] >= line.r_squared[0] - _OWN_ORIGIN:
+            best_viewpoint = middle + reach * place
             place, line, own, mirrored = origin, line_of_origin, np.zeros(3), None
     exponent = float(line.exponents[0])
     return SpacingLaw(
         viewpoint=middle + reach * place if own is None else own,
         exponent=exponent,
-        explained=float(line.explained[0]),
-        by_range=float(line.by_range[0]),
-        in_halves=_least_exponent(halved, place, exponent),
-        in_most=_exponent_of_most(every, place) if viewpoint is None else exponent,
+        r_squared=float(line.r_squared[0]),
+        partial_r_squared=float(line.partial_r_squared[0]),
+        min_half_exponent=_least_exponent(halved, place, exponent),
+        trimmed_exponent=_exponent_of_most(every, place) if viewpoint is None else exponent,
         mirrored=None if mirrored is None else middle + reach * mirrored,
-        searched=searched,
+        best_viewpoint=best_viewpoint,
     )
 
 
@@ -175,7 +180,7 @@ def law_on_rings(
     ----------
     points : (n, 3) float64, metres
     law : SpacingLaw
-        Of these points: the place from which that of the rings is searched, or the frame's origin, or the middle.
+        Of these points: the place from which that of the rings is best_viewpoint, or the frame's origin, or the middle.
     rows : Rows
         Of these points.
     viewpoint : (3,) float64, metres, optional
@@ -264,7 +269,7 @@ def _fit_normals(
             for axis in range(3):
                 way[axis] = (places[p, axis] - places[around[m, 0], axis]) / spacing[m] - mean[axis]
             for column in range(6):
-                scatter[column] += way[AXES[column][0]] * way[AXES[column][1]]
+                scatter[column] += way[SYMMETRIC_INDICES[column][0]] * way[SYMMETRIC_INDICES[column][1]]
         least = plane_normal(scatter, normals[m])
         xx, yy, zz, xy, xz, yz = scatter
         others = xx + yy + zz - least  # sum and product of the other two spreads
@@ -322,7 +327,7 @@ def _look_along_rays(
         for i in range(places.shape[1]):
             x, y, z = places[0, i] - px, places[1, i] - py, places[2, i] - pz
             nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
-            reach = math.sqrt(x * x + y * y + z * z) + _LEAST_RANGE
+            reach = math.sqrt(x * x + y * y + z * z) + _MIN_RANGE
             cosine = abs(x * nx + y * ny + z * nz) / reach
             cosine = cosine if cosine > _MIN_COSINE else _MIN_COSINE
             ranges[v, i] = reach if reach < _FAR else _FAR
@@ -332,15 +337,15 @@ def _look_along_rays(
 class _Lines(NamedTuple):
     """Regressions about k viewpoints: what each explains of the variance, exponent, what range explains, (k,) each."""
 
-    explained: NDArray[np.float64]
+    r_squared: NDArray[np.float64]
     exponents: NDArray[np.float64]
-    by_range: NDArray[np.float64]
+    partial_r_squared: NDArray[np.float64]
 
 
 def _regressions(readings: _Readings, viewpoints: NDArray[np.float64], prior: float = 0.0) -> _Lines:
     """The law about each of k viewpoints, (k, 3).
 
-    A prior, in variances, draws exponents to 1 and counts against what is explained.
+    A prior, in variances, draws exponents to 1 and counts against what is r_squared.
     """
     found = _Lines(*np.empty((3, len(viewpoints))))
     _regress(readings.logs, *_on_law(readings, viewpoints), prior, found)
@@ -362,8 +367,8 @@ def _regress(
         slope = (products + prior * variance) / max(of_x + prior * variance, least)
         slope = min(max(slope, 0.0), _MAX_EXPONENT)
         left = of_y - slope * (2.0 * products - slope * of_x)
-        found.by_range[v] = 1.0 - left / max(of_y, least)
-        found.explained[v] = 1.0 - left / max(variance, least) - prior * (slope - 1.0) ** 2
+        found.partial_r_squared[v] = 1.0 - left / max(of_y, least)
+        found.r_squared[v] = 1.0 - left / max(variance, least) - prior * (slope - 1.0) ** 2
         found.exponents[v] = slope
 
 
@@ -406,7 +411,7 @@ def _exponent_of_most(readings: _Readings, viewpoint: NDArray[np.float64]) -> fl
     return float(_regressions(most, viewpoint[None]).exponents[0])
 
 
-def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+def _best_scanner_positions(readings: _Readings) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """The place, (3,), about which spacing follows the law best, found by pattern searches around the cloud.
 
     In a room only places near the true one lead to it, so the search starts from several, far apart. A plane looks the
@@ -421,17 +426,17 @@ def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDAr
     outside = [(low + high) / 2.0 + far * reach * sphere_directions(40) for far in (1.2, 2.0)]
     candidates = np.concatenate((inside, *outside))
     starts: list[NDArray[np.float64]] = []
-    for place in candidates[np.argsort(-_regressions(some, candidates, _PRIOR).explained, kind="stable")]:
+    for place in candidates[np.argsort(-_regressions(some, candidates, _PRIOR).r_squared, kind="stable")]:
         if all(np.linalg.norm(place - start) > _APART * reach for start in starts):
             starts.append(place)
             if len(starts) == _STARTS:
                 break
     found, steps = _searched(some, np.stack(starts), np.full(len(starts), _FIRST_STEP * reach), 5)
-    best = np.argmax(_regressions(half, found, _PRIOR).explained, keepdims=True)
+    best = np.argmax(_regressions(half, found, _PRIOR).r_squared, keepdims=True)
     place = _searched(half, found[best], steps[best], 8)[0][0]
     other = _mirrored(place, half)
     other = _searched(half, other[None], np.array([float(np.linalg.norm(other - place)) / 8.0]), 5)[0][0]
-    first, second = _regressions(half, np.stack((place, other)), _PRIOR).explained
+    first, second = _regressions(half, np.stack((place, other)), _PRIOR).r_squared
     if second > first:
         place, other = other, place
     return place, other if abs(first - second) < _ALIKE else None
@@ -439,7 +444,7 @@ def _most_telling_places(readings: _Readings) -> tuple[NDArray[np.float64], NDAr
 
 def _mirrored(place: NDArray[np.float64], readings: _Readings) -> NDArray[np.float64]:
     """A place, (3,), on the other side of the plane on which most lies."""
-    normal, offset, _ = densest_plane(readings.places, readings.normals)
+    normal, offset, _ = dominant_plane(readings.places, readings.normals)
     return place - 2.0 * (place @ normal - offset) * normal
 
 
@@ -450,9 +455,9 @@ def _searched(
     each = np.arange(len(places))
     for _ in range(rounds):
         tried = places[:, None] + steps[:, None, None] * _MOVES
-        explained = _regressions(readings, tried.reshape(-1, 3), _PRIOR).explained.reshape(tried.shape[:2])
-        best = np.argmax(explained, axis=1)
-        is_better = explained[each, best] > explained[:, 0] + 1e-4
+        r_squared = _regressions(readings, tried.reshape(-1, 3), _PRIOR).r_squared.reshape(tried.shape[:2])
+        best = np.argmax(r_squared, axis=1)
+        is_better = r_squared[each, best] > r_squared[:, 0] + 1e-4
         places = np.where(is_better[:, None], tried[each, best], places)
         steps = np.where(is_better, steps, 0.5 * steps)
     return places, steps

@@ -239,6 +239,11 @@ class Surface(ShortRepr):
     normals: NDArray[np.float64]
     supervoxels: NDArray[np.int32]
 
+    def mean_edge_lengths(self, n_supervoxels: int) -> NDArray[np.float64]:
+        """Mean edge of each supervoxel's voxels, (n_supervoxels,) float64, metres."""
+        sums = np.bincount(self.supervoxels, self.grid.edge_lengths, n_supervoxels)
+        return sums / np.bincount(self.supervoxels, minlength=n_supervoxels)
+
     def mean_normals(self, n_supervoxels: int) -> NDArray[np.float64]:
         """Mean normal of each supervoxel's voxels, weighted by their points, (n_supervoxels, 3) float64."""
         weights = self.grid.counts.astype(np.float64)

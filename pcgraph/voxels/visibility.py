@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which side of a surface is its outside, where nobody said from where it was seen: the side that is visible from the
-places that tell (`pcgraph.voxels.telling_places`)."""
+places that tell (`pcgraph.voxels.virtual_viewpoints`)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.short_repr import ShortRepr
-from pcgraph.voxels.depth_buffer import cosines_towards, seen_from
+from pcgraph.voxels.depth_buffer import SAME_SURFACE_COSINE, cosines_towards, visibility_from
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid
-from pcgraph.voxels.ground_and_rooms import bearing_plane
-from pcgraph.voxels.telling_places import (
-    TellingPlaces,
+from pcgraph.voxels.ground_and_rooms import supporting_plane
+from pcgraph.voxels.virtual_viewpoints import (
+    VirtualViewpoints,
     coarse_grid,
     either_normals,
     lengths,
-    telling_places,
     unit_frame,
+    virtual_viewpoints,
 )
 
 _EDGE_ON, _LITTLE = 0.02, 0.3  # cosine below which a surface is seen edge-on, and fraction of the voxels that may be
@@ -35,12 +35,11 @@ _CLEAR = 0.3  # votes for a side that need no others, where all voxels are looke
 _PATCH, _CREASE = 10, 0.5  # voxels of a patch, at least, and the cosine between normals at its edges, at most
 _OFF_PATCH = 0.7  # edge lengths between planes of touching voxels: so many, and they are two surfaces
 _HARDLY, _MOSTLY = 0.05, 0.3  # what votes that are not clear count beside edges; and how much more must agree than not
-_SAME = np.float32(0.8)  # cosine between normals on one surface, and more
 
 
 @dataclass(frozen=True, eq=False)
 class VisibleSides(ShortRepr):
-    """Which side of its surface each of v voxels shows.
+    """Outward normals of v voxels, and the viewpoints from which the outside is seen.
 
     Attributes
     ----------
@@ -58,7 +57,7 @@ def visible_sides(
     grid: VoxelGrid,
     normals: NDArray[np.float64],
     viewpoint: NDArray[np.float64] | None = None,
-    telling: TellingPlaces | None = None,
+    telling: VirtualViewpoints | None = None,
     axis: NDArray[np.float64] | None = None,
 ) -> VisibleSides:
     """The outer side of the surface at each voxel, found from what is visible.
@@ -71,8 +70,8 @@ def visible_sides(
     viewpoint : (3,) float64, metres, optional
         About where all was seen from. What lies edge-on from there, as ground does from a place on it, is decided by
         what is visible; if little does, nothing else is asked.
-    telling : TellingPlaces, optional
-        `telling_places(grid, viewpoint)`, where that is known.
+    telling : VirtualViewpoints, optional
+        `virtual_viewpoints(grid, viewpoint)`, where that is known.
     axis : (3,) float64, optional
         Of a scanner at the viewpoint, as for `sides_towards`.
 
@@ -101,12 +100,12 @@ def visible_sides(
         told = _cosines(grid, normals, viewpoint, axis, reach)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
             return VisibleSides(viewpoint[None], _turned(normals, told))
-    telling = telling_places(grid, viewpoint) if telling is None else telling
+    telling = virtual_viewpoints(grid, viewpoint) if telling is None else telling
     places, weights = telling.places, telling.weights
-    votes, (looked_at, stretch) = _TOLD * told, standing_for_all(grid)
+    votes, (looked_at, stretch) = _TOLD * told, occluder_subset(grid)
     centres, widths = (grid.centroids[looked_at] - middle) / reach, stretch * grid.edge_lengths[looked_at] / reach
     sides = normals[looked_at]
-    seen, towards = seen_from(places, centres, widths, sides, stretch), np.empty((len(centres), 3))
+    seen, towards = visibility_from(places, centres, widths, sides, stretch), np.empty((len(centres), 3))
     if telling.part_of_cell.any():
         seen &= telling.parts[:, None] == telling.part_of(centres)
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
@@ -117,8 +116,8 @@ def visible_sides(
     return VisibleSides(seen_from_places, _turned(normals, votes))
 
 
-def standing_for_all(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
-    """Some of many voxels, evenly spread on any plane, and how many times as wide they hide as much as all do."""
+def occluder_subset(grid: VoxelGrid) -> tuple[NDArray[np.int64], float]:
+    """Indices of an evenly spread subset of the voxels, (s,), and the factor to widen them so that it hides as much."""
     step = next((step for many, step in _MANY if grid.n_voxels > many), 1.0)
     if step == 1.0:
         return np.arange(grid.n_voxels), 1.0
@@ -212,10 +211,10 @@ def _turned(normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray
 
 def _smoothed_votes(grid: VoxelGrid, normals: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Votes for the side of each voxel's normal, (v,), overwritten, with those of the voxels around on one surface."""
-    return _spread_votes(grid, _on_one_surface(grid, normals), votes)
+    return _spread_votes(grid, _neighbours_on_one_surface(grid, normals), votes)
 
 
-def _on_one_surface(grid: VoxelGrid, normals: NDArray[np.float64]) -> NDArray[np.int8]:
+def _neighbours_on_one_surface(grid: VoxelGrid, normals: NDArray[np.float64]) -> NDArray[np.int8]:
     """Whether each voxel and each of those around it are on one surface: 1, -1 with opposite normals, or 0."""
     alike = np.empty(len(grid.neighbours), np.int8)
     in_blocks(_compare_normals, grid.n_voxels, grid.neighbourhood, normals, alike)
@@ -245,7 +244,7 @@ def shown_fraction(grid: VoxelGrid, place: NDArray[np.float64]) -> float:
     """
     normals, joined = either_normals(grid), grid.joined
     visible = _visible(grid, place, normals).astype(np.float64)
-    shown = _spread_votes(grid, np.abs(_on_one_surface(grid, normals)), visible) > 0.0
+    shown = _spread_votes(grid, np.abs(_neighbours_on_one_surface(grid, normals)), visible) > 0.0
     return float(np.mean(shown[joined])) if joined.any() else 1.0
 
 
@@ -257,18 +256,18 @@ def _visible(grid: VoxelGrid, place: NDArray[np.float64], normals: NDArray[np.fl
     """Whether each voxel is visible from a place, (v,) bool."""
     middle, reach = unit_frame(grid, np.concatenate((grid.centroids, place[None])))
     centres, widths = (grid.centroids - middle) / reach, grid.edge_lengths / reach
-    return seen_from((place - middle)[None] / reach, centres, widths, normals)[0]
+    return visibility_from((place - middle)[None] / reach, centres, widths, normals)[0]
 
 
-def likelier_place(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of two places, (3,) float64, metres, that from which a quarter more is visible; else that before which things
-    stand on what bears them; else that from which more is visible."""
+def likelier_viewpoint(grid: VoxelGrid, place: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The likelier of two scanner positions, (3,) float64, metres: that from which a quarter more is visible, else that
+    on the free side of the supporting plane, else that from which more is visible."""
     normals = either_normals(grid)
     visible, other_is = _visible_fraction(grid, place, normals), _visible_fraction(grid, other, normals)
     if max(visible, other_is) <= _MUCH_MORE * min(visible, other_is):
         middle, reach = unit_frame(grid, grid.centroids)
         coarse = coarse_grid(grid, middle, reach).cells
-        upwards, offset, _ = bearing_plane(coarse, either_normals(coarse))
+        upwards, offset, _ = supporting_plane(coarse, either_normals(coarse))
         before = [bool((one - middle) / reach @ upwards >= offset) for one in (place, other)]
         if before[0] != before[1]:
             return place if before[0] else other
@@ -377,7 +376,7 @@ def _alike_sides(
         ahead_of_i += way * normals[i, axis]
         ahead_of_j -= way * normals[j, axis]
     least, most = min(abs(ahead_of_i), abs(ahead_of_j)) / edge, max(abs(ahead_of_i), abs(ahead_of_j)) / edge
-    if abs(cosine) > _SAME and most <= _OFF_PATCH:
+    if abs(cosine) > SAME_SURFACE_COSINE and most <= _OFF_PATCH:
         return 1.0 if cosine > 0.0 else -1.0, True
     if abs(cosine) < _CREASE:
         return min(least, 1.0) * (1.0 if (ahead_of_i > 0.0) == (ahead_of_j > 0.0) else -1.0), False
@@ -393,7 +392,7 @@ def _compare_normals(
         for a in range(around.indptr[i], around.indptr[i + 1]):
             j = around.neighbours[a]
             cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
-            alike[a] = np.int8(cosine > _SAME) - np.int8(cosine < -_SAME)  # without a branch
+            alike[a] = np.int8(cosine > SAME_SURFACE_COSINE) - np.int8(cosine < -SAME_SURFACE_COSINE)  # branch-free
 
 
 @kernel

@@ -19,8 +19,8 @@ FORWARDS = (0.0, 0.0, 1.0)
 """Where a camera looks in its own frame."""
 
 
-class Slant(NamedTuple):
-    """How normals lie in the warped space: a plane's n becomes m = n + ray (n . r) r + depth (n . w) a.
+class NormalTransform(NamedTuple):
+    """Transform of normals to the warped space: a plane's n becomes m = n + ray (n . r) r + depth (n . w) a.
 
     r is the direction of the warped place, w what of it lies across the axis a. Then a step dX in the warped space
     leaves the plane by m . dX, in metres of the warped space: scale(p) m = J^-T n, J being the derivative of
@@ -71,9 +71,9 @@ class Warp:
         return np.ones(len(points))
 
     @property
-    def slant(self) -> Slant:
+    def slant(self) -> NormalTransform:
         """How normals lie in the warped space."""
-        return Slant()
+        return NormalTransform()
 
     @property
     def seen_from(self) -> NDArray[np.float64] | None:
@@ -167,10 +167,10 @@ class CameraWarp(Warp):
         return self.viewpoint
 
     @property
-    def slant(self) -> Slant:
+    def slant(self) -> NormalTransform:
         """A step along the axis moves along the ray of the pixel."""
         x, y, z = self.axis.tolist()
-        return Slant(depth=1.0 / self.reference_depth, axis=(x, y, z))
+        return NormalTransform(depth=1.0 / self.reference_depth, axis=(x, y, z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,9 +217,9 @@ class RangeWarp(Warp):
         return self.viewpoint
 
     @property
-    def slant(self) -> Slant:
+    def slant(self) -> NormalTransform:
         """A step along the ray is shorter than one across it."""
-        return Slant(ray=self.growth / (1.0 - self.growth))
+        return NormalTransform(ray=self.growth / (1.0 - self.growth))
 
 
 def _median(values: NDArray[np.float64]) -> float:
@@ -257,9 +257,9 @@ def _ray(points: NDArray[np.float64], p: int, viewpoint: NDArray[np.float64]) ->
 
 @routine
 def warped_normal(
-    slant: Slant, x: float, y: float, z: float, a: float, b: float, c: float
+    slant: NormalTransform, x: float, y: float, z: float, a: float, b: float, c: float
 ) -> tuple[float, float, float]:
-    """The normal (a, b, c) in the warped space at the warped place (x, y, z); see `Slant`."""
+    """The normal (a, b, c) in the warped space at the warped place (x, y, z); see `NormalTransform`."""
     if slant.ray > 0.0:
         square = max(x * x + y * y + z * z, _MIN_LENGTH)
         along = slant.ray * (a * x + b * y + c * z) / square

@@ -9,7 +9,7 @@ from clouds import SPACING, patch, same_partition
 
 import pcgraph
 from pcgraph.metrics import tree_oracle, undersegmentation_error
-from pcgraph.voxels.evidence import autocorrelation, color_evidence, edge_evidence
+from pcgraph.voxels.column_evidence import autocorrelation, color_evidence, crease_contrast
 from pcgraph.voxels.grid import voxel_grid
 from pcgraph.voxels.warp import Warp
 
@@ -58,9 +58,9 @@ def test_without_colours_there_is_no_evidence():
 def test_evidence_has_no_unit_and_no_offset():
     surface = pcgraph.segment(STAIR, OWN[FACE] + 0.2 * NOISE, viewpoint=VIEW).surface
     grid, normals, colors = surface.grid, surface.normals, surface.grid.colors
-    found = edge_evidence(colors, grid, normals)
-    assert edge_evidence(1e-3 * colors + 7.0, grid, normals) == pytest.approx(found, rel=1e-6)
-    assert edge_evidence(np.hstack((colors, colors)), grid, normals) == pytest.approx(found)
+    found = crease_contrast(colors, grid, normals)
+    assert crease_contrast(1e-3 * colors + 7.0, grid, normals) == pytest.approx(found, rel=1e-6)
+    assert crease_contrast(np.hstack((colors, colors)), grid, normals) == pytest.approx(found)
 
 
 def test_without_creases_evidence_is_autocorrelation():
@@ -69,11 +69,11 @@ def test_without_creases_evidence_is_autocorrelation():
     up, x = np.tile((0.0, 0.0, 1.0), (grid.n_voxels, 1)), grid.centroids[:, :1]
     noise = RNG.standard_normal((grid.n_voxels, 1)) * 3.0 / np.sqrt(grid.counts)[:, None]  # 3 per point
     for column, about in ((np.round(x), 1.0), (noise, 0.0), (noise + x, None)):
-        found = edge_evidence(column, grid, up)
+        found = crease_contrast(column, grid, up)
         assert found == pytest.approx(autocorrelation(column, grid)[0], abs=0.1)
         assert about is None or found == pytest.approx(about, abs=0.1)
     lone = voxel_grid(np.eye(3), 0.01, Warp())
-    assert edge_evidence(np.eye(3), lone, np.eye(3)) == 0.0
+    assert crease_contrast(np.eye(3), lone, np.eye(3)) == 0.0
 
 
 def test_noise_in_colours_does_no_harm_and_colours_that_tell_help():

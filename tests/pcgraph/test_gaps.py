@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pcgraph
-from pcgraph.graph.bearing_image import Squares, seen_through, view_from
 from pcgraph.graph.gaps import gaps
+from pcgraph.graph.spherical_image import Surfels, seen_through, view_from
 from pcgraph.voxels.grid import Neighbourhood
 
 VOXEL = 0.05
@@ -82,7 +82,7 @@ def test_gaps_are_those_of_a_search_of_all_pairs():
     points = np.concatenate((sheet(0.0, 1.0), sheet(1.1, 1.6), sheet(0.3, 0.9, 0.12), rng.uniform(0, 1.5, (40, 3))))
     result = pcgraph.segment(points, voxel_size=VOXEL, viewpoint=(1.0, 0.5, 5.0), range_growth=0.0)
     grid, labels = result.surface.grid, result.surface.supervoxels
-    found = gaps(grid, result.surface.normals, labels, result.graph.node_features, result.graph.edges)
+    found = gaps(result.surface, result.graph.node_features, result.graph.edges)
     touching = {tuple(pair) for pair in result.graph.edges.tolist()}
     degree = np.diff(grid.indptr)
     a, b = np.tril_indices(grid.n_voxels, -1)
@@ -126,7 +126,7 @@ def view(place, places, normals):
     edges, n = np.full(len(places), 0.05), len(places)
     touching = Neighbourhood(np.zeros(n + 1, np.uint64), np.empty(0, np.uint32))
     return view_from(
-        place, Squares(np.arange(n), places, normals, edges, edges, np.arange(n, dtype=np.int32), touching)
+        place, Surfels(np.arange(n), places, normals, edges, edges, np.arange(n, dtype=np.int32), touching)
     )
 
 

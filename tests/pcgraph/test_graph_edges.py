@@ -31,7 +31,7 @@ def test_contacts_equal_brute_force(seed, n_supervoxels, density):
         for j in grid.neighbours[grid.indptr[i] : grid.indptr[i + 1]]:
             if owners[i] != owners[j]:
                 rims.setdefault((owners[i], owners[j]), set()).add(i)
-    found = contacts(grid, surface.normals, owners)
+    found = contacts(replace(surface, supervoxels=owners))
     expected = sorted((int(i), int(j)) for i, j in rims if i < j)
     assert [tuple(edge) for edge in found.edges.tolist()] == expected
     assert found.edges.dtype == np.int32
@@ -56,7 +56,7 @@ def test_many_contacts_of_one_supervoxel():
         np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size))) + 0.5, voxel_size=1.0, seed_size=30.0,
         viewpoint=(45, 45, 500),
     ).surface  # fmt: skip
-    found = contacts(surface.grid, surface.normals, np.arange(8100, dtype=np.int32))
+    found = contacts(replace(surface, supervoxels=np.arange(8100, dtype=np.int32)))
     assert len(found.edges) == 2 * 90 * 89 + 2 * 89 * 89  # rows, columns, both diagonals
     assert np.all(found.voxels == 1)
 

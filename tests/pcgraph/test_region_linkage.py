@@ -13,7 +13,7 @@ from graphs import random_graph
 from scipy.spatial.transform import Rotation
 
 import pcgraph
-from pcgraph.tree.region_linkage import RegionLinkage, Ways, region_linkage
+from pcgraph.tree.region_linkage import MergeEdges, RegionLinkage, region_linkage
 
 
 @pytest.mark.parametrize(("known", "side"), [(True, 1.0), (True, -1.0), (False, 1.0), (False, -1.0)])
@@ -43,7 +43,7 @@ def test_the_altitude_of_two_regions_is_the_formula(times_as_large, weight, reli
         leaves, normals=nodes.normal * [[1.0], [0.95]], colors=np.array([[0.9, 0.2, 0.1], [0.5, 0.3, 0.3]])
     )
     costs, weights = np.array([cost]), np.array([weight])
-    found = region_linkage(graph, leaves, Ways.of(graph.edges, costs, weights), color, relief).altitudes[0]
+    found = region_linkage(graph, leaves, MergeEdges.of(graph.edges, costs, weights), color, relief).altitudes[0]
     mean = leaves.counts.mean()
 
     def residual(scatter):

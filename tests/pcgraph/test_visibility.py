@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 import pcgraph
 from pcgraph.metrics import segmentation_covering
-from pcgraph.voxels import telling_places
-from pcgraph.voxels.depth_buffer import seen_from
-from pcgraph.voxels.directions import densest_plane
+from pcgraph.voxels import virtual_viewpoints
+from pcgraph.voxels.depth_buffer import visibility_from
 from pcgraph.voxels.grid import voxel_grid
+from pcgraph.voxels.ground_and_rooms import dominant_plane
 from pcgraph.voxels.spacing import median_spacing
 from pcgraph.voxels.spacing_law import spacing_law
 from pcgraph.voxels.visibility import shown_fraction
@@ -120,7 +120,9 @@ def test_a_wall_has_no_leaks_in_any_direction(direction):
     turn = Rotation.align_vectors([direction], [(0, 0, 1)])[0].as_matrix()
     behind = wall[np.abs(wall[:, :2]).max(axis=1) < 0.8]
     squares = np.concatenate((wall + np.array((0, 0, 1.5)), behind + np.array((0, 0, 2.0)))) @ turn.T
-    seen = seen_from(np.zeros((1, 3)), squares, np.full(len(squares), 0.05), np.tile(turn[:, 2], (len(squares), 1)))[0]
+    seen = visibility_from(
+        np.zeros((1, 3)), squares, np.full(len(squares), 0.05), np.tile(turn[:, 2], (len(squares), 1))
+    )[0]
     assert seen[: len(wall)].mean() > 0.95
     assert not seen[len(wall) :].any()
 
@@ -132,7 +134,7 @@ def test_a_plane_hides_nothing_of_itself_but_another_behind_it(slant, least):
     behind = wall[np.abs(wall[:, :2]).max(axis=1) < 0.4] - np.array((0, 0, 0.2))
     place = 2.0 * np.array([[np.sin(slant), 0.3 * np.sin(slant), np.cos(slant)]])
     squares = np.concatenate((wall, behind))
-    seen = seen_from(place, squares, np.full(len(squares), 0.04), np.tile((0.0, 0.0, 1.0), (len(squares), 1)))[0]
+    seen = visibility_from(place, squares, np.full(len(squares), 0.04), np.tile((0.0, 0.0, 1.0), (len(squares), 1)))[0]
     assert seen[: len(wall)].mean() >= least
     assert not seen[len(wall) :].any()
 
@@ -170,7 +172,7 @@ def test_a_tunnel_with_a_thing_in_it_is_seen_from_within_and_a_pipe_with_one_on_
 
 def test_a_square_in_front_hides_one_behind():
     near, behind, beside = [0.0, 0.0, 1.0], [0.02, 0.0, 3.0], [1.0, 0.0, 3.0]
-    seen = seen_from(
+    seen = visibility_from(
         np.zeros((1, 3)), np.array([near, behind, beside]), np.full(3, 0.2), np.tile((0.0, 0.0, 1.0), (3, 1))
     )[0]
     assert seen.tolist() == [True, False, True]
@@ -197,7 +199,7 @@ def test_one_scan_tells_from_where_it_was_taken():
     assert law.holds
     assert law.viewpoint.tolist() == [0, 0, 0]  # the frame's origin, as it explains as much as any other place
     assert law.exponent == pytest.approx(1.1, abs=0.1)
-    assert law.explained > 0.95
+    assert law.r_squared > 0.95
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -333,7 +335,7 @@ def test_the_densest_plane_is_a_table_whatever_stands_on_it(tilt):
     boards = joined(*(faces((-0.3, y, 0.0), (0.3, y + 0.3, 0.4 + y), 0.01, "+z") for y in (-0.3, 0.0)))
     points, normals = turned(joined(table, tuple(column @ lean.T for column in boards)), (0.0, tilt, 0.0))
     upwards = Rotation.from_rotvec((0.0, tilt, 0.0)).as_matrix()[:, 2]
-    plane = densest_plane(points, normals)
+    plane = dominant_plane(points, normals)
     assert abs(plane.normal @ upwards) > 0.9999
     assert plane.offset == pytest.approx(0.0, abs=0.01)
     assert plane.fraction == pytest.approx(len(table[0]) / len(points))
@@ -531,8 +533,8 @@ def test_slant_alone_is_no_place():
     to_ridge = np.abs(y % 20 - 10)
     z = np.where((np.abs(x % 20 - 10) < 6) & (to_ridge < 5), 8 - 1.6 * to_ridge, 0)
     law = spacing_law(np.column_stack((x, y, z)))
-    assert law.explained > 0.3
-    assert law.by_range < 0.1
+    assert law.r_squared > 0.3
+    assert law.partial_r_squared < 0.1
     assert not law.holds
 
 
@@ -546,15 +548,15 @@ def test_even_spacing_follows_no_law():
 def test_a_lattice_follows_no_law():
     """All readings are the same, so that there is nothing to explain."""
     lattice = np.stack(np.meshgrid(np.arange(49.0), np.arange(49.0), np.arange(2.0), indexing="ij"), -1).reshape(-1, 3)
-    assert not spacing_law(lattice).tells_place
+    assert not spacing_law(lattice).locates_scanner
     assert pcgraph.segment(lattice).objects.max() == 0
 
 
 def test_a_fine_scan_within_a_coarse_one_follows_no_law():
     fine = faces((1.6, 1.1, 0.7), (2.4, 1.9, 1.1), 0.005)[0]
     law = spacing_law(np.concatenate((ROOM[0], fine)) - (2.0, 1.5, 0.0))
-    assert law.explained > 0.5
-    assert law.in_halves < 0.3
+    assert law.r_squared > 0.5
+    assert law.min_half_exponent < 0.3
     assert not law.holds
 
 
@@ -563,8 +565,8 @@ def test_a_law_is_free_of_order_and_of_duplicates():
     mixed = np.random.default_rng(0).permutation(points)
     one, other, twice = (spacing_law(cloud) for cloud in (points, mixed, np.concatenate((points, points[:100]))))
     assert one.viewpoint.tobytes() == other.viewpoint.tobytes()
-    assert (one.exponent, one.explained) == (other.exponent, other.explained)
-    assert twice.explained == pytest.approx(one.explained, abs=0.05)
+    assert (one.exponent, one.r_squared) == (other.exponent, other.r_squared)
+    assert twice.r_squared == pytest.approx(one.r_squared, abs=0.05)
 
 
 def test_voxels_of_one_scan_grow_with_range_unless_told():
@@ -738,10 +740,10 @@ def test_a_thin_wall_hides_what_is_behind_it_also_where_some_voxels_stand_for_ma
     places = np.concatenate((near, far))
     widths = np.full(len(places), 0.05 * np.sqrt(7.0))
     normals = np.tile([1.0, 0.0, 0.0], (len(places), 1))
-    seen = seen_from(np.zeros((1, 3)), places, widths, normals, np.sqrt(7.0))[0]
+    seen = visibility_from(np.zeros((1, 3)), places, widths, normals, np.sqrt(7.0))[0]
     assert seen[: len(near)].all()
     assert np.mean(seen[len(near) :]) < 0.05
-    assert seen_from(np.zeros((1, 3)), places, widths, normals)[0].all()
+    assert visibility_from(np.zeros((1, 3)), places, widths, normals)[0].all()
 
 
 def scans_along_an_aisle(seed, places):
@@ -781,8 +783,8 @@ def test_first_opinions_that_meet_come_to_what_each_comes_to_alone(many):
         row[10 * many * place : 10 * many * place + 15 * many] = 1.0
     places = np.arange(14)
     starts = np.stack([places < 4, places < 1, places > 2, places > 9, places >= 0, places == 7]).astype(np.float32)
-    together = telling_places._agreements(cosines, starts)
-    alone = [telling_places._agreements(cosines, starts[s : s + 1]) for s in range(len(starts))]
+    together = virtual_viewpoints._agreements(cosines, starts)
+    alone = [virtual_viewpoints._agreements(cosines, starts[s : s + 1]) for s in range(len(starts))]
     for column, name in enumerate(together._fields):
         np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), err_msg=name)
     np.testing.assert_array_equal((together.outward > 0.0).sum(axis=1), many * np.array([145, 125, 145, 145, 145, 145]))

@@ -141,3 +141,32 @@ def test_an_index_of_another_version_of_numba_is_none(tmp_path):
     index = tmp_path / "a.nbi"
     index.write_bytes(pickle.dumps("0.1") + b"more")
     assert warmup._version_of(index) == "0.1"
+
+
+def test_what_was_compiled_for_a_class_that_is_no_more_is_compiled_anew(tmp_path):
+    """After an update of the package: numba keeps kernels by function and line, with the classes of their arguments."""
+    source = """
+from typing import NamedTuple
+from pcgraph.parallel import kernel
+
+class {name}(NamedTuple):
+    value: int
+
+@kernel
+def twice(of):
+    return 2 * of.value
+
+print(twice({name}(21)), sum(twice.stats.cache_hits.values()))
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(pcgraph.__file__).parents[1])}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    said = []
+    for name in ("Slant", "Slant", "NormalTransform", "NormalTransform"):
+        (tmp_path / "kernels.py").write_text(source.format(name=name))
+        run = subprocess.run(
+            [sys.executable, "-c", "import kernels"], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert run.returncode == 0, run.stderr
+        said.append(run.stdout.split())
+    assert [value for value, _ in said] == ["42"] * 4
+    assert [hits for _, hits in said[2:]] == ["0", "1"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pcgraph.parallel import in_blocks, kernel, routine
 from pcgraph.voxels.grid import Neighbourhood
 from pcgraph.voxels.surface import Surface
-from pcgraph.voxels.visibility import standing_for_all
+from pcgraph.voxels.visibility import occluder_subset
 
 _MAX_CELLS = 4e6
 _MAX_CELLS_PER_VOXEL = 16  # to either side; only voxels that nearly touch the sensor are wider
@@ -24,8 +24,8 @@ _OFF_PLANE, _OFF_SLOPE = 0.75, 0.05  # voxel edges, and of the distance, at leas
 _MAX_DEPTH = 32  # things one behind the other along a line
 
 
-class Squares(NamedTuple):
-    """What stands for a surface when it is looked at: all its voxels, or of many some, larger ones.
+class Surfels(NamedTuple):
+    """Surfels by which visibility is computed: one per voxel, or larger ones for some where voxels are many.
 
     Attributes
     ----------
@@ -48,28 +48,28 @@ class Squares(NamedTuple):
     neighbourhood: Neighbourhood
 
 
-def squares_of(surface: Surface, some: bool = False) -> Squares:
+def surfels_of(surface: Surface, some: bool = False) -> Surfels:
     """All voxels of a surface, or, if they are many, some."""
     grid, normals, labels = surface.grid, surface.normals, surface.supervoxels
-    voxels, stretch = standing_for_all(grid) if some else (np.arange(grid.n_voxels), 1.0)
+    voxels, stretch = occluder_subset(grid) if some else (np.arange(grid.n_voxels), 1.0)
     edges = grid.edge_lengths
     if len(voxels) == grid.n_voxels:
-        return Squares(voxels, grid.centroids, normals, edges, edges, labels, grid.neighbourhood)
+        return Surfels(voxels, grid.centroids, normals, edges, edges, labels, grid.neighbourhood)
     none_touch = Neighbourhood(np.zeros(len(voxels) + 1, np.int64), np.empty(0, np.int32))
     edges = edges[voxels]
-    return Squares(voxels, grid.centroids[voxels], normals[voxels], edges, stretch * edges, labels[voxels], none_touch)
+    return Surfels(voxels, grid.centroids[voxels], normals[voxels], edges, stretch * edges, labels[voxels], none_touch)
 
 
 class View(NamedTuple):
-    """Squares as they are seen from a place: unit directions to them, (s, 3), and distances, (s,) float64, metres."""
+    """Surfels as they are seen from a place: unit directions to them, (s, 3), and distances, (s,) float64, metres."""
 
-    squares: Squares
+    squares: Surfels
     bearings: NDArray[np.float64]
     ranges: NDArray[np.float64]
 
 
-def view_from(place: NDArray[np.float64], squares: Squares) -> View:
-    """Squares as they are seen from a place, (3,) float64, metres."""
+def view_from(place: NDArray[np.float64], squares: Surfels) -> View:
+    """Surfels as they are seen from a place, (3,) float64, metres."""
     s = len(squares.voxels)
     bearings, ranges = np.empty((s, 3)), np.empty(s)
     in_blocks(_look, s, place, squares.centroids, bearings, ranges)
@@ -96,7 +96,7 @@ def _look(
 
 
 @dataclass(frozen=True, eq=False)
-class BearingImage:
+class SphericalImage:
     """A lattice of directions with the voxel seen in each.
 
     Attributes
@@ -116,7 +116,7 @@ class BearingImage:
         return (self.voxels, self.wraps), (np.ascontiguousarray(self.voxels.T), False)
 
 
-def bearing_image(view: View) -> BearingImage:
+def spherical_image(view: View) -> SphericalImage:
     """Spherical image in which a voxel at median distance fills about one cell.
 
     Notes
@@ -127,11 +127,11 @@ def bearing_image(view: View) -> BearingImage:
     """
     found = _lattice(view, 1.0)
     if found is None:
-        return BearingImage(np.full((1, 1), -1, np.int32))
+        return SphericalImage(np.full((1, 1), -1, np.int32))
     lattice, seen, angles = found
     voxels = np.full(lattice.shape, -1, np.int32)
     _set_nearest(view.ranges, view.squares.widths, seen, angles, lattice.first, lattice.cell, voxels)
-    return BearingImage(voxels, bool(angles[0].max() - lattice.first[0] > math.pi))
+    return SphericalImage(voxels, bool(angles[0].max() - lattice.first[0] > math.pi))
 
 
 class _Lattice(NamedTuple):
@@ -303,7 +303,7 @@ def _see_through(
 
 
 @routine
-def _is_off(far: int, near: int, squares: Squares) -> bool:
+def _is_off(far: int, near: int, squares: Surfels) -> bool:
     """Whether one voxel lies off the plane of another."""
     height = square = 0.0
     for axis in range(3):
@@ -322,37 +322,37 @@ class Jumps(NamedTuple):
     Attributes
     ----------
     edges : (e, 2) int32
-        Squares in front and behind, next to each other.
-    hidings : (c, 2) int32
-        Where something goes into hiding, and where it, or something else, comes out from behind what hid it.
+        Surfels in front and behind, next to each other.
+    occluded_spans : (c, 2) int32
+        Ends of the spans that something hides: the surfel where a surface disappears, and that which appears beyond.
     """
 
     edges: NDArray[np.int32]
-    hidings: NDArray[np.int32]
+    occluded_spans: NDArray[np.int32]
 
 
-def depth_jumps(view: View, image: BearingImage, reach: float, least_gap: float) -> Jumps:
+def depth_jumps(view: View, image: SphericalImage, reach: float, least_gap: float) -> Jumps:
     """Where depth jumps along the rows and columns of an image.
 
     Parameters
     ----------
     view : View
-    image : BearingImage of it
+    image : SphericalImage of it
     reach : float, widths
         How wide a gap without data is looked across.
     least_gap : float, voxel edges
         Difference of range above which surfaces are apart.
     """
     found = [_scan(voxels, wraps, view, reach, least_gap) for voxels, wraps in image.lines]
-    edges, hidings = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return Jumps(edges, hidings)
+    edges, occluded_spans = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Jumps(edges, occluded_spans)
 
 
 @kernel
 def _scan(  # type: ignore[no-untyped-def]
     image: NDArray[np.int32], wraps: bool, view: View, reach: float, least_gap: float
 ):
-    """Depth edges (e, 2), front and behind, and hidings (c, 2), both int32 squares, along the image's rows.
+    """Depth edges (e, 2), front and behind, and occluded_spans (c, 2), both int32 squares, along the image's rows.
 
     Where a line passes from far to near, the far surface goes into hiding; where it passes from near to far, what
     comes out is paired with what went in last. A hole in the data ends all hiding.
@@ -360,11 +360,11 @@ def _scan(  # type: ignore[no-untyped-def]
     ranges, edge_lengths, supervoxels = view.ranges, view.squares.edge_lengths, view.squares.supervoxels
     indptr, neighbours = view.squares.neighbourhood
     depth_edges = np.empty((image.size, 2), np.int32)
-    hidings = np.empty((image.size, 2), np.int32)
-    hidden, (line, columns) = np.empty(_MAX_DEPTH, np.int32), lines_of(image)
+    occluded_spans = np.empty((image.size, 2), np.int32)
+    hidden, (line, columns) = np.empty(_MAX_DEPTH, np.int32), line_buffers(image)
     n_edges = n_hidings = 0
     for row in range(image.shape[0]):
-        stop, lap = squares_along(image[row], wraps, line, columns)
+        stop, lap = surfels_along(image[row], wraps, line, columns)
         depth = 0
         for at in range(1, stop - 1):
             before, i = line[at], line[at + 1]
@@ -395,19 +395,19 @@ def _scan(  # type: ignore[no-untyped-def]
                 entered = hidden[depth % _MAX_DEPTH]
                 known = at >= lap or not wraps  # of a panorama's first lap it is not known what is hidden at its start
                 if known and ranges[entered] > ranges[front] and supervoxels[entered] != supervoxels[behind]:
-                    hidings[n_hidings, 0], hidings[n_hidings, 1] = entered, behind
+                    occluded_spans[n_hidings, 0], occluded_spans[n_hidings, 1] = entered, behind
                     n_hidings += 1
-    return depth_edges[:n_edges].copy(), hidings[:n_hidings].copy()
+    return depth_edges[:n_edges].copy(), occluded_spans[:n_hidings].copy()
 
 
 @routine
-def lines_of(image: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Room for what `squares_along` sets."""
+def line_buffers(image: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Buffers for what `surfels_along` sets."""
     return np.empty(2 * image.shape[1] + 4, np.int32), np.empty(2 * image.shape[1] + 4, np.int32)
 
 
 @routine
-def squares_along(
+def surfels_along(
     cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32], columns: NDArray[np.int32]
 ) -> tuple[int, int]:
     """Set the squares in these cells, each once in a row, from ``line[1]`` on, and where they begin; -1 is around them.

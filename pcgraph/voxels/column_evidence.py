@@ -15,7 +15,7 @@ _ROUNDING = 1e-24  # of squares
 _DOUBT = 64  # pairs across creases that count as much as what is known without any
 
 
-def edge_evidence(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArray[np.float64]) -> float:
+def crease_contrast(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArray[np.float64]) -> float:
     """How much more something changes at creases than on smooth surfaces, 0..1.
 
     0 for noise, for a pattern that does not care for the shape below, and for what is the same everywhere; near 1 where
@@ -50,8 +50,8 @@ def edge_evidence(values: NDArray[np.float64], grid: VoxelGrid, normals: NDArray
 
 
 def color_evidence(grid: VoxelGrid, normals: NDArray[np.float64]) -> float:
-    """`edge_evidence` of the voxels' colours; 0 if they have none."""
-    return 0.0 if grid.colors is None else edge_evidence(grid.colors, grid, normals)
+    """`crease_contrast` of the voxels' colours; 0 if they have none."""
+    return 0.0 if grid.colors is None else crease_contrast(grid.colors, grid, normals)
 
 
 @kernel

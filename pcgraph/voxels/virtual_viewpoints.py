@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places from which the outside of a cloud is seen: those that agree, of many around and within it.
+"""Virtual viewpoints around and within a cloud, and which of them agree on the outer side of its surfaces.
 
 A scanner stood where nothing was, and what it measured it saw from there. So places around and within the cloud are
 tried: those from which much of it is visible, always from the same side, tell which side that is.
@@ -17,54 +17,68 @@ from numpy.typing import NDArray
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.parallel import in_blocks, kernel, routine, summing_routine
 from pcgraph.voxels.cells import bounding_box
-from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, seen_from
-from pcgraph.voxels.directions import farthest_first, sphere_directions
+from pcgraph.voxels.depth_buffer import facing_cosines, hit_fractions, visibility_from
+from pcgraph.voxels.directions import sphere_directions
 from pcgraph.voxels.grid import Neighbourhood, VoxelGrid, voxel_grid
-from pcgraph.voxels.ground_and_rooms import LEVEL, bearing_plane, is_scanned_room
+from pcgraph.voxels.ground_and_rooms import LEVEL, is_scanned_room, supporting_plane
+from pcgraph.voxels.sampling import farthest_points
 from pcgraph.voxels.surface import Windows, fitted_windows
 from pcgraph.voxels.warp import Shift
 
-_CELLS = 5000  # of the coarse grid on which places are compared, about
-_MOSTLY_SURFACES = 0.5  # of the voxels are joined as on a surface, at least
-_OUTSIDE = 42  # places around the cloud, and
-_DISTANCE = 1.3  # how far they stand off its middle, in half diagonals of its bounding box
-_INSIDE = 64  # free places within the bounding box, of a lattice of
-_LATTICE = 12  # along each side
-_MUCH_SMALLER = 0.2  # than the bounding box: a box along the principal axes
-_CLEARANCE = 2.0  # cells between a free place and the next surface
-_SOME = 1500  # cells are looked for in all directions from a place, about
-_AMONG = 0.8  # of the directions in which a place among the surfaces has something, of the most that any place has
-_BLOCKS, _OF_PART = 16, 0.05  # along the box of all, by which parts are told; of the cells in each
-_PARTS_OF_ANY, _PARTS = 3, 8  # at most, and if they are rooms
-_NEARLY_WHOLE, _SMALL = (0.05, 0.95), 0.5  # quantiles of a part's cells; and how long their box is, of that of all
-_SPREAD = 0.75  # of the free places lie far from each other, the others far from surfaces
-_BLOCK = 512  # cells: of many rooms a place sees a few such blocks of them
-_ROUNDS = 12  # of agreement between places and orientations
-_HALVES = 14  # of space, whose outer places agreement starts from; and from all of them, all those inside, in rooms,
-_LEADERS = 6  # single places
-_WELL_SEEN = 0.3  # sum of the cosines under which a cell is seen, weighted
-_FLAT, _LEFT_OPEN = 0.1, 0.02  # cells off its plane is a cell with those around, at most; and of what the places of an
-# agreement see, as much may be planes from behind as cells are coarse, noise thick and things thin
-_CLOSED = 0.96  # of all directions hit by something, from places inside: all was seen from within, or from around it
-_BOTH_SIDES = 0.2  # cosine under which places closed in see either side of a partition, at least
-_FINER = 1, 2, 4  # times as many cells and places, if some are closed in, until one agreement shows
-_SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; where rooms are low
-_FEW, _LAYERS, _LOW = 16, 1.7, 8.0  # places in rooms; cells over each other on average, and in height: rooms too low
-_AS_MUCH = 0.004  # of it by which an agreement shows less than another, and yet as much
-_DECIDED, _OUTSIDE_IN, _BEFORE, _FROM_VIEWPOINT = 0.02, 0.003, 0.002, 0.02  # what counts where as much is seen
-_OF_ROOM, _NEARLY_CLOSED = 0.2, 0.8  # counts that places are closed in, nearly, where floor and ceiling bound all,
-_SEEN_WITHIN_ALONE = 0.001  # or so much of it is seen from none but such places
-_ABOVE_GROUND = 0.05  # in place of _BEFORE where it is plain what is the ground
-_WIDE = 1.2  # tangent of the angle off the optical axis at which a camera still sees, along x and y,
-_NARROW = 0.2  # and beyond which it sees a tenth of all, at least;
-_FROM_CAMERA = 0.93  # of what is visible from the other side of a pit, or table, is from a camera over it, at least
-_VIEWS, _MOST_VIEWS = 12, 128  # places that the voxels themselves are looked at from; and more, each of which
-_NEWS = 0.005  # of all cells is seen by first, or four times as much by second
+# Lengths are edges of coarse cells, and places those of viewpoints, where nothing else is said.
+_CELLS = 5000  # of the coarse grid on which viewpoints are compared, about
+_MIN_ON_SURFACES = 0.5  # fraction of the voxels that are joined; else those that are not count as well
+_FINER = 1, 2, 4  # times as many cells and viewpoints, where some are in rooms, until one agreement shows
+_SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; the latter where rooms are low,
+_MIN_LAYERS, _MAX_HEIGHT = 1.7, 8.0  # of so many cells over each other on average, and no higher than so many in all
+# Candidates
+_N_OUTSIDE = 42  # places around the cloud
+_OUTSIDE_DISTANCE = 1.3  # from its middle, in half diagonals of its bounding box
+_N_INSIDE = 64  # free places within it, of a lattice of
+_LATTICE_SIDE = 12  # places along each side
+_MIN_CLEARANCE = 2.0  # of a free place from the next surface
+_SPREAD_FRACTION = 0.75  # of the free places are far from each other, the others far from surfaces
+_MIN_SURROUNDED = 0.8  # of the directions that hit something, over the most of any place
+_SAMPLED_CELLS = 1500  # which these are tested against, about
+_MAX_TURNED_BOX = 0.2  # volume of a box along the principal axes, over the bounding box's, for it to be used
+_CLOSED = 0.96  # fraction of the directions that hit something, of a place in a room
+_MIN_IN_ROOMS = 16  # such places, for there to be rooms
+# Parts far from each other
+_BLOCKS_ALONG = 16  # blocks along the bounding box: parts have an empty one between them
+_MIN_PART = 0.05  # fraction of the cells
+_MAX_PARTS, _MAX_ROOMS = 3, 8  # of any kind; and if all beyond these are rooms
+_PART_QUANTILES = 0.05, 0.95  # of a part's cells, between which candidates are placed
+_MAX_PART_LENGTH = 0.5  # of the bounding box's length, for a part to have candidates of its own
+# Agreements
+_ROUNDS = 12  # of voting and weighting, at most
+_N_HALVES = 14  # half spaces, whose outer candidates are first opinions
+_N_LEADERS = 6  # single candidates that are
+_BOTH_SIDES = 0.2  # cosine under which candidates in rooms see both sides of a partition
+_WELL_SEEN = 0.3  # weighted sum of the cosines under which a cell is seen well
+_MAX_OFF_PLANE = 0.1  # RMS distance of a flat cell and those around it from their plane
+_CELLS_PER_BLOCK = 512  # for speed: of many rooms a candidate sees few blocks
+# Score of an agreement: the fraction of the surface that it shows, differences up to _SHOWN_TOLERANCE ignored, plus
+_SHOWN_TOLERANCE = 0.004
+_W_UNANIMOUS = 0.02  # times how unanimous its viewpoints are
+_W_OUTSIDE = 0.003  # times how much those around the cloud see from its outer side
+_W_VIEWPOINT, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the same of the likely ones: the given one or
+# the origin; those above the ground; or those on the free side of another supporting plane
+_W_ROOM = 0.2  # times the fraction of the cells in a room, if nearly all its viewpoints are closed in:
+_ENCLOSED_FOR_ROOM = 0.8  # fraction of the directions that hit something
+_MIN_SEEN_FROM_INSIDE_ALONE = 0.001  # fraction of the surface that such viewpoints show more, to count so in a passage
+_MAX_FROM_BEHIND = 0.02  # fraction of what it sees that may be planes from behind; what is more is taken off
+# The origin as a camera's place
+_MAX_SLOPE = 1.2  # tangent off the optical axis, along x and y, within which all lies,
+_MIN_SLOPE = 0.2  # and beyond which a tenth lies
+_MIN_SEEN_OF_OPPOSITE = 0.93  # what it sees over what its mirror image sees, on the other side of the supporting plane
+# Viewpoints that are chosen
+_MIN_CHOSEN, _MAX_CHOSEN = 12, 128  # the latter while each
+_MIN_GAIN = 0.005  # of all cells is first to see, or second to see four times as much
 _TINY = 1e-12
 
 
-class TellingPlaces(NamedTuple):
-    """Places from which the outside is seen, the most telling first.
+class VirtualViewpoints(NamedTuple):
+    """Viewpoints from which the outside is seen, the most telling first.
 
     Attributes
     ----------
@@ -114,7 +128,7 @@ def lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), _TINY)
 
 
-def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> TellingPlaces:
+def virtual_viewpoints(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> VirtualViewpoints:
     """The places that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
 
     Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
@@ -127,100 +141,104 @@ def telling_places(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None
         coarse, points = _in_cells(surfaces, finer * _CELLS)
         may_be_finer = finer < _FINER[-1] and coarse.n_voxels <= grid.n_voxels // 2
         windows = _windows(coarse)
-        tried, part_of_cell = _places_to_try(coarse, points, windows.normals, origin, viewpoint, finer)
-        is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(tried.closed >= _CLOSED)
-        if may_be_finer and is_layered and n_in_rooms < _FEW:
+        candidates, part_of_cell = _candidates(coarse, points, windows.normals, origin, viewpoint, finer)
+        is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(candidates.enclosure >= _CLOSED)
+        if may_be_finer and is_layered and n_in_rooms < _MIN_IN_ROOMS:
             continue  # low rooms have few places at first, and the outside of all of them shows much
-        telling, shown = _telling_places(coarse, points, windows, tried, part_of_cell)
+        telling, shown = _vote(coarse, points, windows, candidates, part_of_cell)
         shows_most = shown >= (_SHOWS_NEARLY_ALL if is_layered else _SHOWS_MOST) or not (is_layered or n_in_rooms)
         if shows_most or not may_be_finer:
             break
     return telling
 
 
-def _telling_places(
-    coarse: VoxelGrid, points: NDArray[np.float64], windows: Windows, tried: _Tried, part_of_cell: NDArray[np.int64]
-) -> tuple[TellingPlaces, float]:
-    """The most telling of places that were tried, and how much of the surface any agreement of them shows."""
-    normals, is_flat = windows.normals, windows.residuals <= (_FLAT * coarse.size) ** 2
-    seen = seen_from(tried.places, coarse.centroids, coarse.edge_lengths, normals)
-    sides = facing_cosines(tried.places, coarse.centroids, normals, seen)
-    in_rooms = tried.closed >= _CLOSED
+def _vote(
+    coarse: VoxelGrid,
+    points: NDArray[np.float64],
+    windows: Windows,
+    candidates: _Candidates,
+    part_of_cell: NDArray[np.int64],
+) -> tuple[VirtualViewpoints, float]:
+    """The candidates that agree best, and how much of the surface any agreement of them shows."""
+    normals, is_flat = windows.normals, windows.residuals <= (_MAX_OFF_PLANE * coarse.size) ** 2
+    seen = visibility_from(candidates.places, coarse.centroids, coarse.edge_lengths, normals)
+    sides = facing_cosines(candidates.places, coarse.centroids, normals, seen)
+    in_rooms = candidates.enclosure >= _CLOSED
     voting = _without_partitions(sides, sides[in_rooms])
-    starts = _starts(voting, tried.places[:_OUTSIDE], tried.likely, in_rooms)
+    starts = _starts(voting, candidates.places[:_N_OUTSIDE], candidates.likely, in_rooms)
     of_place, of_part = _looks_at_parts(seen, part_of_cell)
     if of_part.any():
         asked = of_part[:, None] == part_of_cell
         seen, sides, voting = (np.where(asked, every[of_place], every.dtype.type(0)) for every in (seen, sides, voting))
     found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
-    from_outside, likely, closed = of_place < _OUTSIDE, tried.likely[of_place], tried.closed[of_place]
-    looks = _Looks(sides, from_outside, likely, closed, of_part, part_of_cell, is_flat)
-    room_counts, has_rooms = np.zeros(int(part_of_cell.max()) + 1), np.count_nonzero(in_rooms) >= _FEW
+    from_outside, likely, enclosure = of_place < _N_OUTSIDE, candidates.likely[of_place], candidates.enclosure[of_place]
+    looks = _Looks(sides, from_outside, likely, enclosure, of_part, part_of_cell, is_flat)
+    room_counts, has_rooms = np.zeros(int(part_of_cell.max()) + 1), np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS
     for part in range(len(room_counts) if has_rooms else 0):
         cells = part_of_cell == part
-        room_counts[part] = _OF_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
-    weights, shown = _most_telling(found, looks, coarse.neighbourhood, tried.likely_counts, room_counts)
+        room_counts[part] = _W_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
+    weights, shown = _best_agreement(found, looks, coarse.neighbourhood, candidates.likely_weight, room_counts)
     chosen = _spread_choice(seen, weights)
-    places = tried.places[of_place[chosen]]
-    return TellingPlaces(places, weights[chosen], of_part[chosen], coarse.centroids, part_of_cell), shown
+    places = candidates.places[of_place[chosen]]
+    return VirtualViewpoints(places, weights[chosen], of_part[chosen], coarse.centroids, part_of_cell), shown
 
 
-class _Tried(NamedTuple):
+class _Candidates(NamedTuple):
     """Places from which a cloud may have been seen: k of them, the first around it.
 
     Attributes
     ----------
     places : (k, 3) float64, in the frame of `unit_frame`
-    closed : (k,) float64
+    enclosure : (k,) float64
         Fraction of the directions in which a place within has something; 0 of others.
     likely : (k,) bool
         The viewpoint or origin, if all was seen from about there; else those around that are before what bears things.
-    likely_counts : float
+    likely_weight : float
         What it counts where as much is seen.
     """
 
     places: NDArray[np.float64]
-    closed: NDArray[np.float64]
+    enclosure: NDArray[np.float64]
     likely: NDArray[np.bool_]
-    likely_counts: float
+    likely_weight: float
 
 
-def _places_to_try(
+def _candidates(
     coarse: VoxelGrid,
     points: NDArray[np.float64],
     normals: NDArray[np.float64],
     origin: NDArray[np.float64],
     viewpoint: NDArray[np.float64] | None,
     finer: int,
-) -> tuple[_Tried, NDArray[np.int64]]:
+) -> tuple[_Candidates, NDArray[np.int64]]:
     """Places around the coarse grid, and within, there so many times as many as usual; and the part of each cell."""
     low, high = bounding_box(coarse.centroids)
     part_of_cell, boxes = _parts(coarse, normals, points)
     share, upright = max(finer // (len(boxes) + 1), 1), np.eye(3)
-    in_boxes = np.concatenate([low[None][:0], *(_free_places(coarse, *box, upright, share) for box in boxes)])
+    in_boxes = np.concatenate([low[None][:0], *(_free_viewpoints(coarse, *box, upright, share) for box in boxes)])
     in_boxes = in_boxes[hit_fractions(in_boxes, coarse.centroids) >= _CLOSED]
-    if len(in_boxes) < _FEW:  # none of the parts is a room
+    if len(in_boxes) < _MIN_IN_ROOMS:  # none of the parts is a room
         part_of_cell[:], in_boxes = 0, in_boxes[:0]
-    inside = np.concatenate((_free_places(coarse, *_smallest_box(coarse.centroids), share), in_boxes))
-    directions = sphere_directions(_OUTSIDE)
-    outside = (low + high) / 2.0 + _DISTANCE * lengths((high - low)[None]) / 2.0 * directions
+    inside = np.concatenate((_free_viewpoints(coarse, *_smallest_box(coarse.centroids), share), in_boxes))
+    directions = sphere_directions(_N_OUTSIDE)
+    outside = (low + high) / 2.0 + _OUTSIDE_DISTANCE * lengths((high - low)[None]) / 2.0 * directions
     if not (high > low).any():
         outside = low + directions
-    upwards, offset, is_ground = bearing_plane(coarse, normals)
+    upwards, offset, is_ground = supporting_plane(coarse, normals)
     sees = viewpoint is None and origin @ upwards >= offset and _has_in_view(origin, coarse.centroids)
     if sees and (abs(upwards[2]) < LEVEL or _sees_as_much(origin, upwards, coarse, normals)):
         viewpoint = origin
     elif upwards[2] < -LEVEL:  # no accident: the frame stands upright, and things lie in a pit
         upwards = -upwards
     places = np.concatenate((outside, inside))
-    closed = np.concatenate((np.zeros(_OUTSIDE), hit_fractions(inside, coarse.centroids)))
+    enclosure = np.concatenate((np.zeros(_N_OUTSIDE), hit_fractions(inside, coarse.centroids)))
     if viewpoint is not None:
-        places, closed = np.concatenate((places, viewpoint[None])), np.append(closed, 0.0)
+        places, enclosure = np.concatenate((places, viewpoint[None])), np.append(enclosure, 0.0)
         likely = np.arange(len(places)) == len(places) - 1
-        return _Tried(places, closed, likely, _FROM_VIEWPOINT), part_of_cell
+        return _Candidates(places, enclosure, likely, _W_VIEWPOINT), part_of_cell
     likely = np.zeros(len(places), np.bool_)
-    likely[:_OUTSIDE] = directions @ upwards > 0.0
-    return _Tried(places, closed, likely, _ABOVE_GROUND if is_ground else _BEFORE), part_of_cell
+    likely[:_N_OUTSIDE] = directions @ upwards > 0.0
+    return _Candidates(places, enclosure, likely, _W_ABOVE_GROUND if is_ground else _W_FREE_SIDE), part_of_cell
 
 
 class _Looks(NamedTuple):
@@ -232,7 +250,7 @@ class _Looks(NamedTuple):
         Signed cosines, 0 hidden.
     from_outside, likely : (k,) bool
         Whether they are those of places around the cloud, and of places before what bears things or of the viewpoint.
-    closed : (k,) float64
+    enclosure : (k,) float64
         Fraction of the directions in which a place has something.
     of_part : (k,) int64
         The part at which each is.
@@ -244,7 +262,7 @@ class _Looks(NamedTuple):
     sides: NDArray[np.float32]
     from_outside: NDArray[np.bool_]
     likely: NDArray[np.bool_]
-    closed: NDArray[np.float64]
+    enclosure: NDArray[np.float64]
     of_part: NDArray[np.int64]
     part_of_cell: NDArray[np.int64]
     is_flat: NDArray[np.bool_]
@@ -272,7 +290,7 @@ def _is_layered(coarse: VoxelGrid) -> bool:
     thin = int(np.argmin(high - low))
     across, along = (np.unique(cells, return_inverse=True)[1] for cells in np.delete(coarse.cells, thin, axis=1).T)
     columns = np.unique(across * coarse.n_voxels + along)
-    return bool(coarse.n_voxels >= _LAYERS * len(columns) and (high - low)[thin] < _LOW * coarse.size)
+    return bool(coarse.n_voxels >= _MIN_LAYERS * len(columns) and (high - low)[thin] < _MAX_HEIGHT * coarse.size)
 
 
 def _without_partitions(sides: NDArray[np.float32], of_rooms: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -290,16 +308,16 @@ def _starts(
     sides: NDArray[np.float32], outside: NDArray[np.float64], likely: NDArray[np.bool_], in_rooms: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Weights of the places, (s, k), from which agreement may start: first opinions as different as there are."""
-    starts = np.zeros((_HALVES + 4 + _LEADERS, len(sides)), np.float32)
-    starts[:_HALVES, :_OUTSIDE] = sphere_directions(_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
-    starts[_HALVES, :_OUTSIDE] = 1.0
-    starts[_HALVES + 1, _OUTSIDE:] = 1.0
-    starts[_HALVES + 2] = likely
-    starts[_HALVES + 3] = in_rooms if np.count_nonzero(in_rooms) >= _FEW else 0.0
+    starts = np.zeros((_N_HALVES + 4 + _N_LEADERS, len(sides)), np.float32)
+    starts[:_N_HALVES, :_N_OUTSIDE] = sphere_directions(_N_HALVES) @ (outside - outside.mean(axis=0)).T > 0.0
+    starts[_N_HALVES, :_N_OUTSIDE] = 1.0
+    starts[_N_HALVES + 1, _N_OUTSIDE:] = 1.0
+    starts[_N_HALVES + 2] = likely
+    starts[_N_HALVES + 3] = in_rooms if np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS else 0.0
     unseen = np.ones((2, sides.shape[1]), np.float32)  # of each side
     news = np.empty(len(sides), np.float32)
-    for start in starts[_HALVES + 4 :]:
-        in_blocks(_tell_news, len(sides), sides, unseen, news, smallest=1)
+    for start in starts[_N_HALVES + 4 :]:
+        in_blocks(_set_gains, len(sides), sides, unseen, news, smallest=1)
         leader = int(np.argmax(news))
         start[leader] = 1.0
         unseen[0, sides[leader] > 0.0] = 0.0
@@ -315,7 +333,7 @@ def _has_in_view(place: NDArray[np.float64], centres: NDArray[np.float64]) -> bo
     slopes = rays[:, :2] / rays[:, 2:]
     is_around = (slopes.min(axis=0) < 0.0).all() and (slopes.max(axis=0) > 0.0).all()
     aside = np.abs(slopes).max(axis=1)
-    return bool(is_around and aside.max() < _WIDE and np.mean(aside > _NARROW) > 0.1)
+    return bool(is_around and aside.max() < _MAX_SLOPE and np.mean(aside > _MIN_SLOPE) > 0.1)
 
 
 def _sees_as_much(
@@ -327,12 +345,12 @@ def _sees_as_much(
     """
     low, high = bounding_box(coarse.centroids)
     opposite = place - 2.0 * ((place - (low + high) / 2.0) @ upwards) * upwards
-    seen = seen_from(np.stack((place, opposite)), coarse.centroids, coarse.edge_lengths, normals).mean(axis=1)
-    return bool(seen[0] >= _FROM_CAMERA * seen[1])
+    seen = visibility_from(np.stack((place, opposite)), coarse.centroids, coarse.edge_lengths, normals).mean(axis=1)
+    return bool(seen[0] >= _MIN_SEEN_OF_OPPOSITE * seen[1])
 
 
 @summing_routine
-def _news(sides: NDArray[np.float32], unseen: NDArray[np.float32]) -> np.float32:
+def _marginal_gain(sides: NDArray[np.float32], unseen: NDArray[np.float32]) -> np.float32:
     """Sum of the cosines that a place sees of sides that no leader has seen."""
     total = np.float32(0.0)
     for i in range(len(sides)):
@@ -341,12 +359,12 @@ def _news(sides: NDArray[np.float32], unseen: NDArray[np.float32]) -> np.float32
 
 
 @kernel
-def _tell_news(
+def _set_gains(
     start: int, stop: int, sides: NDArray[np.float32], unseen: NDArray[np.float32], news: NDArray[np.float32]
 ) -> None:
     """Set what each place sees that no leader has seen."""
     for k in range(start, stop):
-        news[k] = _news(sides[k], unseen)
+        news[k] = _marginal_gain(sides[k], unseen)
 
 
 @kernel
@@ -356,14 +374,14 @@ def _see_blocks(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray
     for k in range(start, stop):
         for block in range(sees.shape[1]):
             some = False
-            for i in range(block * _BLOCK, min((block + 1) * _BLOCK, n)):
+            for i in range(block * _CELLS_PER_BLOCK, min((block + 1) * _CELLS_PER_BLOCK, n)):
                 some |= sides[k, i] != nothing
             sees[k, block] = some
 
 
 def _seen_blocks(sides: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Whether k places, whose sides of n cells are 0 where hidden, (k, n), see any cell of each block, (k, b)."""
-    sees = np.empty((len(sides), -(-sides.shape[1] // _BLOCK)), np.bool_)
+    sees = np.empty((len(sides), -(-sides.shape[1] // _CELLS_PER_BLOCK)), np.bool_)
     in_blocks(_see_blocks, len(sides), sides, sees, smallest=1)
     return sees
 
@@ -455,10 +473,62 @@ def _path_met(paths: _Paths, s: int, this_round: int) -> int:
     return -1
 
 
+@routine
+def _vote_on_sides(
+    weights: NDArray[np.float32],
+    sides: NDArray[np.float32],
+    sees: NDArray[np.bool_],
+    total: NDArray[np.float32],
+    outward: NDArray[np.float32],
+) -> bool:
+    """Let viewpoints vote, by their weights, on the side on which the outside of each cell lies; whether any changed.
+
+    `total` is scratch.
+    """
+    n_places, n_blocks = sees.shape
+    for i in range(len(total)):
+        total[i] = 0.0
+    for k in range(n_places):
+        if weights[k] > 0.0:
+            for block in range(n_blocks):
+                if sees[k, block]:
+                    of_block = slice(block * _CELLS_PER_BLOCK, (block + 1) * _CELLS_PER_BLOCK)
+                    _add(weights[k], sides[k, of_block], total[of_block])
+    changed = False
+    for i in range(len(total)):
+        side = np.float32(total[i] > 0.0) - np.float32(total[i] < 0.0)
+        changed |= side != outward[i]
+        outward[i] = side
+    return changed
+
+
+@routine
+def _weigh_by_agreement(
+    sides: NDArray[np.float32], sees: NDArray[np.bool_], outward: NDArray[np.float32], found: _Agreements, s: int
+) -> None:
+    """Weigh each viewpoint by how much it sees and how far that agrees with the vote, the largest weight being 1."""
+    n_places, n_blocks = sees.shape
+    weights, largest = found.weights[s], np.float32(_TINY)
+    for k in range(n_places):
+        net = known = np.float32(0.0)
+        for block in range(n_blocks):
+            if sees[k, block]:
+                of_block = slice(block * _CELLS_PER_BLOCK, (block + 1) * _CELLS_PER_BLOCK)
+                more, more_known = _balance(sides[k, of_block], outward[of_block])
+                net, known = net + more, known + more_known
+        found.agreed[s, k], found.known[s, k] = (net + known) / 2.0, known
+        net = max(net, np.float32(0.0))
+        weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
+        largest = max(largest, weights[k])
+    for k in range(n_places):
+        weights[k] /= largest
+
+
 @kernel
 def _agree(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray[np.bool_], found: _Agreements) -> None:
-    """Places that agree decide where the outside lies, and those that see it there count, by turns until it stands."""
-    (n_places, n), n_blocks = sides.shape, sees.shape[1]
+    """Alternate until nothing changes: viewpoints vote on the outer side of each cell, then each is weighed by how far
+    it agrees with the vote."""
+    n = sides.shape[1]
     total = np.empty(n, np.float32)
     paths = _Paths(
         np.empty((stop - start, _ROUNDS, n), np.int8),
@@ -470,19 +540,9 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray[np.b
         for i in range(n):
             outward[i] = 0.0
         for this_round in range(_ROUNDS):
+            changed = _vote_on_sides(weights, sides, sees, total, outward)
             for i in range(n):
-                total[i] = 0.0
-            for k in range(n_places):
-                if weights[k] > 0.0:
-                    for block in range(n_blocks):
-                        if sees[k, block]:
-                            of_block = slice(block * _BLOCK, (block + 1) * _BLOCK)
-                            _add(weights[k], sides[k, of_block], total[of_block])
-            changed = False
-            for i in range(n):
-                side = np.int8(total[i] > 0.0) - np.int8(total[i] < 0.0)
-                changed |= side != outward[i]
-                outward[i] = paths.outward[s - start, this_round, i] = side
+                paths.outward[s - start, this_round, i] = np.int8(outward[i])
             if not changed:
                 paths.rounds[s - start] = this_round
                 break
@@ -492,27 +552,14 @@ def _agree(start: int, stop: int, sides: NDArray[np.float32], sees: NDArray[np.b
                 found.agreed[s], found.known[s] = found.agreed[start + other], found.known[start + other]
                 break
             paths.told[s - start] = this_round + 1
-            largest = np.float32(_TINY)
-            for k in range(n_places):
-                net = known = np.float32(0.0)
-                for block in range(n_blocks):
-                    if sees[k, block]:
-                        of_block = slice(block * _BLOCK, (block + 1) * _BLOCK)
-                        more, more_known = _balance(sides[k, of_block], outward[of_block])
-                        net, known = net + more, known + more_known
-                found.agreed[s, k], found.known[s, k] = (net + known) / 2.0, known
-                net = max(net, np.float32(0.0))
-                weights[k] = math.sqrt(net) * (net / max(known, np.float32(_TINY))) ** 4
-                largest = max(largest, weights[k])
-            for k in range(n_places):
-                weights[k] /= largest
+            _weigh_by_agreement(sides, sees, outward, found, s)
 
 
-def _most_telling(
+def _best_agreement(
     found: _Agreements,
     looks: _Looks,
     around: Neighbourhood,
-    likely_counts: float,
+    likely_weight: float,
     room_counts: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
     """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
@@ -527,24 +574,32 @@ def _most_telling(
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
     of_looks = found.weights[different].astype(np.float64)
     of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
-    every, closed = of_looks @ of_parts, of_looks @ (of_parts * looks.closed[:, None])
-    is_closed = ((closed >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
-    within = (closed >= _NEARLY_CLOSED * every) & (every > 0.0)
+    every, enclosure = of_looks @ of_parts, of_looks @ (of_parts * looks.enclosure[:, None])
+    is_closed = ((enclosure >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
+    within = (enclosure >= _ENCLOSED_FOR_ROOM * every) & (every > 0.0)
     rooms_count = within @ room_counts
     shown, contradicted = np.empty(len(different)), np.empty(len(different))
     sees, show = _seen_blocks(looks.sides), partial(in_blocks, _show, len(different), different, looks, smallest=1)
-    if len(room_counts) == 1 and not room_counts.any() and np.count_nonzero(looks.closed >= _CLOSED) >= _FEW:
+    if (
+        len(room_counts) == 1
+        and not room_counts.any()
+        and np.count_nonzero(looks.enclosure >= _CLOSED) >= _MIN_IN_ROOMS
+    ):
         show(sees, found, around, np.zeros_like(is_closed), shown, contradicted)
         by_places_within, by_others = (shown[some].max(initial=0.0) for some in (within[:, 0], ~within[:, 0]))
-        rooms_count = _OF_ROOM * within[:, 0] * (by_places_within > by_others + _SEEN_WITHIN_ALONE)
+        rooms_count = _W_ROOM * within[:, 0] * (by_places_within > by_others + _MIN_SEEN_FROM_INSIDE_ALONE)
     show(sees, found, around, is_closed, shown, contradicted)
     most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
     for s, fraction, of_rooms, against in zip(different, shown, rooms_count, contradicted, strict=True):
         weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
-        score = min(float(fraction), most_shown - _AS_MUCH) + float(of_rooms) - max(float(against) - _LEFT_OPEN, 0.0)
+        score = (
+            min(float(fraction), most_shown - _SHOWN_TOLERANCE)
+            + float(of_rooms)
+            - max(float(against) - _MAX_FROM_BEHIND, 0.0)
+        )
         decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
-        score += _DECIDED * float(decided[visible > 0.0].mean())
-        for some, counts in ((looks.from_outside, _OUTSIDE_IN), (looks.likely, likely_counts)):
+        score += _W_UNANIMOUS * float(decided[visible > 0.0].mean())
+        for some, counts in ((looks.from_outside, _W_OUTSIDE), (looks.likely, likely_weight)):
             score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
         if score > most:
             most, best = score, weights
@@ -600,7 +655,7 @@ def _show(
             if weights[k] > 0.0:
                 for block in range(sees.shape[1]):
                     if sees[k, block]:
-                        of_block = slice(block * _BLOCK, (block + 1) * _BLOCK)
+                        of_block = slice(block * _CELLS_PER_BLOCK, (block + 1) * _CELLS_PER_BLOCK)
                         of_place, against_it = _add_shown(
                             weights[k], sides[k, of_block], outward[of_block], is_flat[of_block], of_cells[of_block]
                         )
@@ -625,9 +680,9 @@ def _spread_choice(seen: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDA
     left, sees = weights[places], seen[places].astype(np.float32)
     interest = np.ones(seen.shape[1], np.float32)
     chosen: list[int] = []
-    while len(chosen) < _MOST_VIEWS and left.any():
+    while len(chosen) < _MAX_CHOSEN and left.any():
         best = int(np.argmax(left * np.einsum("kn,n->k", sees, interest)))
-        if len(chosen) >= _VIEWS and sees[best] @ interest < _NEWS * len(interest):
+        if len(chosen) >= _MIN_CHOSEN and sees[best] @ interest < _MIN_GAIN * len(interest):
             break
         chosen.append(best)
         interest[sees[best] > 0.0] *= np.float32(0.25)
@@ -692,7 +747,7 @@ def _surfaces(grid: VoxelGrid, middle: NDArray[np.float64], reach: float) -> _Su
     """
     points, edges = np.diff(grid.starts).astype(np.float64), grid.edge_lengths
     counts = grid.joined
-    if np.mean(counts) < _MOSTLY_SURFACES:
+    if np.mean(counts) < _MIN_ON_SURFACES:
         counts[:] = True
     if grid.levels is None:
         size, some = float(edges[0] if edges.min() == edges.max() else np.median(edges)), np.flatnonzero(counts)
@@ -733,19 +788,19 @@ def _parts(
     boxes: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     if not length > 0.0:
         return part_of_cell, boxes
-    blocks = voxel_grid(centres, length / _BLOCKS, Shift(low))
+    blocks = voxel_grid(centres, length / _BLOCKS_ALONG, Shift(low))
     piece = connected_components(blocks.touching_pairs(), blocks.n_voxels)[blocks.voxel_of_point]
     counts, part = np.bincount(piece), 0
-    for number in np.argsort(-counts, kind="stable")[:_PARTS]:
+    for number in np.argsort(-counts, kind="stable")[:_MAX_ROOMS]:
         cells = piece == number
-        if counts[number] < _OF_PART * len(centres):
+        if counts[number] < _MIN_PART * len(centres):
             break
-        if part >= _PARTS_OF_ANY and not _is_room(cells, coarse, normals, points):
+        if part >= _MAX_PARTS and not _is_room(cells, coarse, normals, points):
             continue
         part_of_cell[cells] = part
         part += 1
-        lowest, highest = np.quantile(centres[cells], _NEARLY_WHOLE, axis=0)
-        if (highest - lowest).max() < _SMALL * length:
+        lowest, highest = np.quantile(centres[cells], _PART_QUANTILES, axis=0)
+        if (highest - lowest).max() < _MAX_PART_LENGTH * length:
             boxes.append((lowest, highest))
     return part_of_cell, boxes
 
@@ -768,30 +823,30 @@ def _smallest_box(
     offsets = centres - centres.mean(axis=0)
     axes = np.linalg.eigh(np.einsum("ij,ik->jk", offsets, offsets))[1].T
     lowest, highest = bounding_box(np.einsum("ij,kj->ik", centres, axes))
-    if np.prod(highest - lowest) < _MUCH_SMALLER * np.prod(high - low):
+    if np.prod(highest - lowest) < _MAX_TURNED_BOX * np.prod(high - low):
         return lowest, highest, axes
     return low, high, np.eye(3)
 
 
-def _free_places(
+def _free_viewpoints(
     coarse: VoxelGrid, low: NDArray[np.float64], high: NDArray[np.float64], axes: NDArray[np.float64], finer: int
 ) -> NDArray[np.float64]:
     """Places within a box along axes, the farthest off all surfaces first, (k, 3); so many times as many as usual."""
     from scipy.spatial import cKDTree
 
-    n, lattice_side = finer * _INSIDE, round(_LATTICE * finer ** (1.0 / 3.0))
+    n, lattice_side = finer * _N_INSIDE, round(_LATTICE_SIDE * finer ** (1.0 / 3.0))
     steps = (np.arange(lattice_side) + 0.5) / lattice_side
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.einsum("ij,jk->ik", low + lattice * (high - low), axes)
     tree = cKDTree(coarse.centroids, 64, balanced_tree=False, compact_nodes=False)  # for few places
     clearance = tree.query(places)[0] / coarse.size
-    free = np.flatnonzero(clearance > _CLEARANCE)
+    free = np.flatnonzero(clearance > _MIN_CLEARANCE)
     if not len(free):
         return places[:0]
     places, clearance = places[free], clearance[free]
-    hits = hit_fractions(places, coarse.centroids[:: max(1, coarse.n_voxels // _SOME)])
-    among = np.flatnonzero(hits >= _AMONG * hits.max())  # not the corners of the box around a room askew to it
-    chosen = among[farthest_first(places[among], int(np.argmax(clearance[among])), int(_SPREAD * n))]
+    hits = hit_fractions(places, coarse.centroids[:: max(1, coarse.n_voxels // _SAMPLED_CELLS)])
+    among = np.flatnonzero(hits >= _MIN_SURROUNDED * hits.max())  # not the corners of the box around a room askew to it
+    chosen = among[farthest_points(places[among], int(np.argmax(clearance[among])), int(_SPREAD_FRACTION * n))]
     order = np.argsort(-clearance, kind="stable")
     rest = order[~np.isin(order, chosen)][: n - len(chosen)]
     return places[np.concatenate((chosen, rest))]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pcgraph.voxels.cells import UNIT_CELLS, cell_keys, sorted_keys, starts_of_runs
 from pcgraph.voxels.grading import BLOCK, Grading
 from pcgraph.voxels.grid import (
-    AROUND_ON_SURFACE,
+    MIN_NEIGHBOURS_ON_SURFACE,
     VoxelGrid,
     VoxelLists,
     occupied_cells,
@@ -22,35 +22,43 @@ from pcgraph.voxels.grid import (
 from pcgraph.voxels.spacing_law import SpacingLaw
 from pcgraph.voxels.surface import roughness
 
-VOXELS_PER_SEED = 5.0  # voxel edges between seeds, at most,
-_MIN_VOXELS_PER_SEED = 3.0  # and at least
-_MANY_SUPERVOXELS = 800
-_MANY_ON_SMOOTH = 6000  # where surfaces are
-_SMOOTH, _ROUGH = 0.14, 0.2  # smooth, in voxel edges of roughness at most; at least as rough have no more,
-_WELL_JOINED = 0.9  # and so many of the voxels are joined
-_VOXELS_OF_SUPERVOXEL = 0.86  # times the square of the edges between seeds
-_MIN_JOINED = 0.75  # of the voxels have
-_HALF_JOINED, _MIN_GAIN = 0.5, 0.1  # of them, by each step, where half of them have,
-_MUCH_GAIN = 0.15  # or where fewer have, of several scans; else half is enough
-_ENLARGEMENTS = 10
-# Voxels can be smaller by steps of a quarter of a power of two
-_REFINEMENTS = 4  # at most,
-_FEW_VOXELS, _MANY_VOXELS = 120_000, 300_000  # and at most to about the latter, for the time's sake,
-_ALL_JOINED = 0.93  # and of them,
-_STILL_JOINED = 0.97  # or of those that are, where not even _MIN_JOINED are,
-_JOINED_OF_SCAN = 0.98  # or, of one scan's, of fewer than _ALL_JOINED,
-_THINNED = 0.7  # whose spacing grows by a smaller power of range, near or far,
-_PRICE_OF_ROUGHNESS = 0.25, 0.4  # less so much of their roughness, where voxels were few or not, stay joined,
-_FEWEST, _ENOUGH, _OF_FEWEST = 750, 40_000, 0.5  # or, of the latter down to so few, fewer, to this, less all of it,
-_SLAB = 1 << 14  # as so many in the middle tell
-_MIN_VOXELS = 500
-# Voxels can be larger in some blocks
-_LEVELS = 3  # by so many powers of two at most,
-_APART = 0.2, 0.6  # where fewer of them are joined, of at most
-_FEW_GRADED, _MANY_GRADED = 10_000, 20_000  # voxels, or at least,
-_LEAST, _MORE = 20, 0.2  # and of so many larger ones at least _MIN_JOINED, and so many more by each power of two,
-_FEWER, _OF_SURFACE = 0.65, 0.4  # unless larger voxels are so many times fewer and fewer of them joined: lines
-_NEARLY_ALL, _HARDLY_ANY = 0.98, 0.003  # if fewer of all are joined, and more of all lie there
+# Seeds
+VOXELS_PER_SEED = 5.0
+"""Voxel edges between seeds, by default and at most."""
+_MIN_VOXELS_PER_SEED = 3.0
+_MIN_SUPERVOXELS = 800  # seeds move closer until there are about so many
+_MIN_SUPERVOXELS_ON_SMOOTH = 6000  # or so many, on smooth surfaces
+_SMOOTH, _ROUGH = 0.14, 0.2  # roughness, voxel edges, of smooth surfaces and of others; interpolated
+_MIN_JOINED_IF_SMOOTH = 0.9  # joined fraction below which no surface counts as smooth
+_VOXELS_PER_SUPERVOXEL = 0.86  # over the squared spacing of seeds in voxel edges
+# Larger voxels, by half powers of two. A voxel is joined if it has MIN_NEIGHBOURS_ON_SURFACE neighbours.
+_MIN_JOINED = 0.75  # joined fraction below which voxels are enlarged, and at which that stops
+_HALF_JOINED = 0.5
+_MIN_GAIN = 0.1  # of the joined fraction by each step, if half were joined at first
+_MIN_GAIN_OF_SPARSE = 0.15  # the same if fewer were, in several scans
+_MAX_ENLARGEMENTS = 10
+_MIN_VOXELS = 500  # left
+# Smaller voxels, by quarters of a power of two
+_MAX_REFINEMENTS = 4
+_FEW_VOXELS = 120_000  # above: only if _ALL_JOINED are joined, and at the higher price of roughness
+_MAX_VOXELS = 300_000  # of a refined grid, about
+_ALL_JOINED = 0.93  # joined fraction that has to remain
+_KEPT_JOINED = 0.97  # fraction of the joined ones that has to remain, where fewer than _MIN_JOINED are
+_KEPT_JOINED_OF_SCAN = 0.98  # the same in one scan,
+_THINNED_EXPONENT = 0.7  # which is refined only if its spacing grows with a smaller power of range than this
+_PRICE_OF_ROUGHNESS = 0.25, 0.4  # times roughness is taken off the joined fraction: up to _FEW_VOXELS, and above
+_FEW, _ENOUGH = 750, 40_000  # voxels between which the joined fraction that has to remain rises, by the logarithm,
+_MIN_JOINED_OF_FEW = 0.5  # from this to _ALL_JOINED, or 1 in one scan
+_SLAB = 1 << 14  # voxels in the middle of the grid's order on which refining is judged
+# Grading: larger voxels in some blocks, by powers of two
+_MAX_LEVEL = 3
+_SPARSE = 0.2, 0.6  # joined fraction below which a block is sparse, in small grids and in large ones
+_SMALL_GRID, _LARGE_GRID = 10_000, 20_000  # voxels
+_MIN_VOXELS_AROUND = 20  # larger voxels in and around a block, to judge it
+_MIN_GAIN_PER_LEVEL = 0.2  # of the joined fraction, if half were joined at first
+_LINE_RATIO, _LINE_JOINED = 0.65, 0.4  # a block holds lines if doubled edges leave fewer voxels, and fewer are joined
+_NEARLY_ALL_JOINED = 0.98  # no grading from here on,
+_MIN_GRADED = 0.003  # nor if a smaller fraction of all voxels would be larger
 
 
 def seed_spacing(grid: VoxelGrid) -> float:
@@ -59,27 +67,27 @@ def seed_spacing(grid: VoxelGrid) -> float:
     On smooth surfaces that are seen from all around, as those of meshes and of thinned clouds, many are better: their
     normals are exact, and small things need supervoxels of their own.
     """
-    usual, smaller = _edges_per_seed(grid, _MANY_SUPERVOXELS), _edges_per_seed(grid, _MANY_ON_SMOOTH)
-    if smaller < usual and not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _WELL_JOINED:
-        share = min(max((_ROUGH - roughness(grid)) / (_ROUGH - _SMOOTH), 0.0), 1.0)
-        usual = _edges_per_seed(grid, _MANY_SUPERVOXELS * (_MANY_ON_SMOOTH / _MANY_SUPERVOXELS) ** share)
+    usual, smaller = _edges_per_seed(grid, _MIN_SUPERVOXELS), _edges_per_seed(grid, _MIN_SUPERVOXELS_ON_SMOOTH)
+    if smaller < usual and not grid.warp.of_one_scan and _joined(np.diff(grid.indptr)) >= _MIN_JOINED_IF_SMOOTH:
+        fraction = min(max((_ROUGH - roughness(grid)) / (_ROUGH - _SMOOTH), 0.0), 1.0)
+        usual = _edges_per_seed(grid, _MIN_SUPERVOXELS * (_MIN_SUPERVOXELS_ON_SMOOTH / _MIN_SUPERVOXELS) ** fraction)
     return grid.size * usual
 
 
 def _edges_per_seed(grid: VoxelGrid, many: float) -> float:
     """Voxel edges between seeds that give so many supervoxels, within what is sensible."""
-    edges = math.sqrt(grid.n_voxels / (_VOXELS_OF_SUPERVOXEL * many))
+    edges = math.sqrt(grid.n_voxels / (_VOXELS_PER_SUPERVOXEL * many))
     return min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 
-def fitting_size(
+def adapted_voxel_size(
     points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, largest: float = math.inf
 ) -> tuple[float, float]:
     """The size of the voxels, or a larger one where surfaces fall apart, or a smaller one where they would stay whole.
 
     On a surface most voxels have at least five others around them. The second is the size that it would be were voxels
     not few. They are made smaller for that where points lie so evenly that no blocks need larger ones
-    (`fitting_grading`), and not so evenly that all get smaller ones anyway.
+    (`adapted_grading`), and not so evenly that all get smaller ones anyway.
 
     Parameters
     ----------
@@ -93,11 +101,11 @@ def fitting_size(
     """
     degrees = np.diff(grid.indptr)
     joined, of_few = _joined(degrees), _enough_of_few(grid, law)
-    is_dust = joined < min(_MIN_JOINED, of_few)
-    larger = _without_dust(points, grid, degrees, largest) if is_dust else grid.size
-    usual = _with_detail(points, grid, law, degrees) if larger == grid.size else larger
-    if usual == grid.size and joined >= of_few and fitting_grading(grid) is None:
-        return _finest(points, grid, slice(0, grid.n_voxels), _REFINEMENTS, of_few, 1.0), usual
+    is_fragmented = joined < min(_MIN_JOINED, of_few)
+    larger = _enlarged_size(points, grid, degrees, largest) if is_fragmented else grid.size
+    usual = _refined_size(points, grid, law, degrees) if larger == grid.size else larger
+    if usual == grid.size and joined >= of_few and adapted_grading(grid) is None:
+        return _finest(points, grid, slice(0, grid.n_voxels), _MAX_REFINEMENTS, of_few, 1.0), usual
     return usual, usual
 
 
@@ -110,16 +118,16 @@ def _enough_of_few(grid: VoxelGrid, law: SpacingLaw | None) -> float:
     n, of_one_scan = grid.n_voxels, grid.warp.of_one_scan
     if n >= _ENOUGH or (of_one_scan and law is None):
         return math.inf
-    share = _share_by_logarithm(n, _FEWEST, _ENOUGH)
-    return _OF_FEWEST + share * ((1.0 if of_one_scan else _ALL_JOINED) - _OF_FEWEST)
+    fraction = _log_interpolated(n, _FEW, _ENOUGH)
+    return _MIN_JOINED_OF_FEW + fraction * ((1.0 if of_one_scan else _ALL_JOINED) - _MIN_JOINED_OF_FEW)
 
 
 def _joined(degrees: NDArray[np.int64]) -> float:
     """Fraction of the voxels that have as many others around them as on a surface."""
-    return float(np.mean(degrees >= AROUND_ON_SURFACE))
+    return float(np.mean(degrees >= MIN_NEIGHBOURS_ON_SURFACE))
 
 
-def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> float:
+def _enlarged_size(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray[np.int64], largest: float) -> float:
     """The size, or one larger by half powers of two, enough to join what falls apart.
 
     What is no surface at any size, as a line, stays. So does the size where half of it is joined and larger voxels
@@ -129,8 +137,8 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
     """
     cells, size, joined, joined_at_first = [grid.cells, grid.cells], grid.size, 0.0, _joined(degrees)
     few_beams, best = grid.warp.of_one_scan and joined_at_first < _HALF_JOINED, grid.size
-    least, much = (math.inf, _MUCH_GAIN) if joined_at_first < _HALF_JOINED else (grid.size, _MIN_GAIN)
-    for step in range(1, _ENLARGEMENTS + 1):
+    least, much = (math.inf, _MIN_GAIN_OF_SPARSE) if joined_at_first < _HALF_JOINED else (grid.size, _MIN_GAIN)
+    for step in range(1, _MAX_ENLARGEMENTS + 1):
         size *= math.sqrt(2.0)
         if size > largest:
             break
@@ -152,7 +160,7 @@ def _without_dust(points: NDArray[np.float64], grid: VoxelGrid, degrees: NDArray
     return best
 
 
-def _with_detail(
+def _refined_size(
     points: NDArray[np.float64], grid: VoxelGrid, law: SpacingLaw | None, degrees: NDArray[np.int64]
 ) -> float:
     """The size, or one smaller by quarters of a power of two, down to a half, where nearly all stay joined.
@@ -166,18 +174,18 @@ def _with_detail(
     the time's sake no grid gets very many voxels so, nor one of many that are not all joined.
     """
     n, size, of_one_scan = grid.n_voxels, grid.size, grid.warp.of_one_scan
-    if of_one_scan and (law is None or law.in_halves >= _THINNED):
+    if of_one_scan and (law is None or law.min_half_exponent >= _THINNED_EXPONENT):
         return size
     joined = _joined(degrees)
     if not _HALF_JOINED <= joined < (_ALL_JOINED if of_one_scan else math.inf):
         return size
-    steps = min(_REFINEMENTS, int(2.0 * math.log2(_MANY_VOXELS / n)))  # to as many voxels as a surface would have
+    steps = min(_MAX_REFINEMENTS, int(2.0 * math.log2(_MAX_VOXELS / n)))  # to as many voxels as a surface would have
     if steps < 1 or (n > _FEW_VOXELS and joined < _ALL_JOINED):
         return size
     slab = slice(max(0, (n - _SLAB) // 2), min(n, (n + _SLAB) // 2))
     of_slab = _joined(degrees[slab])
-    least = _ALL_JOINED if of_slab >= _MIN_JOINED else _STILL_JOINED * of_slab
-    least = _JOINED_OF_SCAN * of_slab if of_one_scan else least
+    least = _ALL_JOINED if of_slab >= _MIN_JOINED else _KEPT_JOINED * of_slab
+    least = _KEPT_JOINED_OF_SCAN * of_slab if of_one_scan else least
     if joined < least and not of_one_scan:
         return size
     return _finest(points, grid, slab, steps, least, _PRICE_OF_ROUGHNESS[n > _FEW_VOXELS])
@@ -196,7 +204,7 @@ def _finest(points: NDArray[np.float64], grid: VoxelGrid, slab: slice, steps: in
     return size
 
 
-def fitting_grading(grid: VoxelGrid) -> Grading | None:
+def adapted_grading(grid: VoxelGrid) -> Grading | None:
     """Blocks in which voxels are larger by powers of two, as points lie too far apart there; None if there are few.
 
     So it is far from the tripods of several scans, near one of which spacing was read. Whether surfaces fall apart is
@@ -210,7 +218,7 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
         Its voxels are of one size.
     """
     joined = grid.joined
-    if grid.warp.of_one_scan or np.mean(joined) >= _NEARLY_ALL:
+    if grid.warp.of_one_scan or np.mean(joined) >= _NEARLY_ALL_JOINED:
         return None
     keys, pitch = cell_keys(grid.cells / BLOCK, grid.size)
     ordered, order = sorted_keys(keys)
@@ -219,9 +227,9 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
     block[order] = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     around, blocks = touching_voxels(ordered[starts[:-1]], *pitch), np.floor(grid.cells[order[starts[:-1]]] / BLOCK)
     at_first, before = _joined_around(joined, block, around)
-    levels, asked = np.zeros(len(at_first), np.int8), at_first < _apart(grid.n_voxels)
+    levels, asked = np.zeros(len(at_first), np.int8), at_first < _sparse_below(grid.n_voxels)
     cells, of_block = grid.cells, block
-    for level in range(1, _LEVELS + 1):
+    for level in range(1, _MAX_LEVEL + 1):
         if not asked.any():
             break
         cells = np.floor(cells / 2.0)
@@ -229,30 +237,30 @@ def fitting_grading(grid: VoxelGrid) -> Grading | None:
         ordered, order = sorted_keys(keys)
         first = starts_of_runs(ordered)[:-1]
         cells, of_block = cells[order[first]], of_block[order[first]]
-        joined = touching_counts(ordered[first], *pitch) >= AROUND_ON_SURFACE
-        share, n = _joined_around(joined, of_block, around)
-        asked &= (n > _FEWER * before) | (share >= _OF_SURFACE)
+        joined = touching_counts(ordered[first], *pitch) >= MIN_NEIGHBOURS_ON_SURFACE
+        fraction, n = _joined_around(joined, of_block, around)
+        asked &= (n > _LINE_RATIO * before) | (fraction >= _LINE_JOINED)
         before = n
-        whole = asked & (share >= _MIN_JOINED) & (n >= _LEAST)
-        whole &= (at_first < _HALF_JOINED) | (share - at_first >= _MORE * level)
+        whole = asked & (fraction >= _MIN_JOINED) & (n >= _MIN_VOXELS_AROUND)
+        whole &= (at_first < _HALF_JOINED) | (fraction - at_first >= _MIN_GAIN_PER_LEVEL * level)
         levels[whole] = level
         asked &= ~whole
     larger = levels > 0
-    if np.mean(larger[block]) < _HARDLY_ANY:
+    if np.mean(larger[block]) < _MIN_GRADED:
         return None
     return Grading(blocks[larger], levels[larger])
 
 
-def _apart(n_voxels: int) -> float:
+def _sparse_below(n_voxels: int) -> float:
     """Fraction of the voxels around that are joined below which larger ones are asked for.
 
     Of few voxels, each thing has few, and needs them more than its surface needs to be whole.
     """
-    least, most = _APART
-    return least + _share_by_logarithm(n_voxels, _FEW_GRADED, _MANY_GRADED) * (most - least)
+    least, most = _SPARSE
+    return least + _log_interpolated(n_voxels, _SMALL_GRID, _LARGE_GRID) * (most - least)
 
 
-def _share_by_logarithm(n: int, few: int, many: int) -> float:
+def _log_interpolated(n: int, few: int, many: int) -> float:
     """How far a number is from few to many, 0..1, by the logarithm."""
     return min(max(math.log(n / few) / math.log(many / few), 0.0), 1.0)
 
