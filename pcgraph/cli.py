@@ -59,6 +59,9 @@ def segment(
             help="Spacing of supervoxels in metres. Default: 5 x the voxel edge, down to 3 x where that leaves few."
         ),
     ] = None,
+    supervoxels: Annotated[
+        int | None, typer.Option(help="About how many supervoxels there are, in place of --seed-size.")
+    ] = None,
     method: Annotated[
         str,
         typer.Option(
@@ -124,6 +127,7 @@ def segment(
             features=features or None,
             voxel_size=voxel_size,
             seed_size=seed_size,
+            n_supervoxels=supervoxels,
             camera=camera,
             range_growth=range_growth,
             method=member("SupervoxelMethod", method),

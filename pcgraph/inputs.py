@@ -342,6 +342,13 @@ def fraction(name: str, value: float) -> float:
     return number
 
 
+def whole_number(name: str, value: int) -> int:
+    """The value as int, if it is a whole number of at least 1; ValueError otherwise."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"expected {name} as a whole number of at least 1, got {value!r}")
+    return int(value)
+
+
 def _number(value: float) -> float:
     """The value as float; NaN if it is no number."""
     if isinstance(value, (str, bytes)):

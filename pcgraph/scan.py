@@ -36,6 +36,7 @@ from pcgraph.inputs import (
     fraction,
     non_negative,
     positive,
+    whole_number,
 )
 from pcgraph.parallel import side_by_side
 from pcgraph.pixels import with_pixels
@@ -52,7 +53,13 @@ from pcgraph.supervoxels.surface_growth import SurfaceGrowth
 from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
-from pcgraph.voxels.adapted_size import adapted_grading, adapted_voxel_size, seed_spacing
+from pcgraph.voxels.adapted_size import (
+    MIN_VOXELS_PER_SEED,
+    adapted_grading,
+    adapted_voxel_size,
+    seed_spacing,
+    spacing_for,
+)
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.column_evidence import color_evidence
 from pcgraph.voxels.grid import VoxelGrid, grid_union, grid_without, voxel_grid, voxel_means, with_means
@@ -83,6 +90,7 @@ _FEW_OUTLIERS = 0.95  # fraction of the points left from which on scale and view
 _NOISY = 0.9  # fraction left up to which outliers are sought in voxels half as large, too
 _MIN_SHOWN = 0.8  # fraction of the surface that an estimated scanner position must see
 _MAX_VIEWPOINTS = 3  # from which continuations are sought, where the cloud was not seen from one
+_MAX_TRIES, _NEAR = 5, 0.02  # spacings that are tried for a number of supervoxels; logarithm by which that may be off
 _SAMPLED_VOXELS = 64  # whose points' viewpoints are candidates for these
 
 
@@ -95,6 +103,7 @@ def segment(
     features: Features = None,
     voxel_size: float | None = None,
     seed_size: float | None = None,
+    n_supervoxels: int | None = None,
     camera: bool | None = None,
     range_growth: float | None = None,
     method: SupervoxelMethod | None = None,
@@ -137,6 +146,10 @@ def segment(
         Spacing of supervoxels (R_seed of Papon et al. 2013, PCL's seed_resolution), at least `voxel_size`. Default: 5
         times `voxel_size`, or less, 3 times at least, where that would leave fewer than some 800 supervoxels, or 6000
         on smooth surfaces.
+    n_supervoxels : int, optional
+        About how many supervoxels there are, in place of `seed_size`: within a few per cent, but at least one for each
+        piece that touches nothing else, and at most one for each voxel, which are smaller for that, down to a half,
+        unless `voxel_size` is given.
     camera : bool, optional
         Whether voxels grow in proportion to depth from the viewpoint, being `voxel_size` at the median depth, as a
         camera's pixels do. Default: organised clouds that a camera took, unless voxels grow with range: those in front
@@ -174,6 +187,10 @@ def segment(
     Supervoxels: Papon et al. 2013 (VCCS). Convexity: Stein et al. 2014 (LCCP).
     """
     points, colors, normals, viewpoint, features = as_arrays(points, colors, normals, viewpoint, features)
+    if n_supervoxels is not None:
+        n_supervoxels = whole_number("n_supervoxels", n_supervoxels)
+        if seed_size is not None:
+            raise ValueError("expected seed_size or n_supervoxels, got both")
     method = SurfaceGrowth() if method is None else method
     settings = Settings.of(method, RegionLinkage() if linkage is None else linkage, object_altitude)
     cloud = with_pixels(clean_cloud(points, colors, normals, features))
@@ -189,6 +206,7 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(found.voxelised.cloud, spacing)
         found = _with_adapted_size(found, asked)
+        found = found if n_supervoxels is None else _with_enough_voxels(found, n_supervoxels)
     cloud, grid, viewpoint = _without(found.voxelised, detached_voxels(found.voxelised.grid))
     grid = with_means(grid, cloud.colors, cloud.features)
     warn_of_volume(grid)
@@ -197,6 +215,8 @@ def segment(
     oriented = _oriented_planes(grid, settings.method, found.law, viewpoint)
     if grid.size < found.orienting_size and viewpoint is None:
         oriented = _oriented_as_larger(oriented, grid, cloud, found, settings.method)
+    if n_supervoxels is not None:
+        seed_size = _seed_size_for(n_supervoxels, cloud, grid, oriented.planes, settings.method)
     scan = Scan(
         cloud,
         grid,
@@ -405,7 +425,7 @@ def segment_scan(scan: Scan, earlier: Segmentation | None, settings: Settings) -
     """Segmentation of a scan: the algorithm from voxels on."""
     cloud, grid, planes = scan.cloud, scan.grid, scan.oriented.planes
     method, linkage = settings.method, settings.linkage
-    normals = planes.normals if cloud.normals is None else _given_normals(grid, cloud.normals, planes.normals)
+    normals = _normals(cloud, grid, planes)
     if earlier is not None:
         normals = normals.copy()  # the planes keep their own
         normals[scan.initial_labels >= 0] = earlier.surface.normals
@@ -493,12 +513,33 @@ def _leaves(
     return replace(leaves, normals=surface.mean_normals(n_leaves))
 
 
-def _given_normals(grid: VoxelGrid, given: NDArray[np.float64], estimated: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of the given normals of each voxel's points; the estimate where there is none."""
-    means = voxel_means(given, grid)
+def _seed_size_for(
+    n_supervoxels: int, cloud: CleanCloud, grid: VoxelGrid, planes: LocalPlanes, method: SupervoxelMethod
+) -> float:
+    """Spacing of supervoxels, metres, of which there are about so many: the best of a few that come ever nearer."""
+    normals, none = _normals(cloud, grid, planes), np.full(grid.n_voxels, -1, np.int32)
+    seed, best, least_off, before = spacing_for(n_supervoxels, grid), grid.size, math.inf, 0
+    for _ in range(_MAX_TRIES):
+        seed = max(seed, grid.size)
+        n = int(_supervoxels(method, grid, normals, seed, none).max()) + 1
+        off = abs(math.log(n / n_supervoxels))
+        if off < least_off:
+            best, least_off = seed, off
+        if off <= _NEAR or n == before or (n < n_supervoxels and seed == grid.size):
+            break  # there are as many pieces, or no more voxels
+        before = n
+        seed *= math.sqrt(n / n_supervoxels)
+    return best
+
+
+def _normals(cloud: CleanCloud, grid: VoxelGrid, planes: LocalPlanes) -> NDArray[np.float64]:
+    """Mean of the given normals of each voxel's points, (v, 3); that of its plane where none is given."""
+    if cloud.normals is None:
+        return planes.normals
+    means = voxel_means(cloud.normals, grid)
     length = np.linalg.norm(means, axis=1, keepdims=True)
     usable = length > 1e-6
-    return np.where(usable, means / np.where(usable, length, 1.0), estimated)
+    return np.where(usable, means / np.where(usable, length, 1.0), planes.normals)
 
 
 # --- voxels: their size, and what is left out -------------------------------------------------------------------------
@@ -602,6 +643,17 @@ def _with_adapted_size(found: _Voxels, asked: _Asked) -> _Voxels:
     if may_grade and (grading := adapted_grading(voxelised.grid)) is not None:
         voxelised = voxelised._replace(grid=voxel_grid(voxelised.cloud.points, size, warp, grading))
     return found._replace(voxelised=voxelised, warp=warp, orienting_size=orienting_size)
+
+
+def _with_enough_voxels(found: _Voxels, n_supervoxels: int) -> _Voxels:
+    """The same with voxels so small that supervoxels have a few each, down to a half; but not where some are larger."""
+    cloud, grid, viewpoint = found.voxelised
+    edges_per_seed = spacing_for(n_supervoxels, grid) / grid.size
+    if grid.levels is not None or edges_per_seed >= MIN_VOXELS_PER_SEED:
+        return found
+    size = max(edges_per_seed / MIN_VOXELS_PER_SEED, 0.5) * grid.size
+    warp = _from_corner(found.warp, found.with_outliers[0], size)
+    return found._replace(voxelised=Voxelised(cloud, voxel_grid(cloud.points, size, warp), viewpoint), warp=warp)
 
 
 def _scale(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgraph.hierarchy import binary_children, num_leaves, propagate_sequential, propagation_sources
+from pcgraph.inputs import whole_number
 from pcgraph.parallel import kernel
 
 
@@ -36,7 +37,7 @@ def horizontal_cut(
         As for `SegmentationTree.cut`, with its errors.
     """
     n_leaves = num_leaves(parents)
-    if _whole("min_size", min_size) == 1:
+    if whole_number("min_size", min_size) == 1:
         last = n_leaves + _merges(altitudes[n_leaves:], n, altitude, n_leaves)
         return propagation_sources(parents, parents < last)[:n_leaves].copy()
     cores = size_cores(parents, counts, min_size)
@@ -59,12 +60,6 @@ def _merges(merge_altitudes: NDArray[np.float64], n: int | None, altitude: float
     if level.ndim or level.dtype.kind not in "fiu" or np.isnan(level):
         raise ValueError(f"expected altitude as a number in the linkage's unit, got {altitude!r}")
     return int(np.searchsorted(merge_altitudes, float(level), side="right"))
-
-
-def _whole(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"expected {name} as a whole number of at least 1, got {value!r}")
-    return int(value)
 
 
 @kernel
@@ -182,7 +177,7 @@ def stable_cut(
     parents: NDArray[np.int32], altitudes: NDArray[np.float64], counts: NDArray[np.int64], min_size: int
 ) -> NDArray[np.int32]:
     """Node of each leaf, (n_leaves,) int32, in the most stable segmentation; see `SegmentationTree.cut_stable`."""
-    least = min(_whole("min_size", min_size), int(counts[-1]))
+    least = min(whole_number("min_size", min_size), int(counts[-1]))
     chosen = stable_nodes(parents, altitudes, counts, least)
     if not chosen.any():  # only parts that do not touch, each too small
         chosen[-1] = True

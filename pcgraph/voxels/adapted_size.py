@@ -25,7 +25,8 @@ from pcgraph.voxels.surface import roughness
 # Seeds
 VOXELS_PER_SEED = 5.0
 """Voxel edges between seeds, by default and at most."""
-_MIN_VOXELS_PER_SEED = 3.0
+MIN_VOXELS_PER_SEED = 3.0
+"""The same, at least, by default."""
 _MIN_SUPERVOXELS = 800  # seeds move closer until there are about so many
 _MIN_SUPERVOXELS_ON_SMOOTH = 6000  # or so many, on smooth surfaces
 _SMOOTH, _ROUGH = 0.14, 0.2  # roughness, voxel edges, of smooth surfaces and of others; interpolated
@@ -76,8 +77,13 @@ def seed_spacing(grid: VoxelGrid) -> float:
 
 def _edges_per_seed(grid: VoxelGrid, many: float) -> float:
     """Voxel edges between seeds that give so many supervoxels, within what is sensible."""
-    edges = math.sqrt(grid.n_voxels / (_VOXELS_PER_SUPERVOXEL * many))
-    return min(max(edges, _MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
+    edges = spacing_for(many, grid) / grid.size
+    return min(max(edges, MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
+
+
+def spacing_for(n_supervoxels: float, grid: VoxelGrid) -> float:
+    """Spacing, metres, of so many supervoxels, about, on the surface that the voxels of a grid cover."""
+    return grid.size * math.sqrt(grid.n_voxels / (_VOXELS_PER_SUPERVOXEL * n_supervoxels))
 
 
 def adapted_voxel_size(

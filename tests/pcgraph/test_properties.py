@@ -108,6 +108,8 @@ def settings_of(draw, points):
         chosen["voxel_size"] = extent(points) * draw(st.sampled_from([1e-9, 1e-3, 0.03, 0.1, 0.3, 3.0, 1e9]))
         if draw(st.booleans()):
             chosen["seed_size"] = chosen["voxel_size"] * draw(st.sampled_from([1.0, 1.5, 4.0, 30.0, 1e12]))
+    if "seed_size" not in chosen and draw(st.booleans()):
+        chosen["n_supervoxels"] = draw(st.sampled_from([1, 7, 1000]))
     kind = draw(st.sampled_from(["default", "inside", "one", "each", "camera", "range"]))
     if kind == "inside":
         chosen["viewpoint"] = points[len(points) // 2]

@@ -113,6 +113,9 @@ def test_values_of_supervoxels_on_points():
         ({"linkage": "ward"}, "expected a linkage such as"),
         ({"linkage": pcgraph.WardLinkage}, "expected a linkage such as"),
         ({"camera": "no"}, "expected camera as True, False or None"),
+        ({"n_supervoxels": 0}, "expected n_supervoxels as a whole number of at least 1, got 0"),
+        ({"n_supervoxels": 20.0}, "expected n_supervoxels as a whole number"),
+        ({"n_supervoxels": 20, "seed_size": 0.1}, "expected seed_size or n_supervoxels, got both"),
     ],
 )
 def test_settings_of_another_kind_are_refused(options, message):

@@ -20,6 +20,27 @@ def test_every_method_covers_and_connects(method, name):
     assert_covered_and_connected(DEGENERATE[name], pcgraph.segment(DEGENERATE[name], method=method))
 
 
+@pytest.mark.parametrize("method", [pcgraph.SurfaceGrowth(), pcgraph.Vccs()], ids=["surface", "vccs"])
+@pytest.mark.parametrize("n", [20, 100, 700, 4000])
+def test_there_are_about_as_many_supervoxels_as_asked_for(method, n):
+    points, _ = two_boxes_on_a_plane()[:2]
+    result = pcgraph.segment(points, viewpoint=(0, 0, 2), n_supervoxels=n, method=method)
+    assert result.tree.n_leaves == pytest.approx(n, rel=0.1)
+    usual = pcgraph.segment(points, viewpoint=(0, 0, 2), method=method)
+    assert usual.voxel_size / 2 <= result.voxel_size <= usual.voxel_size
+    again = pcgraph.segment(
+        points, viewpoint=(0, 0, 2), voxel_size=result.voxel_size, seed_size=result.seed_size, method=method
+    )
+    assert np.array_equal(again.supervoxels, result.supervoxels)
+
+
+def test_there_is_a_supervoxel_for_each_piece_and_at_most_one_for_each_voxel():
+    points = np.concatenate([patch((x, 0, 0), (0.2, 0, 0), (0, 0.2, 0)) for x in np.arange(7.0)])
+    assert pcgraph.segment(points, n_supervoxels=2).tree.n_leaves == 7
+    finest = pcgraph.segment(points, voxel_size=0.05, n_supervoxels=10**9)
+    assert finest.tree.n_leaves == finest.surface.grid.n_voxels
+
+
 @pytest.mark.parametrize(
     "edge", [3.4, pytest.param(3.7, marks=pytest.mark.xfail(reason="where cells start now, a row of points is wrong"))]
 )
