@@ -818,13 +818,13 @@ def _oriented_planes(
     if viewpoint is None:
         position = None if law is None else _scanner_position(law, grid)
         if position is None:
-            planes, telling = side_by_side(
+            planes, virtual = side_by_side(
                 lambda: method.planes(grid, _far_along(grid, upwards)), lambda: virtual_viewpoints(grid)
             )
         else:
-            planes, telling = method.planes(grid, position), None
+            planes, virtual = method.planes(grid, position), None
         axis = None if law is None or position is None else law.axis
-        sides = visible_sides(grid, planes.normals, position, telling, axis)
+        sides = visible_sides(grid, planes.normals, position, virtual, axis)
         planes = replace(planes, normals=sides.normals)
         scanner_moved = position is None and law is not None and law.holds
         return OrientedPlanes(

@@ -65,7 +65,7 @@ _W_VIEWPOINT, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the sam
 # the origin; those above the ground; or those on the free side of another supporting plane
 _W_ROOM = 0.2  # times the fraction of the cells in a room, if nearly all its viewpoints are closed in:
 _ENCLOSED_FOR_ROOM = 0.8  # fraction of the directions that hit something
-_MIN_SEEN_FROM_INSIDE_ALONE = 0.001  # fraction of the surface that such viewpoints show more, to count so in a passage
+_MIN_SHOWN_FROM_INSIDE = 0.001  # fraction of the surface that such viewpoints show more, to count so in a passage
 _MAX_FROM_BEHIND = 0.02  # fraction of what it sees that may be planes from behind; what is more is taken off
 # The origin as a camera's place
 _MAX_SLOPE = 1.2  # tangent off the optical axis, along x and y, within which all lies,
@@ -78,7 +78,7 @@ _TINY = 1e-12
 
 
 class VirtualViewpoints(NamedTuple):
-    """Viewpoints from which the outside is seen, the most telling first.
+    """Viewpoints from which the outside is seen, by decreasing weight.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ def lengths(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def virtual_viewpoints(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = None) -> VirtualViewpoints:
-    """The places that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
+    """Viewpoints that tell which side of the voxels' surface is its outside; arguments as for `visible_sides`.
 
     Of many rooms, whose partitions are thin and which hold few places each, more are looked at, through smaller cells;
     and where floors and ceilings lie near to each other for cells of that size, so that hardly a place is in a room.
@@ -145,11 +145,11 @@ def virtual_viewpoints(grid: VoxelGrid, viewpoint: NDArray[np.float64] | None = 
         is_layered, n_in_rooms = _is_layered(coarse), np.count_nonzero(candidates.enclosure >= _CLOSED)
         if may_be_finer and is_layered and n_in_rooms < _MIN_IN_ROOMS:
             continue  # low rooms have few places at first, and the outside of all of them shows much
-        telling, shown = _vote(coarse, points, windows, candidates, part_of_cell)
+        viewpoints, shown = _vote(coarse, points, windows, candidates, part_of_cell)
         shows_most = shown >= (_SHOWS_NEARLY_ALL if is_layered else _SHOWS_MOST) or not (is_layered or n_in_rooms)
         if shows_most or not may_be_finer:
             break
-    return telling
+    return viewpoints
 
 
 def _vote(
@@ -173,11 +173,13 @@ def _vote(
     found = _agreements(voting, np.ascontiguousarray(starts[:, of_place]))
     from_outside, likely, enclosure = of_place < _N_OUTSIDE, candidates.likely[of_place], candidates.enclosure[of_place]
     looks = _Looks(sides, from_outside, likely, enclosure, of_part, part_of_cell, is_flat)
-    room_counts, has_rooms = np.zeros(int(part_of_cell.max()) + 1), np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS
-    for part in range(len(room_counts) if has_rooms else 0):
+    room_scores, has_rooms = np.zeros(int(part_of_cell.max()) + 1), np.count_nonzero(in_rooms) >= _MIN_IN_ROOMS
+    for part in range(len(room_scores) if has_rooms else 0):
         cells = part_of_cell == part
-        room_counts[part] = _W_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
-    weights, shown = _best_agreement(found, looks, coarse.neighbourhood, candidates.likely_weight, room_counts)
+        room_scores[part] = _W_ROOM * np.mean(cells) * _is_room(cells, coarse, normals, points)
+    may_be_passage = bool(has_rooms) and len(room_scores) == 1 and not room_scores.any()
+    around, likely_weight = coarse.neighbourhood, candidates.likely_weight
+    weights, shown = _best_agreement(found, looks, around, likely_weight, room_scores, may_be_passage)
     chosen = _spread_choice(seen, weights)
     places = candidates.places[of_place[chosen]]
     return VirtualViewpoints(places, weights[chosen], of_part[chosen], coarse.centroids, part_of_cell), shown
@@ -560,50 +562,54 @@ def _best_agreement(
     looks: _Looks,
     around: Neighbourhood,
     likely_weight: float,
-    room_counts: NDArray[np.float64],
+    room_scores: NDArray[np.float64],
+    may_be_passage: bool,
 ) -> tuple[NDArray[np.float64], float]:
-    """Weights of the places, (k,) float64, in the agreement that shows most of the surface; how much any shows.
+    """Weights of the viewpoints, (k,) float64, in the agreement of the highest score; how much any agreement shows.
 
     Crevices between things are crests from behind, which are seen the better: what little that is decides nothing.
     A crease is hidden by what is beside it, so cells count as shown beside shown ones; but not where an agreement is
-    one of places closed in, as in a room: of that part all but narrow gaps is seen from within. Where that is no plain
-    room, of which floor and ceiling tell, it is a tunnel or a gallery if its places show, creases and all, what others
-    do not show: what was scanned had been seen, and whatever stands in a pipe is hidden from all who are outside.
+    one of viewpoints in a room: of that part all but narrow gaps is seen from within. A room's floor and ceiling tell
+    that it is one. A passage, such as a tunnel or a gallery, has none that tell, and is one if viewpoints within show,
+    creases and all, what others do not: what was scanned had been seen, and what stands in a pipe is hidden from all
+    who are outside.
     """
-    visible = np.abs(looks.sides).sum(axis=1)
     different = np.array(list({outward.tobytes(): s for s, outward in enumerate(found.outward)}.values()))
-    of_looks = found.weights[different].astype(np.float64)
+    weights = found.weights[different].astype(np.float64)
     of_parts = (looks.of_part == np.arange(looks.part_of_cell.max() + 1)[:, None]).T.astype(np.float64)
-    every, enclosure = of_looks @ of_parts, of_looks @ (of_parts * looks.enclosure[:, None])
-    is_closed = ((enclosure >= _CLOSED * every) & (every > 0.0)).any(axis=0)[looks.part_of_cell]
-    within = (enclosure >= _ENCLOSED_FOR_ROOM * every) & (every > 0.0)
-    rooms_count = within @ room_counts
-    shown, contradicted = np.empty(len(different)), np.empty(len(different))
-    sees, show = _seen_blocks(looks.sides), partial(in_blocks, _show, len(different), different, looks, smallest=1)
-    if (
-        len(room_counts) == 1
-        and not room_counts.any()
-        and np.count_nonzero(looks.enclosure >= _CLOSED) >= _MIN_IN_ROOMS
-    ):
-        show(sees, found, around, np.zeros_like(is_closed), shown, contradicted)
-        by_places_within, by_others = (shown[some].max(initial=0.0) for some in (within[:, 0], ~within[:, 0]))
-        rooms_count = _W_ROOM * within[:, 0] * (by_places_within > by_others + _MIN_SEEN_FROM_INSIDE_ALONE)
-    show(sees, found, around, is_closed, shown, contradicted)
-    most_shown, most, best = float(shown.max()), -np.inf, found.weights[0]
-    for s, fraction, of_rooms, against in zip(different, shown, rooms_count, contradicted, strict=True):
-        weights, agreed, known = found.weights[s], found.agreed[s], found.known[s]
-        score = (
-            min(float(fraction), most_shown - _SHOWN_TOLERANCE)
-            + float(of_rooms)
-            - max(float(against) - _MAX_FROM_BEHIND, 0.0)
-        )
-        decided = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
-        score += _W_UNANIMOUS * float(decided[visible > 0.0].mean())
-        for some, counts in ((looks.from_outside, _W_OUTSIDE), (looks.likely, likely_weight)):
-            score += counts * float(agreed[some].sum() / max(float(visible[some].sum()), _TINY))
-        if score > most:
-            most, best = score, weights
-    return best.astype(np.float64), most_shown
+    total, enclosure = weights @ of_parts, weights @ (of_parts * looks.enclosure[:, None])
+    is_closed = ((enclosure >= _CLOSED * total) & (total > 0.0)).any(axis=0)[looks.part_of_cell]
+    is_within = (enclosure >= _ENCLOSED_FOR_ROOM * total) & (total > 0.0)
+    show = partial(_shown, different, looks, _seen_blocks(looks.sides), found, around)
+    shown, from_behind = show(is_closed)
+    within = is_within @ room_scores
+    if may_be_passage:
+        with_creases, inside = show(np.zeros_like(is_closed))[0], is_within[:, 0]
+        alone = with_creases[inside].max(initial=0.0) > with_creases[~inside].max(initial=0.0) + _MIN_SHOWN_FROM_INSIDE
+        within = _W_ROOM * inside * alone
+    most_shown = float(shown.max())
+    scores = np.minimum(shown, most_shown - _SHOWN_TOLERANCE) + within - np.maximum(from_behind - _MAX_FROM_BEHIND, 0.0)
+    visible = np.abs(looks.sides).sum(axis=1)
+    agreed, known = found.agreed[different], found.known[different]
+    unanimous = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
+    scores += _W_UNANIMOUS * unanimous[:, visible > 0.0].mean(axis=1)
+    for some, weight in ((looks.from_outside, _W_OUTSIDE), (looks.likely, likely_weight)):
+        scores += weight * agreed[:, some].sum(axis=1) / max(float(visible[some].sum()), _TINY)
+    return weights[int(np.argmax(scores))], most_shown
+
+
+def _shown(
+    different: NDArray[np.int64],
+    looks: _Looks,
+    sees: NDArray[np.bool_],
+    found: _Agreements,
+    around: Neighbourhood,
+    is_closed: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What `_show` sets for some of the agreements, (d,) each."""
+    shown, from_behind = np.empty(len(different)), np.empty(len(different))
+    in_blocks(_show, len(different), different, looks, sees, found, around, is_closed, shown, from_behind, smallest=1)
+    return shown, from_behind
 
 
 @summing_routine

@@ -44,7 +44,7 @@ class VisibleSides(ShortRepr):
     Attributes
     ----------
     places : (k, 3) float64, metres
-        From which the outside is seen, the most telling first; or the viewpoint, where that is known.
+        From which the outside is seen, by decreasing weight; or the viewpoint, where that is known.
     normals : (v, 3) float64
         Unit normals, outwards.
     """
@@ -57,7 +57,7 @@ def visible_sides(
     grid: VoxelGrid,
     normals: NDArray[np.float64],
     viewpoint: NDArray[np.float64] | None = None,
-    telling: VirtualViewpoints | None = None,
+    virtual: VirtualViewpoints | None = None,
     axis: NDArray[np.float64] | None = None,
 ) -> VisibleSides:
     """The outer side of the surface at each voxel, found from what is visible.
@@ -70,7 +70,7 @@ def visible_sides(
     viewpoint : (3,) float64, metres, optional
         About where all was seen from. What lies edge-on from there, as ground does from a place on it, is decided by
         what is visible; if little does, nothing else is asked.
-    telling : VirtualViewpoints, optional
+    virtual : VirtualViewpoints, optional
         `virtual_viewpoints(grid, viewpoint)`, where that is known.
     axis : (3,) float64, optional
         Of a scanner at the viewpoint, as for `sides_towards`.
@@ -100,14 +100,14 @@ def visible_sides(
         told = _cosines(grid, normals, viewpoint, axis, reach)
         if np.mean(np.abs(told) < _EDGE_ON) < _LITTLE:
             return VisibleSides(viewpoint[None], _turned(normals, told))
-    telling = virtual_viewpoints(grid, viewpoint) if telling is None else telling
-    places, weights = telling.places, telling.weights
+    virtual = virtual_viewpoints(grid, viewpoint) if virtual is None else virtual
+    places, weights = virtual.places, virtual.weights
     votes, (looked_at, stretch) = _TOLD * told, occluder_subset(grid)
     centres, widths = (grid.centroids[looked_at] - middle) / reach, stretch * grid.edge_lengths[looked_at] / reach
     sides = normals[looked_at]
     seen, towards = visibility_from(places, centres, widths, sides, stretch), np.empty((len(centres), 3))
-    if telling.part_of_cell.any():
-        seen &= telling.parts[:, None] == telling.part_of(centres)
+    if virtual.part_of_cell.any():
+        seen &= virtual.parts[:, None] == virtual.part_of(centres)
     in_blocks(_look_around, len(centres), places, weights, seen, centres, towards)
     votes[looked_at] += np.einsum("ij,ij->i", towards, sides) / lengths(towards)
     seen_from_places = middle + reach * places if viewpoint is None else viewpoint[None]
