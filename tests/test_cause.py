@@ -11,6 +11,7 @@ import cause_scenes
 import numpy as np
 import pytest
 from synthetic import plane_signals, stereo_rig
+from tiers import to_validate
 
 import rangesim
 from rangesim import (
@@ -21,6 +22,7 @@ from rangesim import (
     IdealToF,
     Lens,
     Sensor,
+    Signals,
     SpadDetector,
     StructuredLight,
     decode,
@@ -58,7 +60,11 @@ AGREEMENT = 0.99
 # ---- The scenes -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cause", [c for c in Cause if c], ids=lambda c: c.name.lower())
+@pytest.mark.parametrize(
+    "cause",
+    [*(c for c in Cause if c and c is not Cause.MOTION), *to_validate(Cause.MOTION)],
+    ids=lambda c: c.name.lower(),
+)
 def test_a_scene_made_for_it_produces_each_cause(cause: Cause) -> None:
     """Rules and an independent decision name the same cause in 99 % of the failed pixels, and each has one."""
     case = getattr(cause_scenes, cause.name.lower())()
@@ -73,12 +79,18 @@ def test_a_scene_made_for_it_produces_each_cause(cause: Cause) -> None:
     assert (case.decided[failed] == cause).sum() >= 20
 
 
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    """Of one pass of the tabletop for all sensors."""
+    scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
+    sensors = [sensor for sensor, _ in SENSORS.values()]
+    return rangesim.transport(scene, scene.rig(width=64, height=48), sensors, spp=4)
+
+
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("noise", [True, False], ids=["noise", "noise-free"])
-def test_no_failed_pixel_is_without_a_cause(name: str, noise: bool) -> None:
+def test_no_failed_pixel_is_without_a_cause(signals: Signals, name: str, noise: bool) -> None:
     sensor, detector = SENSORS[name]
-    scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
-    signals = rangesim.transport(scene, scene.rig(width=64, height=48), [sensor], spp=4)
     capture = expose(signals, sensor, detector if noise else None)
     image = decode(capture)
     found = explain(image, capture, signals)
@@ -88,6 +100,7 @@ def test_no_failed_pixel_is_without_a_cause(name: str, noise: bool) -> None:
     assert failed.any()
 
 
+@pytest.mark.validation
 def test_what_other_light_spoils_on_the_tabletop_is_better_without_it() -> None:
     """AMCW on many surfaces: pixels named multipath or caustic lose most of their error with direct light alone; those
     of mirrors and glass do not get right by it."""

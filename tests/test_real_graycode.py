@@ -34,6 +34,7 @@ def decoded(capture: Capture) -> RangeImage:
     return decode(capture)
 
 
+@pytest.mark.validation
 def test_it_agrees_with_opencv(capture: Capture, decoded: RangeImage) -> None:
     """All pixels of a grid that OpenCV decodes with its thresholds (40 and 5) come out the same, and no others.
 

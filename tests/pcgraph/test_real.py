@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from test_guarantees import assert_covered_and_connected
 
 import pcgraph
 
 
+@pytest.mark.validation
 def test_real_clouds_fall_into_objects(real_clouds):
     overlaps, errors = [], []
     for path in real_clouds[::3]:
