@@ -151,6 +151,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     assert 0.8 < np.mean(squares) < 1.2
 
 
+@pytest.mark.validation
 def test_a_shared_lens_is_found_with_its_deviation() -> None:
     scene = around(8, 120)
     wrong = Intrinsics(1280, 960, 1150, 1160, 650, 470)

@@ -81,6 +81,7 @@ def test_degenerate_motion_is_refused() -> None:
         structure_from_motion(Tracks(scene.tracks.image, scene.tracks.point, far), camera)
 
 
+@pytest.mark.validation
 def test_a_view_that_comes_twice_does_no_harm() -> None:
     scene = around(5, 60)
     twice = Tracks.from_dense(scene.tracks.dense()[[0, 0, 1, 2, 2, 3, 4]])
