@@ -55,6 +55,7 @@ SENSORS: dict[str, tuple[Sensor, Any]] = {
     "ideal": (IdealToF(), None),
 }
 AGREEMENT = 0.99
+BINS, SPLIT = TransientHistogram(0.0, 0.5, 80), LengthSplit(0.0, 0.5, 80)
 
 
 # ---- The scenes -------------------------------------------------------------------------------------
@@ -81,10 +82,10 @@ def test_a_scene_made_for_it_produces_each_cause(cause: Cause) -> None:
 
 @pytest.fixture(scope="module")
 def signals() -> Signals:
-    """Of one pass of the tabletop for all sensors."""
+    """Of one pass of the tabletop for all sensors, and for light over path length."""
     scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
     sensors = [sensor for sensor, _ in SENSORS.values()]
-    return rangesim.transport(scene, scene.rig(width=64, height=48), sensors, spp=4)
+    return rangesim.transport(scene, scene.rig(width=64, height=48), [*sensors, BINS, SPLIT], spp=4)
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -309,12 +310,9 @@ def test_the_docs_define_every_cause() -> None:
 # ---- The energy split over path length --------------------------------------------------------------
 
 
-def test_the_split_over_path_length_adds_up_to_bins_and_to_the_energy_split() -> None:
-    scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
-    bins, split = TransientHistogram(0.0, 0.5, 80), LengthSplit(0.0, 0.5, 80)
-    signals = rangesim.transport(scene, scene.rig(0.03, width=64, height=48), [bins, split], spp=4)
-    parts = signals.channels[split].reshape(len(KINDS), 80, 48, 64)
-    np.testing.assert_allclose(parts.sum(axis=0), signals.channels[bins], rtol=1e-5, atol=1e-6)
+def test_the_split_over_path_length_adds_up_to_bins_and_to_the_energy_split(signals: Signals) -> None:
+    parts = signals.channels[SPLIT].reshape(len(KINDS), 80, 48, 64)
+    np.testing.assert_allclose(parts.sum(axis=0), signals.channels[BINS], rtol=1e-5, atol=1e-6)
     for kind, part in zip(KINDS, parts, strict=True):
         np.testing.assert_allclose(part.sum(axis=0), getattr(signals.energy, kind), rtol=1e-4, atol=1e-6)
     assert all(parts[k].any() for k in (DIRECT, MULTIPATH, SPECULAR, CAUSTIC))
