@@ -108,6 +108,7 @@ def test_the_sky_seen_through_a_slab_and_in_it() -> None:
     assert seen.mean() == pytest.approx(expected.mean(), rel=2e-3)
 
 
+@pytest.mark.validation
 def test_what_the_projector_lights_is_seen_through_a_slab_weakened_and_as_far_away() -> None:
     """The projector stands behind the slab and lights the wall straight."""
     images = []
@@ -313,6 +314,7 @@ def test_glass_that_absorbs_nothing_is_the_same_to_the_byte() -> None:
         assert getattr(images[0], name).tobytes() == getattr(images[1], name).tobytes()
 
 
+@pytest.mark.validation
 def test_holes_inside_the_glass_change_nothing() -> None:
     hole = wall((NEAR + FAR) / 2, {"type": "mask", "opacity": 0.0, "bsdf": matte()})
     scene = scene_of(slab=filled(slab()), lamp=lamp(), hole=hole)

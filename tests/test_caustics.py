@@ -229,6 +229,7 @@ def before_the_projector(**parts: dict[str, Any]) -> rangesim.Signals:
     return transport(scene, rig, [ProjectorCoordinates()], spp=64, max_depth=2, caustic_radius_m=4e-3)
 
 
+@pytest.mark.validation
 def test_a_thin_pane_dims_the_light_and_does_not_shift_it() -> None:
     free = before_the_projector()
     pane = before_the_projector(pane=wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3))

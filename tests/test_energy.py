@@ -200,7 +200,8 @@ def test_a_white_furnace_hides_lossless_glass() -> None:
     np.testing.assert_allclose(ambient, 1.0, atol=2e-3)
 
 
-@pytest.mark.parametrize("thickness_m", [5e-5, *to_validate(1e-2, 1e-4)])
+@pytest.mark.validation
+@pytest.mark.parametrize("thickness_m", [1e-2, 1e-4, 5e-5])
 def test_thin_glass_keeps_both_faces(thickness_m: float) -> None:
     """A foil passes as much as a pane, and delays the light by (n - 1) d."""
     response = FirstReturn()

@@ -328,7 +328,7 @@ def test_rays_from_the_projector_s_lens_spread_as_its_blur_says() -> None:
         assert blur == pytest.approx(0.5 * 4e-3 * lens.fx * abs(1 / z - 1 / 0.9), abs=1e-4)
 
 
-@pytest.mark.parametrize("focus", [0.6, 1.0, 3.0])
+@pytest.mark.parametrize("focus", [0.6, *to_validate(1.0, 3.0)])
 def test_fringes_lose_the_contrast_that_the_formula_says(plane: rangesim.Scene, focus: float) -> None:
     rig = before_plane(plane, projector_lens=Lens(4e-3, focus))
     fringes = Fringes(0, 16.0)
@@ -352,6 +352,7 @@ def test_fringes_lose_the_contrast_that_the_formula_says(plane: rangesim.Scene, 
     np.testing.assert_allclose(blurred / modulation, expected, rtol=1e-4)
 
 
+@pytest.mark.validation
 def test_the_modulation_that_a_camera_measures_falls_with_depth(plane: rangesim.Scene) -> None:
     """A camera close to the projector and turned away sees the plane at many depths z of the projector."""
     sensor = StructuredLight(320, 200, steps=4)

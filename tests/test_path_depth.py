@@ -71,6 +71,7 @@ def test_what_is_seen_through_a_hollow_ball_is_that_of_a_deep_path_tracer() -> N
     assert energy.projector.mean() / straight > 0.8
 
 
+@pytest.mark.validation
 def test_light_off_coats_and_through_holes_counts_the_scattering_surface_alone() -> None:
     """At max_depth 2 a coat shows the lit wall, and so do six holes one behind the other."""
     coat: dict[str, Any] = {"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0}

@@ -165,6 +165,7 @@ def mean_delay_m(sigma_t: float, albedo: float) -> tuple[float, float]:
     return float(measured), float(albedo / sigma_t * (logs[1] - logs[0]) / (2 * step))
 
 
+@pytest.mark.validation
 def test_translucent_objects_read_too_long_and_halving_the_density_doubles_it() -> None:
     found = {sigma_t: mean_delay_m(sigma_t, 0.9) for sigma_t in (4000.0, 2000.0)}
     for measured, expected in found.values():
