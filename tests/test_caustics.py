@@ -569,14 +569,8 @@ def test_photons_of_many_seeds_light_every_pixel_that_sees_glass() -> None:
 # ---- Same bytes -------------------------------------------------------------------------------------
 
 
-GRAY = StructuredLight(axes=("columns",), code="gray")
-WHITE = Images(np.ones((1, 800, 1280), np.float32))
-BINS = TransientHistogram(0.0, 0.5, 60)
-
-
-def all_sensors() -> list[Any]:
-    tof = [AmcwToF((20e6,)), rangesim.DirectToF(bins=32, bin_s=800e-12)]
-    return [StructuredLight(axes=("columns",)), *tof, GRAY, WHITE, BINS]
+def all_sensors() -> list[rangesim.Sensor]:
+    return [StructuredLight(axes=("columns",)), AmcwToF((20e6,)), rangesim.DirectToF(bins=32, bin_s=800e-12)]
 
 
 def test_caustics_leave_all_other_light_as_it_was() -> None:
@@ -636,10 +630,12 @@ def test_threads_change_no_byte() -> None:
 def test_every_response_sees_the_caustics() -> None:
     scene = rangesim.load_scene(SCENES / "tabletop.xml")
     rig = scene.rig(width=64, height=48)
-    signals = transport(scene, rig, all_sensors(), spp=8)
+    light = StructuredLight(axes=("columns",), code="gray")
+    images, bins = Images(np.ones((1, 800, 1280), np.float32)), TransientHistogram(0.0, 0.5, 60)
+    signals = transport(scene, rig, [light, images, bins], spp=8)
     white = signals.energy.projector
     assert (signals.energy.caustic > 0.5 * white).any()
-    frames = signals.frames(GRAY, ambient_transmission=0.0)
+    frames = signals.frames(light, ambient_transmission=0.0)
     np.testing.assert_allclose(frames[0:-2:2] + frames[1:-2:2], np.broadcast_to(white, (11, 48, 64)), rtol=1e-4)
-    np.testing.assert_allclose(signals.channels[WHITE][0], white, rtol=1e-4)
-    np.testing.assert_allclose(signals.channels[BINS].sum(axis=0), white, rtol=1e-4)
+    np.testing.assert_allclose(signals.channels[images][0], white, rtol=1e-4)
+    np.testing.assert_allclose(signals.channels[bins].sum(axis=0), white, rtol=1e-4)

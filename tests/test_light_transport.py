@@ -40,15 +40,6 @@ def all_sensors() -> list[rangesim.Sensor]:
     ]
 
 
-GRAY = StructuredLight(axes=("columns",), code="gray")
-WHITE = Images(np.ones((1, 800, 1280), np.float32))
-
-
-def everything() -> list[rangesim.Sensor | Images]:
-    """What tests trace on the tabletop, whose kernels take seconds to compile, so that they share them."""
-    return [GRAY, WHITE, *all_sensors()]
-
-
 # ---- Closed forms -----------------------------------------------------------------------------------
 
 
@@ -190,8 +181,9 @@ def test_bins_add_up_to_the_steady_image(corner: rangesim.Scene) -> None:
 
 
 def test_a_pattern_and_its_inverse_add_up_to_white(tabletop: rangesim.Scene) -> None:
-    signals = transport(tabletop, tabletop.rig(**SIZE), everything(), spp=8)
-    frames = signals.frames(GRAY, ambient_transmission=0.0)
+    light = StructuredLight(axes=("columns",), code="gray")
+    signals = transport(tabletop, tabletop.rig(**SIZE), [light], spp=8)
+    frames = signals.frames(light, ambient_transmission=0.0)
     white, black = frames[-2], frames[-1]
     np.testing.assert_allclose(frames[0:-2:2] + frames[1:-2:2], np.broadcast_to(white, (11, 48, 64)), rtol=1e-5)
     assert not black.any()
@@ -229,10 +221,10 @@ def test_threads_and_memory_budget_do_not_change_a_byte(tabletop: rangesim.Scene
     results = []
     for threads, memory in ((1, 2 << 30), (2, 2 << 30), (2, 2 << 20)):
         dr.set_thread_count(threads)
-        results.append(all_bytes(transport(tabletop, rig, everything(), spp=4, seed=7, memory_bytes=memory)))
+        results.append(all_bytes(transport(tabletop, rig, all_sensors(), spp=4, seed=7, memory_bytes=memory)))
     dr.set_thread_count(before)
     assert results[0] == results[1] == results[2]
-    assert results[0] != all_bytes(transport(tabletop, rig, everything(), spp=4, seed=8))
+    assert results[0] != all_bytes(transport(tabletop, rig, all_sensors(), spp=4, seed=8))
 
 
 def test_a_second_pass_compiles_nothing_wherever_its_arrays_lie(tabletop: rangesim.Scene) -> None:
@@ -429,7 +421,7 @@ def test_ground_truth_of_the_plane() -> None:
 
 
 def test_ground_truth_knows_the_objects(tabletop: rangesim.Scene) -> None:
-    truth = transport(tabletop, tabletop.rig(**SIZE), everything(), spp=1).truth
+    truth = transport(tabletop, tabletop.rig(**SIZE), [], spp=1).truth
     classes = {
         truth.instance_names[i]: truth.material_names[m]
         for i, m in zip(truth.instance.ravel(), truth.material.ravel(), strict=True)
@@ -456,13 +448,14 @@ def test_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
 
 def test_unlit_pixels_never_reach_a_response(tabletop: rangesim.Scene) -> None:
     """Where the projector does not reach, u and v may be anything; patterns must not be looked up there."""
+    images = Images(np.ones((1, 800, 1280), np.float32))
     rig = tabletop.rig(**SIZE)
     away = Rig(rig.camera, rig.projector, rig.T_world_camera, look_at((0, 0, 0.5), (1, 0, 0.5), (0, -1, 0)))
     for seed in range(4):
-        signals = transport(tabletop, away, everything(), spp=16, seed=seed)
+        signals = transport(tabletop, away, [images, *all_sensors()], spp=16, seed=seed)
         for values in signals.channels.values():
             assert np.isfinite(values).all()
-        np.testing.assert_allclose(signals.channels[WHITE][0], signals.energy.projector, rtol=1e-5)
+        np.testing.assert_allclose(signals.channels[images][0], signals.energy.projector, rtol=1e-5)
 
 
 def test_wrong_kinds_of_arguments_get_one_clear_sentence(corner: rangesim.Scene) -> None:
