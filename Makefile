@@ -8,7 +8,7 @@ DEMO_OUT := out/demo
 export PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test coverage test-quick fuzz kernels lint format constraints audit clean system
+.PHONY: help demo test validate coverage fuzz kernels lint format constraints audit clean system
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /|/' | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -20,18 +20,18 @@ demo: $(VENV)/.installed ## set up if needed, run the comparison on the tabletop
 # Each worker traces with all cores for a part of its time: more than four workers gain nothing. Files go in the order
 # of tests/conftest.py, as those of most tests are not those that take longest.
 PARALLEL := -n auto --maxprocesses=4 --dist loadfile --no-loadscope-reorder
-test: $(VENV)/.installed-test ## set up if needed, lint, check types, run every test
+test: $(VENV)/.installed-test ## set up if needed, lint, check types, run the tests but those of `make validate`
 	@$(MAKE) --no-print-directory -j 2 lint kernels
-	$(BIN)/python -m pytest $(PARALLEL)
+	$(BIN)/python -m pytest $(PARALLEL) -m "not validation"
+
+validate: $(VENV)/.installed-test kernels ## long comparisons and statistics, before a release: docs/validation.md
+	$(BIN)/python -m pytest $(PARALLEL) -m validation
 
 kernels: $(VENV)/.installed-test # compiled once beside mypy, which leaves a core; else by each worker of the tests
 	@$(BIN)/python -c "from pcgraph.warmup import compile_kernels; compile_kernels()"
 
-coverage: $(VENV)/.installed-test ## every test, and which lines none reaches; takes a third longer
+coverage: $(VENV)/.installed-test ## every test of both, and which lines none reaches; takes a third longer
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term
-
-test-quick: $(VENV)/.installed-test ## the tests without those marked slow
-	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 N := 20000
 SEED := $(shell date +%Y%m%d)

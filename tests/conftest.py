@@ -36,9 +36,14 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.disable()
 
 
+LONGEST = ("test_readme.py", "test_fuzz.py", "test_interruption.py", "test_trust.py", "test_own_sensors.py")
+"""The files that take longest, which start processes or run all examples."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The file that takes longest, which runs all examples, first: else one worker ends minutes after the others."""
-    items.sort(key=lambda item: item.path.name != "test_readme.py")
+    """The files that take longest first: else one worker ends minutes after the others."""
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(LONGEST)))
 
 
 def pytest_collection_finish() -> None:

@@ -19,6 +19,7 @@ from delta_scenes import (
 )
 from plain_mitsuba import plain_scene, render, z_score
 from synthetic import counted_return
+from tiers import to_validate
 
 from rangesim import Intrinsics, Rig, Scene, load_scene, transport
 from rangesim.errors import FileFormatError
@@ -107,6 +108,7 @@ def test_the_sky_seen_through_a_slab_and_in_it() -> None:
     assert seen.mean() == pytest.approx(expected.mean(), rel=2e-3)
 
 
+@pytest.mark.validation
 def test_what_the_projector_lights_is_seen_through_a_slab_weakened_and_as_far_away() -> None:
     """The projector stands behind the slab and lights the wall straight."""
     images = []
@@ -162,6 +164,7 @@ def test_a_photon_keeps_its_way_and_length_and_loses_by_the_way_inside() -> None
     assert set(np.round(passes)) >= {1, 3}
 
 
+@pytest.mark.validation
 def test_caustics_behind_a_slab_are_as_bright_as_the_photons_that_land() -> None:
     """The camera stands behind the slab; the light passes it once."""
     images = []
@@ -178,7 +181,7 @@ def test_caustics_behind_a_slab_are_as_bright_as_the_photons_that_land() -> None
 # ---- Glint ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("slabs", [1, 2])
+@pytest.mark.parametrize("slabs", [1, *to_validate(2)])
 def test_the_lens_seen_through_slabs_is_weakened_by_each(slabs: int) -> None:
     close_up = Intrinsics.from_fov(64, 48, 5)  # so that a good part of a pixel's paths hit the lens
     rig = rig_of(close_up, PROJECTOR, (0.0, 0.0, 1.5), looks_at=(0.0, 0.0, 0.0))
@@ -243,6 +246,7 @@ def over() -> Any:
     return transform().translate([0.0, 2.0, 1.0]).rotate([1, 0, 0], 90).scale(1.0)
 
 
+@pytest.mark.validation
 @pytest.mark.filterwarnings("ignore:.*lamp")
 @pytest.mark.parametrize(
     "kind",
@@ -265,6 +269,7 @@ def test_bodies_of_absorbing_glass_look_as_in_volpath(kind: str) -> None:
     assert seen.mean() == pytest.approx(reference.mean(), rel=0.01)
 
 
+@pytest.mark.validation
 def test_indirect_light_through_a_slab_is_that_of_volpath() -> None:
     """The far wall is lit straight, and once more by way of a near wall behind the slab: no caustics, as the near wall
     gets none that would be seen."""
@@ -309,6 +314,7 @@ def test_glass_that_absorbs_nothing_is_the_same_to_the_byte() -> None:
         assert getattr(images[0], name).tobytes() == getattr(images[1], name).tobytes()
 
 
+@pytest.mark.validation
 def test_holes_inside_the_glass_change_nothing() -> None:
     hole = wall((NEAR + FAR) / 2, {"type": "mask", "opacity": 0.0, "bsdf": matte()})
     scene = scene_of(slab=filled(slab()), lamp=lamp(), hole=hole)

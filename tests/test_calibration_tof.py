@@ -118,6 +118,7 @@ def test_what_is_left_is_the_noise_as_the_exact_inverse_leaves_it(calibration):
     assert np.std(calibration.offset_m - DELAY) < 1.3 * calibration.noise_m / np.sqrt(len(DISTANCES))
 
 
+@pytest.mark.validation
 def test_no_range_is_off_as_a_whole(calibration):
     """What orders beyond the series' leave is 0.1 mm, also without noise; the noise of one set of targets, 20 for 24
     coefficients, moves all pixels at a range by 0.07 mm, hence the mean of four calibrations."""

@@ -11,6 +11,7 @@ import cause_scenes
 import numpy as np
 import pytest
 from synthetic import plane_signals, stereo_rig
+from tiers import to_validate
 
 import rangesim
 from rangesim import (
@@ -21,6 +22,7 @@ from rangesim import (
     IdealToF,
     Lens,
     Sensor,
+    Signals,
     SpadDetector,
     StructuredLight,
     decode,
@@ -53,12 +55,17 @@ SENSORS: dict[str, tuple[Sensor, Any]] = {
     "ideal": (IdealToF(), None),
 }
 AGREEMENT = 0.99
+BINS, SPLIT = TransientHistogram(0.0, 0.5, 80), LengthSplit(0.0, 0.5, 80)
 
 
 # ---- The scenes -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cause", [c for c in Cause if c], ids=lambda c: c.name.lower())
+@pytest.mark.parametrize(
+    "cause",
+    [*(c for c in Cause if c and c is not Cause.MOTION), *to_validate(Cause.MOTION)],
+    ids=lambda c: c.name.lower(),
+)
 def test_a_scene_made_for_it_produces_each_cause(cause: Cause) -> None:
     """Rules and an independent decision name the same cause in 99 % of the failed pixels, and each has one."""
     case = getattr(cause_scenes, cause.name.lower())()
@@ -73,12 +80,18 @@ def test_a_scene_made_for_it_produces_each_cause(cause: Cause) -> None:
     assert (case.decided[failed] == cause).sum() >= 20
 
 
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    """Of one pass of the tabletop for all sensors, and for light over path length."""
+    scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
+    sensors = [sensor for sensor, _ in SENSORS.values()]
+    return rangesim.transport(scene, scene.rig(width=64, height=48), [*sensors, BINS, SPLIT], spp=4)
+
+
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("noise", [True, False], ids=["noise", "noise-free"])
-def test_no_failed_pixel_is_without_a_cause(name: str, noise: bool) -> None:
+def test_no_failed_pixel_is_without_a_cause(signals: Signals, name: str, noise: bool) -> None:
     sensor, detector = SENSORS[name]
-    scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
-    signals = rangesim.transport(scene, scene.rig(width=64, height=48), [sensor], spp=4)
     capture = expose(signals, sensor, detector if noise else None)
     image = decode(capture)
     found = explain(image, capture, signals)
@@ -88,6 +101,7 @@ def test_no_failed_pixel_is_without_a_cause(name: str, noise: bool) -> None:
     assert failed.any()
 
 
+@pytest.mark.validation
 def test_what_other_light_spoils_on_the_tabletop_is_better_without_it() -> None:
     """AMCW on many surfaces: pixels named multipath or caustic lose most of their error with direct light alone; those
     of mirrors and glass do not get right by it."""
@@ -296,12 +310,9 @@ def test_the_docs_define_every_cause() -> None:
 # ---- The energy split over path length --------------------------------------------------------------
 
 
-def test_the_split_over_path_length_adds_up_to_bins_and_to_the_energy_split() -> None:
-    scene = rangesim.load_scene(ROOT / "scenes" / "tabletop.xml")
-    bins, split = TransientHistogram(0.0, 0.5, 80), LengthSplit(0.0, 0.5, 80)
-    signals = rangesim.transport(scene, scene.rig(0.03, width=64, height=48), [bins, split], spp=4)
-    parts = signals.channels[split].reshape(len(KINDS), 80, 48, 64)
-    np.testing.assert_allclose(parts.sum(axis=0), signals.channels[bins], rtol=1e-5, atol=1e-6)
+def test_the_split_over_path_length_adds_up_to_bins_and_to_the_energy_split(signals: Signals) -> None:
+    parts = signals.channels[SPLIT].reshape(len(KINDS), 80, 48, 64)
+    np.testing.assert_allclose(parts.sum(axis=0), signals.channels[BINS], rtol=1e-5, atol=1e-6)
     for kind, part in zip(KINDS, parts, strict=True):
         np.testing.assert_allclose(part.sum(axis=0), getattr(signals.energy, kind), rtol=1e-4, atol=1e-6)
     assert all(parts[k].any() for k in (DIRECT, MULTIPATH, SPECULAR, CAUSTIC))

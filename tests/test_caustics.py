@@ -23,6 +23,7 @@ from delta_scenes import (
     transform,
     wall,
 )
+from tiers import to_validate
 
 import rangesim
 from rangesim import AmcwToF, IdealToF, Intrinsics, Rig, Scene, StructuredLight, transport
@@ -98,6 +99,7 @@ def test_the_length_of_sight_through_a_slab_is_that_of_snell_s_law() -> None:
     assert not signals.energy.direct.any()
 
 
+@pytest.mark.validation
 def test_light_and_sight_through_a_slab_and_what_time_of_flight_makes_of_it() -> None:
     """A slab before the plane lets it appear (n - 1) d too far: camera and projector both look through it.
 
@@ -194,10 +196,12 @@ def test_light_off_a_flat_mirror_is_that_of_the_image_source() -> None:
     check_image_source(*beside_a_mirror(MIRROR), lambda d: fresnel_conductor(d[..., 0]))
 
 
+@pytest.mark.validation
 def test_light_off_polished_plastic_is_fresnel_s_share_of_the_image_source() -> None:
     check_image_source(*beside_a_mirror(PLASTIC), lambda d: fresnel_dielectric(np.sqrt(1 - d[..., 0] ** 2)))
 
 
+@pytest.mark.validation
 def test_light_through_a_pane_and_off_plastic_lands_and_goes_on() -> None:
     """On the plastic a photon that came through glass both lands and goes on; fractions of either must add up."""
     pane = wall(0.1, {**GLASS, "type": "thindielectric"}, 0.19)
@@ -225,6 +229,7 @@ def before_the_projector(**parts: dict[str, Any]) -> rangesim.Signals:
     return transport(scene, rig, [ProjectorCoordinates()], spp=64, max_depth=2, caustic_radius_m=4e-3)
 
 
+@pytest.mark.validation
 def test_a_thin_pane_dims_the_light_and_does_not_shift_it() -> None:
     free = before_the_projector()
     pane = before_the_projector(pane=wall(0.2, {**GLASS, "type": "thindielectric"}, 0.15, x=0.3))
@@ -246,7 +251,7 @@ def test_light_through_a_cut_out_hole_arrives_undimmed_and_counts_as_caustic() -
     np.testing.assert_array_equal(through.energy.caustic, through.energy.projector)
 
 
-@pytest.mark.parametrize("nested", [matte(), PLASTIC, MIRROR], ids=lambda bsdf: str(bsdf["type"]))
+@pytest.mark.parametrize("nested", [matte(), *to_validate(PLASTIC, MIRROR)], ids=lambda bsdf: str(bsdf["type"]))
 def test_half_a_hole_passes_half_the_light(nested: dict[str, Any]) -> None:
     free = before_the_projector()
     veil = {"type": "mask", "opacity": 0.5, "bsdf": nested}
@@ -273,6 +278,7 @@ def tilted(file: Path, square: Any, towards: Any, degrees: float, bsdf: dict[str
     return mesh(file, square, np.tile(tilt, (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), bsdf)
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("wound_outwards", [True, False])
 @pytest.mark.parametrize("degrees", [60, 30, -15])
 def test_photons_meet_shading_normals_as_direct_light_does(
@@ -297,6 +303,7 @@ def test_photons_meet_shading_normals_as_direct_light_does(
     assert np.abs(ratio.reshape(4, 12, 4, 16).mean(axis=(1, 3)) - 1).max() < 0.05
 
 
+@pytest.mark.validation
 def test_a_coarse_smooth_ball_has_no_facets_behind_a_pane(tmp_path: Path) -> None:
     """Each 4 x 4 pixels are as bright as in direct light, on the facets and along their edges."""
     import trimesh
@@ -435,7 +442,7 @@ def test_radii_follow_the_law_of_progressive_photon_mapping() -> None:
     np.testing.assert_allclose(radii[1:] ** 2, radii[:-1] ** 2 * (i + ALPHA) / (i + 1))
 
 
-@pytest.mark.parametrize(("photons", "radius_m"), [(50_000, 1e-3), (400_000, 1e-3), (400_000, 3e-3)])
+@pytest.mark.parametrize(("photons", "radius_m"), [(50_000, 1e-3), *to_validate((400_000, 1e-3), (400_000, 3e-3))])
 def test_flux_depends_on_neither_radius_nor_number_of_photons(photons: int, radius_m: float) -> None:
     scene, rig = ball_over_a_plane()
     landed = trace_photons(TracedScene.of(scene.mitsuba, rig), 1.0, 400_000, 16, 3, 2 << 30)
@@ -449,6 +456,7 @@ def test_flux_depends_on_neither_radius_nor_number_of_photons(photons: int, radi
     assert received == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.validation
 def test_levels_change_the_noise_and_not_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
 
     scene, rig = ball_over_a_plane()
@@ -487,6 +495,7 @@ def fringe_contrast(scene: Scene, rig: Rig, **options: Any) -> float:
     return float((amplitude / signals.energy.projector[board]).mean())
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("wall_z", [0.9, 6.0])
 def test_a_far_wall_does_not_blur_near_fringes_behind_a_pane(wall_z: float) -> None:
     pane = wall(0.5, {**GLASS, "type": "thindielectric"}, 0.1)
@@ -497,6 +506,7 @@ def test_a_far_wall_does_not_blur_near_fringes_behind_a_pane(wall_z: float) -> N
     assert behind == pytest.approx(free, abs=0.05)
 
 
+@pytest.mark.validation
 def test_more_photons_make_less_noise() -> None:
     scene, rig = beside_a_mirror(MIRROR)
     noise = []

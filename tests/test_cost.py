@@ -144,6 +144,7 @@ def test_durations_are_readable(seconds: float, text: str) -> None:
     )
 
 
+@pytest.mark.validation
 def test_a_long_run_is_estimated_by_a_trial_within_a_factor_of_three() -> None:
     experiment = Experiment(MATTE, width=320, height=240, spp=64, instruments=(instrument("ideal-tof"),))
     scene = load_scene(experiment.scene)

@@ -20,6 +20,7 @@ from delta_scenes import (
     transform,
     wall,
 )
+from tiers import to_validate
 
 from rangesim import Intrinsics, Rig, Scene, look_at, transport
 from rangesim.light_transport.photons import Photons, trace_photons
@@ -118,6 +119,7 @@ def test_in_a_closed_box_all_light_lands_or_is_absorbed() -> None:
 # ---- Closed boxes and white furnaces ----------------------------------------------------------------
 
 
+@pytest.mark.validation
 def test_what_a_plane_receives_behind_a_slab_is_what_the_slab_passes() -> None:
     """The camera stands behind the slab and sees all of the lit part of the plane."""
     scene = scene_of(slab=slab(0.2, 0.25), wall=wall(1.0, matte(0.5)))
@@ -170,7 +172,7 @@ FACES = [((1, 0, 0), (0, 0, 1)), ((-1, 0, 0), (0, 0, 1)), ((0, 1, 0), (0, 0, 1))
 DOWN_Z = (0.0, 0.0, 1.0)
 
 
-@pytest.mark.parametrize("inside", ["nothing", "glass ball", "cut-out"])
+@pytest.mark.parametrize("inside", ["nothing", *to_validate("glass ball", "cut-out")])
 def test_an_integrating_sphere_keeps_its_flux_with_lossless_glass_inside(inside: str) -> None:
     """The wall receives Phi (1 + rho + rho^2 + ...), whatever lossless delta surfaces the light meets on its way."""
     at = [0.9, 0.0, 0.0]  # the beam goes through it to a wall that the cameras see
@@ -198,6 +200,7 @@ def test_a_white_furnace_hides_lossless_glass() -> None:
     np.testing.assert_allclose(ambient, 1.0, atol=2e-3)
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("thickness_m", [1e-2, 1e-4, 5e-5])
 def test_thin_glass_keeps_both_faces(thickness_m: float) -> None:
     """A foil passes as much as a pane, and delays the light by (n - 1) d."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from delta_scenes import GLASS, MIRROR, matte, rig_of, scene_of
 from delta_scenes import wall as wall_at
+from tiers import to_validate
 
 from pcgraph import read_cloud
 from rangesim import (
@@ -134,7 +135,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # ---- The same readings, wherever the scene stands ----------------------------------------------------
 
 
-@pytest.mark.parametrize("by", [ROOM, UTM])
+@pytest.mark.parametrize("by", [UTM, *to_validate((ROOM,))])
 def test_a_room_that_is_moved_reads_the_same(by: tuple[float, ...], tmp_path: Path) -> None:
     here, there = (measured(load_scene(room(at, tmp_path))) for at in ((0.0, 0.0, 0.0), by))
     assert np.array_equal(there.truth.instance, here.truth.instance)
@@ -150,6 +151,7 @@ def test_a_room_that_is_moved_reads_the_same(by: tuple[float, ...], tmp_path: Pa
         np.testing.assert_allclose(getattr(there.energy, name), expected, atol=1e-4 * expected.mean(), rtol=1e-4)
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("by", [ROOM, UTM])
 def test_caustics_glint_and_what_is_seen_through_glass_are_the_same(by: tuple[float, ...], tmp_path: Path) -> None:
     here, there = (measured(load_scene(glass(at)), photons=50_000) for at in ((0.0, 0.0, 0.0), by))
@@ -223,6 +225,7 @@ def facing_y() -> Any:
     return mi.ScalarTransform4d().rotate([1, 0, 0], 90).scale(20)
 
 
+@pytest.mark.validation
 def test_what_moves_moves_in_the_world(tmp_path: Path) -> None:
     """A ball on an arc about a place in the world, a mesh on a straight line, seen from a rig that turns."""
     sensor = AmcwToF((60e6,))

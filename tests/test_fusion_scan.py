@@ -157,6 +157,7 @@ def test_fused_views_of_structured_light_are_better_than_one(scene) -> None:  # 
     assert error.recall > 0.65  # neither the underside nor what the part's blocks hide of each other
 
 
+@pytest.mark.validation
 def test_true_surfaces_are_where_rays_meet_them() -> None:
     scene = load_scene("tabletop")
     surfaces = true_surfaces(scene)

@@ -56,6 +56,7 @@ def test_it_agrees_with_opencv() -> None:
         assert cost[0] <= cost[1] * (1 + 1e-9)
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("plane", [False, True])
 def test_it_reaches_the_bound_and_knows_it(plane: bool) -> None:
     random = np.random.default_rng(2)
@@ -77,6 +78,7 @@ def test_it_reaches_the_bound_and_knows_it(plane: bool) -> None:
     assert not any(fit.is_ambiguous for fit in fits)
 
 
+@pytest.mark.validation
 def test_a_small_plane_has_two_poses_and_both_are_reported() -> None:
     random = np.random.default_rng(3)
     reported = right = 0

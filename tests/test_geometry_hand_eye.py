@@ -35,6 +35,7 @@ def test_both_arrangements_are_exact_without_noise(n: int) -> None:
         assert found.rotation_rms_rad < 1e-8
 
 
+@pytest.mark.validation
 def test_errors_are_what_the_covariance_says() -> None:
     random, turn, move = np.random.default_rng(1), 2e-3, 1e-3
     whitened, rms = [], []

@@ -66,6 +66,7 @@ def test_it_agrees_with_opencv_and_scikit_image() -> None:
         np.testing.assert_allclose(homography_dlt(a, b), alike(linear, UNIT), atol=1e-6)
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("noisy", ["second", "both"])
 def test_estimates_reach_the_bound_and_know_it(noisy) -> None:  # type: ignore[no-untyped-def]
     random, n = np.random.default_rng(3), 20
@@ -96,6 +97,7 @@ def test_estimates_reach_the_bound_and_know_it(noisy) -> None:  # type: ignore[n
     assert np.count_nonzero(values > 1e-9) == 8
 
 
+@pytest.mark.validation
 def test_where_points_are_mapped_is_known_to_the_covariance() -> None:
     random = np.random.default_rng(4)
     at, off, sigma = np.array([(100.0, 300.0)]), [], []

@@ -137,6 +137,7 @@ def test_the_eight_point_algorithm_is_scikit_images() -> None:
     assert np.linalg.svd(eight_point(a, b), compute_uv=False)[2] < 1e-15
 
 
+@pytest.mark.validation
 def test_f_reaches_the_bound_and_knows_it() -> None:
     random, n = np.random.default_rng(6), 25
     X = points(random, n)
@@ -190,6 +191,7 @@ def turn_between(T: np.ndarray) -> float:
     return float(Rotation.from_matrix(T_SECOND_FIRST[:3, :3] @ T[:3, :3].T).magnitude())
 
 
+@pytest.mark.validation
 def test_the_relative_pose_reaches_the_bound() -> None:
     random, n = np.random.default_rng(8), 20
     X = points(random, n)

@@ -116,6 +116,7 @@ def test_in_a_convex_ball_the_lens_is_demagnified() -> None:
     assert np.mean([seen(s) for s in seeds]) == pytest.approx(expected, rel=0.04)
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize(
     ("x", "radius", "spread"),
     [
@@ -144,6 +145,7 @@ def test_a_projector_in_view_is_seen_straight() -> None:
     check(signals, intensity(rig, tangent) / d**2, d)
 
 
+@pytest.mark.validation
 def test_through_a_pane_the_lens_is_seen_nearer_and_dimmer() -> None:
     rig = rig_of(CAMERA, PROJECTOR, (0.0, 0.0, 1.5), looks_at=(0.0, 0.0, 0.0))
     scene = scene_of(pane=slab(0.5, 0.55))

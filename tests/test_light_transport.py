@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from delta_scenes import GLASS, MIRROR, matte, rig_of, scene_of, wall
 from synthetic import all_bytes
+from tiers import to_validate
 
 import rangesim
 from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, StructuredLight, look_at, transport
@@ -128,7 +129,7 @@ def perspective(to_world: Any) -> dict[str, Any]:
 
 
 @pytest.mark.filterwarnings("ignore::rangesim.errors.TruncationWarning")  # cornell has more to give
-@pytest.mark.parametrize(("name", "max_depth"), [("corner", 6), ("tabletop", 40), ("cornell", 6)])
+@pytest.mark.parametrize(("name", "max_depth"), [("corner", 6), *to_validate(("tabletop", 40), ("cornell", 6))])
 def test_white_and_ambient_agree_with_mitsuba_s_path_integrator(name: str, max_depth: int) -> None:
     """To the same depth; with glass and mirrors, which Mitsuba counts, to one where nothing is left."""
     import mitsuba as mi
@@ -145,6 +146,7 @@ def test_white_and_ambient_agree_with_mitsuba_s_path_integrator(name: str, max_d
     assert (energy.ambient.max() > 0) == scene.has_ambient
 
 
+@pytest.mark.validation
 def test_patterns_agree_with_a_projector_that_shows_them() -> None:
     import mitsuba as mi
     from plain_mitsuba import plain_scene, render, show, z_score
@@ -247,6 +249,7 @@ def test_progress_ends_at_one_and_changes_nothing(corner: rangesim.Scene) -> Non
     assert shares[-1] == 1.0
 
 
+@pytest.mark.validation
 def test_independent_seeds_are_unbiased(corner: rangesim.Scene) -> None:
     """Means of 12 seeds at 4 spp agree with one long pass: no bias from sharing paths between patterns."""
     rig, light = corner.rig(**SIZE), StructuredLight(code="gray")
@@ -322,6 +325,7 @@ NESTED: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("nested", NESTED)
 def test_the_holes_of_a_mask_are_as_if_nothing_were_there_whatever_it_is_cut_from(nested: str) -> None:
     """Two quadrants of a sheet before the camera are cut out. There, what is lit straight is that of a free wall."""

@@ -31,6 +31,7 @@ def seconds(call: Any) -> float:
     return time.perf_counter() - start
 
 
+@pytest.mark.validation
 def test_what_meets_a_delta_surface_is_found_without_asking_each_shape(crowd: Scene) -> None:
     """In a part of the time that one virtual call of all shapes takes."""
     import drjit as dr
@@ -98,6 +99,7 @@ def mixed(folder: Path) -> dict[str, Any]:
     return scene
 
 
+@pytest.mark.validation
 def test_surfaces_are_those_of_mitsuba_to_the_last_bit(tmp_path: Path) -> None:
     scene = load_scene(mixed(tmp_path))
     import drjit as dr

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiers import to_validate
 
 import rangesim
 from rangesim.environment.backend import select_variant
@@ -100,7 +101,7 @@ def test_clear_materials_absorb_what_their_tables_say(name: str) -> None:
         assert found["albedo"] == 0
 
 
-@pytest.mark.parametrize("name", EXTINCTIONS)
+@pytest.mark.parametrize("name", ["bk7", *to_validate(*(n for n in EXTINCTIONS if n != "bk7"))])
 def test_a_body_of_a_clear_material_is_filled_by_its_interior(tmp_path: Path, name: str) -> None:
     """A slab of 1 m, so that each of them takes some of the light."""
     filled = f'<ref id="{name}_interior" name="interior"/>'
@@ -148,7 +149,9 @@ def test_every_material_is_classified_and_listed_in_the_docs() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::rangesim.errors.TruncationWarning")
-@pytest.mark.parametrize("names", [NEAR_INFRARED, [n for n in NAMES if n.endswith("_550nm")]], ids=["850", "550"])
+@pytest.mark.parametrize(
+    "names", [*to_validate((NEAR_INFRARED,)), [n for n in NAMES if n.endswith("_550nm")]], ids=["850", "550"]
+)
 def test_no_material_returns_more_than_it_receives(tmp_path: Path, names: list[str]) -> None:
     """White furnace: balls of all materials in a uniform light of 1 look no brighter than it, and black ones dark."""
     columns, body = 6, ""
@@ -170,6 +173,7 @@ def test_no_material_returns_more_than_it_receives(tmp_path: Path, names: list[s
         assert levels["black_fabric"] == pytest.approx(0.35, abs=0.02)
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("name", ["bk7", "pmma", "window_pane"])
 def test_clear_materials_lose_nothing(tmp_path: Path, name: str) -> None:
     body = f'<include filename="materials/{name}.xml"/><shape type="sphere"><ref id="{name}"/></shape>'
@@ -247,7 +251,7 @@ def test_light_comes_back_to_a_lamp_beside_the_camera(tmp_path: Path) -> None:
     assert sheeting[16, 4] > 30 * paper[16, 4]  # and from slanted places too, where a mirror would send it off
 
 
-@pytest.mark.parametrize("falloff", [0.0, 3.0])
+@pytest.mark.parametrize("falloff", [3.0, *to_validate(0.0)])
 def test_retro_reflection_is_sampled_as_it_is_evaluated(falloff: float, tmp_path: Path, monkeypatch: object) -> None:
     """Chi-square test of sample() against pdf(); weight = eval / pdf; reciprocity; no energy gained."""
     import drjit as dr

@@ -77,6 +77,7 @@ def test_projective_factorisation_is_exact_without_noise(missing: float) -> None
     assert (depths > 0).all()
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 def test_projective_factorisation_reaches_the_bound(missing: float) -> None:
     ratios = []

@@ -69,6 +69,7 @@ def test_factorisation_is_exact_without_noise(missing: float, seed: int) -> None
     np.testing.assert_allclose(found.coefficients[:, 1:].mean(axis=0), 0, atol=1e-9)
 
 
+@pytest.mark.validation
 def test_noisy_tracks_with_missing_points_are_recovered_to_their_deviations() -> None:
     for method in (factorise_nonrigid, adjust_nonrigid):
         errors, ratios = [], []
@@ -84,6 +85,7 @@ def test_noisy_tracks_with_missing_points_are_recovered_to_their_deviations() ->
         assert 0.5 < np.median(ratios) < 2
 
 
+@pytest.mark.validation
 def test_factorisation_reaches_the_bound_of_the_pixels() -> None:
     ratios = []
     for seed in range(8):
@@ -113,6 +115,7 @@ def smooth(noise: float, seed: int) -> tuple[np.ndarray, Tracks]:
     return seen - seen.mean(axis=1, keepdims=True), Tracks.from_dense(dense)
 
 
+@pytest.mark.validation
 def test_a_temporal_prior_helps_what_few_images_see() -> None:
     free, held = [], []
     for seed in range(6):
@@ -189,6 +192,7 @@ def test_degenerate_deformations_are_refused() -> None:
         TemporalPrior(shape_bend_px=0.0)
 
 
+@pytest.mark.validation
 def test_an_estimated_prior_leaves_what_the_tracks_say() -> None:
     """Complete tracks determine the shape; a prior that bends are chance is to change little of it, and to state it."""
     ratios, worse = [], []
@@ -224,6 +228,7 @@ def test_slow_waves_in_few_images_are_refused() -> None:
             adjust_nonrigid(tracks, 4)
 
 
+@pytest.mark.validation
 def test_a_wrong_minimum_of_missing_points_is_left() -> None:
     """A waving sheet, 8 % missing, whose factorisation used to end at 0.8 px of noise instead of 0.3, 31 % off."""
     random = np.random.default_rng(2)

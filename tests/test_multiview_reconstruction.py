@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from many_views import aligned, around, perturbed, position_error, walk
 from scipy.spatial.transform import Rotation
+from tiers import to_validate
 
 from rangesim.errors import RangesimWarning
 from rangesim.multiview import Tracks, adjust_online, bundle_adjust, structure_from_motion
@@ -24,6 +25,7 @@ def test_without_noise_everything_is_found_up_to_a_similarity() -> None:
     assert found.inliers.all()
 
 
+@pytest.mark.validation
 def test_wrong_observations_are_found_and_the_rest_is_as_good_as_without_them() -> None:
     scene = around(8, 120, fraction=0.6)
     random = np.random.default_rng(3)
@@ -79,6 +81,7 @@ def test_degenerate_motion_is_refused() -> None:
         structure_from_motion(Tracks(scene.tracks.image, scene.tracks.point, far), camera)
 
 
+@pytest.mark.validation
 def test_a_view_that_comes_twice_does_no_harm() -> None:
     scene = around(5, 60)
     twice = Tracks.from_dense(scene.tracks.dense()[[0, 0, 1, 2, 2, 3, 4]])
@@ -86,6 +89,7 @@ def test_a_view_that_comes_twice_does_no_harm() -> None:
     assert np.sqrt(((aligned(found.points, scene.X) - scene.X) ** 2).mean()) < 0.01
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("life", [10, 25])
 def test_online_is_within_a_fifth_of_offline(life: int) -> None:
     squares = []
@@ -132,7 +136,7 @@ def test_what_cannot_be_placed_online_is_refused() -> None:
         adjust_online(scene.tracks, scene.camera, scene.T[:1])
 
 
-@pytest.mark.parametrize("wrong", ["noise", "lens", "tracks"])
+@pytest.mark.parametrize("wrong", ["lens", *to_validate("noise", "tracks")])
 def test_a_misfit_is_told(wrong: str) -> None:
     """A noise stated ten times too small, a focal length twice too long, most observations wrong."""
     scene = around(5, 60)
@@ -148,6 +152,7 @@ def test_a_misfit_is_told(wrong: str) -> None:
         structure_from_motion(tracks, camera, noise_px=0.05 if wrong == "noise" else 0.5)
 
 
+@pytest.mark.validation
 def test_a_lens_off_by_two_per_cent_bends_the_shape_little_and_shows_in_the_noise() -> None:
     scene = around(6, 100)
     camera = replace(scene.camera, fx=1.02 * scene.camera.fx, fy=1.02 * scene.camera.fy)

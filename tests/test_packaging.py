@@ -43,7 +43,6 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_the_wheel_holds_scenes_templates_and_types(built: Path) -> None:
     with zipfile.ZipFile(next(built.glob("*.whl"))) as wheel:
         names = set(wheel.namelist())
@@ -55,7 +54,6 @@ def test_the_wheel_holds_scenes_templates_and_types(built: Path) -> None:
     assert {name.split("/")[0] for name in names} == {"rangesim", "pcgraph", f"rangesim-{PROJECT['version']}.dist-info"}
 
 
-@pytest.mark.slow
 def test_the_sdist_holds_what_its_tests_need(built: Path) -> None:
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
@@ -65,7 +63,6 @@ def test_the_sdist_holds_what_its_tests_need(built: Path) -> None:
     assert wanted <= names
 
 
-@pytest.mark.slow
 def test_an_installed_wheel_measures_its_own_scenes(built: Path, tmp_path: Path) -> None:
     """Outside the checkout, with the package from the wheel and its dependencies from here. The kernels are left as
     Python: to compile all of them for a place of their own takes longer than to run them on a few pixels."""

@@ -55,6 +55,7 @@ def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean(
     assert abs(error.mean()) < 0.01
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize("indirect", ["raw", "filtered"])
 def test_the_estimated_noise_of_a_reading_is_that_between_seeds(matte: Scene, indirect: Any) -> None:
     """Both halves are stratified, and the whole is better still: the estimate errs on the safe side."""
@@ -74,6 +75,7 @@ def test_the_estimated_noise_of_a_reading_is_that_between_seeds(matte: Scene, in
         assert 0.8 < np.mean(estimated) / spread < 1.4
 
 
+@pytest.mark.validation
 def test_light_through_glass_knows_the_noise_of_its_photons() -> None:
     """All pixels of a pass share its photons, but no photon serves both halves."""
     scene = load_scene("glassware")
@@ -118,6 +120,7 @@ def test_groups_are_the_pixels_of_an_instance_in_a_square_and_their_sigma_is_tha
     assert (group_sigma(np.full((40, 50), np.inf), group) == np.inf).all()
 
 
+@pytest.mark.validation
 def test_more_samples_go_where_sampling_is_not_small_and_nowhere_else(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plane has no sampling noise at all; on glass there is plenty."""
     given: list[np.ndarray] = []
@@ -186,7 +189,7 @@ def test_settings_of_adaptive_sampling_out_of_range_are_refused(matte: Scene) ->
 def test_where_nothing_can_be_read_no_samples_are_wasted() -> None:
     scene = load_scene("glassware")
     sensor = AmcwToF()
-    signals = transport(scene, scene.rig(0.03, **SMALL_IMAGE), [sensor], spp=16)
+    signals = transport(scene, scene.rig(0.03, **SMALL_IMAGE), [sensor], spp=16, photons=0, glint=False)
     signals_of = {sensor: signals}.__getitem__
     for exposure_s in (1e-12, 10.0):
         one = Instrument("one", sensor, exposure_s=exposure_s)

@@ -34,6 +34,7 @@ def decoded(capture: Capture) -> RangeImage:
     return decode(capture)
 
 
+@pytest.mark.validation
 def test_it_agrees_with_opencv(capture: Capture, decoded: RangeImage) -> None:
     """All pixels of a grid that OpenCV decodes with its thresholds (40 and 5) come out the same, and no others.
 
@@ -64,6 +65,7 @@ def test_it_agrees_with_opencv(capture: Capture, decoded: RangeImage) -> None:
     assert ours == theirs + edges
 
 
+@pytest.mark.validation
 def test_the_board_is_a_plane(real_data: Path, capture: Capture) -> None:
     """Median distance to the plane: 3.5 mm at 3.66 m, 0.10 %; a smooth bowl, so the calibration's (RMS 0.86 px).
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from plain_mitsuba import plain_scene, render, show, z_score
+from tiers import to_validate
 
 import rangesim
 from rangesim import AmcwToF, transport
@@ -115,7 +116,7 @@ def half_space(albedo: float, cos_light: np.ndarray, cos_view: np.ndarray) -> np
 # ---- Closed forms -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("g", [0.0, 0.8, -0.3])
+@pytest.mark.parametrize("g", [0.8, *to_validate(0.0, -0.3)])
 def test_light_scattered_once_has_chandrasekhar_s_closed_form(g: float) -> None:
     """L = albedo p(theta) E mu0 / (mu0 + mu) (1 - exp(-sigma_t d (1/mu0 + 1/mu))) for a slab of depth d."""
     for sigma_t, depth_m, spp in ((3000.0, 0.04, 1024), (250.0, 0.004, 2048)):
@@ -129,7 +130,7 @@ def test_light_scattered_once_has_chandrasekhar_s_closed_form(g: float) -> None:
         np.testing.assert_allclose(signals.energy.direct, expected, rtol=0.12)
 
 
-@pytest.mark.parametrize("albedo", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("albedo", [0.9, *to_validate(0.5, 0.99)])
 def test_a_dense_medium_reflects_as_the_h_functions_say(albedo: float) -> None:
     scene = scene_of(slab(), medium(8000.0, albedo))
     rig = scene.rig(baseline_m=0.25)
@@ -164,6 +165,7 @@ def mean_delay_m(sigma_t: float, albedo: float) -> tuple[float, float]:
     return float(measured), float(albedo / sigma_t * (logs[1] - logs[0]) / (2 * step))
 
 
+@pytest.mark.validation
 def test_translucent_objects_read_too_long_and_halving_the_density_doubles_it() -> None:
     found = {sigma_t: mean_delay_m(sigma_t, 0.9) for sigma_t in (4000.0, 2000.0)}
     for measured, expected in found.values():
@@ -184,6 +186,7 @@ def test_the_decoded_range_is_behind_the_boundary() -> None:
     assert (signals.energy.multipath > signals.energy.direct).all()
 
 
+@pytest.mark.validation
 def test_stripes_finer_than_the_mean_free_path_lose_their_contrast() -> None:
     scene = scene_of(slab(), medium(1000.0, 0.99))
     rig = scene.rig(baseline_m=0.1, projector_size=(640, 400))
@@ -198,6 +201,7 @@ def test_stripes_finer_than_the_mean_free_path_lose_their_contrast() -> None:
 # ---- Against Mitsuba's own volumetric integrator ----------------------------------------------------
 
 
+@pytest.mark.validation
 @pytest.mark.parametrize(
     ("shape", "inside", "white", "spp"),
     [
@@ -236,6 +240,7 @@ def test_white_and_stripes_agree_with_volpath(
         assert own.mean() == pytest.approx(reference.mean(), rel=0.015)
 
 
+@pytest.mark.validation
 def test_sun_and_lamps_reach_a_medium_as_in_volpath() -> None:
     import mitsuba as mi
 

@@ -18,6 +18,7 @@ from scanned_scenes import Scene, ball, box, rod, scan, sphere_of_rays
 from scanned_streets import GROUND, SENSOR_M, street, sweep
 from scipy.spatial import cKDTree
 from scores import completed, mean_overlap
+from tiers import to_validate
 
 import pcgraph
 from pcgraph.metrics import weighted_overlap
@@ -109,7 +110,9 @@ def _corner(concave: bool) -> np.ndarray:
     return points
 
 
-@pytest.mark.parametrize(("kind", "least"), [("turntable", 0.98), ("stereo_table", 0.98), ("plant", 0.89)])
+@pytest.mark.parametrize(
+    ("kind", "least"), [("turntable", 0.98), ("stereo_table", 0.98), *to_validate(("plant", 0.89))]
+)
 def test_kinds_that_were_held_back_are_segmented_with_nothing_given(kind, least):
     found = getattr(scanned_elsewhere, kind)()
     assert weighted_overlap(pcgraph.segment(found.points).labels, found.things) > least
@@ -141,6 +144,7 @@ def _pcl_is_here() -> bool:
     return subprocess.run(["pkg-config", "--exists", "pcl_segmentation"], check=False).returncode == 0
 
 
+@pytest.mark.validation
 @pytest.mark.skipif(not _pcl_is_here(), reason="PCL (libpcl-dev) is not here")
 @pytest.mark.parametrize(("concave", "segments"), [(True, 2), (False, 1)])
 def test_lccp_of_pcl_parts_walls_only_at_a_concave_edge(concave, segments):

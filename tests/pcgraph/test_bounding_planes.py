@@ -184,6 +184,7 @@ def test_after_an_update_pieces_of_several_scans_are_one():
     assert (x.max(axis=1) > 2.0).all()
 
 
+@pytest.mark.validation
 @pytest.mark.filterwarnings("ignore")  # more objects than a tenth of the supervoxels
 def test_many_pieces_take_little_time():
     """A floor in 1600 pieces below as many boards. All pairs of pieces were looked at once, which took a minute."""

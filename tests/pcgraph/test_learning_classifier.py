@@ -27,6 +27,7 @@ def rooms():
     return results, [view.classes for view in views], [view.up for view in views]
 
 
+@pytest.mark.validation
 def test_rooms_are_learned_from_rooms(rooms):
     results, classes, ups = rooms
     taught = learning.NodeClassifier().fit(results[:3], classes[:3], ups[:3])

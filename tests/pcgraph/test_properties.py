@@ -13,6 +13,7 @@ from clouds import refines, same_partition, two_boxes_on_a_plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_guarantees import assert_covered_and_connected
+from tiers import draws
 
 import pcgraph
 from pcgraph import (
@@ -331,7 +332,7 @@ def things_on_a_floor(seed):
     return np.concatenate(points) + rng.normal(0.0, 0.002, (sum(map(len, points)), 3))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", draws(4, 1))
 def test_neither_unit_nor_place_nor_rounding_changes_objects(seed):
     """Each of these was another draw of the points that tell the spacing, of cells and of seeds."""
     points = things_on_a_floor(seed)

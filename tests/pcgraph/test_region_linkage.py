@@ -11,6 +11,7 @@ import pytest
 from clouds import two_boxes_on_a_plane
 from graphs import random_graph
 from scipy.spatial.transform import Rotation
+from tiers import draws
 
 import pcgraph
 from pcgraph.tree.region_linkage import MergeEdges, RegionLinkage, region_linkage
@@ -157,7 +158,7 @@ def test_a_thing_in_a_hollow_of_rolling_ground_is_no_less_one_than_on_a_hill():
     ("degrees", "noise", "least"),
     [(28.0, 0.01, 0.97), (33.0, 0.03, 0.97), (38.0, 0.06, 0.96), (48.0, 0.03, 0.97), (48.0, 0.06, 0.96)],
 )
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", draws(3, 1))
 def test_heaps_are_objects_however_long_the_line_around_them(degrees, noise, least, seed):
     """Of 28 to 43 degrees, as sand and gravel lie, they were one object with the ground, of 48 in more noise."""
     rng = np.random.default_rng(seed)

@@ -14,6 +14,7 @@ from test_visibility import (
     scanned_furniture,
     scanned_scene,
 )
+from tiers import draws
 
 import pcgraph
 from pcgraph.voxels.rings import Rows, _slopes, scanner_of_rings
@@ -53,7 +54,7 @@ def test_derivatives_of_slopes():
         assert _slopes(rows, frame, unknown)[1] == pytest.approx(numbers, abs=3e-5)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", draws(8))
 def test_rings_tell_place_and_axis(seed):
     """However the scanner is tilted, in any unit, and with an eighth of the rows across its rings."""
     rows, turn, unit = tangents_of_rings(seed, 0.003), turned(seed), 10.0 ** (20 * seed - 80)
@@ -97,7 +98,7 @@ def furniture_in_rings(seed, n_beams):
     return rays * ranges[:, None] + place, place
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", draws(8))
 def test_a_scanner_of_few_beams_is_found(seed):
     """Spacing alone puts it off by half the median range."""
     turn = turned(seed)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tiers import draws, to_validate
 
 import pcgraph
 from pcgraph.metrics import segmentation_covering
@@ -202,7 +203,7 @@ def test_one_scan_tells_from_where_it_was_taken():
     assert law.r_squared > 0.95
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", draws(4))
 def test_the_place_follows_the_scan(seed):
     """Ground and one wall are nearly their own mirror image: what is visible tells on which side the scanner stood."""
     turn, shift = Rotation.random(rng=np.random.default_rng(seed)).as_matrix(), np.array([300.0, -80.0, 12.0])
@@ -241,7 +242,7 @@ def image_of_a_table(seed):
     return rays * (z + rng.normal(0, 0.001, z.shape))[:, None]
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", draws(8))
 def test_a_turned_image_is_seen_from_its_camera(seed):
     """From the cosines at which rays meet surfaces, as spacing on a table hardly tells where the camera was."""
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
@@ -363,7 +364,7 @@ def test_a_trench_is_seen_from_above_also_where_its_frame_is_below_it(height, de
     assert fraction_outward(points + np.array([0.3, -0.2, height]), normals) > 0.96
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", draws(8))
 def test_boxes_before_a_wall_are_seen_from_the_camera(seed):
     """Six boxes in front of a wall: from behind as much is visible."""
     rng = np.random.default_rng(seed)
@@ -376,7 +377,7 @@ def test_boxes_before_a_wall_are_seen_from_the_camera(seed):
     assert fraction_facing(points, pcgraph.segment(points), np.zeros(3)) > 0.97
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", draws(8))
 def test_a_thinned_image_of_a_table_is_seen_from_above_it_however_turned(seed):
     """From below as much is visible; but things stand on tables, and none hangs under this one."""
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
@@ -385,7 +386,7 @@ def test_a_thinned_image_of_a_table_is_seen_from_above_it_however_turned(seed):
 
 
 @pytest.mark.parametrize(
-    "seed", [pytest.param(0, marks=pytest.mark.xfail(reason="12 of 16 draws are right")), 1, 5, 10]
+    "seed", [pytest.param(0, marks=pytest.mark.xfail(reason="12 of 16 draws are right")), 1, *to_validate(5, 10)]
 )
 def test_late_echoes_behind_a_thinned_image_of_a_table_do_not_turn_it_inside_out(seed):
     """Each in a cube of its own, so that thinning leaves nearly all: they are no surface, and stretch no box."""
@@ -397,7 +398,7 @@ def test_late_echoes_behind_a_thinned_image_of_a_table_do_not_turn_it_inside_out
     assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.95
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", draws(4))
 def test_wooded_ground_above_an_origin_in_its_middle_is_seen_from_above(seed):
     """Seen from the air, x and y centred and the elevation kept: as before a camera, but the ground hides trees."""
     rng, n, n_houses = np.random.default_rng(seed), 12_000, 20
@@ -427,7 +428,7 @@ def scanned_furniture(seed, place=(7.0, 1.0, 1.2), size=(8.0, 5.0, 2.6), n=180, 
     return rays * ranges[:, None] + place + rng.normal(0, 0.003, rays.shape), place
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", draws(16))
 def test_the_place_in_a_room_is_found_whichever_way_it_is_turned(seed):
     """A search from the one best of the places tried first ended outside the room, from two of these sixteen."""
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
@@ -437,6 +438,7 @@ def test_the_place_in_a_room_is_found_whichever_way_it_is_turned(seed):
     assert np.linalg.norm(law.viewpoint - 100.0 - turn @ place) < 0.15  # m
 
 
+@pytest.mark.validation
 def test_a_scanners_pole_does_not_mislead():
     """Rows of equal angles meet above the scanner: a sixth of the points of an empty room lie there."""
     from_within = 0
@@ -449,7 +451,7 @@ def test_a_scanners_pole_does_not_mislead():
 
 
 @pytest.mark.parametrize("place", [(3.8, 2.7), (0.6, 2.7), (3.4, 0.6)])
-@pytest.mark.parametrize("size", [(0.6, 0.6, 1.9), (1.0, 0.6, 0.75)])
+@pytest.mark.parametrize("size", [(0.6, 0.6, 1.9), *to_validate(((1.0, 0.6, 0.75),))])
 def test_a_cabinet_near_the_walls_of_a_closed_room_faces_them(place, size):
     """No place sees its back but edge-on: its edges tell."""
     rng, low = np.random.default_rng(0), np.array([*place, 0.0])
@@ -486,7 +488,10 @@ def test_an_underside_faces_the_ground_and_goes_with_its_body(height):
 POLE = pytest.mark.xfail(reason="in three of ten draws too little of the room tells")
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=POLE), 2, pytest.param(3, marks=POLE), 5, 6])
+@pytest.mark.parametrize(
+    "seed",
+    [0, pytest.param(1, marks=POLE), *to_validate(2, 5, 6), pytest.param(3, marks=[POLE, pytest.mark.validation])],
+)
 def test_a_scanners_pole_says_nothing_against_its_own_place(seed):
     """Told where the scanner stood, spacing below it grows with range by no power; elsewhere it does."""
     points, place = scanned_furniture(seed, (4.2, 0.8, 1.5), (5.0, 4.0, 2.6), highest=80, n_boxes=3)
@@ -515,7 +520,8 @@ def rings_ahead(seed):
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 1, pytest.param(2, marks=pytest.mark.xfail(reason="21 of 24 draws are right")), 3, 4, 5, 6, 7]
+    "seed",
+    [0, 1, pytest.param(2, marks=pytest.mark.xfail(reason="21 of 24 draws are right")), *to_validate(3, 4, 5, 6, 7)],
 )
 def test_points_on_one_ring_tell_no_slant(seed):
     """They lie on the cone of its beam, edge-on to the rays: taken for the surface, the scanner was underground."""
@@ -618,8 +624,7 @@ def _rooms(nx, ny, doors, seed=0, wall=0.12):
         (2, 1, False),
         (2, 2, False),
         (3, 2, True),
-        (5, 4, False),
-        (9, 6, True),
+        *to_validate((5, 4, False), (9, 6, True)),
     ],
 )
 def test_rooms_side_by_side_are_seen_from_within(nx, ny, doors):
@@ -659,10 +664,8 @@ def scanned_corridor(length, places, step, seed=0, width=2.2, height=2.6):
 @pytest.mark.parametrize(
     ("length", "places", "step"),
     [
-        (12.0, (2, 5, 7, 10), 0.9),
         (20.0, (4, 16), 0.9),
-        (20.0, (6, 14), 0.7),
-        (25.0, (4, 8, 12.5, 17, 21), 0.7),
+        *to_validate((12.0, (2, 5, 7, 10), 0.9), (20.0, (6, 14), 0.7), (25.0, (4, 8, 12.5, 17, 21), 0.7)),
     ],
 )
 def test_an_empty_corridor_is_seen_from_its_tripods(length, places, step, turn):
@@ -681,9 +684,8 @@ def test_an_empty_corridor_is_seen_from_its_tripods(length, places, step, turn):
 @pytest.mark.parametrize(
     ("length", "places", "step", "width", "height"),
     [
-        (120.0, (20, 60, 100), 1.1, 40.0, 5.0),
         (120.0, (15, 45), 1.0, 40.0, 5.0),
-        (100.0, (10, 50, 90), 1.3, 30.0, 4.0),
+        *to_validate((120.0, (20, 60, 100), 1.1, 40.0, 5.0), (100.0, (10, 50, 90), 1.3, 30.0, 4.0)),
     ],
 )
 def test_a_low_hall_is_seen_from_its_tripods(length, places, step, width, height):
@@ -705,7 +707,7 @@ def test_voxels_are_not_finer_because_points_lie_densely_near_a_tripod(seed):
     assert pcgraph.segment(points).voxel_size >= 0.99 * 3.5 * median_spacing(points)
 
 
-@pytest.mark.parametrize("n", [2, 6])
+@pytest.mark.parametrize("n", [2, *to_validate(6)])
 def test_rooms_far_apart_are_seen_from_within_each(n):
     """Only the first three of them had places of their own."""
     rooms = [scanned_corridor(5.0 + 0.3 * k, (1.5, 3.5), 1.2, seed=k)[:2] for k in range(n)]
@@ -714,7 +716,7 @@ def test_rooms_far_apart_are_seen_from_within_each(n):
 
 
 @pytest.mark.filterwarnings("ignore:expected far fewer objects")  # the house falls apart
-@pytest.mark.parametrize(("away", "seed"), [(10.0, 0), (20.0, 1), (30.0, 2), (50.0, 3)])
+@pytest.mark.parametrize(("away", "seed"), [(10.0, 0), *to_validate((20.0, 1), (30.0, 2), (50.0, 3))])
 def test_a_room_from_whose_window_a_house_was_seen_is_seen_from_within(away, seed):
     """A lattice of places over all had few in the room, and the house was taken to be seen from them all."""
     rng = np.random.default_rng(seed)
@@ -762,7 +764,7 @@ def scans_along_an_aisle(seed, places):
     return np.concatenate(scans)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", draws(2, 1))
 def test_the_middle_of_a_way_does_not_show_all_that_was_passed(seed):
     """So it is not from there that all was seen, though spacing may grow with range about it."""
     middle = np.array([8.25, 9.0, 0.9])
