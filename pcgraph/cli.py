@@ -119,6 +119,8 @@ def segment(
         targets = _targets(cloud, out)
         if objects is not None and altitude is not None:
             raise ValueError("expected --objects or --altitude, got both: choose one")
+        if seed_size is not None and supervoxels is not None:
+            raise ValueError("expected --seed-size or --supervoxels, got both: choose one")
         read = _read(cloud, color)
         result = _segmented(
             cloud,

@@ -34,7 +34,7 @@ _MAX_COARSENING = 4.0  # unless the spacing would grow by more than this factor
 _FAR_BAND = 1.4  # steps are read at depths between far / this and far * this
 _MIN_PER_PITCH = 0.4  # of what rows, or columns, are apart
 # Flying pixels
-_MIN_SLOPE = 20.0  # by how many pixels' pitches their depth differs from both neighbours',
+_MIN_SLOPE = 20.0  # by how many pixels' pitches their depth differs from both neighbours', or one beside a hole,
 _MIN_STEPS = 6.0  # and by how many steps of depth
 _MAX_SLOPE_PIXELS = 4  # within so many pixels the slope on which they lie ends,
 _END_OF_SLOPE = 0.3  # that of inverse depth being less than this fraction of what it is there

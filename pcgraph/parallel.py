@@ -21,8 +21,19 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         try:
             return super().load_overload(sig, target_context)
         except (AttributeError, ImportError):
-            self.flush()
+            self._forget()
             return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except (AttributeError, ImportError):
+            self._forget()
+            super().save_overload(sig, data)
+
+    def _forget(self) -> None:
+        with self._guard_against_spurious_io_errors():
+            self.flush()
 
 
 def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -88,7 +99,7 @@ def in_blocks(loop: Callable[..., _A], n: int, *arguments: object, smallest: int
 
 
 def side_by_side(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:
-    """Results of two independent calls, run in two threads; both should release the GIL."""
+    """Results of two independent calls, in two threads if there are as many; both should release the GIL."""
     if int(config.NUMBA_NUM_THREADS) < 2:
         return first(), second()
     with ThreadPoolExecutor(1) as other:

@@ -39,12 +39,8 @@ _MORE, _COUNTED, _ENOUGH = 1 << 13, 300, 100  # points of a sample, those that c
 _GROWTH, _FITS = 1.4, 4  # of the reach, each time, and how often a camera is fitted to the points within,
 _SETTLED = 0.02  # if so many of them count now and did not, or the other way round
 _SURE, _ON_PIXEL = 0.3, 0.1  # so many have to be off their pixels by less than that;
-_TIMES, _PRECISE, _OFF_PIXEL, _MIN_INLIERS = (
-    8.0,
-    0.02,
-    0.25,
-    0.4,
-)  # so many times as far off is not counted, if it is not most
+_TIMES, _PRECISE, _OFF_PIXEL = 8.0, 0.02, 0.25  # so many times as far off is not counted,
+_MIN_INLIERS = 0.4  # if so many are left
 _ALONG = 1e-3  # what an affine camera sees from its direction weighs, where points lie on one plane
 _BETTER = 0.7  # a pinhole camera leaves that much of the squares that an affine one leaves, at most
 _SKEW, _REDUCED = 0.02, 32  # cosine between rows and columns, at most; and changes after which no shortest steps come

@@ -54,10 +54,10 @@ from pcgraph.tree.linkage import Linkage, checked_merges
 from pcgraph.tree.region_linkage import RegionLinkage
 from pcgraph.tree.tree import segmentation_tree
 from pcgraph.voxels.adapted_size import (
-    MIN_VOXELS_PER_SEED,
     adapted_grading,
     adapted_voxel_size,
     seed_spacing,
+    size_for,
     spacing_for,
 )
 from pcgraph.voxels.cells import bounding_box
@@ -90,8 +90,8 @@ _FEW_OUTLIERS = 0.95  # fraction of the points left from which on scale and view
 _NOISY = 0.9  # fraction left up to which outliers are sought in voxels half as large, too
 _MIN_SHOWN = 0.8  # fraction of the surface that an estimated scanner position must see
 _MAX_VIEWPOINTS = 3  # from which continuations are sought, where the cloud was not seen from one
-_MAX_TRIES, _NEAR = 5, 0.02  # spacings that are tried for a number of supervoxels; logarithm by which that may be off
 _SAMPLED_VOXELS = 64  # whose points' viewpoints are candidates for these
+_MAX_TRIES, _NEAR = 5, 0.02  # spacings tried for a number of supervoxels; logarithm of what it may be off by
 
 
 def segment(
@@ -147,9 +147,9 @@ def segment(
         times `voxel_size`, or less, 3 times at least, where that would leave fewer than some 800 supervoxels, or 6000
         on smooth surfaces.
     n_supervoxels : int, optional
-        About how many supervoxels there are, in place of `seed_size`: within a few per cent, but at least one for each
-        piece that touches nothing else, and at most one for each voxel, which are smaller for that, down to a half,
-        unless `voxel_size` is given.
+        About how many supervoxels there are, in place of `seed_size`: from some dozens on within a few per cent, but at
+        least one for each piece that touches nothing else, and at most one for each voxel. For many, voxels are
+        smaller, down to a half, as long as surfaces stay whole; not if `voxel_size` is given or some are larger.
     camera : bool, optional
         Whether voxels grow in proportion to depth from the viewpoint, being `voxel_size` at the median depth, as a
         camera's pixels do. Default: organised clouds that a camera took, unless voxels grow with range: those in front
@@ -194,6 +194,7 @@ def segment(
     method = SurfaceGrowth() if method is None else method
     settings = Settings.of(method, RegionLinkage() if linkage is None else linkage, object_altitude)
     cloud = with_pixels(clean_cloud(points, colors, normals, features))
+    n_supervoxels = None if n_supervoxels is None else min(n_supervoxels, len(cloud.points))
     is_given = viewpoint is not None
     viewpoint, axis = _viewpoint_and_axis(viewpoint, cloud, bool(camera))
     compile_in_two_processes()
@@ -206,8 +207,10 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(found.voxelised.cloud, spacing)
         found = _with_adapted_size(found, asked)
-        found = found if n_supervoxels is None else _with_enough_voxels(found, n_supervoxels)
     cloud, grid, viewpoint = _without(found.voxelised, detached_voxels(found.voxelised.grid))
+    if n_supervoxels is not None and voxel_size is None:
+        grid = _fine_enough(grid, cloud, found.warp, n_supervoxels)
+    found = found._replace(voxelised=Voxelised(cloud, grid, viewpoint))
     grid = with_means(grid, cloud.colors, cloud.features)
     warn_of_volume(grid)
     if is_given and viewpoint is not None and viewpoint.ndim == 1:
@@ -517,17 +520,16 @@ def _seed_size_for(
     n_supervoxels: int, cloud: CleanCloud, grid: VoxelGrid, planes: LocalPlanes, method: SupervoxelMethod
 ) -> float:
     """Spacing of supervoxels, metres, of which there are about so many: the best of a few that come ever nearer."""
-    normals, none = _normals(cloud, grid, planes), np.full(grid.n_voxels, -1, np.int32)
-    seed, best, least_off, before = spacing_for(n_supervoxels, grid), grid.size, math.inf, 0
+    normals = _normals(cloud, grid, planes)
+    seed, best, least_off = spacing_for(n_supervoxels, grid), grid.size, math.inf
     for _ in range(_MAX_TRIES):
         seed = max(seed, grid.size)
-        n = int(_supervoxels(method, grid, normals, seed, none).max()) + 1
+        n = int(_supervoxels(method, grid, normals, seed, np.full(grid.n_voxels, -1, np.int32)).max()) + 1
         off = abs(math.log(n / n_supervoxels))
         if off < least_off:
             best, least_off = seed, off
-        if off <= _NEAR or n == before or (n < n_supervoxels and seed == grid.size):
-            break  # there are as many pieces, or no more voxels
-        before = n
+        if off <= _NEAR or (n < n_supervoxels and seed == grid.size):
+            break
         seed *= math.sqrt(n / n_supervoxels)
     return best
 
@@ -586,9 +588,9 @@ class _Voxels(NamedTuple):
     warp : Warp
         How voxels grow.
     is_noisy : bool
-        Whether noise was sought in voxels half as large, too.
+        Whether so many points were noise that it was sought in voxels half as large from the start.
     orienting_size : float, metres
-        Of the voxels that decide which side is outside, where these are not smaller.
+        Edge of the voxels that decide which side is outside, where those of `voxelised` are smaller.
     """
 
     voxelised: Voxelised
@@ -645,15 +647,10 @@ def _with_adapted_size(found: _Voxels, asked: _Asked) -> _Voxels:
     return found._replace(voxelised=voxelised, warp=warp, orienting_size=orienting_size)
 
 
-def _with_enough_voxels(found: _Voxels, n_supervoxels: int) -> _Voxels:
-    """The same with voxels so small that supervoxels have a few each, down to a half; but not where some are larger."""
-    cloud, grid, viewpoint = found.voxelised
-    edges_per_seed = spacing_for(n_supervoxels, grid) / grid.size
-    if grid.levels is not None or edges_per_seed >= MIN_VOXELS_PER_SEED:
-        return found
-    size = max(edges_per_seed / MIN_VOXELS_PER_SEED, 0.5) * grid.size
-    warp = _from_corner(found.warp, found.with_outliers[0], size)
-    return found._replace(voxelised=Voxelised(cloud, voxel_grid(cloud.points, size, warp), viewpoint), warp=warp)
+def _fine_enough(grid: VoxelGrid, cloud: CleanCloud, warp: Warp, n_supervoxels: int) -> VoxelGrid:
+    """The grid, or one of smaller voxels, so that so many supervoxels have some each; but not where some are larger."""
+    size = grid.size if grid.levels is not None else size_for(n_supervoxels, cloud.points, grid)
+    return grid if size == grid.size else voxel_grid(cloud.points, size, _from_corner(warp, cloud, size))
 
 
 def _scale(

@@ -232,15 +232,15 @@ class FacingWays(NamedTuple):
     widths: NDArray[np.float64]
 
 
-def facing_ways(places: NDArray[np.float64], project: NDArray[np.float64], piece: NDArray[np.int64]) -> FacingWays:
-    """Ways between places on borders, (b, 3) metres, whose project on a plane, (b, 2) in voxel edges, are triangulated,
-    and which are on a piece each, (b,).
+def facing_ways(places: NDArray[np.float64], projected: NDArray[np.float64], piece: NDArray[np.int64]) -> FacingWays:
+    """Ways between places on borders, (b, 3) metres, whose projections on a plane, (b, 2) in voxel edges, are
+    triangulated, and which are on a piece each, (b,).
 
-    The project are joggled, so that places on a lattice or a line are no error.
+    The projections are joggled, so that places on a lattice or a line are no error.
     """
     triangles = np.empty((0, 3), np.int32)
     if len(places) >= _MIN_TRIANGULATED:
-        triangles = Delaunay(project, qhull_options="QJ").simplices
+        triangles = Delaunay(projected, qhull_options="QJ").simplices
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     ends, _ = distinct_pairs(*np.sort(sides[piece[sides[:, 0]] != piece[sides[:, 1]]], axis=1).T)
     lengths = np.linalg.norm(places[ends[:, 1]] - places[ends[:, 0]], axis=1)

@@ -49,7 +49,7 @@ class Continuations(ShortRepr):
     pairs : (r, 2) int32
         Supervoxels i < j, rows in ascending order, once each.
     crossings : (r,) int64
-        Lines of the bearing image along which that happens, or ways across a gap in a bounding plane.
+        Lines of the spherical image along which that happens, or ways across a gap in a bounding plane.
     width : (r,) float64, metres
         Mean distance across what hides the surface between.
     angle : (r,) float64, radians, 0..pi
@@ -119,17 +119,17 @@ def continuations(
 
     Completion behind what hides a surface: Kellman and Shipley 1991; borders: Nakayama et al. 1989.
     """
-    squares = surfels_of(surface, some=True)
-    views = [view_from(place, squares) for place in places]
+    surfels = surfels_of(surface, some=True)
+    views = [view_from(place, surfels) for place in places]
     images = [spherical_image(view) for view in views]
     jumps = [depth_jumps(view, image, REACH, MIN_GAP) for view, image in zip(views, images, strict=True)]
-    occluded_spans = squares.voxels[np.concatenate([of_view.occluded_spans for of_view in jumps])]
+    occluded_spans = surfels.voxels[np.concatenate([of_view.occluded_spans for of_view in jumps])]
     found = continuations_of(surface, nodes, occluded_spans)
     found = found.chosen(found.coplanar & (found.crossings >= _MIN_CROSSINGS))
     sides = np.sort(faces[found.pairs], axis=1)
     between, pair = distinct_pairs(sides[:, 0], sides[:, 1])
     hidden, opened = np.bincount(pair, found.crossings, len(between)), np.zeros(len(between), np.int64)
-    both_ways, face = _both_ways(between, int(faces.max()) + 1), faces[squares.supervoxels]
+    both_ways, face = _both_ways(between, int(faces.max()) + 1), faces[surfels.supervoxels]
     for view, image in zip(views, images, strict=True):
         for lines, wraps in image.lines:
             _count_open(lines, wraps, view, face, both_ways, opened)
@@ -190,10 +190,10 @@ def _count_open(
 ) -> None:
     """Add how often, along the rows of an image, one face of each pair ends in the open on the way to the other.
 
-    A face, `face` says which of each square, ends or begins in the open where something farther, or nothing, or the
+    A face, `face` says which of each surfel, ends or begins in the open where something farther, or nothing, or the
     other face itself lies beside it.
     """
-    n_faces, widths, around = len(ways.starts) - 1, view.squares.widths, image.shape[1]
+    n_faces, widths, around = len(ways.starts) - 1, view.surfels.widths, image.shape[1]
     last, ends_open = np.full(n_faces, -1, np.int64), np.zeros(n_faces, np.bool_)
     line, columns = line_buffers(image)
     farthest = around // 2 if wraps else around  # the way from one to the other is no more than half a turn

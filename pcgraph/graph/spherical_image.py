@@ -33,7 +33,7 @@ class Surfels(NamedTuple):
         All that follows has a row for each.
     centroids, normals : (s, 3) float64
     edge_lengths, widths : (s,) float64, metres
-        Of the voxels, and of the squares, which are wider where they stand for voxels beside them.
+        Of the voxels, and of the surfels, which are wider where they stand for voxels beside them.
     supervoxels : (s,) int32
     neighbourhood : Neighbourhood of s voxels
         Which of them touch; none where some stand for others.
@@ -63,17 +63,17 @@ def surfels_of(surface: Surface, some: bool = False) -> Surfels:
 class View(NamedTuple):
     """Surfels as they are seen from a place: unit directions to them, (s, 3), and distances, (s,) float64, metres."""
 
-    squares: Surfels
+    surfels: Surfels
     bearings: NDArray[np.float64]
     ranges: NDArray[np.float64]
 
 
-def view_from(place: NDArray[np.float64], squares: Surfels) -> View:
+def view_from(place: NDArray[np.float64], surfels: Surfels) -> View:
     """Surfels as they are seen from a place, (3,) float64, metres."""
-    s = len(squares.voxels)
+    s = len(surfels.voxels)
     bearings, ranges = np.empty((s, 3)), np.empty(s)
-    in_blocks(_look, s, place, squares.centroids, bearings, ranges)
-    return View(squares, bearings, ranges)
+    in_blocks(_look, s, place, surfels.centroids, bearings, ranges)
+    return View(surfels, bearings, ranges)
 
 
 @kernel
@@ -102,7 +102,7 @@ class SphericalImage:
     Attributes
     ----------
     voxels : (h, w) int32
-        Square that is seen, -1 where none. Cells that touch are neighbouring directions.
+        Surfel that is seen, -1 where none. Cells that touch are neighbouring directions.
     wraps : bool
         Whether what lies between the last column and the first is a gap like any other, as in a panorama.
     """
@@ -130,7 +130,7 @@ def spherical_image(view: View) -> SphericalImage:
         return SphericalImage(np.full((1, 1), -1, np.int32))
     lattice, seen, angles = found
     voxels = np.full(lattice.shape, -1, np.int32)
-    _set_nearest(view.ranges, view.squares.widths, seen, angles, lattice.first, lattice.cell, voxels)
+    _set_nearest(view.ranges, view.surfels.widths, seen, angles, lattice.first, lattice.cell, voxels)
     return SphericalImage(voxels, bool(angles[0].max() - lattice.first[0] > math.pi))
 
 
@@ -145,13 +145,13 @@ class _Lattice(NamedTuple):
 
 
 def _lattice(view: View, of_width: float) -> tuple[_Lattice, NDArray[np.int64], NDArray[np.float64]] | None:
-    """A lattice of cells of so many widths of a square at median distance; the squares that lie in a direction, (s,),
+    """A lattice of cells of so many widths of a surfel at median distance; the surfels that lie in a direction, (s,),
     and their azimuths and elevations in its frame, (2, s). None if all lie at the place."""
-    squares = view.squares
-    seen = np.flatnonzero(view.ranges > 0.5 * squares.edge_lengths)  # the sensor's own voxel lies in no direction
+    surfels = view.surfels
+    seen = np.flatnonzero(view.ranges > 0.5 * surfels.edge_lengths)  # the sensor's own voxel lies in no direction
     if not len(seen):
         return None
-    cell = of_width * float(np.median(squares.widths[seen] / view.ranges[seen]))
+    cell = of_width * float(np.median(surfels.widths[seen] / view.ranges[seen]))
     cell = max(cell, math.sqrt(4.0 * math.pi / _MAX_CELLS))
     frame, angles = _frame(view.bearings, seen), np.empty((2, len(seen)))
     in_blocks(_set_angles, len(seen), view.bearings, seen, frame, angles)
@@ -213,7 +213,7 @@ def _set_nearest(
     cell: float,
     image: NDArray[np.int32],
 ) -> None:
-    """Set the nearest square of each cell; `first` is the angles of the image's corner."""
+    """Set the nearest surfel of each cell; `first` is the angles of the image's corner."""
     height, width = image.shape
     for at in range(len(seen)):
         i = np.int32(seen[at])
@@ -277,7 +277,7 @@ def _see_through(
 ) -> None:
     """Set what `seen_through` returns, given the farthest voxel in each cell of the lattice."""
     (height, width), cell, corner = farthest.shape, lattice.cell, lattice.first
-    frame, bearings, ranges, edge_lengths = lattice.frame, view.bearings, view.ranges, view.squares.edge_lengths
+    frame, bearings, ranges, edge_lengths = lattice.frame, view.bearings, view.ranges, view.surfels.edge_lengths
     for i in range(start, stop):
         p, q = source[i], target[i]
         behind = max(ranges[p], ranges[q]) + _BEHIND * max(edge_lengths[p], edge_lengths[q])
@@ -299,18 +299,18 @@ def _see_through(
                 far = farthest[row, column]
                 x, y = ((column + 0.5) * cell - azimuth) * narrowing, (row + 0.5) * cell - elevation
                 if far >= 0 and x * x + y * y <= radius * radius and ranges[far] > behind:
-                    through[i] = through[i] or (_is_off(far, p, view.squares) and _is_off(far, q, view.squares))
+                    through[i] = through[i] or (_is_off(far, p, view.surfels) and _is_off(far, q, view.surfels))
 
 
 @routine
-def _is_off(far: int, near: int, squares: Surfels) -> bool:
+def _is_off(far: int, near: int, surfels: Surfels) -> bool:
     """Whether one voxel lies off the plane of another."""
     height = square = 0.0
     for axis in range(3):
-        way = squares.centroids[far, axis] - squares.centroids[near, axis]
-        height += way * squares.normals[near, axis]
+        way = surfels.centroids[far, axis] - surfels.centroids[near, axis]
+        height += way * surfels.normals[near, axis]
         square += way * way
-    return abs(height) > max(_OFF_PLANE * squares.edge_lengths[near], _OFF_SLOPE * math.sqrt(square))
+    return abs(height) > max(_OFF_PLANE * surfels.edge_lengths[near], _OFF_SLOPE * math.sqrt(square))
 
 
 # --- depth edges along the lines of that image ---
@@ -352,17 +352,17 @@ def depth_jumps(view: View, image: SphericalImage, reach: float, least_gap: floa
 def _scan(  # type: ignore[no-untyped-def]
     image: NDArray[np.int32], wraps: bool, view: View, reach: float, least_gap: float
 ):
-    """Depth edges (e, 2), front and behind, and occluded_spans (c, 2), both int32 squares, along the image's rows.
+    """Depth edges (e, 2), front and behind, and occluded spans (c, 2), both int32 surfels, along the image's rows.
 
     Where a line passes from far to near, the far surface goes into hiding; where it passes from near to far, what
     comes out is paired with what went in last. A hole in the data ends all hiding.
     """
-    ranges, edge_lengths, supervoxels = view.ranges, view.squares.edge_lengths, view.squares.supervoxels
-    indptr, neighbours = view.squares.neighbourhood
+    ranges, edge_lengths, supervoxels = view.ranges, view.surfels.edge_lengths, view.surfels.supervoxels
+    indptr, neighbours = view.surfels.neighbourhood
     depth_edges = np.empty((image.size, 2), np.int32)
     occluded_spans = np.empty((image.size, 2), np.int32)
     hidden, (line, columns) = np.empty(_MAX_DEPTH, np.int32), line_buffers(image)
-    n_edges = n_hidings = 0
+    n_edges = n_spans = 0
     for row in range(image.shape[0]):
         stop, lap = surfels_along(image[row], wraps, line, columns)
         depth = 0
@@ -395,9 +395,9 @@ def _scan(  # type: ignore[no-untyped-def]
                 entered = hidden[depth % _MAX_DEPTH]
                 known = at >= lap or not wraps  # of a panorama's first lap it is not known what is hidden at its start
                 if known and ranges[entered] > ranges[front] and supervoxels[entered] != supervoxels[behind]:
-                    occluded_spans[n_hidings, 0], occluded_spans[n_hidings, 1] = entered, behind
-                    n_hidings += 1
-    return depth_edges[:n_edges].copy(), occluded_spans[:n_hidings].copy()
+                    occluded_spans[n_spans, 0], occluded_spans[n_spans, 1] = entered, behind
+                    n_spans += 1
+    return depth_edges[:n_edges].copy(), occluded_spans[:n_spans].copy()
 
 
 @routine
@@ -410,7 +410,7 @@ def line_buffers(image: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[n
 def surfels_along(
     cells: NDArray[np.int32], wraps: bool, line: NDArray[np.int32], columns: NDArray[np.int32]
 ) -> tuple[int, int]:
-    """Set the squares in these cells, each once in a row, from ``line[1]`` on, and where they begin; -1 is around them.
+    """Set the surfels in these cells, each once in a row, from ``line[1]`` on, and where they begin; -1 is around them.
 
     Returns their end and where the second lap starts: of a panorama they are there twice, as lines go round.
     """
@@ -436,11 +436,11 @@ def surfels_along(
 @routine
 def apart(front: int, behind: int, view: View, reach: float) -> bool:
     """Whether two bearings lie further apart than `reach` widths."""
-    bearings, ranges, widths = view.bearings, view.ranges, view.squares.widths
-    squares = 0.0
+    bearings, ranges, widths = view.bearings, view.ranges, view.surfels.widths
+    total = 0.0
     for axis in range(3):
-        squares += (bearings[front, axis] - bearings[behind, axis]) ** 2
-    return squares > (reach * max(widths[front] / ranges[front], widths[behind] / ranges[behind])) ** 2
+        total += (bearings[front, axis] - bearings[behind, axis]) ** 2
+    return total > (reach * max(widths[front] / ranges[front], widths[behind] / ranges[behind])) ** 2
 
 
 @routine
@@ -450,7 +450,7 @@ def _stands_off(front: int, behind: int, beyond: int, view: View, gap: float) ->
     A surface seen at a slant gets deeper, too, but stays in its plane (the normal's), and in its line (to the voxel
     beyond): the latter holds where lines are too far apart for normals, as the rings of a spinning scanner.
     """
-    bearings, ranges, normals = view.bearings, view.ranges, view.squares.normals
+    bearings, ranges, normals = view.bearings, view.ranges, view.surfels.normals
     height = offsets = along = lengths = 0.0
     for axis in range(3):
         at = ranges[behind] * bearings[behind, axis]

@@ -134,17 +134,17 @@ def _under(
 ) -> NDArray[np.int64]:
     """Voxels at both ends of the ways, (c, 2), under what stands between pieces that are one."""
     edge, plane = surface.grid.size, Plane(surface.grid.centroids[0], upwards, plane_basis(upwards))
-    piece, project = of_supervoxel[surface.supervoxels[border]], plane.project(surface.grid.centroids[border])
-    cells = voxel_grid(np.column_stack((project / (_THINNED * edge), piece)), 1.0, Warp())
+    piece, projected = of_supervoxel[surface.supervoxels[border]], plane.project(surface.grid.centroids[border])
+    cells = voxel_grid(np.column_stack((projected / (_THINNED * edge), piece)), 1.0, Warp())
     some = np.sort(cells.order[cells.starts[:-1]])
-    border, project, piece = border[some], project[some], piece[some]
+    border, projected, piece = border[some], projected[some], piece[some]
     places, others = surface.grid.centroids[border], nodes.centroid[of_supervoxel < 0]
-    ways = facing_ways(places, project / edge, piece)
+    ways = facing_ways(places, projected / edge, piece)
     ends = plane.heights(places)[ways.ends]
     hidden = np.zeros(len(ways.ends), np.bool_)
     if len(others) and len(ways.ends):
         some = np.arange(1, min(_NEAR, len(others)) + 1)
-        distance, near = cKDTree(plane.project(others)).query(project[ways.ends].mean(axis=1), k=some)
+        distance, near = cKDTree(plane.project(others)).query(projected[ways.ends].mean(axis=1), k=some)
         over = distance <= np.maximum(0.5 * ways.lengths, _HIGH * edge)[:, None]
         rise = plane.heights(others)[near] - ends.max(axis=1)[:, None]
         hidden = (over & (rise > _HIGH * edge) & (np.ptp(ends, axis=1)[:, None] < _LEVELS * rise)).any(axis=1)

@@ -41,51 +41,69 @@ class RegionLinkage(Linkage):
 
     Notes
     -----
-    Two regions A and B merge at
+    Two regions merge at an altitude, in radians, of evidence times weight::
 
-        ((c + relief R + H + c0 + c1 ln(1 + l / l0)) s + max(c - c2, 0) max(s0 - s, 0) u + k1 c (1 - s) D m / (m + m2))
-            E / (E + e0) (l / (l + l0))^1/2 (1 + M / (r m))^1/4 m / (m + m0),    s = (w / (b + w))^3/4
+        evidence = (c + relief R + H + c0 + c1 ln(1 + l / l0)) s
+                   + max(c - c2, 0) max(s0 - s, 0) u
+                   + k1 c (1 - s) D m / (m + m2)
+        weight   = E / (E + e0)  (l / (l + l0))^1/2  (1 + M / (r m))^1/4  m / (m + m0)
 
-    where c is the mean cost of their contacts, weighted by length (concavity as in LCCP, Stein et al. 2014); E is the
-    increase of the squared distances to the regions' best planes and mean colours by the merge, at least e1 m (q - q0)
-    with q the mean square distance of the larger one from its own plane, and l = E / b that per length b of the
-    contact, lambda of Mumford and Shah (Koepfler et al. 1994), in voxel edges and masses of a mean supervoxel; w is the
-    width of the smaller region; m and M are the masses of the smaller and the larger one. So what lies on one plane and
-    has one colour merges first, whatever its normals, unless the larger one is so uneven, as hills are, that its plane
-    says nothing; a small piece merges early, as its contact says little, and a handful of points at once, but a piece
-    later with a surface a hundred times as large, so that a thing is whole before it joins what it stands on; and a
-    valley counts most between two large surfaces that meet along a line short for their size. What is steep of it
-    counts half at least, s0, however long the line, so that a heap is told from the ground; but only as far as the
-    surfaces beside it are smooth, so that the crown of a tree is not parted at its clefts: u is the mean over the
-    contacts of 1 / (1 + (v / v1)^2), where v is the circular variance of the rougher supervoxel's normals, 1 less the
-    length of their mean. A valley along which colours change, as where a door or a curtain is before its wall, counts
-    however long it is: D, 0..1, is d^2 / (1 + d^2), d being the distance of the two mean colours, times `color`. Prints
-    and shadows, on one plane or over an edge, have no valley, and what has no colours has D = 0. Contacts are touching
-    voxels, at a price gaps (`pcgraph.graph.gaps.gaps`), at none continuations behind what hides a surface
-    (`pcgraph.graph.continuations.continuations`) and of planes that bound the scene
-    (`pcgraph.graph.bounding_planes.bounding_planes`) and, so that specks are the first to go in coarser cuts, bridges
-    (`pcgraph.graph.bridges.bridges`): two regions that nothing but bridges joins merge above the altitude of
-    objects, at their mean cost times m / (m + 1); but bridges between specks of a few points that lie about as near to
-    each other as to anything count as contacts at 3 rad, so that a surface sampled too thinly for voxels is no dust.
-    Two of one terrain (`pcgraph.graph.terrain.terrain`) merge at the altitude of objects, if they do no sooner.
+    Lengths are in voxel edges, masses in mean supervoxels:
+
+    - m, M: masses of the smaller and of the larger region.
+    - c: mean cost of their contacts, weighted by length: concavity as in LCCP (Stein et al. 2014).
+    - b, w: length of their contact, and width of the smaller region; s = (w / (b + w))^3/4, how short the contact is.
+    - E: increase of the squared distances to the regions' best planes and mean colours by the merge, at least
+      e1 m (q - q0), with q the mean square distance of the larger one from its own plane; l = E / b, lambda of Mumford
+      and Shah (Koepfler et al. 1994).
+    - u: mean over the contacts of 1 / (1 + (v / v1)^2), v being the circular variance of the rougher supervoxel's
+      normals, 1 less the length of their mean.
+    - D = d^2 / (1 + d^2), d being the distance of the two mean colours times `color`; 0 without colours.
+
+    What the terms do:
+
+    - E, l: what lies on one plane and has one colour merges first, whatever its normals; unless the larger region is so
+      uneven, as hills are, that its plane says nothing.
+    - m / (m + m0): a small piece merges early, as its contact says little, and a handful of points at once.
+    - M / (r m): a piece merges later with a surface a hundred times as large, so that a thing is whole before it joins
+      what it stands on.
+    - c s: a valley counts most between two large surfaces that meet along a line short for their size.
+    - c2, s0: what is steep of a valley counts half at least, however long the line, so that a heap is told from the
+      ground; but only as far as the surfaces beside it are smooth, so that the crown of a tree is not parted at its
+      clefts.
+    - k1: a valley along which colours change, as where a door or a curtain is before its wall, counts however long it
+      is. Prints and shadows, on one plane or over an edge, have no valley.
 
     R, 0..1, says that the smaller region stands in relief: the larger one surrounds it, and it lies off the larger
-    one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two.
+    one's plane by little, but as a whole. Normals of voxels do not show such a step: it is as high as a voxel or two::
 
         R = (t^2 b / (b1 w))^2 (1 - r1 m / M) m / (m + m2) / (1 + (v / d^2)^8) / (1 + (d / d1)^2),  v = 4 p + q + v0
 
-    where t is the fraction of the smaller region's contacts that are with the larger one, and b counts up to b1 w; d is
-    the distance of the smaller one's mean from the larger one's plane, p the variance of its distances to that plane
-    and q that of the larger one's own, in voxel edges. R is 0 where the larger one is not r1 times as large, and where
-    the smaller one lies behind it: as with concavity, what stands out of a surface is another thing, and what is sunk
-    into it, as panes in a wall, is not. Where it is not known from where the cloud was seen, either side counts, as
-    which is the outer one of a bare sheet is a guess.
+    t is the fraction of the smaller region's contacts that are with the larger one, and b counts up to b1 w; d is the
+    distance of the smaller one's mean from the larger one's plane, p the variance of its own distances to that plane.
+    R is 0 where the larger one is not r1 times as large, and where the smaller one lies behind it: as with concavity,
+    what stands out of a surface is another thing, and what is sunk into it, as panes in a wall, is not. Where it is not
+    known from where the cloud was seen, either side counts, as which is the outer one of a bare sheet is a guess.
 
     H, radians, says that the smaller region is a heap or a hump on the larger one: a valley runs all around it, so that
-    s is small, but there is no other way out of it. As R, it is 0 where the larger one is not r1 times as large; and,
-    whatever is known of the sides, where the smaller one lies behind its plane, as the floor of a pit does.
+    s is small, but there is no other way out of it::
 
         H = h1 max(c - h0, 0) t^8 u m / (m + m2)
+
+    It is 0 where the larger one is not r1 times as large; and, whatever is known of the sides, where the smaller one
+    lies behind its plane, as the floor of a pit does.
+
+    Regions merge along
+
+    - contacts: voxels that touch;
+    - gaps, at a price (`pcgraph.graph.gaps.gaps`);
+    - continuations behind what hides a surface, and of planes that bound the scene, at no cost
+      (`pcgraph.graph.continuations.continuations`, `pcgraph.graph.bounding_planes.bounding_planes`);
+    - terrain, at the altitude of objects if they do no sooner (`pcgraph.graph.terrain.terrain`);
+    - bridges from specks (`pcgraph.graph.bridges.bridges`): where nothing else joins two regions, above the altitude of
+      objects, at their mean cost times m / (m + 1), so that specks are the first to go in coarser cuts. Bridges between
+      specks of a few points that lie about as near to each other as to anything count as contacts at 3 rad, so that a
+      surface sampled too thinly for voxels does not fall apart.
 
     The constants were chosen for the mean over depth images of tables, a fused office, simulated rooms and streets,
     bins and airborne scans (docs/pcgraph_benchmarks.md); none is far from others that do as well.

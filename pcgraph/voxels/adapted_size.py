@@ -24,9 +24,9 @@ from pcgraph.voxels.surface import roughness
 
 # Seeds
 VOXELS_PER_SEED = 5.0
-"""Voxel edges between seeds, by default and at most."""
+"""Voxel edges between seeds by default, at most,"""
 MIN_VOXELS_PER_SEED = 3.0
-"""The same, at least, by default."""
+"""and at least."""
 _MIN_SUPERVOXELS = 800  # seeds move closer until there are about so many
 _MIN_SUPERVOXELS_ON_SMOOTH = 6000  # or so many, on smooth surfaces
 _SMOOTH, _ROUGH = 0.14, 0.2  # roughness, voxel edges, of smooth surfaces and of others; interpolated
@@ -35,7 +35,9 @@ _VOXELS_PER_SUPERVOXEL = 0.86  # over the squared spacing of seeds in voxel edge
 # Larger voxels, by half powers of two. A voxel is joined if it has MIN_NEIGHBOURS_ON_SURFACE neighbours.
 _MIN_JOINED = 0.75  # joined fraction below which voxels are enlarged, and at which that stops
 _HALF_JOINED = 0.5
-_MIN_GAIN = 0.1  # of the joined fraction by each step, if half were joined at first
+_MIN_GAIN = (
+    0.1  # of the joined fraction by each step, if half were joined at first; of a sweep of few beams from half on
+)
 _MIN_GAIN_OF_SPARSE = 0.15  # the same if fewer were, in several scans
 _MAX_ENLARGEMENTS = 10
 _MIN_VOXELS = 500  # left
@@ -79,6 +81,23 @@ def _edges_per_seed(grid: VoxelGrid, many: float) -> float:
     """Voxel edges between seeds that give so many supervoxels, within what is sensible."""
     edges = spacing_for(many, grid) / grid.size
     return min(max(edges, MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
+
+
+def size_for(n_supervoxels: int, points: NDArray[np.float64], grid: VoxelGrid) -> float:
+    """The voxel size, metres, or a smaller one, down to a half, at which so many supervoxels have some voxels each.
+
+    As long as three quarters of the voxels stay joined, or half where fewer are from the start.
+    """
+    size, least = grid.size, _MIN_JOINED if _joined(np.diff(grid.indptr)) >= _MIN_JOINED else _HALF_JOINED
+    finer = grid
+    for step in range(1, _MAX_REFINEMENTS + 1):
+        if spacing_for(n_supervoxels, finer) >= MIN_VOXELS_PER_SEED * finer.size:
+            break
+        finer = voxel_grid(points, grid.size / 2.0 ** (step / 4.0), grid.warp)
+        if _joined(np.diff(finer.indptr)) < least:
+            break
+        size = finer.size
+    return size
 
 
 def spacing_for(n_supervoxels: float, grid: VoxelGrid) -> float:

@@ -15,8 +15,8 @@ SAME_SURFACE_COSINE = np.float32(0.8)
 """Cosine between normals on one surface, at least."""
 _BINS_PER_RADIAN = 0.35  # of the octahedral map, over its width, on average
 _MAX_BINS = 512  # along each side: a map that stays in the cache
-_SLANTED = np.float32(8.0)  # widths between squares of one surface of which one may seem to hide the other
-_STEEPEST = np.float32(4.0)  # of a square that is seen at a slant: tangent of its angle
+_SLANTED = np.float32(8.0)  # widths between surfels of one surface of which one may seem to hide the other
+_STEEPEST = np.float32(4.0)  # of a surfel that is seen at a slant: tangent of its angle
 _TINY = 1e-12
 _NOTHING = np.iinfo(np.int64).max
 _NUMBER = (1 << 32) - 1
@@ -30,7 +30,7 @@ def visibility_from(
     normals: NDArray[np.float64],
     stretch: float = 1.0,
 ) -> NDArray[np.bool_]:
-    """Whether each of n squares is visible from each of k places, (k, n) bool: none is in front by more than its depth.
+    """Whether each of n surfels is visible from each of k places, (k, n) bool: none is in front by more than its depth.
 
     Parameters
     ----------
@@ -39,17 +39,17 @@ def visibility_from(
     centres : (n, 3) float64
     widths : (n,) float64
     normals : (n, 3) float64
-        Towards either side. A square that is seen at a slant hides little of what lies beside it on the same surface.
+        Towards either side. A surfel that is seen at a slant hides little of what lies beside it on the same surface.
     stretch : float, >= 1
-        Widths over depths: squares that stand for others beside them are wider, but no deeper.
+        Widths over depths: surfels that stand for others beside them are wider, but no deeper.
     """
     seen = np.empty((len(places), len(centres)), np.bool_)
     some = slice(None, None, max(1, len(centres) // 200))  # to know how fine a map it takes
     ranges = np.linalg.norm(places[:, None] - centres[None, some], axis=2)
     typical = np.median(widths[some] / np.maximum(ranges, 1e-12), axis=1)
     bins = np.clip(1.0 / (_BINS_PER_RADIAN * typical), 64, _MAX_BINS).astype(np.int64)
-    squares = _Surfels(_columns(centres), _columns(normals), widths.astype(np.float32), np.float32(1.0 / stretch))
-    in_blocks(_look, len(places), places.astype(np.float32), bins, squares, seen, smallest=1)
+    surfels = _Surfels(_columns(centres), _columns(normals), widths.astype(np.float32), np.float32(1.0 / stretch))
+    in_blocks(_look, len(places), places.astype(np.float32), bins, surfels, seen, smallest=1)
     return seen
 
 
@@ -140,15 +140,15 @@ def _find_bins(place: NDArray[np.float32], centres: NDArray[np.float32], bins: N
 
 
 class _Views(NamedTuple):
-    """How squares look from a place, (n,) float32 each.
+    """How surfels look from a place, (n,) float32 each.
 
     Attributes
     ----------
     u, v : on the octahedral map, in bins
     halves : half widths on it, a little more, in bins
     ranges : of their centres
-    slopes : how much farther a square is per bin beside its centre, as it is deeper than wide if seen at a slant
-    limits : what is nearer than this hides the square
+    slopes : how much farther a surfel is per bin beside its centre, as it is deeper than wide if seen at a slant
+    limits : what is nearer than this hides the surfel
     """
 
     u: NDArray[np.float32]
@@ -165,15 +165,15 @@ def _look(
     stop: int,
     places: NDArray[np.float32],
     bins_of: NDArray[np.int64],
-    squares: _Surfels,
+    surfels: _Surfels,
     seen: NDArray[np.bool_],
 ) -> None:
-    """Set what is seen from each place, by the least range in each bin of directions that a square may cover.
+    """Set what is seen from each place, by the least range in each bin of directions that a surfel may cover.
 
-    A bin holds the range, whose bits as a float32 sort as it does, above the number of the square that has it.
+    A bin holds the range, whose bits as a float32 sort as it does, above the number of the surfel that has it.
     """
-    n, nothing, half_bin = squares.centres.shape[1], np.float32(0.0), np.float32(0.5)
-    depth = squares.depth  # read here: a field read where squares are compared costs that loop half its time again
+    n, nothing, half_bin = surfels.centres.shape[1], np.float32(0.0), np.float32(0.5)
+    depth = surfels.depth  # read here: a field read where surfels are compared costs that loop half its time again
     at, doubtful = np.empty(n, np.int64), np.empty(n + 1, np.int64)
     views = _Views(
         np.empty(n, np.float32),
@@ -190,7 +190,7 @@ def _look(
     for k in range(start, stop):
         bins, last = bins_of[k], bins_of[k] - 1
         nearest[: bins * bins] = _NOTHING
-        _view(places[k], bins, squares, views)
+        _view(places[k], bins, surfels, views)
         for i in range(n):
             at[i] = 0
             if views.ranges[i] <= nothing:
@@ -209,15 +209,15 @@ def _look(
             too_far = views.limits[i] - np.int32(nearest[at[i]] >> 32).view(np.float32)
             seen[k, i] = too_far <= nothing
             doubtful[n_doubtful] = i
-            n_doubtful += (too_far > nothing) & (too_far < _SLANTED * squares.widths[i])
+            n_doubtful += (too_far > nothing) & (too_far < _SLANTED * surfels.widths[i])
         for i in doubtful[:n_doubtful]:
-            seen[k, i] = _on_one_surface(i, nearest[at[i]] & _NUMBER, squares, depth)
+            seen[k, i] = _on_one_surface(i, nearest[at[i]] & _NUMBER, surfels, depth)
 
 
 @routine
-def _view(place: NDArray[np.float32], bins: int, squares: _Surfels, views: _Views) -> None:
-    """Set how squares look from a place, on a map of bins x bins. One at the place has range 0 and is not seen."""
-    centres, normals, widths, depth_of_width = squares
+def _view(place: NDArray[np.float32], bins: int, surfels: _Surfels, views: _Views) -> None:
+    """Set how surfels look from a place, on a map of bins x bins. One at the place has range 0 and is not seen."""
+    centres, normals, widths, depth_of_width = surfels
     px, py, pz = place
     nothing, one, halves, bin_size = np.float32(0.0), np.float32(1.0), np.float32(0.5 * bins), np.float32(2.0 / bins)
     margin, widest = np.float32(0.6), np.float32(24.0)
@@ -228,7 +228,7 @@ def _view(place: NDArray[np.float32], bins: int, squares: _Surfels, views: _View
         views.u[i], views.v[i] = (u + one) * halves, (v + one) * halves
         square = x * x + y * y + z * z
         distance = math.sqrt(square)
-        bin_width = bin_size * total  # across the direction, at least, as of the square
+        bin_width = bin_size * total  # across the direction, at least, as of the surfel
         half = margin * widths[i] / bin_width
         half = half if half < widest else widest
         views.halves[i] = half
@@ -245,9 +245,9 @@ def _view(place: NDArray[np.float32], bins: int, squares: _Surfels, views: _View
 
 
 @routine
-def _on_one_surface(i: int, j: int, squares: _Surfels, depth: np.float32) -> bool:
-    """Whether two squares lie on each other's planes and near: at a slant one may seem to hide the other."""
-    centres, normals, width = squares.centres, squares.normals, squares.widths[i]
+def _on_one_surface(i: int, j: int, surfels: _Surfels, depth: np.float32) -> bool:
+    """Whether two surfels lie on each other's planes and near: at a slant one may seem to hide the other."""
+    centres, normals, width = surfels.centres, surfels.normals, surfels.widths[i]
     cosine = off = off_other = square = np.float32(0.0)
     for axis in range(3):
         way = centres[axis, i] - centres[axis, j]

@@ -40,8 +40,8 @@ _MAX_EXPONENT = 1.5
 _WIDE_SPAN = 3.0  # of the ranges, from a tenth to nine tenths of the readings: over this the law is looked at in halves
 _MIN_EXPONENT_OF_HALF = 0.3
 _ENDS, _MIN_OF_MOST = 0.1, 0.7  # of the readings, nearest and farthest; exponent of the others, of that of all
-_ALIKE = 0.02  # r_squared variance: what explains less than this more is no better
-_OWN_ORIGIN = 0.05  # r_squared variance by which another place must beat the frame's origin
+_ALIKE = 0.02  # difference of r_squared, at most, of two places that explain as much
+_OWN_ORIGIN = 0.05  # difference of r_squared by which another place must beat the frame's origin
 _MIN_COSINE = 0.1  # between a surface and the rays that meet it: at less a beam's spacing is that along its rows
 _ROW = 0.1  # of the variance along a row of points is at most across it
 _PRIOR = 0.1  # of the variance for a deviation of 1 from the exponent of a beam of constant angle, in search of a place
@@ -180,7 +180,7 @@ def law_on_rings(
     ----------
     points : (n, 3) float64, metres
     law : SpacingLaw
-        Of these points: the place from which that of the rings is best_viewpoint, or the frame's origin, or the middle.
+        Of these points: the place from which that of the rings is searched, or the frame's origin, or the middle.
     rows : Rows
         Of these points.
     viewpoint : (3,) float64, metres, optional
@@ -345,7 +345,7 @@ class _Lines(NamedTuple):
 def _regressions(readings: _Readings, viewpoints: NDArray[np.float64], prior: float = 0.0) -> _Lines:
     """The law about each of k viewpoints, (k, 3).
 
-    A prior, in variances, draws exponents to 1 and counts against what is r_squared.
+    A prior, in variances, draws exponents to 1 and counts against r_squared.
     """
     found = _Lines(*np.empty((3, len(viewpoints))))
     _regress(readings.logs, *_on_law(readings, viewpoints), prior, found)

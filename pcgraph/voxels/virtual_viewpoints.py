@@ -28,7 +28,11 @@ from pcgraph.voxels.warp import Shift
 # Lengths are edges of coarse cells, and places those of viewpoints, where nothing else is said.
 _CELLS = 5000  # of the coarse grid on which viewpoints are compared, about
 _MIN_ON_SURFACES = 0.5  # fraction of the voxels that are joined; else those that are not count as well
-_FINER = 1, 2, 4  # times as many cells and viewpoints, where some are in rooms, until one agreement shows
+_FINER = (
+    1,
+    2,
+    4,
+)  # times as many cells and viewpoints, where there are rooms, until one agreement shows
 _SHOWS_MOST, _SHOWS_NEARLY_ALL = 0.85, 0.95  # of the surface; the latter where rooms are low,
 _MIN_LAYERS, _MAX_HEIGHT = 1.7, 8.0  # of so many cells over each other on average, and no higher than so many in all
 # Candidates
@@ -54,7 +58,7 @@ _ROUNDS = 12  # of voting and weighting, at most
 _N_HALVES = 14  # half spaces, whose outer candidates are first opinions
 _N_LEADERS = 6  # single candidates that are
 _BOTH_SIDES = 0.2  # cosine under which candidates in rooms see both sides of a partition
-_WELL_SEEN = 0.3  # weighted sum of the cosines under which a cell is seen well
+_WELL_SEEN = 0.3  # weighted sum of cosines from which on a cell is seen well
 _MAX_OFF_PLANE = 0.1  # RMS distance of a flat cell and those around it from their plane
 _CELLS_PER_BLOCK = 512  # for speed: of many rooms a candidate sees few blocks
 # Score of an agreement: the fraction of the surface that it shows, differences up to _SHOWN_TOLERANCE ignored, plus
@@ -63,8 +67,8 @@ _W_UNANIMOUS = 0.02  # times how unanimous its viewpoints are
 _W_OUTSIDE = 0.003  # times how much those around the cloud see from its outer side
 _W_VIEWPOINT, _W_ABOVE_GROUND, _W_FREE_SIDE = 0.02, 0.05, 0.002  # times the same of the likely ones: the given one or
 # the origin; those above the ground; or those on the free side of another supporting plane
-_W_ROOM = 0.2  # times the fraction of the cells in a room, if nearly all its viewpoints are closed in:
-_ENCLOSED_FOR_ROOM = 0.8  # fraction of the directions that hit something
+_W_ROOM = 0.2  # times the fraction of the cells in a room (in a passage 1), if its viewpoints are closed in:
+_ENCLOSED_FOR_ROOM = 0.8  # weighted mean of the fraction of directions that hit something
 _MIN_SHOWN_FROM_INSIDE = 0.001  # fraction of the surface that such viewpoints show more, to count so in a passage
 _MAX_FROM_BEHIND = 0.02  # fraction of what it sees that may be planes from behind; what is more is taken off
 # The origin as a camera's place
@@ -590,6 +594,8 @@ def _best_agreement(
     most_shown = float(shown.max())
     scores = np.minimum(shown, most_shown - _SHOWN_TOLERANCE) + within - np.maximum(from_behind - _MAX_FROM_BEHIND, 0.0)
     visible = np.abs(looks.sides).sum(axis=1)
+    if not visible.any():
+        return weights[0], most_shown
     agreed, known = found.agreed[different], found.known[different]
     unanimous = np.abs(2.0 * agreed / np.maximum(known, _TINY) - 1.0)
     scores += _W_UNANIMOUS * unanimous[:, visible > 0.0].mean(axis=1)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which side of a surface is its outside, where nobody said from where it was seen: the side that is visible from the
-places that tell (`pcgraph.voxels.virtual_viewpoints`)."""
+"""Which side of a surface is its outside, where nobody said from where it was seen: the side that is visible from
+virtual viewpoints (`pcgraph.voxels.virtual_viewpoints`)."""
 
 from __future__ import annotations
 
