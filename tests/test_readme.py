@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -58,11 +61,48 @@ ARGUMENTS = {
     "two_cameras": ["--width", "80"],
 }
 """Of the examples that can be had smaller."""
+INTERPRETER = """
+import contextlib, json, os, runpy, sys, traceback
+
+for line in sys.stdin:
+    folder, *sys.argv = json.loads(line)
+    os.chdir(folder)
+    sys.path[0] = os.path.dirname(sys.argv[0])
+    with open("printed", "w") as printed, contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            runpy.run_path(sys.argv[0], run_name="__main__")
+            failed = False
+        except SystemExit as end:
+            failed = end.code not in (None, 0)
+        except BaseException:
+            failed = True
+            traceback.print_exc()
+    print(json.dumps(failed), flush=True)
+"""
+"""One process for all examples, as importing the renderer and the viewers takes as long as many of them."""
+
+
+@pytest.fixture(scope="module")
+def interpreter() -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, "-c", INTERPRETER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield process
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
-def test_examples_run(path: Path, tmp_path: Path) -> None:
-    assert run([sys.executable, str(path), *ARGUMENTS.get(path.stem, [])], tmp_path)
+def test_examples_run(path: Path, tmp_path: Path, interpreter: subprocess.Popen[str]) -> None:
+    assert interpreter.stdin is not None
+    assert interpreter.stdout is not None
+    asked = json.dumps([str(tmp_path), str(path), *ARGUMENTS.get(path.stem, [])])
+    impatience = threading.Timer(300.0, interpreter.kill)
+    impatience.start()
+    print(asked, file=interpreter.stdin, flush=True)
+    answer = interpreter.stdout.readline()
+    impatience.cancel()
+    printed = (tmp_path / "printed").read_text()
+    assert json.loads(answer or "true") is False, printed
+    assert printed
 
 
 def test_links_between_documents_lead_somewhere() -> None:
