@@ -46,13 +46,13 @@ def test_the_shell_lines_of_the_readme_run(tmp_path: Path) -> None:
 
 ARGUMENTS = {
     "calibration": ["calibration.png", "--width", "320", "--poses", "3"],
-    "light_over_length": ["light_over_length.png", "--spp", "64"],
-    "motion": ["motion", "--width", "80", "--speeds", "0", "1"],
+    "light_over_length": ["light_over_length.png", "--spp", "16"],
+    "motion": ["motion", "--width", "48", "--speeds", "0", "1"],
     "part_pose": ["part.png", "--width", "280", "--spacing-mm", "3"],
     "rendered_motion": ["rendered_motion.png", "--views", "3", "--width", "160"],
     "rectification": ["rectification.png", "--width", "80"],
     "scan": ["--views", "3", "--width", "48", "--out", "out/scan.ply"],
-    "segmentation": ["--width", "160"],
+    "segmentation": ["--width", "96"],
     "sparse_against_dense": [
         *("page.html", "--views", "2", "--width", "32", "--voxel-mm", "8", "--things", "opaque", "glass")
     ],
