@@ -91,7 +91,7 @@ _NOISY = 0.9  # fraction left up to which outliers are sought in voxels half as 
 _MIN_SHOWN = 0.8  # fraction of the surface that an estimated scanner position must see
 _MAX_VIEWPOINTS = 3  # from which continuations are sought, where the cloud was not seen from one
 _SAMPLED_VOXELS = 64  # whose points' viewpoints are candidates for these
-_MAX_TRIES, _NEAR = 5, 0.02  # spacings tried for a number of supervoxels; logarithm of what it may be off by
+_MAX_TRIES, _NEAR = 8, 0.02  # spacings tried for a number of supervoxels; logarithm of what it may be off by
 
 
 def segment(
@@ -519,9 +519,13 @@ def _leaves(
 def _seed_size_for(
     n_supervoxels: int, cloud: CleanCloud, grid: VoxelGrid, planes: LocalPlanes, method: SupervoxelMethod
 ) -> float:
-    """Spacing of supervoxels, metres, of which there are about so many: the best of a few that come ever nearer."""
+    """Spacing of supervoxels, metres, of which there are about so many: the best of a few that come ever nearer.
+
+    Their number jumps where cells of seeds come to lie otherwise on walls: then the middle of the interval is next.
+    """
     normals = _normals(cloud, grid, planes)
     seed, best, least_off = spacing_for(n_supervoxels, grid), grid.size, math.inf
+    more, fewer = grid.size, math.inf  # spacings that give more, and fewer
     for _ in range(_MAX_TRIES):
         seed = max(seed, grid.size)
         n = int(_supervoxels(method, grid, normals, seed, np.full(grid.n_voxels, -1, np.int32)).max()) + 1
@@ -530,7 +534,10 @@ def _seed_size_for(
             best, least_off = seed, off
         if off <= _NEAR or (n < n_supervoxels and seed == grid.size):
             break
+        more, fewer = (max(more, seed), fewer) if n > n_supervoxels else (more, min(fewer, seed))
         seed *= math.sqrt(n / n_supervoxels)
+        if fewer < math.inf and not more < seed < fewer:
+            seed = math.sqrt(more * fewer)
     return best
 
 
