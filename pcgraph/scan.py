@@ -210,7 +210,7 @@ def segment(
     cloud, grid, viewpoint = _without(found.voxelised, detached_voxels(found.voxelised.grid))
     if n_supervoxels is not None and voxel_size is None:
         grid = _fine_enough(grid, cloud, found.warp, n_supervoxels)
-    found = found._replace(voxelised=Voxelised(cloud, grid, viewpoint))
+    found = found._replace(voxelised=Voxelised(cloud, grid, viewpoint))  # the grid before need not stay in memory
     grid = with_means(grid, cloud.colors, cloud.features)
     warn_of_volume(grid)
     if is_given and viewpoint is not None and viewpoint.ndim == 1:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from pcgraph.detection.boxes import OrientedBox, inside_outline, outline, standing_box, tight_box
-from pcgraph.detection.plane_detection import Planes, find_planes, members, voxel_edges
+from pcgraph.detection.plane_detection import Planes, find_planes, members
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.inputs import non_negative
@@ -211,7 +211,8 @@ def supervoxels_above(segmentation: Segmentation, support: _Support, margin: flo
     basis = plane_basis(support.up)
     centroids = segmentation.graph.node_features.centroid
     inside = inside_outline(centroids @ basis.T, outline(support.outline @ basis.T), margin)
-    clear = centroids @ support.up - support.level > MIN_CLEARANCE * voxel_edges(segmentation)
+    edges = segmentation.surface.mean_edge_lengths(segmentation.tree.n_leaves)
+    clear = centroids @ support.up - support.level > MIN_CLEARANCE * edges
     return inside & clear & ~support.member
 
 

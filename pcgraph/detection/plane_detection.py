@@ -202,7 +202,7 @@ count as its thickness is then more than its width, so its normal may point anyw
 def planar_patches(segmentation: Segmentation, tolerance: float | None, angle: float) -> PlanarPatches:
     """Supervoxels of a segmentation, for this tolerance (metres; None: from the noise) and angle (radians)."""
     nodes, moments = segmentation.graph.node_features, segmentation.leaves
-    edge = voxel_edges(segmentation)
+    edge = segmentation.surface.mean_edge_lengths(segmentation.tree.n_leaves)
     if tolerance is None:
         noise = surface_noise(nodes.residual, edge, nodes.size)
         tolerances = np.clip(NOISE_FACTOR * noise, MIN_TOLERANCE * edge, MAX_TOLERANCE * edge)
@@ -219,11 +219,6 @@ def planar_patches(segmentation: Segmentation, tolerance: float | None, angle: f
         edges=segmentation.graph.edges,
         smooth=(edges.step <= np.minimum(tolerances[i], tolerances[j])) & (edges.normal_angle <= angle),
     )
-
-
-def voxel_edges(segmentation: Segmentation) -> NDArray[np.float64]:
-    """Mean edge of each supervoxel's voxels, (n_leaves,) float64, metres."""
-    return segmentation.surface.mean_edge_lengths(segmentation.tree.n_leaves)
 
 
 FLAT_FRACTION = 0.25
