@@ -151,8 +151,7 @@ class VoxelGrid(ShortRepr):
         """The voxels that touch some, (t,): the row of the one in `voxels`, (s,), and the other."""
         degrees = np.diff(self.indptr)[voxels]
         row = np.repeat(np.arange(len(voxels)), degrees)
-        at = np.arange(len(row)) + np.repeat(self.indptr[voxels] - np.cumsum(degrees) + degrees, degrees)
-        return row, self.neighbours[at]
+        return row, self.neighbours[_concatenated_ranges(self.indptr[voxels], degrees)]
 
     def touching_pairs(self) -> NDArray[np.int64]:
         """Pairs of voxels that touch, (m, 2), each in both orders."""
@@ -404,7 +403,7 @@ def _touching(
 
 
 def _concatenated_ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Places of rows of so many that start at these, one row after the other."""
+    """The ranges start..start + count - 1, one after the other."""
     return np.arange(counts.sum()) + np.repeat(starts - np.cumsum(counts) + counts, counts)
 
 
