@@ -57,8 +57,8 @@ from pcgraph.voxels.adapted_size import (
     adapted_grading,
     adapted_voxel_size,
     seed_spacing,
-    size_for,
-    spacing_for,
+    seed_spacing_for,
+    voxel_size_for,
 )
 from pcgraph.voxels.cells import bounding_box
 from pcgraph.voxels.column_evidence import color_evidence
@@ -524,7 +524,7 @@ def _seed_size_for(
     Their number jumps where cells of seeds come to lie otherwise on walls: then the middle of the interval is next.
     """
     normals = _normals(cloud, grid, planes)
-    seed, best, least_off = spacing_for(n_supervoxels, grid), grid.size, math.inf
+    seed, best, least_off = seed_spacing_for(n_supervoxels, grid), grid.size, math.inf
     more, fewer = grid.size, math.inf  # spacings that give more, and fewer
     for _ in range(_MAX_TRIES):
         seed = max(seed, grid.size)
@@ -656,7 +656,7 @@ def _with_adapted_size(found: _Voxels, asked: _Asked) -> _Voxels:
 
 def _fine_enough(grid: VoxelGrid, cloud: CleanCloud, warp: Warp, n_supervoxels: int) -> VoxelGrid:
     """The grid, or one of smaller voxels, so that so many supervoxels have some each; but not where some are larger."""
-    size = grid.size if grid.levels is not None else size_for(n_supervoxels, cloud.points, grid)
+    size = grid.size if grid.levels is not None else voxel_size_for(n_supervoxels, cloud.points, grid)
     return grid if size == grid.size else voxel_grid(cloud.points, size, _from_corner(warp, cloud, size))
 
 

@@ -79,11 +79,11 @@ def seed_spacing(grid: VoxelGrid) -> float:
 
 def _edges_per_seed(grid: VoxelGrid, many: float) -> float:
     """Voxel edges between seeds that give so many supervoxels, within what is sensible."""
-    edges = spacing_for(many, grid) / grid.size
+    edges = seed_spacing_for(many, grid) / grid.size
     return min(max(edges, MIN_VOXELS_PER_SEED), VOXELS_PER_SEED)
 
 
-def size_for(n_supervoxels: int, points: NDArray[np.float64], grid: VoxelGrid) -> float:
+def voxel_size_for(n_supervoxels: int, points: NDArray[np.float64], grid: VoxelGrid) -> float:
     """The voxel size, metres, or a smaller one, down to a half, at which so many supervoxels have some voxels each.
 
     As long as three quarters of the voxels stay joined, or half where fewer are from the start.
@@ -91,7 +91,7 @@ def size_for(n_supervoxels: int, points: NDArray[np.float64], grid: VoxelGrid) -
     size, least = grid.size, _MIN_JOINED if _joined(np.diff(grid.indptr)) >= _MIN_JOINED else _HALF_JOINED
     finer = grid
     for step in range(1, _MAX_REFINEMENTS + 1):
-        if spacing_for(n_supervoxels, finer) >= MIN_VOXELS_PER_SEED * finer.size:
+        if seed_spacing_for(n_supervoxels, finer) >= MIN_VOXELS_PER_SEED * finer.size:
             break
         finer = voxel_grid(points, grid.size / 2.0 ** (step / 4.0), grid.warp)
         if _joined(np.diff(finer.indptr)) < least:
@@ -100,7 +100,7 @@ def size_for(n_supervoxels: int, points: NDArray[np.float64], grid: VoxelGrid) -
     return size
 
 
-def spacing_for(n_supervoxels: float, grid: VoxelGrid) -> float:
+def seed_spacing_for(n_supervoxels: float, grid: VoxelGrid) -> float:
     """Spacing, metres, of so many supervoxels, about, on the surface that the voxels of a grid cover."""
     return grid.size * math.sqrt(grid.n_voxels / (_VOXELS_PER_SUPERVOXEL * n_supervoxels))
 
