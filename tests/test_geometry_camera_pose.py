@@ -43,6 +43,29 @@ def test_exact_pixels_give_the_pose_through_a_distorted_lens(n: int, plane: bool
         assert np.abs(difference(found.T_camera_object)).max() < 1e-4
 
 
+@pytest.mark.parametrize("metres", [30.0, 1000.0, 5e5])
+@pytest.mark.parametrize(("n", "plane"), [(6, False), (30, False), (12, True)])
+@pytest.mark.parametrize("fit", [fit_camera_pose, find_camera_pose])
+def test_far_from_the_origin_it_is_the_same(fit, metres: float, n: int, plane: bool) -> None:  # type: ignore[no-untyped-def]
+    """Points at an offset give the pose at the origin, moved, with the covariance carried along."""
+    random = np.random.default_rng(n)
+    X = target(random, n, plane)
+    x = seen(X) + random.normal(0, 0.1, (n, 2))
+    offset = metres * np.array([1.0, -0.7, 0.1])
+    near, far = fit(X, x, CAMERA, noise_px=0.1), fit(X + offset, x, CAMERA, noise_px=0.1)
+    moved = far.T_camera_object.copy()
+    moved[:3, 3] += moved[:3, :3] @ offset
+    np.testing.assert_allclose(moved[:3, :3], near.T_camera_object[:3, :3], atol=1e-8)
+    np.testing.assert_allclose(moved[:3, 3], near.T_camera_object[:3, 3], atol=1e-8 + 1e-15 * metres)
+    np.testing.assert_array_equal(far.inliers, near.inliers)
+    np.testing.assert_allclose(far.covariance[:3, :3], near.covariance[:3, :3], rtol=1e-5, atol=1e-14)
+    # that of the translation: by t = t_near - R offset, of draws of the pose at the origin
+    draws = random.multivariate_normal(np.zeros(6), near.covariance, 20000)
+    R = near.T_camera_object[:3, :3]
+    t = draws[:, 3:] - Rotation.from_rotvec(draws[:, :3]).apply(R @ offset)
+    np.testing.assert_allclose(far.covariance[3:, 3:], np.cov(t.T), atol=0.04 * np.trace(np.cov(t.T)))
+
+
 def test_it_agrees_with_opencv() -> None:
     random = np.random.default_rng(1)
     for _ in range(10):

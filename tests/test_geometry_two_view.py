@@ -65,6 +65,28 @@ def test_f_has_rank_two_and_its_lines_and_epipoles_hold() -> None:
     np.testing.assert_allclose(lines_in_first(F, b) @ e, 0, atol=1e-9)
 
 
+def at(P: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """The camera matrix for world points moved by an offset."""
+    return np.hstack([P[:, :3], (P[:, 3] - P[:, :3] @ offset)[:, None]])
+
+
+@pytest.mark.parametrize("metres", [30.0, 1000.0, 5e5])
+@pytest.mark.parametrize("baseline", [1.0, 0.01])
+def test_f_of_cameras_does_not_depend_on_where_they_stand(metres: float, baseline: float) -> None:
+    """Nor on which of them is first; two that stand together are refused there too."""
+    offset = metres * np.array([1.0, -0.7, 0.1])
+    other = projection_matrix(K, rigid((0.1, 0.2, 0.3), (0.3 * baseline, 0.1 * baseline, -0.05 * baseline)))
+    for first, second in ((FIRST, other), (other, FIRST)):
+        near, far = (
+            fundamental_from_cameras(first, second),
+            fundamental_from_cameras(at(first, offset), at(second, offset)),
+        )
+        np.testing.assert_allclose(alike(far, near), near, atol=1e-14 * metres / baseline + 1e-12)
+    turned = projection_matrix(K, rigid((0.1, 0.2, 0.3), (0, 0, 0)))
+    with pytest.raises(ValueError, match="same centre"):
+        fundamental_from_cameras(at(FIRST, offset), at(turned, offset))
+
+
 def test_f_has_seven_degrees_of_freedom_and_e_five() -> None:
     def from_camera(v: np.ndarray) -> np.ndarray:
         return alike(fundamental_from_cameras(FIRST, v.reshape(3, 4)), F).ravel()

@@ -72,7 +72,8 @@ def fit_camera_pose(
 
     Parameters
     ----------
-    points : (n, 3) metres, coordinates of the object, n >= 4. pixels : (n, 2), as the camera shows them.
+    points : (n, 3) metres, coordinates of the object, n >= 4; they may lie far from its origin, as map coordinates do.
+    pixels : (n, 2), as the camera shows them.
     noise_px : standard deviation of a coordinate; None: from the residuals.
 
     Raises
@@ -84,6 +85,59 @@ def fit_camera_pose(
     """
     X, x = _checked(points, pixels, camera, 4)
     check_noise(noise_px)
+    middle = X.mean(axis=0)
+    return _from_middle(_fitted(X - middle, x, camera, noise_px), middle)
+
+
+def find_camera_pose(
+    points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, noise_px: float = 1.0, *, seed: int = 0
+) -> CameraPose:
+    """The pose that most pairs agree with: OpenCV's USAC over P3P, then `fit_camera_pose` until the inliers stay.
+
+    A pair is an inlier where its error is below the 99 % quantile at `noise_px`, in front of the camera. The same
+    seed gives the same result.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, n >= 6. pixels : (n, 2). noise_px : of a right pair.
+
+    Raises
+    ------
+    ValueError
+        As `fit_camera_pose`, or no more pairs agree than chance would let.
+    """
+    import cv2
+
+    X, x = _checked(points, pixels, camera, 6)
+    check_noise(noise_px)
+    middle = X.mean(axis=0)
+    X = X - middle
+    threshold = consensus.inlier_threshold(noise_px, 2)
+    ideal = ideal_pixels(camera, x)
+    found = cv2.solvePnPRansac(
+        X, ideal, calibration_matrix(camera), np.zeros(5), params=consensus.usac(threshold, seed)
+    )
+    chosen = np.zeros(len(X), dtype=bool)
+    if found[0] and found[4] is not None:
+        chosen[np.asarray(found[4]).ravel()] = True
+    _refuse_chance(int(chosen.sum()), x, threshold)
+
+    def fit(some: np.ndarray) -> CameraPose:
+        return fit_camera_pose(X[some], x[some], camera, noise_px=noise_px)
+
+    def error(model: CameraPose) -> Array:
+        return _errors(model.T_camera_object, X, x, camera)
+
+    model, inliers = consensus.consistent_set(chosen, threshold, fit, error, least=4)
+    _refuse_chance(int(inliers.sum()), x, threshold)
+    residuals = error(model)[inliers]
+    noise = float(np.sqrt(residuals @ residuals / (2 * len(residuals) - PARAMETERS)))
+    covariance = model.covariance * (noise / noise_px) ** 2
+    return _from_middle(replace(model, inliers=inliers, noise_px=noise, covariance=covariance), middle)
+
+
+def _fitted(X: Array, x: Array, camera: Intrinsics, noise_px: float | None) -> CameraPose:
+    """`fit_camera_pose` of points that are near the origin."""
     extents = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if extents[1] <= ROUNDING * extents[0]:
         raise ValueError(
@@ -119,48 +173,23 @@ def fit_camera_pose(
     return CameraPose(best.state, covariance, float(noise), np.ones(len(X), dtype=bool), others)
 
 
-def find_camera_pose(
-    points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, noise_px: float = 1.0, *, seed: int = 0
-) -> CameraPose:
-    """The pose that most pairs agree with: OpenCV's USAC over P3P, then `fit_camera_pose` until the inliers stay.
+def _from_middle(found: CameraPose, middle: Array) -> CameraPose:
+    """The pose for the points as given, of the one for points moved by -middle (3,)."""
 
-    A pair is an inlier where its error is below the 99 % quantile at `noise_px`, in front of the camera. The same
-    seed gives the same result.
+    def shifted(T: Array) -> Array:
+        result = T.copy()
+        result[:3, 3] = T[:3, 3] - T[:3, :3] @ middle
+        return result
 
-    Parameters
-    ----------
-    points : (n, 3) metres, n >= 6. pixels : (n, 2). noise_px : of a right pair.
-
-    Raises
-    ------
-    ValueError
-        As `fit_camera_pose`, or no more pairs agree than chance would let.
-    """
-    import cv2
-
-    X, x = _checked(points, pixels, camera, 6)
-    check_noise(noise_px)
-    threshold = consensus.inlier_threshold(noise_px, 2)
-    ideal = ideal_pixels(camera, x)
-    found = cv2.solvePnPRansac(
-        X, ideal, calibration_matrix(camera), np.zeros(5), params=consensus.usac(threshold, seed)
+    m = found.T_camera_object[:3, :3] @ middle
+    carry = np.eye(6)  # t - exp(w) R m: a turn w moves the translation by m x w
+    carry[3:, :3] = np.array([[0.0, -m[2], m[1]], [m[2], 0.0, -m[0]], [-m[1], m[0], 0.0]])
+    return replace(
+        found,
+        T_camera_object=shifted(found.T_camera_object),
+        covariance=carry @ found.covariance @ carry.T,
+        others=tuple(shifted(T) for T in found.others),
     )
-    chosen = np.zeros(len(X), dtype=bool)
-    if found[0] and found[4] is not None:
-        chosen[np.asarray(found[4]).ravel()] = True
-    _refuse_chance(int(chosen.sum()), x, threshold)
-
-    def fit(some: np.ndarray) -> CameraPose:
-        return fit_camera_pose(X[some], x[some], camera, noise_px=noise_px)
-
-    def error(model: CameraPose) -> Array:
-        return _errors(model.T_camera_object, X, x, camera)
-
-    model, inliers = consensus.consistent_set(chosen, threshold, fit, error, least=4)
-    _refuse_chance(int(inliers.sum()), x, threshold)
-    residuals = error(model)[inliers]
-    noise = float(np.sqrt(residuals @ residuals / (2 * len(residuals) - PARAMETERS)))
-    return replace(model, inliers=inliers, noise_px=noise, covariance=model.covariance * (noise / noise_px) ** 2)
 
 
 def _checked(points: ArrayLike, pixels: ArrayLike, camera: Intrinsics, least: int) -> tuple[Array, Array]:

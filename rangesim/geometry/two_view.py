@@ -67,12 +67,36 @@ def fundamental_from_cameras(first: ArrayLike, second: ArrayLike) -> Array:
     ValueError
         Both have one centre: the views are related by a homography, and there is no F.
     """
-    p, q = (checked_array(name, P, 3, 4) for name, P in (("first", first), ("second", second)))
+    p, q, origin = centred_cameras(
+        *(checked_array(name, P, 3, 4) for name, P in (("first", first), ("second", second)))
+    )
     C = centre(p)
     epipole = q @ C
-    if np.linalg.norm(epipole) <= 1e-12 * np.linalg.norm(q) * np.linalg.norm(C):
+    rounding = SHIFT_ROUNDING * np.linalg.norm(q[:, :3]) * np.linalg.norm(origin) * abs(C[3])
+    if np.linalg.norm(epipole) <= 1e-12 * np.linalg.norm(q) * np.linalg.norm(C) + rounding:
         raise ValueError("expected two cameras that stand apart, got two with the same centre: there is no epipole.")
     return unit_norm(_cross_matrix(epipole / np.linalg.norm(epipole)) @ q @ np.linalg.pinv(p))
+
+
+def centred_cameras(p: Array, q: Array) -> tuple[Array, Array, Array]:
+    """Two camera matrices (3, 4) for a world whose origin is the first one's centre, and that centre (3,) in metres.
+
+    At map coordinates the last column is so large that the distance of the cameras is rounding beside it; points and
+    epipoles are solved for here, and points moved back. An affine camera, which has no centre, changes nothing.
+    """
+    rows = np.linalg.norm(p[..., :3], axis=-1)  # pixels against 1
+    if p.ndim != 2 or q.ndim != 2 or not rows.all():
+        return p, q, np.zeros(3)
+    block = p[:, :3] / rows[:, None]
+    if abs(np.linalg.det(block)) <= ROUNDING**1.5:
+        return p, q, np.zeros(3)
+    origin = np.linalg.solve(block, -p[:, 3] / rows)
+    moved = [np.hstack([P[:, :3], (P[:, 3] + P[:, :3] @ origin)[:, None]]) for P in (p, q)]
+    return moved[0], moved[1], origin
+
+
+SHIFT_ROUNDING = 64 * float(np.finfo(np.float64).eps)
+"""Of the last column, relative to the distance it was moved by: that of the given one, and of the move."""
 
 
 def essential_from_pose(T_second_first: ArrayLike) -> Array:
