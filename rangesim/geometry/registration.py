@@ -94,12 +94,12 @@ def icp(
         poses that fit nearly alike.
     """
     moving, fixed, middles = _checked(source, target)
-    start = np.eye(4) if T_target_source is None else pose(T_target_source, "T_target_source")
+    given = np.eye(4) if T_target_source is None else pose(T_target_source, "T_target_source")
     _check_fraction(min_fitness)
     if max_distance_m is not None and not max_distance_m > 0:
         raise ValueError(f"expected max_distance_m to be positive, got {max_distance_m!r}.")
     surface = _Surface.of(fixed)
-    start = middles.to_middles(start)
+    start = middles.to_middles(given)
     results = [_refined(moving, surface, start, d) for d in surface.halved(max_distance_m)]
     found = max(results, key=_agreement)
     _refuse_failure(found, min_fitness, "start nearer to the right pose, with a larger max_distance_m, or by register")
