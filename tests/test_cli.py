@@ -221,7 +221,10 @@ def _write_bad_files(folder: Path) -> None:
         (["decode", "empty", "--projector", "64x64"], "expected 26 images .* got 0"),
         (["decode", "gap"], "white.png is missing"),
         (["decode", "gap", "--axes", "rows", "--bits", "12"], "how it was taken: leave out --axes, --bits"),
-        (["decode", "empty", "--projector", "64x64", "--unit", "1"], "expected --calibration FILE.xml with --unit"),
+        (
+            ["decode", "empty", "--projector", "64x64", "--unit", "1"],
+            "--calibration FILE.xml or FILE.yml with",
+        ),
         (["decode", "crop"], "expected 120 x 90 uint16 .* got 60 x 60"),
     ],
 )
