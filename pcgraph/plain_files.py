@@ -260,6 +260,19 @@ def why(problem: OSError) -> str:
     return DISK.get(problem.errno or 0) or problem.strerror or str(problem)
 
 
+def said(problem: OSError) -> str:
+    """What an operating system's error says, for people: of which file, and why."""
+    if problem.errno is None:
+        return str(problem)
+    if problem.filename is not None:
+        return f"cannot use {os.fsdecode(problem.filename)}: {why(problem)}"
+    try:
+        os.getcwd()
+    except OSError:
+        return "expected a working directory, but this one is gone: change to another"
+    return why(problem)
+
+
 def flush(path: Path) -> None:
     """Flush a file, or the entries of a directory, to the disk."""
     handle = os.open(path, os.O_RDONLY)
