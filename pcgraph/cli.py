@@ -15,6 +15,7 @@ import typer
 import pcgraph
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
 from pcgraph.families import member
+from pcgraph.plain_files import said
 
 if TYPE_CHECKING:
     import numpy as np
@@ -139,8 +140,9 @@ def segment(
         level = result.object_altitude if objects is None else None
         labels = result.labels if level is not None and min_size == 1 else result.cut(objects, level, min_size)
         _write(targets, read, result, labels)
-    except (PcgraphError, ValueError, MemoryError) as error:
-        message = " ".join(str(error).split()) or "the cloud does not fit into memory: choose a larger voxel size"
+    except (PcgraphError, ValueError, MemoryError, OSError) as error:
+        message = said(error) if isinstance(error, OSError) else str(error)
+        message = " ".join(message.split()) or "the cloud does not fit into memory: choose a larger voxel size"
         typer.echo(f"pcgraph: {message.rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
     _print_summary(result, labels, targets, time.perf_counter() - start)
@@ -159,7 +161,7 @@ def _targets(cloud: Path, out: Path | None) -> list[Path]:
             raise CloudWriteError(f"expected --out as a .ply or .npz file or a folder, got {out.name!r}")
         if not out.parent.is_dir():
             raise CloudWriteError(f"cannot write {out}: there is no folder {out.parent}; create it first")
-        if out.resolve() == cloud.resolve():
+        if os.path.realpath(out) == os.path.realpath(cloud):
             raise CloudWriteError(f"--out is the input itself, {out}: choose another name")
         targets = [out]
     else:

@@ -319,3 +319,13 @@ def test_the_command_line_loads_nothing_heavy() -> None:
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert answer.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("letters", [256, 3000])
+def test_an_operating_systems_error_is_said_in_words(command: Command, letters: int) -> None:
+    name = "n" * letters
+    answer = command("verify", name)
+    assert answer.status == 1
+    assert answer.err.startswith("rangesim: cannot use nnn")
+    assert answer.err.endswith("n/experiment.json: File name too long\n")
+    assert "Errno" not in answer.err

@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
-import os
-import re
 import warnings
 import zipfile
 from os import PathLike
@@ -19,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pcgraph.cloud import Cloud
 from pcgraph.errors import CloudWriteError
 from pcgraph.io.ply import encode_ply
-from pcgraph.plain_files import write_file
+from pcgraph.plain_files import is_sealed, sealed, unsealed, write_file
 
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
@@ -30,35 +27,12 @@ FORMAT = "pcgraph-segmentation"
 
 The sum is that of the file with zeros in place of the sum. Who corrects labels by hand makes the file their own.
 """
-_SEAL = re.compile(rf"{FORMAT} sha256 (?P<sum>[0-9a-f]{{64}})(?:\n|\Z)".encode())
-_UNSEALED = f"{FORMAT} sha256 {'0' * 64}"
-_BLOCK = 1 << 20
 _INSTEAD = {"i8": "f8", "u8": "f8", "f2": "f4", "f16": "f8", "b1": "u1"}  # of types that PLY has not
 
 
 def is_segmentation(path: Path) -> bool:
     """Whether a file is one that `write_segmentation` wrote, and nobody changed."""
-    with path.open("rb") as stream:
-        start = 0 if path.suffix.lower() == ".ply" else max(0, stream.seek(0, os.SEEK_END) - len(_UNSEALED))
-        stream.seek(start)
-        seal = _SEAL.search(stream.read(200))
-        if seal is None:
-            return False
-        stream.seek(0)
-        sha256, left = hashlib.sha256(), start + seal.start("sum")
-        while left and (block := stream.read(min(left, _BLOCK))):
-            sha256.update(block)
-            left -= len(block)
-        sha256.update(b"0" * len(stream.read(64)))
-        while block := stream.read(_BLOCK):
-            sha256.update(block)
-    return sha256.hexdigest().encode() == seal["sum"]
-
-
-def _sealed(content: bytes, place: int) -> bytes:
-    """The bytes of a file with its sum in place of the zeros after `place`."""
-    start = content.index(_UNSEALED.encode(), place) + len(_UNSEALED) - 64
-    return content[:start] + hashlib.sha256(content).hexdigest().encode() + content[start + 64 :]
+    return is_sealed(path, FORMAT, at_end=path.suffix.lower() != ".ply")
 
 
 def write_segmentation(
@@ -150,7 +124,7 @@ def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
         vector = stored.ndim > cloud.points.ndim - 1
         parts = {f"{name}_{i}" if vector else name: rows[:, i] for i in range(rows.shape[1])}
         columns |= {part: values for part, values in parts.items() if part.lower() not in ours and part not in columns}
-    return _sealed(encode_ply(columns, _UNSEALED), 0)
+    return sealed(encode_ply(columns, unsealed(FORMAT)), FORMAT)
 
 
 def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) -> bytes:
@@ -168,9 +142,8 @@ def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
     with zipfile.ZipFile(stream, "a") as archive:
-        archive.comment = _UNSEALED.encode()
-    content = stream.getvalue()
-    return _sealed(content, len(content) - len(_UNSEALED))
+        archive.comment = unsealed(FORMAT).encode()
+    return sealed(stream.getvalue(), FORMAT, at_end=True)
 
 
 def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:

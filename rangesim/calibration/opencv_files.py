@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.plain_files import read_file, write_file
+from pcgraph.plain_files import read_file, sealed, unsealed, write_file
 from rangesim.errors import FileFormatError
 from rangesim.geometry.camera_matrix import calibration_matrix
 from rangesim.rig import Intrinsics, Rig, pose
+from rangesim.rig.calibration_files import SEAL
 from rangesim.settings.bounds import Bounds, check_number
 from rangesim.settings.config import brief
 
@@ -137,7 +138,9 @@ def _write(path: str | Path, entries: dict[str, Any]) -> None:
     storage = cv2.FileStorage(path.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for name, value in entries.items():
         storage.write(name, np.ascontiguousarray(value) if isinstance(value, np.ndarray) else value)
-    write_file(path, storage.releaseAndGetString().encode(), FileFormatError, make_parents=True)
+    storage.writeComment(unsealed(SEAL))
+    content = sealed(storage.releaseAndGetString().encode(), SEAL, at_end=True)
+    write_file(path, content, FileFormatError, make_parents=True)
 
 
 def _opencv_matrix(device: Intrinsics) -> np.ndarray:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 import rangesim
+from pcgraph.plain_files import said
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
@@ -63,7 +64,7 @@ def main() -> None:
     except (RangesimError, ValueError, OSError) as error:
         if "--debug" in sys.argv:
             raise
-        typer.echo(f"rangesim: {sentence(str(error))}", err=True)
+        typer.echo(f"rangesim: {sentence(said(error) if isinstance(error, OSError) else str(error))}", err=True)
         sys.exit(1)
 
 

@@ -18,18 +18,6 @@ if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.rig import Intrinsics
 
-MAX_HEAD = 4096
-"""Bytes of a file that say whose it is."""
-_OPENCV = (b"camera_width", b"camera_matrix")
-MARKS = {
-    ".json": (b'"camera"', b'"projector"', b'"fx"'),
-    ".yml": _OPENCV,
-    ".yaml": _OPENCV,
-    ".xml": _OPENCV,
-    ".npz": (b"cosines_m.npy",),
-    ".html": (b"Calibration of a camera and a projector",),
-}
-"""What the files of this command have in their beginning, by suffix."""
 MAX_BOARD_M = 20.0
 """Larger boards are taken for millimetres."""
 KINDS = ("checkerboard", "charuco", "circles")
@@ -119,6 +107,7 @@ def calibrate_command(
         _time_of_flight(target, taken, [str(path) for path in captures], out)
         return
     found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
+    check_places(out, report)  # the work took its time
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
     if report is not None:
@@ -134,21 +123,20 @@ def check_places(out: Path, report: Path | None) -> None:
     Raises
     ------
     FileFormatError
-        A place is a directory, or holds a file that is neither a calibration nor a page of this command.
+        A place is a directory, or holds a file that this command did not write, or that somebody changed since.
     """
+    from pcgraph.plain_files import is_sealed
     from rangesim.errors import FileFormatError
+    from rangesim.rig.calibration_files import SEAL
 
     for path in (out, *((report,) if report else ())):
         if not path.exists():
             continue
         if not path.is_file():
             raise FileFormatError(f"cannot write {path}: it exists and is no plain file; choose another path.")
-        with path.open("rb") as file:
-            start = file.read(MAX_HEAD)
-        marks = MARKS[path.suffix.lower()]
-        if start and not all(mark in start for mark in marks):
+        if path.stat().st_size and not is_sealed(path, SEAL, at_end=True):
             raise FileFormatError(
-                f"cannot write {path}: it holds something else than rangesim calibrate writes, and would be lost; "
+                f"cannot write {path}: it was not written by rangesim calibrate, or changed since, and would be lost; "
                 "choose another path or move it."
             )
 
@@ -185,6 +173,7 @@ def _camera_alone(
     found = calibrate_camera(
         board, views, width, height, coefficients=coefficients, names=[str(path) for path in images]
     )
+    check_places(out, None)
     save_opencv_camera(found.camera, out)
     lines = [_device_line("camera", found.camera, found.deviations), "reprojection, pixels, root mean square:"]
     for path, residual in zip(images, found.residuals, strict=True):
@@ -199,6 +188,7 @@ def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out
     from rangesim.calibration import calibrate_tof, find_board_ranges
 
     found = calibrate_tof(captures, find_board_ranges(board, captures, names), names=names)
+    check_places(out, None)
     found.save(out)
     lengths = np.linspace(found.shortest_m, found.longest_m, 1000)
     unseen = 100 * float(np.isnan(found.offset_m).mean())

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import subprocess
 import sys
@@ -130,6 +131,58 @@ def test_missing_file_in_a_process_of_its_own(tmp_path):
     assert_refused_process = (done.returncode, done.stdout, list(tmp_path.iterdir()))
     assert assert_refused_process == (1, "", [])
     assert done.stderr == f"pcgraph: cannot read {tmp_path / 'none.pcd'}: No such file or directory.\n"
+
+
+@pytest.mark.parametrize("letters", [256, 300, 5000])
+def test_names_too_long_are_one_sentence(scene, tmp_path, letters):
+    name = "n" * letters
+    for arguments in (
+        (f"{name}.ply",),
+        (tmp_path / f"{name}.pcd", "--out", tmp_path / "out.npz"),
+        (scene, "--out", tmp_path / f"{name}.npz"),
+        (scene, "--out", tmp_path / name),
+        (scene, "--linkage", f"{name}.json", "--out", tmp_path / "out.npz"),
+    ):
+        assert_refused(run(*arguments), "File name too long", tmp_path, [scene.name])
+
+
+def test_a_link_to_itself_is_one_sentence(scene, tmp_path):
+    loop = tmp_path / "loop.ply"
+    loop.symlink_to(loop)
+    names = [scene.name, loop.name]
+    for arguments in ((loop,), (loop, "--out", tmp_path / "out.npz")):
+        assert_refused(run(*arguments), f"cannot read {loop}", tmp_path, names)
+    assert_refused(run(scene, "--out", loop), "is a link to a file that does not exist", tmp_path, names)
+    assert_refused(run(scene, "--out", loop / "a.ply"), "there is no folder", tmp_path, names)
+
+
+def test_an_older_output_that_cannot_be_read_is_one_sentence(scene, tmp_path, monkeypatch):
+    place = tmp_path / "out.npz"
+    place.write_bytes(b"older")
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr("pcgraph.io.segmentation_files.is_segmentation", refuse)
+    assert_refused(
+        run(scene, "--out", place), f"cannot use {place}: Permission denied", tmp_path, [scene.name, place.name]
+    )
+    assert place.read_bytes() == b"older"
+
+
+def test_a_working_directory_that_is_gone_is_one_sentence(scene, tmp_path):
+    code = """if True:
+        import os, sys
+        from pcgraph.__main__ import main
+        os.mkdir(sys.argv[1]); os.chdir(sys.argv[1]); os.rmdir(sys.argv[1])
+        sys.argv = ["pcgraph", "segment", sys.argv[2], *sys.argv[3:]]
+        main()
+    """
+    for more in ((), ("--out", "a.ply"), ("--out", "folder")):
+        command = [sys.executable, "-c", code, str(tmp_path / "gone"), str(scene), *more]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr == "pcgraph: expected a working directory, but this one is gone: change to another.\n"
 
 
 def test_a_directory_is_no_cloud(tmp_path):
