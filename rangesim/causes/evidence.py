@@ -78,8 +78,9 @@ class Evidence:
 
     @cached_property
     def saturated(self) -> np.ndarray:
-        """Some frame at its largest digital number, which the decoder refused or which made the error."""
-        return self.capture.saturated(self.capture.frames) & (self.missing | ~self.optical)
+        """Some frame at its largest digital number, or no pulse left, which the decoder refused or made the error."""
+        full = self.capture.saturated(self.capture.frames) | (self.image.status == Status.SATURATED)
+        return full & (self.missing | ~self.optical)
 
     # ---- The surface ---------------------------------------------------------------------------------
 
