@@ -12,11 +12,13 @@ import numpy as np
 
 from rangesim import limits
 from rangesim.capture import Capture
+from rangesim.decoding.contradictions import fringe_contradiction
 from rangesim.decoding.gray import GrayCode, GrayThresholds, decode_gray, direct_contrast
 from rangesim.decoding.phase_shift import PhaseThresholds, refine_by_phase
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulate import TriangulationLimits, range_image_from_coordinates
+from rangesim.errors import warn
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for, of_type
 from rangesim.settings.bounds import Bounds, check_fields, whole
@@ -198,7 +200,10 @@ class StructuredLightDecoder(Decoder):
         check_fields(self)
 
     def decode(self, capture: Capture) -> RangeImage:
-        """Range image of a `StructuredLight` capture; ValueError also if the rig's projector is not of its size."""
+        """Range image of a `StructuredLight` capture; ValueError also if the rig's projector is not of its size.
+
+        `RangesimWarning` if frames and code contradict each other as a whole.
+        """
         sensor = of_type(capture.sensor, StructuredLight)
         if capture.rig is not None:
             sensor.check(capture.rig.projector.width, capture.rig.projector.height)
@@ -211,7 +216,9 @@ class StructuredLightDecoder(Decoder):
             else:
                 fringes, least_swing = capture.frames[frames], self.gray.relative_bit * contrast.values
                 period_px = response.period_px
-                codes[axis] = refine_by_phase(capture, codes[axis], fringes, period_px, least_swing, self.phase)
+                gray = codes[axis]
+                codes[axis] = refine_by_phase(capture, gray, fringes, period_px, least_swing, self.phase)
+                _warn_of(fringe_contradiction(gray, codes[axis], fringes, period_px, axis))
         for axis, code in codes.items():
             outside = (code.coordinate < -0.5) | (code.coordinate > sensor.size(axis) + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
@@ -239,6 +246,11 @@ class StructuredLightDecoder(Decoder):
         if sensor.code == "gray-phase":
             least = np.maximum(least, self.phase.least_signal(sensor.steps, 0.5, FrameContent(), background))
         return least
+
+
+def _warn_of(contradiction: str | None) -> None:
+    if contradiction is not None:
+        warn(contradiction)
 
 
 def _worst(statuses: list[np.ndarray]) -> np.ndarray:

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures read as what they are not say so, with the likely cause; sound ones, clean or noisy, are silent."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import plane_signals, stereo_rig
+
+from rangesim.capture import Capture
+from rangesim.capture.exposure import expose
+from rangesim.decoding import decode
+from rangesim.electronics.detector import Detector
+from rangesim.errors import RangesimWarning
+from rangesim.sensors import StructuredLight
+
+SENSORS = [
+    StructuredLight(),
+    StructuredLight(steps=3),
+    StructuredLight(axes=("columns", "rows"), period_px=20.0),
+    StructuredLight(period_px=37.0, steps=6),
+]
+
+
+def fringes(sensor: StructuredLight) -> list[slice]:
+    """Where the frames of the fringes stand, per axis."""
+    return [run.frames for run in sensor.layout()][1::2]
+
+
+def capture_of(sensor: StructuredLight, detector: Detector | None = None, exposure_s: float = 1e-3) -> Capture:
+    signals = plane_signals(stereo_rig(), sensor, ambient=0.01)
+    return expose(signals, sensor, detector, exposure_s=exposure_s) if detector else expose(signals, sensor)
+
+
+def with_fringes(capture: Capture, change: str, amount: float = 0.0) -> Capture:
+    """The capture with other fringes: `reversed`, or the whole signal `later` by projector pixels."""
+    sensor = capture.sensor
+    assert isinstance(sensor, StructuredLight)
+    frames = capture.frames.copy()
+    steps = 2 * np.pi * np.arange(sensor.steps) / sensor.steps
+    for run in fringes(sensor):
+        shown = frames[run].astype(np.float64)
+        mean = shown.mean(axis=0)
+        vector = 2 / sensor.steps * np.tensordot(np.exp(1j * steps), shown, axes=1)
+        if change == "reversed":
+            vector = vector.conj()
+        vector = vector * np.exp(-2j * np.pi * amount / sensor.period_px)
+        frames[run] = [mean + (vector * np.exp(-1j * s)).real for s in steps]
+    return replace(capture, frames=frames)
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=str)
+@pytest.mark.parametrize("exposure_s", [None, 1e-3, 4e-4, 1e-4, 3e-5])
+def test_sound_captures_are_silent(sensor: StructuredLight, exposure_s: float | None) -> None:
+    """Warnings are errors in these tests."""
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    decode(capture)
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=str)
+def test_fringes_in_the_other_direction_are_named(sensor: StructuredLight) -> None:
+    with pytest.warns(RangesimWarning, match="along columns contradict the Gray code.*other direction"):
+        decode(with_fringes(capture_of(replace(sensor, axes=("columns",))), "reversed"))
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=str)
+@pytest.mark.parametrize("quarters", [-1, 1])
+def test_a_start_at_sine_is_named_with_its_pixels(sensor: StructuredLight, quarters: int) -> None:
+    sensor = replace(sensor, axes=("columns",))
+    later = quarters * sensor.period_px / 4
+    with pytest.warns(RangesimWarning, match="contradict the Gray code") as caught:
+        decode(with_fringes(capture_of(sensor), "later", later))
+    found = re.search(r"start ([0-9.]+) projector pixels too (early|late)", str(caught[0].message))
+    assert found is not None
+    assert float(found[1]) == pytest.approx(abs(later), abs=0.25)
+    assert found[2] == ("late" if later > 0 else "early")
+
+
+@pytest.mark.parametrize("later", [-0.5, 0.5])
+@pytest.mark.parametrize("steps", [3, 4, 5])
+@pytest.mark.parametrize("exposure_s", [None, 4e-4])
+def test_a_start_half_a_pixel_off_is_named(later: float, steps: int, exposure_s: float | None) -> None:
+    sensor = StructuredLight(steps=steps)
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    with pytest.warns(
+        RangesimWarning, match=rf"start 0\.[456] projector pixels too {'late' if later > 0 else 'early'}"
+    ):
+        decode(with_fringes(capture, "later", later))
