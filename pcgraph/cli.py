@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import pcgraph
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line
 from pcgraph.families import member
 from pcgraph.plain_files import said
 
@@ -143,7 +143,7 @@ def segment(
     except (PcgraphError, ValueError, MemoryError, OSError) as error:
         message = said(error) if isinstance(error, OSError) else str(error)
         message = " ".join(message.split()) or "the cloud does not fit into memory: choose a larger voxel size"
-        typer.echo(f"pcgraph: {message.rstrip('.')}.", err=True)
+        typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
     _print_summary(result, labels, targets, time.perf_counter() - start)
 
@@ -211,7 +211,7 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
             raise CloudReadError(f"cannot segment {path}: {error}") from None
     for warning in caught:
         if issubclass(warning.category, pcgraph.CloudWarning):
-            typer.echo(f"pcgraph: warning: {warning.message}.", err=True)
+            typer.echo(f"pcgraph: warning: {one_line(warning.message)}.", err=True)
         else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     return result
@@ -236,6 +236,6 @@ def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: lis
         ("edges", str(len(result.graph.edges))),
         ("objects", str(int(labels.max()) + 1)),
         ("seconds", f"{seconds:.2f}"),
-        *(("written", str(target)) for target in targets),
+        *(("written", one_line(target)) for target in targets),
     ):
         typer.echo(f"{name:<12} {value}")

@@ -10,6 +10,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -329,3 +331,31 @@ def test_an_operating_systems_error_is_said_in_words(command: Command, letters: 
     assert answer.err.startswith("rangesim: cannot use nnn")
     assert answer.err.endswith("n/experiment.json: File name too long\n")
     assert "Errno" not in answer.err
+
+
+@pytest.mark.parametrize("order", ["\x1b[2J", "\u202e", "\n", "\x9b1m"])
+def test_names_of_shapes_give_no_orders_to_a_terminal(order: str) -> None:
+    from rangesim.cli.scan import _table
+
+    name = f"a{order}b"
+    result: Any = SimpleNamespace(
+        things=(name, "sphere"),
+        errors={name: None, "sphere": SimpleNamespace(accuracy_m=1e-3, recall=0.5)},
+        materials={name: order, "sphere": "matte"},
+        seen=None,
+        poses=None,
+    )
+    code = {"\n": "\\n"}.get(order[0], f"\\u{ord(order[0]):04x}") + order[1:]
+    lines = _table(result).split("\n")
+    assert lines[1].split() == [f"a{code}b", code, "-", "-", "-"]
+    assert lines[2].split() == ["sphere", "matte", "1.000", "mm", "50.0%", "-"]
+    assert len(lines) == 3
+
+
+def test_names_of_directories_give_no_orders_to_a_terminal(command: Command, tmp_path: Path) -> None:
+    place = tmp_path / "a\x1b[2J\u202e\nb"
+    assert (
+        command("run", PLANE, *IDEAL, *TINY, "--out", place).out == f"{tmp_path}/a\\u001b[2J\\u202e\\nb/report.html\n"
+    )
+    answer = command("verify", place)
+    assert answer.out.startswith(f"{tmp_path}/a\\u001b[2J\\u202e\\nb: all ")

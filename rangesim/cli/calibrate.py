@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rangesim.cli.decode import TOF_SUFFIX, load_frames, structured_light
+from rangesim.errors import one_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -113,8 +114,8 @@ def calibrate_command(
     if report is not None:
         page = render_calibration(found, [str(path) for path in captures], [c.frames[WHITE] for c in taken])
         write_file(report, page.encode(), FileFormatError, make_parents=True)
-        typer.echo(f"{report}: written.")
-    typer.echo(f"{out}: written.")
+        typer.echo(f"{one_line(report)}: written.")
+    typer.echo(f"{one_line(out)}: written.")
 
 
 def check_places(out: Path, report: Path | None) -> None:
@@ -177,8 +178,8 @@ def _camera_alone(
     save_opencv_camera(found.camera, out)
     lines = [_device_line("camera", found.camera, found.deviations), "reprojection, pixels, root mean square:"]
     for path, residual in zip(images, found.residuals, strict=True):
-        lines.append(f"  {path}  {(residual**2).sum(axis=1).mean() ** 0.5:.3f}")
-    typer.echo("\n".join([*lines, f"  all  {found.rms_px:.3f}", f"{out}: written."]))
+        lines.append(f"  {one_line(path)}  {(residual**2).sum(axis=1).mean() ** 0.5:.3f}")
+    typer.echo("\n".join([*lines, f"  all  {found.rms_px:.3f}", f"{one_line(out)}: written."]))
 
 
 def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out: Path) -> None:
@@ -198,7 +199,7 @@ def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out
         f"noise of a reading {500 * found.noise_m:.2f} mm; ranges from {found.shortest_m / 2:.2f} to "
         f"{found.longest_m / 2:.2f} m."
     )
-    typer.echo(f"{out}: written.")
+    typer.echo(f"{one_line(out)}: written.")
 
 
 def _board(kind: str, points: str, spacing: float, marker: float | None, dictionary: str) -> Board:
@@ -240,7 +241,7 @@ def _table(found: RigCalibration, captures: list[Path]) -> str:
     lines.append(f"{'baseline':10s}{1e3 * found.baseline_m:.4f} ± {1e3 * found.baseline_deviation_m:.2g} mm")
     lines.append("reprojection, pixels, root mean square in camera and projector:")
     for path, *both in zip(captures, found.camera_residuals, found.projector_residuals, strict=True):
-        lines.append(f"  {path}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
+        lines.append(f"  {one_line(path)}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
     lines.append(f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}")
     return "\n".join(lines)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rangesim.cli.progress import say_where
+from rangesim.errors import one_line
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
@@ -222,10 +223,10 @@ def _summary(image: RangeImage, out: Path) -> str:
 
     fraction = 100 * float(image.valid.mean())
     if image.camera is None:
-        return f"{out}: {fraction:.1f} % of the pixels decoded; without --calibration there is no depth."
+        return f"{one_line(out)}: {fraction:.1f} % of the pixels decoded; without --calibration there is no depth."
     z = image.z[image.valid]
     depth = f", z from {z.min():.3f} to {z.max():.3f} m" if z.size else ""
     off = float((image.status == Status.CODE_ERROR).mean())
     hint = f"; {100 * off:.1f} % of the codes miss their epipolar line or each other" if off > 0.1 else ""
     doubt = ": check --calibration and --code-step" if hint and off > image.valid.mean() else ""
-    return f"{out}: {fraction:.1f} % of the pixels measured{depth}{hint}{doubt}."
+    return f"{one_line(out)}: {fraction:.1f} % of the pixels measured{depth}{hint}{doubt}."

@@ -185,6 +185,21 @@ def test_a_working_directory_that_is_gone_is_one_sentence(scene, tmp_path):
         assert done.stderr == "pcgraph: expected a working directory, but this one is gone: change to another.\n"
 
 
+@pytest.mark.parametrize("order", ["\x1b[2J", "\u202e", "\x9b31m", "\n", "\r", "\u2028", "\u200f", "\udcff"])
+def test_names_give_no_orders_to_a_terminal(scene, tmp_path, order):
+    code = {"\n": "\\n"}.get(order[0], f"\\u{ord(order[0]):04x}") + order[1:]
+    hostile = tmp_path / f"red{order}evil.ply"
+    scene.rename(hostile)
+    done = run(hostile, "--out", tmp_path / "out", *VIEW)
+    assert done.exit_code == 0, done.output
+    places = [line.split(maxsplit=1)[1] for line in done.stdout.splitlines() if line.startswith("written")]
+    assert places == [f"{tmp_path}/out/red{code}evil.segments{suffix}" for suffix in (".ply", ".npz")]
+    missing = run(tmp_path / f"{order}no.ply")
+    assert (missing.exit_code, missing.stdout) == (1, "")
+    assert missing.stderr.count("\n") == 1
+    assert not any(order[0] in text for text in (done.stdout.replace("\n", "") + missing.stderr[:-1],))
+
+
 def test_a_directory_is_no_cloud(tmp_path):
     folder = tmp_path / "scans.pcd"
     folder.mkdir()
