@@ -56,7 +56,8 @@ class Timing:
     lines : "rows" from top to bottom, or "columns" from left to right.
     bands : int >= 1, the lines of a scan are rendered in so many bands (fewer if there are fewer lines), each at the
         time of its middle. Every band is a pass of its own.
-    single_tap : bool, an AMCW camera takes its taps one after another.
+    single_tap : bool, an AMCW camera takes its taps one after another. That is when they are taken, not how bright they
+        are: a pixel that collects half of the light for each has twice as much as `AmcwToF` gives a tap in an exposure.
     start_s : float, middle of the first exposure.
     exposure_s, exposure_samples : float >= 0 and int >= 1: the exposure is rendered at so many times, evenly spread,
         and averaged. By default the motion within an exposure is neglected.
