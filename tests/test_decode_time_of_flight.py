@@ -73,6 +73,27 @@ def test_amcw_is_exact_without_noise(waveform: str, frequencies: tuple[float, ..
         assert np.nanmax(np.abs(image.z - signals.truth.z)) < 5e-5
 
 
+@pytest.mark.parametrize("waveform", ["sine", "square"])
+@pytest.mark.parametrize("frequencies", [(20e6,), (20e6, 80e6, 100e6)])
+@pytest.mark.parametrize("ambient", [0.0, 0.3])
+def test_the_taps_of_a_frequency_share_the_light_of_one_exposure(
+    waveform: str, frequencies: tuple[float, ...], ambient: float
+) -> None:
+    """They add up to what came in, and the phase has the noise of so many electrons: sqrt(2 / N) / contrast."""
+    rig = stereo_rig(baseline_m=0.02)
+    sensor = AmcwToF(frequencies, waveform=waveform)  # type: ignore[arg-type]
+    signals = plane_signals(rig, sensor, ambient=ambient)
+    lit = signals.truth.projector_visible
+    for taps in np.split(signals.frames(sensor), len(frequencies)):
+        np.testing.assert_allclose(taps.sum(axis=0)[lit] / (signals.energy.direct[lit] + ambient), 1, rtol=1e-5)
+        if ambient == 0.0 and waveform == "sine":
+            electrons = 1000 * taps[:, lit] / signals.energy.direct[lit]  # as many reach each pixel
+            drawn = np.random.default_rng(0).poisson(electrons).astype(np.float32)
+            off = 2 * np.pi * (tap_phase(drawn[:, None]).normalised - tap_phase(electrons[:, None]).normalised)
+            off = (off + np.pi) % (2 * np.pi) - np.pi
+            assert off.std() == pytest.approx(np.sqrt(2 / 1000) / sensor.contrast, rel=0.03)
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0.05, 18.7), st.sampled_from([(80e6, 16e6, 120e6), (24e6, 56e6)]))
 def test_amcw_unwraps_up_to_the_common_range(range_m: float, frequencies: tuple[float, ...]) -> None:

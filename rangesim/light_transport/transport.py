@@ -13,6 +13,7 @@ import numpy as np
 from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.caustics import caustic_maps, caustic_photons
 from rangesim.light_transport.device import Device
+from rangesim.light_transport.devices_in_media import check_devices
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
@@ -95,8 +96,8 @@ def transport(
     Raises
     ------
     ValueError
-        A number out of its range, patterns that do not fit the projector, too little memory, or rigs of different
-        emitters.
+        A number out of its range, patterns that do not fit the projector, too little memory, rigs of different
+        emitters, or a camera or projector inside a medium that fills a shape.
 
     Warns
     -----
@@ -109,6 +110,7 @@ def transport(
     report, launches = Progress(progress), Launches(is_watched=progress is not None)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     adaptive = _adaptive(settings, sensors, responses)
+    check_devices(scene.mitsuba, [scene.in_renderer(one) for one in rigs])
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     views = [_CameraPass(scene, traced, one, settings, adaptive, number) for number, one in enumerate(rigs)]
     fewest = min(int(view.samples.min()) for view in views)
