@@ -50,6 +50,10 @@ OF_POSE = 5
 OF_ROTATION = 3
 MAX_PIXELS = 1e5
 """Coordinates of images, about."""
+MIN_EXTENT = 0.05
+"""Coordinates of the smallest images, about: those of a lens of 6 degrees in units of its focal length."""
+SINGLE_ROUNDING = 1e-6
+"""Relative; a few roundings of single precision, in which matrices of other programs come."""
 ANOTHER = 0.02
 """Difference of an entry of F, at unit norm in normalised coordinates, from which on it is another one."""
 MAX_STANDARD_DEVIATION = 0.3
@@ -545,7 +549,9 @@ def _checked_F(F: ArrayLike) -> Array:
         raise ValueError(f"expected F of shape (3, 3), got {matrix.shape}.")
     # pixels against ones: in units of some hundred pixels the blocks of F are of one size
     block, border = np.linalg.norm(matrix[:2, :2]), max(np.linalg.norm(matrix[2, :2]), np.linalg.norm(matrix[:2, 2]))
-    unit = min(border / block, MAX_PIXELS) if border > 0 and block > 0 else 1.0
+    # an epipole at the origin, as of forward motion, leaves a border that is rounding and tells no unit
+    has_unit = block > 0 and border > SINGLE_ROUNDING * block
+    unit = min(max(border / block, MIN_EXTENT), MAX_PIXELS) if has_unit else 1.0
     values = np.linalg.svd(matrix * np.outer([unit, unit, 1], [unit, unit, 1]), compute_uv=False)
     if not (values[1] > 1e-12 * values[0] and values[2] <= 1e-6 * values[0]):
         raise ValueError(f"expected F of rank 2, got singular values {values.tolist()} after scaling.")
