@@ -549,6 +549,54 @@ def test_broken_files_of_opencv_are_refused(rendered, tmp_path):
         load_opencv(place)
 
 
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+def test_a_matrix_is_measured_before_opencv_makes_room_for_it(rendered, tmp_path, suffix):
+    import cv2
+
+    from rangesim.calibration.opencv_files import load_opencv
+    from rangesim.errors import FileFormatError
+
+    rig = rendered[1]
+    K = [[rig.camera.fx, 0, rig.camera.cx - 0.5], [0, rig.camera.fy, rig.camera.cy - 0.5], [0, 0, 1]]
+    right = {"rows": 3, "cols": 3, "dt": "d", "data": [float(x) for row in K for x in row]}
+
+    def written(matrix):
+        storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+        for name in ("camera", "projector"):
+            storage.write(f"{name}_width", 640)
+            storage.write(f"{name}_height", 480)
+            storage.write(f"{name}_distortion", np.zeros((1, 5)))
+        storage.write("R", np.eye(3))
+        storage.write("T", np.array([[-0.1], [0], [0]]))
+        storage.write("projector_matrix", np.array(K))
+        storage.startWriteStruct("camera_matrix", cv2.FILE_NODE_MAP, "opencv-matrix")
+        for key, value in matrix.items():
+            if key == "data":
+                storage.startWriteStruct("data", cv2.FILE_NODE_SEQ + cv2.FILE_NODE_FLOW)
+                for number in value:
+                    storage.write("", number)
+                storage.endWriteStruct()
+            else:
+                storage.write(key, value)
+        storage.endWriteStruct()
+        place = tmp_path / f"rig{suffix}"
+        place.write_text(storage.releaseAndGetString())
+        return place
+
+    found = load_opencv(written(right)).camera
+    assert np.allclose([found.fx, found.fy, found.cx], [rig.camera.fx, rig.camera.fy, rig.camera.cx], rtol=1e-12)
+    for key, values in {
+        "rows": (None, -1, 0, 2, 2**30, 3.0),
+        "cols": (None, -1, 0, 4, 2**30, "3"),
+        "dt": (None, "", "3d", "9999d", "x", 8),
+        "data": (None, [], [1.0] * 8, [1.0] * 10, ["1"] * 9),
+    }.items():
+        for value in values:
+            wrong = {k: v for k, v in {**right, key: value}.items() if v is not None}
+            with pytest.raises(FileFormatError, match="matrix 'camera_matrix' of 3 x 3 finite numbers"):
+                load_opencv(written(wrong))
+
+
 def test_the_command_calibrates_a_camera_from_photographs(rendered, tmp_path, capsys):
     import cv2
 

@@ -245,24 +245,30 @@ def test_runs_of_pixels_are_dealt_out_once_each_and_evenly(n: int) -> None:
 # ---- Progress ---------------------------------------------------------------------------------------
 
 
-def test_progress_grows_to_one_and_is_told_at_most_ten_times_a_second(
-    tabletop: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_grows_to_one(tabletop: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel_launches, "LAUNCH_S", 0.01)
     monkeypatch.setattr(kernel_launches, "FIRST_UNITS", 1 << 15)
-    monkeypatch.setattr(kernel_launches, "REPORT_S", 0.05)
+    monkeypatch.setattr(kernel_launches, "REPORT_S", 0.0)
     shares: list[float] = []
-    times: list[float] = []
-
-    def progress(fraction: float) -> None:
-        shares.append(fraction)
-        times.append(time.monotonic())
-
-    transport(tabletop, tabletop.rig(width=160, height=120), [], spp=48, progress=progress)
+    transport(tabletop, tabletop.rig(width=160, height=120), [], spp=48, progress=shares.append)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert len(set(shares)) > 3  # a GPU is done in two more reports
-    assert (np.diff(times)[:-1] > 0.9 * kernel_launches.REPORT_S).all()
+
+
+def test_progress_is_told_at_most_ten_times_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock_s = 0.0
+    monkeypatch.setattr(kernel_launches.time, "monotonic", lambda: clock_s)
+    told_s: list[float] = []
+    progress = kernel_launches.Progress(lambda _: told_s.append(clock_s))
+    for step in range(1000):  # 3 s in steps of 3 ms
+        clock_s = 0.003 * step
+        progress(step / 1000)
+    assert len(told_s) == 30  # every 34 steps: 0.102 s
+    assert (np.diff(told_s) >= kernel_launches.REPORT_S).all()
+    progress(1.0)  # the last one whatever the time
+    assert told_s[-2:] == [told_s[-2], clock_s]
+    assert len(told_s) == 31
 
 
 def test_what_progress_raises_ends_the_pass(tabletop: Scene) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -89,10 +90,27 @@ def _device(storage: Any, name: str) -> Intrinsics:
 
 def _matrix(storage: Any, name: str, shape: tuple[int, int]) -> np.ndarray:
     node = storage.getNode(name)
-    value = node.mat() if node.isMap() else None
+    value = node.mat() if _is_matrix(node, shape) else None
     if value is None or value.shape != shape or not np.isfinite(value).all():
         raise ValueError(f"expected a matrix {name!r} of {shape[0]} x {shape[1]} finite numbers.")
     return np.asarray(value, dtype=np.float64)
+
+
+def _is_matrix(node: Any, shape: tuple[int, int]) -> bool:
+    """Whether a node has rows, cols, dt and data of a matrix of this shape.
+
+    OpenCV makes room for what they say and checks little: without cols, or with -1, it writes beyond its memory.
+    """
+    if not node.isMap():
+        return False
+    rows, cols, dt, data = (node.getNode(key) for key in ("rows", "cols", "dt", "data"))
+    if not (rows.isInt() and cols.isInt() and (int(rows.real()), int(cols.real())) == shape):
+        return False
+    if not (dt.isString() and re.fullmatch("1?[ucwsifd]", dt.string()) and data.isSeq()):
+        return False
+    return data.size() == shape[0] * shape[1] and all(
+        data.at(k).isInt() or data.at(k).isReal() for k in range(data.size())
+    )
 
 
 def _entries(name: str, device: Intrinsics) -> dict[str, Any]:

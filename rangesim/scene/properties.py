@@ -7,6 +7,8 @@ Mitsuba takes most numbers as they come; a reflectance of 2 or a radius of NaN s
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -63,6 +65,10 @@ NOT_OF_MEDIA = ("sigma_a", "sigma_s", "material")
 """Ways to state a medium that Mitsuba 3.9 does not know, and says nothing about."""
 BITMAP_SOURCES = ("filename", "bitmap", "data")
 """What a bitmap texture may be made of; without any, Mitsuba 3.9 crashes."""
+PLUGINS = Path(mi.__file__).resolve().parent / "plugins"
+"""Where the plugins that come with Mitsuba are."""
+LIBRARIES = (".so", ".dylib", ".dll")
+"""Suffixes of native code on Linux, macOS and Windows."""
 FLOAT_IMAGES = (".exr", ".pfm", ".hdr", ".rgbe")
 """Texture files whose values may lie outside 0..1."""
 
@@ -108,6 +114,27 @@ def check_dictionary(scene: Any, label: str) -> None:
                 raise FileFormatError(f"{label}: expected {name} to be a value of 64 bits, got {shown(value)}.")
             if not isinstance(key, str):
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
+            if key == "type" and isinstance(value, str):
+                check_plugin(value, label)
+
+
+def check_plugin(name: str, label: str) -> None:
+    """Raise FileFormatError if Mitsuba would run native code from outside itself for a plugin of this name.
+
+    Mitsuba loads `plugins/NAME.so` from wherever its file resolver finds it: from the folder of a scene, too. What is
+    registered in Python has no such file.
+    """
+    if re.fullmatch(r"[A-Za-z0-9_-]*", name) is None:
+        raise FileFormatError(
+            f"{label}: expected a type to be the plain name of a plugin of Mitsuba, got {shown(name)}."
+        )
+    for suffix in LIBRARIES:
+        found = Path(str(mi.file_resolver().resolve(f"plugins/{name}{suffix}")))
+        if os.path.lexists(found) and found.resolve().parent != PLUGINS:
+            raise FileFormatError(
+                f"{label}: type {shown(name)} is no plugin of Mitsuba, and native code beside a scene is not run; "
+                f"remove {found.name} or use another type."
+            )
 
 
 def check_properties(state: Any, label: str) -> None:
@@ -115,6 +142,8 @@ def check_properties(state: Any, label: str) -> None:
 
     The message names the node and the property: 'shape "ball": expected radius to be positive and finite, got nan'.
     """
+    for node in state.nodes:
+        check_plugin(node.props.plugin_name(), label)
     parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
     for index, node in enumerate(state.nodes):
         bounds = PROPERTIES.get(node.type.name, {})
