@@ -92,6 +92,35 @@ def test_register_needs_no_first_guess_and_repeats() -> None:
     np.testing.assert_allclose(found.T_target_source, register(source, target).T_target_source, atol=1e-9)
 
 
+@pytest.mark.parametrize("metres", [1.0, 3.0, 30.0, 1000.0, 5e5])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_far_from_the_origin_icp_finds_the_same(metres: float, seed: int) -> None:
+    """The target at an offset, and the source at another: the pose is that of the clouds at the origin, moved."""
+    source, target = pair(part, 3e-4, n=2000, seed=seed)
+    guess = rigid((0.05, 0.04, -0.06), (0.004, 0, 0.003)) @ TRUE
+    near = icp(source, target, guess)
+    by = rigid((0, 0, 0), metres * np.array([1.0, -0.7, 0.1]))
+    before = rigid((0, 0, 0), metres * np.array([-0.3, 0.4, 1.0]))
+    far = icp(source - before[:3, 3], target + by[:3, 3], by @ guess @ before)
+    moved = np.linalg.inv(by) @ far.T_target_source @ np.linalg.inv(before)
+    atol = 1e-8 + 1e-14 * metres
+    np.testing.assert_allclose(moved[:3, :3], near.T_target_source[:3, :3], atol=atol)
+    np.testing.assert_allclose(moved[:3, 3], near.T_target_source[:3, 3], atol=1e-7 + 1e-12 * metres)
+    assert off(near)[1] < 3e-4
+    assert far.agreement == pytest.approx(near.agreement, abs=1e-4)
+
+
+@pytest.mark.parametrize("metres", [1000.0, 5e5])
+def test_far_from_the_origin_register_finds_the_same(metres: float) -> None:
+    source, target = pair(part, 3e-4, n=2000)
+    by = metres * np.array([1.0, -0.7, 0.1])
+    E = register(source + by, target + by).T_target_source
+    E[:3, 3] += E[:3, :3] @ by - by
+    E = E @ np.linalg.inv(TRUE)
+    assert np.degrees(Rotation.from_matrix(E[:3, :3]).magnitude()) < 0.3
+    assert np.linalg.norm(E[:3, 3]) < 5e-4
+
+
 def overlap(x: float) -> tuple[np.ndarray, np.ndarray]:
     """The part from -0.15 to x, and from -x to 0.15."""
     source, target = pair(part, 3e-4, n=6000)

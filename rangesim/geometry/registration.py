@@ -8,7 +8,7 @@ too small an overlap).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +38,8 @@ ATTEMPTS = 4
 """Runs of RANSAC, with seeds of their own."""
 COMPARED_POINTS = 3000
 """Of the source, by which poses are compared."""
+FAR_EXTENTS = 5.0
+"""Clouds further than this from the origin, in units of their extent, are moved there before they are solved."""
 AS_GOOD = 0.95
 """Fraction of the best agreement at which another pose fits alike."""
 
@@ -85,23 +87,26 @@ def icp(
     max_distance_m : how far points may be from their partners at first; None: 12 spacings of the target.
     min_fitness : least fraction of the source with a partner at the end.
 
+    The clouds may lie far from the origin, as at map coordinates: they are solved about their middles then.
+
     Raises
     ------
     ValueError
         Fewer than 20 different points, fewer partners than `min_fitness`, surfaces that slide on each other, or two
         poses that fit nearly alike.
     """
-    moving, fixed = _checked(source, target)
-    start = np.eye(4) if T_target_source is None else pose(T_target_source, "T_target_source")
+    moving, fixed, middles = _checked(source, target)
+    given = np.eye(4) if T_target_source is None else pose(T_target_source, "T_target_source")
     _check_fraction(min_fitness)
     if max_distance_m is not None and not max_distance_m > 0:
         raise ValueError(f"expected max_distance_m to be positive, got {max_distance_m!r}.")
     surface = _Surface.of(fixed)
+    start = middles.to_middles(given)
     results = [_refined(moving, surface, start, d) for d in surface.halved(max_distance_m)]
     found = max(results, key=_agreement)
     _refuse_failure(found, min_fitness, "start nearer to the right pose, with a larger max_distance_m, or by register")
     _refuse_others(found, results, moving, surface)
-    return found
+    return replace(found, T_target_source=middles.from_middles(found.T_target_source))
 
 
 def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, seed: int = 0) -> Registration:
@@ -124,7 +129,7 @@ def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, 
         As `icp`; or another pose fits nearly as well: a symmetric shape, or one with too little to tell its sides
         apart.
     """
-    moving, fixed = _checked(source, target)
+    moving, fixed, middles = _checked(source, target)
     _check_fraction(min_fitness)
     surface = _Surface.of(fixed)
     few = moving[np.random.default_rng(seed).permutation(len(moving))[:COMPARED_POINTS]]
@@ -138,7 +143,7 @@ def register(source: ArrayLike, target: ArrayLike, *, min_fitness: float = 0.3, 
     found = _refined(moving, surface, best.T_target_source, PARTNER_SPACINGS * surface.spacing)
     _refuse_failure(found, min_fitness, "scan with more overlap, or give icp a first guess")
     _refuse_others(best, tried, few, surface)
-    return found
+    return replace(found, T_target_source=middles.from_middles(found.T_target_source))
 
 
 def nearest_similarity(source: Array, target: Array) -> Array:
@@ -153,6 +158,28 @@ def nearest_similarity(source: Array, target: Array) -> Array:
     T[:3, :3] = (values * signs).sum() / max((a**2).sum(), 1e-300) * (u * signs) @ vt
     T[:3, 3] = target.mean(axis=0) - T[:3, :3] @ source.mean(axis=0)
     return T
+
+
+class _Middles(NamedTuple):
+    """(3,) of the source and of the target, metres: where the origins of the solved clouds lie; 0 of a cloud near its.
+
+    Far from the origin a turn about it moves the clouds by metres: the steps of ICP are then neither small nor exact.
+    """
+
+    source: Array
+    target: Array
+
+    def to_middles(self, T: Array) -> Array:
+        """T_target_source (4, 4) between the clouds moved to their middles."""
+        result = T.copy()
+        result[:3, 3] = T[:3, :3] @ self.source + T[:3, 3] - self.target
+        return result
+
+    def from_middles(self, T: Array) -> Array:
+        """T_target_source (4, 4) between the clouds as given."""
+        result = T.copy()
+        result[:3, 3] = T[:3, 3] + self.target - T[:3, :3] @ self.source
+        return result
 
 
 class _Surface(NamedTuple):
@@ -200,13 +227,21 @@ def _turned(T: Array, source: Array, target: Array) -> list[Array]:
     return result
 
 
-def _checked(source: ArrayLike, target: ArrayLike) -> tuple[Array, Array]:
+def _checked(source: ArrayLike, target: ArrayLike) -> tuple[Array, Array, _Middles]:
+    """The clouds moved to their middles, and these."""
     clouds = checked_array("source", source, None, 3), checked_array("target", target, None, 3)
     for name, points in zip(("source", "target"), clouds, strict=True):
         if points.ndim != 2:
             raise ValueError(f"expected {name} of shape (n, 3), got {points.shape}.")
         check_distinct(name, points, LEAST_POINTS, "a registration")
-    return clouds
+    middles = _Middles(*(_middle(points) for points in clouds))
+    return clouds[0] - middles.source, clouds[1] - middles.target, middles
+
+
+def _middle(points: Array) -> Array:
+    """(3,) of the points; 0 where they are near the origin, as they are then solved as well as they stand."""
+    middle, extent = points.mean(axis=0), np.linalg.norm(np.ptp(points, axis=0))
+    return np.asarray(middle if np.linalg.norm(middle) > FAR_EXTENTS * extent else np.zeros(3))
 
 
 def _check_fraction(min_fitness: float) -> None:
