@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 
@@ -89,3 +90,39 @@ def test_a_start_half_a_pixel_off_is_named(later: float, steps: int, exposure_s:
         RangesimWarning, match=rf"start 0\.[456] projector pixels too {'late' if later > 0 else 'early'}"
     ):
         decode(with_fringes(capture, "later", later))
+
+
+@pytest.mark.parametrize("frame", [0, 2])
+@pytest.mark.parametrize("steps", [3, 4, 6])
+@pytest.mark.parametrize("exposure_s", [None, 4e-4, 1e-4])
+def test_a_black_frame_and_a_repeated_one_are_named(frame: int, steps: int, exposure_s: float | None) -> None:
+    sensor = StructuredLight(steps=steps)
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    run, (black, repeated) = fringes(sensor)[0], capture.frames[None].repeat(2, axis=0)
+    black[run.start + frame] = black[-1]
+    repeated[run.start + frame] = repeated[run.start + 1]
+    with pytest.warns(RangesimWarning, match=f"frame columns_phase{frame} is black everywhere"):
+        decode(replace(capture, frames=black))
+    first, second = sorted((frame, 1))
+    with pytest.warns(RangesimWarning, match=f"frame columns_phase{second} repeats columns_phase{first}"):
+        decode(replace(capture, frames=repeated))
+
+
+@pytest.mark.parametrize("gamma", [1.5, 2.2])
+@pytest.mark.parametrize("steps", [3, 4, 7])
+@pytest.mark.parametrize("exposure_s", [None, 4e-4])
+def test_a_gamma_is_named_with_the_mean_it_makes(gamma: float, steps: int, exposure_s: float | None) -> None:
+    """The mean of ((1 + cos x) / 2)^gamma is G(gamma + 1/2) / (sqrt(pi) G(gamma + 1))."""
+    sensor = StructuredLight(steps=steps)
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    frames, run = capture.frames.copy(), fringes(sensor)[0]
+    black = frames[-1].astype(np.float64)
+    contrast = frames[-2] - black
+    share = np.clip((frames[run] - black) / np.where(contrast > 0, contrast, np.inf), 0, 1)
+    frames[run] = (black + contrast * share**gamma).astype(frames.dtype)
+    with pytest.warns(RangesimWarning, match="check that projector and camera are linear") as caught:
+        decode(replace(capture, frames=frames))
+    found = re.search(r"mean lies at (\d+) % of the way", str(caught[0].message))
+    assert found is not None
+    expected = math.gamma(gamma + 0.5) / (math.sqrt(math.pi) * math.gamma(gamma + 1))
+    assert int(found[1]) == pytest.approx(100 * expected, abs=2)

@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesim import limits
 from rangesim.capture import Capture
-from rangesim.decoding.contradictions import fringe_contradiction
+from rangesim.decoding.contradictions import fringe_contradiction, level_contradiction
 from rangesim.decoding.gray import GrayCode, GrayThresholds, decode_gray, direct_contrast
 from rangesim.decoding.phase_shift import PhaseThresholds, refine_by_phase
 from rangesim.decoding.range_image import RangeImage
@@ -218,7 +218,8 @@ class StructuredLightDecoder(Decoder):
                 period_px = response.period_px
                 gray = codes[axis]
                 codes[axis] = refine_by_phase(capture, gray, fringes, period_px, least_swing, self.phase)
-                _warn_of(fringe_contradiction(gray, codes[axis], fringes, period_px, axis))
+                contradiction = level_contradiction(capture, gray, codes[axis], frames, sensor.frame_names(), axis)
+                _warn_of(contradiction or fringe_contradiction(gray, codes[axis], fringes, period_px, axis))
         for axis, code in codes.items():
             outside = (code.coordinate < -0.5) | (code.coordinate > sensor.size(axis) + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
