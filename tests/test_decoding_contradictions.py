@@ -16,6 +16,7 @@ from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
+from rangesim.response import GrayBits
 from rangesim.sensors import StructuredLight
 
 SENSORS = [
@@ -126,3 +127,45 @@ def test_a_gamma_is_named_with_the_mean_it_makes(gamma: float, steps: int, expos
     assert found is not None
     expected = math.gamma(gamma + 0.5) / (math.sqrt(math.pi) * math.gamma(gamma + 1))
     assert int(found[1]) == pytest.approx(100 * expected, abs=2)
+
+
+def as_plain_binary(capture: Capture) -> Capture:
+    """The capture with its Gray bits replaced by plain binary: each bit the exclusive or of those above."""
+    sensor = capture.sensor
+    assert isinstance(sensor, StructuredLight)
+    frames = capture.frames.copy()
+    runs = [run.frames for run in sensor.layout() if isinstance(run.response, GrayBits)]
+    for run in runs:
+        pairs = frames[run].reshape(-1, 2, *frames.shape[1:])
+        shown = np.logical_xor.accumulate(pairs[:, 0] > pairs[:, 1], axis=0)
+        pairs[:, 0], pairs[:, 1] = (np.where(s, pairs.max(axis=1), pairs.min(axis=1)) for s in (shown, ~shown))
+        frames[run] = pairs.reshape(-1, *frames.shape[1:])
+    return replace(capture, frames=frames)
+
+
+@pytest.mark.parametrize("exposure_s", [None, 4e-4, 1e-4])
+@pytest.mark.parametrize("axes", [("columns",), ("rows",)])
+@pytest.mark.parametrize("code", ["gray", "gray-phase"])
+def test_plain_binary_is_named(code: str, axes: tuple[str, ...], exposure_s: float | None) -> None:
+    sensor = StructuredLight(code=code, axes=axes)  # type: ignore[arg-type]
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    decode(capture)
+    with pytest.warns(RangesimWarning) as caught:
+        decode(as_plain_binary(capture))
+    assert len(caught) == 1
+    found = re.search(
+        rf"bits along {axes[0]} .* binary numbers .* lie ([0-9.]+) cells apart, as Gray code ([0-9.]+)",
+        str(caught[0].message),
+    )
+    assert found is not None
+    cells_per_pixel = 1280 * 45 / 60 / 160 / (1 if code == "gray" else 8)
+    assert float(found[1]) == pytest.approx(max(1, cells_per_pixel), rel=0.5)
+    assert float(found[2]) > 1.25 * float(found[1])
+
+
+@pytest.mark.parametrize("axes", [("columns",), ("rows",), ("columns", "rows")])
+def test_gray_code_of_any_fineness_is_silent(axes: tuple[str, ...]) -> None:
+    for width in (16, 100, 320):
+        for distance_m in (0.5, 1.0, 2.5):
+            sensor = StructuredLight(code="gray", axes=axes)  # type: ignore[arg-type]
+            decode(expose(plane_signals(stereo_rig(width, width), sensor, distance_m=distance_m), sensor))

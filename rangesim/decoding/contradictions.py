@@ -25,6 +25,11 @@ LEAST_OFFSET_PX = 0.25
 LEVEL_ERROR = 0.03
 """Of white - black, by which the mean of the fringes may miss the middle between black and white."""
 PHASE_BINS = 8
+LEAST_STEPS = 100
+"""Pairs of neighbouring pixels in different cells; fewer do not tell plain binary from Gray code."""
+FARTHER = 0.3
+"""In powers of two, by which neighbours lie farther apart if read as Gray code, of plain binary; about 1 expected."""
+MOST_BEHIND = 0.3
 LEAST_CELLS = 8
 """Gray cells that must be in view to say that a frame is black or white everywhere."""
 
@@ -124,6 +129,28 @@ def _medians(values: np.ndarray, members: list[np.ndarray]) -> tuple[np.ndarray,
     medians = np.array([np.median(values[m]) for m in members])
     spread = [np.median(np.abs(values[m] - x)) for m, x in zip(members, medians, strict=True)]
     return medians, 1.253 * 1.483 * np.array(spread) / np.sqrt([len(m) for m in members])
+
+
+def binary_contradiction(gray: GrayCode, axis: str) -> str | None:
+    """A sentence if the patterns look like plain binary numbers, None if they look like Gray code.
+
+    Neighbouring pixels see neighbouring cells. Numbers in plain binary, read as Gray code, lie farther apart.
+    """
+    cell = gray.coordinate / gray.cell_px
+    usable = (cell % 1 == 0.5) & (gray.status == Status.OK)
+    number = np.where(usable, cell, 0).astype(np.int64)
+    plain = number ^ (number >> 1)  # the bits as shown
+    apart = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = usable[here] & usable[there] & (number[here] != number[there])
+        apart.append([np.abs(n[there][both] - n[here][both]) for n in (number, plain)])
+    as_gray, as_binary = (np.log2(np.concatenate(steps)) for steps in zip(*apart, strict=True))
+    if len(as_gray) < LEAST_STEPS or as_gray.mean() < as_binary.mean() + FARTHER:
+        return None
+    return (
+        f"the bits along {axis} contradict Gray code: read as plain binary numbers neighbouring pixels lie "
+        f"{2 ** as_binary.mean():.1f} cells apart, as Gray code {2 ** as_gray.mean():.1f}: check which code was shown."
+    )
 
 
 def _comparable(gray: GrayCode, refined: GrayCode) -> np.ndarray:
