@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import plane_signals, stereo_rig
+from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
@@ -17,6 +17,7 @@ from rangesim.decoding import decode
 from rangesim.electronics.detector import Detector
 from rangesim.errors import RangesimWarning
 from rangesim.response import GrayBits
+from rangesim.rig import translation
 from rangesim.sensors import StructuredLight
 
 SENSORS = [
@@ -169,3 +170,42 @@ def test_gray_code_of_any_fineness_is_silent(axes: tuple[str, ...]) -> None:
         for distance_m in (0.5, 1.0, 2.5):
             sensor = StructuredLight(code="gray", axes=axes)  # type: ignore[arg-type]
             decode(expose(plane_signals(stereo_rig(width, width), sensor, distance_m=distance_m), sensor))
+
+
+def share_behind(capture: Capture) -> float:
+    """Percent of decoded pixels that decode's warning says meet behind."""
+    with pytest.warns(RangesimWarning, match="meet behind camera or projector") as caught:
+        image = decode(capture)
+    found = re.search(r"^(\d+) % of the decoded rays", str(caught[0].message))
+    assert found is not None
+    assert image.projector_column is not None
+    decoded = np.isfinite(image.projector_column)
+    assert int(found[1]) <= 100 * (decoded & ~image.valid).sum() / decoded.sum() + 0.5
+    return float(found[1])
+
+
+@pytest.mark.parametrize("distance_m", [0.6, 1.0, 3.0])
+@pytest.mark.parametrize("axes", [("columns",), ("columns", "rows")])
+@pytest.mark.parametrize("code", ["gray", "gray-phase"])
+def test_a_mirrored_camera_is_told_by_rays_that_meet_behind(
+    code: str, axes: tuple[str, ...], distance_m: float
+) -> None:
+    sensor = StructuredLight(code=code, axes=axes)  # type: ignore[arg-type]
+    capture = expose(plane_signals(stereo_rig(), sensor, distance_m=distance_m), sensor)
+    decode(capture)
+    assert 25 < share_behind(replace(capture, frames=capture.frames[:, :, ::-1].copy())) < 50
+
+
+def test_an_inverted_calibration_is_told_by_rays_that_meet_behind() -> None:
+    """Parallel axes: every ray meets behind, with the baseline to the other side."""
+    rig, sensor = stereo_rig(T_camera_projector=translation(0.2, 0, 0)), StructuredLight()
+    capture = expose(plane_signals(rig, sensor, distance_m=1.5), sensor)
+    inverted = replace(rig, T_camera_projector=np.linalg.inv(rig.T_camera_projector))
+    assert share_behind(replace(capture, rig=inverted)) == 100
+
+
+def test_noise_on_what_is_far_away_is_silent() -> None:
+    """At 500 m rays are parallel within 0.5 pixels, and half of them meet behind."""
+    rig, sensor = stereo_rig(T_camera_projector=translation(0.2, 0, 0)), StructuredLight(code="gray")
+    image = decode(expose(signals_of_depth(rig, np.full((120, 160), 500.0), [sensor]), sensor))
+    assert not image.valid.any()

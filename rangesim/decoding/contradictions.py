@@ -29,7 +29,10 @@ LEAST_STEPS = 100
 """Pairs of neighbouring pixels in different cells; fewer do not tell plain binary from Gray code."""
 FARTHER = 0.3
 """In powers of two, by which neighbours lie farther apart if read as Gray code, of plain binary; about 1 expected."""
-MOST_BEHIND = 0.3
+MOST_BEHIND = 0.2
+"""Share of pixels whose rays meet behind a device, and clearly so; a few do by interreflection."""
+CLEARLY_BEHIND_PX = 10.0
+"""Projector pixels from parallel; less may be noise on what is far away."""
 LEAST_CELLS = 8
 """Gray cells that must be in view to say that a frame is black or white everywhere."""
 
@@ -150,6 +153,23 @@ def binary_contradiction(gray: GrayCode, axis: str) -> str | None:
     return (
         f"the bits along {axis} contradict Gray code: read as plain binary numbers neighbouring pixels lie "
         f"{2 ** as_binary.mean():.1f} cells apart, as Gray code {2 ** as_gray.mean():.1f}: check which code was shown."
+    )
+
+
+def behind_contradiction(behind_px: np.ndarray) -> str | None:
+    """A sentence if many rays meet behind camera or projector, None if not.
+
+    Parameters
+    ----------
+    behind_px : (n,) float, as `ProjectorTriangulation` has it.
+    """
+    share = float((behind_px > CLEARLY_BEHIND_PX).mean()) if len(behind_px) >= LEAST_PIXELS else 0.0
+    if share <= MOST_BEHIND:
+        return None
+    return (
+        f"{100 * share:.0f} % of the decoded rays meet behind camera or projector, where nothing is, so the depth of "
+        "the others is doubtful: check that no image is mirrored, that T_camera_projector is not its inverse, and that "
+        "the axes and their order are those shown."
     )
 
 

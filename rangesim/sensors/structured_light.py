@@ -239,6 +239,7 @@ class StructuredLightDecoder(Decoder):
             confidence=contrast.values / np.float32(capture.full_scale),
             intensity=capture.frames[WHITE].astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
+            code_is_doubted=any(contradictions.values()),
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
