@@ -15,12 +15,14 @@ from rangesim.cli.progress import say_where
 if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.decoding.range_image import RangeImage
+    from rangesim.rig import Rig
     from rangesim.sensors import Sensor, StructuredLight
 
 OF_PATTERNS = ("code", "projector", "axes", "period", "steps")
 OF_BARE_IMAGES = (*OF_PATTERNS, "bits")
 TOF_SUFFIX = ".npz"
 """Of what `rangesim calibrate` writes of time-of-flight cameras."""
+OWN_CALIBRATIONS = (".json", TOF_SUFFIX)
 OF_XML_CALIBRATIONS = ("code_step", "unit")
 
 
@@ -42,7 +44,14 @@ def decode_command(
     period: Annotated[float, typer.Option(help="Of gray-phase images: fringe period, projector pixels.")] = 16.0,
     steps: Annotated[int, typer.Option(help="Of gray-phase images: phase steps per axis.")] = 4,
     code_step: Annotated[int, typer.Option(help="Projector pixels per Gray cell when an .xml was calibrated.")] = 1,
-    unit: Annotated[float, typer.Option(help="Metres per unit of length of an .xml calibration.")] = 1e-3,
+    unit: Annotated[
+        float | None,
+        typer.Option(
+            help="Metres per unit of length of a calibration. (default: 0.001 for .xml of procam-calibration, 1 for "
+            "OpenCV's .yml and .xml)",
+            show_default=False,
+        ),
+    ] = None,
     bits: Annotated[
         int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
     ] = None,
@@ -71,6 +80,7 @@ def decode_command(
     """
     import rangesim
     from pcgraph.output import check_directory
+    from rangesim.cli.decode_summary import summary
     from rangesim.cli.decoded_files import DECODED, write_decoded
 
     _refuse_what_would_be_ignored(context, capture, calibration)
@@ -84,9 +94,10 @@ def decode_command(
     if calibration and calibration.suffix.lower() == TOF_SUFFIX:
         image = _calibrated_tof(loaded, calibration)
     else:
-        image = rangesim.decode(_calibrated(loaded, calibration, code_step, unit) if calibration else loaded)
+        loaded = _calibrated(loaded, calibration, code_step, unit) if calibration else loaded
+        image = rangesim.decode(loaded)
     write_decoded(image, loaded, out)
-    typer.echo(_summary(image, out))
+    typer.echo(summary(image, loaded, out))
 
 
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
@@ -100,6 +111,8 @@ def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibra
         raise ValueError(f"expected either --sensor or {surplus}.")
     if calibration is None and (surplus := _options(OF_XML_CALIBRATIONS, given)):
         raise ValueError(f"expected --calibration FILE.xml with {surplus}.")
+    if calibration and calibration.suffix.lower() in OWN_CALIBRATIONS and "unit" in given:
+        raise ValueError(f"{calibration} is in metres: leave out --unit.")
 
 
 def _from_command_line(context: typer.Context, name: str) -> bool:
@@ -144,16 +157,28 @@ def _full_scale(capture: Capture, bits: int) -> Capture:
     return replace(capture, frames=np.rint(capture.frames * stretch).astype(dtype))
 
 
-def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float) -> Capture:
+def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float | None) -> Capture:
     """The capture with the rig of a calibration file."""
     from rangesim.rig.calibration_files import load_calibration
 
     if _is_opencv(calibration):
         from rangesim.calibration.opencv_files import load_opencv
 
-        return replace(capture, rig=load_opencv(calibration))
+        return replace(capture, rig=_in_metres(load_opencv(calibration), unit_m))
     size = capture.sensor.emitter.size
-    return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
+    return replace(capture, rig=load_calibration(calibration, size, code_step, 1e-3 if unit_m is None else unit_m))
+
+
+def _in_metres(rig: Rig, unit_m: float | None) -> Rig:
+    """The rig of a file whose lengths are in units of `unit_m` metres; None: metres."""
+    from rangesim.settings.bounds import Bounds, check_number
+
+    if unit_m is None:
+        return rig
+    check_number("unit", unit_m, Bounds("metres per unit", 1e-9, 1e6))
+    pose = rig.T_camera_projector.copy()
+    pose[:3, 3] *= unit_m
+    return replace(rig, T_camera_projector=pose)
 
 
 def _is_opencv(calibration: Path) -> bool:
@@ -205,18 +230,3 @@ def structured_light(code: str, projector: str, axes: str, period: float, steps:
         period_px=period,
         steps=steps,
     )
-
-
-def _summary(image: RangeImage, out: Path) -> str:
-    """What came out, in a line."""
-    from rangesim.decoding.status import Status
-
-    fraction = 100 * float(image.valid.mean())
-    if image.camera is None:
-        return f"{out}: {fraction:.1f} % of the pixels decoded; without --calibration there is no depth."
-    z = image.z[image.valid]
-    depth = f", z from {z.min():.3f} to {z.max():.3f} m" if z.size else ""
-    off = float((image.status == Status.CODE_ERROR).mean())
-    hint = f"; {100 * off:.1f} % of the codes miss their epipolar line or each other" if off > 0.1 else ""
-    doubt = ": check --calibration and --code-step" if hint and off > image.valid.mean() else ""
-    return f"{out}: {fraction:.1f} % of the pixels measured{depth}{hint}{doubt}."
