@@ -18,6 +18,7 @@ from rangesim.calibration.opencv_files import save_opencv
 from rangesim.capture import Capture
 from rangesim.capture.exposure import expose
 from rangesim.cli import app
+from rangesim.decoding import decode
 from rangesim.decoding.status import Status
 from rangesim.electronics.detector import Detector
 from rangesim.rig.calibration_files import save_calibration
@@ -128,3 +129,35 @@ def test_millimetres_in_a_file_of_opencvs(suffix: str, distance_m: float, tmp_pa
     with np.load(tmp_path / "right" / "out" / "range.npz") as maps:
         assert np.nanmedian(np.abs(maps["z"] / signals.truth.z - 1)) < 1e-3
         assert np.isfinite(maps["z"]).mean() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("dtype", "level"), [(np.uint8, 235), (np.uint8, 200), (np.uint16, 30_000), (np.uint16, 60000)]
+)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("clipped_share", [0.05, 0.2, 0.5])
+def test_levels_that_clip_below_full_scale_are_saturated(
+    dtype: type[np.unsignedinteger], level: int, seed: int, clipped_share: float
+) -> None:
+    """Fringes of an unknown camera; those clipped are refused, those not clipped measured."""
+    sensor = StructuredLight()
+    capture = expose(plane_signals(stereo_rig(), sensor), sensor, Detector(), exposure_s=3e-4, seed=seed)
+    shade = np.linspace(0.3, 1, 160)
+    white = np.quantile(capture.frames[-2] * shade, 1 - clipped_share)
+    frames = np.rint(np.minimum(capture.frames * shade * level / white, level)).astype(dtype)
+    clipped = Capture(frames, sensor)
+    is_clipped = (frames[-6:-2] == level).any(axis=0)
+    assert is_clipped.mean() > 0.02
+    status = decode(clipped).status
+    assert (status[is_clipped] == Status.SATURATED).mean() > 0.99
+    assert (status[~is_clipped] == Status.OK).mean() > 0.9
+    not_clipped = np.rint(capture.frames * shade * level / (capture.frames * shade).max()).astype(dtype)
+    assert not (decode(Capture(not_clipped, sensor)).status == Status.SATURATED).any()
+
+
+@pytest.mark.parametrize("level", [210, 235])
+@pytest.mark.parametrize("code", ["gray", "gray-phase"])
+def test_patterns_of_one_brightness_are_not_clipped(code: str, level: int) -> None:
+    sensor = StructuredLight(320, 200, code=code)  # type: ignore[arg-type]
+    image = decode(Capture(np.rint(10 + (level - 10) * sensor.patterns()).astype(np.uint8), sensor))
+    assert (image.status == Status.OK).all()
