@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rangesim.cli.progress import say_where
-from rangesim.errors import one_line
 
 if TYPE_CHECKING:
     from rangesim.capture import Capture
@@ -77,6 +76,7 @@ def decode_command(
     """
     import rangesim
     from pcgraph.output import check_directory
+    from rangesim.cli.decode_summary import summary
     from rangesim.cli.decoded_files import DECODED, write_decoded
 
     _refuse_what_would_be_ignored(context, capture, calibration)
@@ -90,9 +90,10 @@ def decode_command(
     if calibration and calibration.suffix.lower() == TOF_SUFFIX:
         image = _calibrated_tof(loaded, calibration)
     else:
-        image = rangesim.decode(_calibrated(loaded, calibration, code_step, unit) if calibration else loaded)
+        loaded = _calibrated(loaded, calibration, code_step, unit) if calibration else loaded
+        image = rangesim.decode(loaded)
     write_decoded(image, loaded, out)
-    typer.echo(_summary(image, out))
+    typer.echo(summary(image, loaded, out))
 
 
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
@@ -215,18 +216,3 @@ def structured_light(code: str, projector: str, axes: str, period: float, steps:
         period_px=period,
         steps=steps,
     )
-
-
-def _summary(image: RangeImage, out: Path) -> str:
-    """What came out, in a line."""
-    from rangesim.decoding.status import Status
-
-    fraction = 100 * float(image.valid.mean())
-    if image.camera is None:
-        return f"{one_line(out)}: {fraction:.1f} % of the pixels decoded; without --calibration there is no depth."
-    z = image.z[image.valid]
-    depth = f", z from {z.min():.3f} to {z.max():.3f} m" if z.size else ""
-    off = float((image.status == Status.CODE_ERROR).mean())
-    hint = f"; {100 * off:.1f} % of the codes miss their epipolar line or each other" if off > 0.1 else ""
-    doubt = ": check --calibration and --code-step" if hint and off > image.valid.mean() else ""
-    return f"{one_line(out)}: {fraction:.1f} % of the pixels measured{depth}{hint}{doubt}."

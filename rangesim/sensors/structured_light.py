@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesim import limits
 from rangesim.capture import Capture
-from rangesim.decoding.contradictions import fringe_contradiction
+from rangesim.decoding.contradictions import binary_contradiction, fringe_contradiction, level_contradiction
 from rangesim.decoding.gray import GrayCode, GrayThresholds, decode_gray, direct_contrast
 from rangesim.decoding.phase_shift import PhaseThresholds, refine_by_phase
 from rangesim.decoding.range_image import RangeImage
@@ -209,16 +209,24 @@ class StructuredLightDecoder(Decoder):
             sensor.check(capture.rig.projector.width, capture.rig.projector.height)
         contrast = direct_contrast(capture, capture.frames[WHITE], capture.frames[BLACK], self.gray)
         codes: dict[str, GrayCode] = {}
+        contradictions: dict[str, str | None] = {}
         for axis, response, frames in sensor.layout():
             if isinstance(response, GrayBits):
                 shift, size = response.shift, sensor.size(axis)
                 codes[axis] = decode_gray(capture, capture.frames[frames], shift, size, contrast, self.gray)
+                contradictions[axis] = binary_contradiction(codes[axis], axis)
             else:
                 fringes, least_swing = capture.frames[frames], self.gray.relative_bit * contrast.values
                 period_px = response.period_px
                 gray = codes[axis]
                 codes[axis] = refine_by_phase(capture, gray, fringes, period_px, least_swing, self.phase)
-                _warn_of(fringe_contradiction(gray, codes[axis], fringes, period_px, axis))
+                contradictions[axis] = (
+                    contradictions[axis]
+                    or level_contradiction(capture, gray, codes[axis], frames, sensor.frame_names(), axis)
+                    or fringe_contradiction(gray, codes[axis], fringes, period_px, axis)
+                )
+        for contradiction in filter(None, contradictions.values()):
+            warn(contradiction)
         for axis, code in codes.items():
             outside = (code.coordinate < -0.5) | (code.coordinate > sensor.size(axis) + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
@@ -231,6 +239,7 @@ class StructuredLightDecoder(Decoder):
             confidence=contrast.values / np.float32(capture.full_scale),
             intensity=capture.frames[WHITE].astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
+            code_is_doubted=any(contradictions.values()),
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
@@ -246,11 +255,6 @@ class StructuredLightDecoder(Decoder):
         if sensor.code == "gray-phase":
             least = np.maximum(least, self.phase.least_signal(sensor.steps, 0.5, FrameContent(), background))
         return least
-
-
-def _warn_of(contradiction: str | None) -> None:
-    if contradiction is not None:
-        warn(contradiction)
 
 
 def _worst(statuses: list[np.ndarray]) -> np.ndarray:
