@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,8 +160,16 @@ def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.gen
     return column.reshape(*shape, *column.shape[1:]).copy()
 
 
-def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.float64]:
-    """First `n_rows` x `n_columns` numbers of a text, in reading order.
+def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
+    """First `n_rows` rows of numbers of a text, a row in each line; empty lines do not count.
+
+    Parameters
+    ----------
+    body : bytes
+        Lines that end in a line feed. What follows the last row is not read.
+    n_rows, n_columns : int
+    first_line : int
+        Number of the body's first line in its file, from 1, for messages.
 
     Returns
     -------
@@ -169,16 +179,36 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.fl
     Raises
     ------
     CloudReadError
-        Too few numbers, or a word that is not a number.
+        Too few rows, a row of more or fewer words than columns, or a word that is not a number.
     """
     needed = n_rows * n_columns
     if needed > len(body):  # a number takes a byte at least: refuse before allocating what a header invents
         raise CloudReadError(f"the header promises {needed} numbers, but only {len(body)} bytes follow")
-    words = body.split(None, needed)[:needed]
-    if len(words) < needed:
-        raise CloudReadError(f"the header promises {n_rows} points ({needed} numbers), but {len(words)} follow")
-    try:
-        # Not through an array of the words: each would take as many bytes as the longest.
-        return np.fromiter(map(float, words), np.float64, needed).reshape(n_rows, n_columns)
-    except ValueError as error:
-        raise CloudReadError(f"expected numbers only in the ascii data: {str(error)[:120]}") from None
+    rows = _rows_of_text(body, n_rows, n_columns, first_line)
+    # Not through an array of the words: each would take as many bytes as the longest.
+    return np.fromiter(chain.from_iterable(rows), np.float64, needed).reshape(n_rows, n_columns)
+
+
+def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> Iterator[list[float]]:
+    """Numbers of each row."""
+    left = n_rows
+    lines = enumerate(BytesIO(body), first_line)
+    while left:
+        number, line = next(lines, (0, b""))
+        if not number:
+            raise CloudReadError(f"the header promises {n_rows} points, but {n_rows - left} rows of numbers follow")
+        words = line.split(None, n_columns)
+        if not words:
+            continue
+        if len(words) != n_columns:
+            got = f"more than {n_columns}" if len(words) > n_columns else f"{len(words)}"
+            raise CloudReadError(
+                f"expected {n_columns} numbers in each line, one for each field of the header, "
+                f"but line {number} has {got}: correct the line or the header"
+            )
+        try:
+            yield [float(word) for word in words]
+        except ValueError as error:
+            reason = str(error)[:120]
+            raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {reason}") from None
+        left -= 1

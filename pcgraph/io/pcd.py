@@ -34,6 +34,8 @@ class PcdHeader:
         Sensor position.
     data : str
         ``ascii``, ``binary`` or ``binary_compressed``.
+    n_lines : int
+        Lines that the header takes in its file.
     """
 
     names: tuple[str, ...]
@@ -43,6 +45,7 @@ class PcdHeader:
     height: int
     viewpoint: NDArray[np.float64]
     data: str
+    n_lines: int
 
     @property
     def n_points(self) -> int:
@@ -61,7 +64,8 @@ def read_pcd(content: bytes) -> Cloud:
     Raises
     ------
     CloudReadError
-        The header is incomplete or contradicts itself, or the data is shorter than the header says.
+        The header is incomplete or contradicts itself, the data is shorter than the header says, or a row of text has
+        more or fewer numbers than the header has fields.
     """
     header, body = _parse_header(content)
     readers = {"ascii": _ascii_columns, "binary": _binary_columns, "binary_compressed": _compressed_columns}
@@ -86,10 +90,10 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
         raise CloudReadError(
             f"expected PCD header lines {', '.join(_REQUIRED)}; missing or empty: {', '.join(missing)}"
         )
-    return _checked_header(entries), content[position:]
+    return _checked_header(entries, content.count(b"\n", 0, position)), content[position:]
 
 
-def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
+def _checked_header(entries: dict[str, list[str]], n_lines: int) -> PcdHeader:
     names = tuple(entries["FIELDS"])
     counts = _integers(entries, "COUNT", default=[1] * len(names))
     sizes = _integers(entries, "SIZE")
@@ -109,7 +113,7 @@ def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
     if min(width, height) < 0 or points != width * height:
         raise CloudReadError(f"expected POINTS = WIDTH x HEIGHT, got {points} != {width} x {height}")
     viewpoint = _viewpoint(entries.get("VIEWPOINT", []))
-    return PcdHeader(names, tuple(dtypes), tuple(counts), width, height, viewpoint, entries["DATA"][0].lower())
+    return PcdHeader(names, tuple(dtypes), tuple(counts), width, height, viewpoint, entries["DATA"][0].lower(), n_lines)
 
 
 def _integers(entries: dict[str, list[str]], key: str, default: list[int] | None = None) -> list[int]:
@@ -135,7 +139,7 @@ def _viewpoint(words: list[str]) -> NDArray[np.float64]:
 
 
 def _ascii_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
-    table = numbers_from_text(body, header.n_points, sum(header.counts))
+    table = numbers_from_text(body, header.n_points, sum(header.counts), header.n_lines + 1)
     columns: dict[str, NDArray[np.generic]] = {}
     first = 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):

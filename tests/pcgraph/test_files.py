@@ -117,6 +117,48 @@ def test_ply_colours_of_any_type(kind, stored, expected):
     assert read_ply(text.encode()).colors.tolist() == [expected]
 
 
+def text_files(rows: list[str]) -> dict:
+    """Readers and files of x, y, z, w for each row given, as PCD and as PLY; their first row is in line 12 and 13."""
+    names = ["x", "y", "z", "w"]
+    pcd = f"# by hand\nVERSION 0.7\nFIELDS {' '.join(names)}\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    pcd += "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA ascii\n"
+    ply = "ply\nformat ascii 1.0\ncomment by hand\nelement camera 1\nproperty int id\nelement vertex 3\n"
+    ply += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    body = "\n".join(rows) + "\n"
+    return {"pcd": (read_pcd, (pcd + body).encode()), "ply": (read_ply, (ply + "7\n" + body).encode())}
+
+
+@pytest.mark.parametrize("kind", ["pcd", "ply"])
+@pytest.mark.parametrize(
+    ("rows", "row", "got"),
+    [
+        (["1 2 3 4", "5 6 7", "9 9 9 9 9"], 1, "3"),  # as many numbers in all as the header promises
+        (["1 2 3 4", "5 6 7 8 0", "9 9 9"], 1, "more than 4"),
+        (["1 2 3 4 0 \r", "5 6 7 8", "9 9 9 9"], 0, "more than 4"),
+        (["", "1 2 3 4", " \t\r", "5 6 7 8", "9"], 4, "1"),
+    ],
+)
+def test_rows_of_text_are_as_long_as_the_header_says(kind, rows, row, got):
+    """They were read as one stream of numbers, so that a number too many moved all that follow."""
+    reader, content = text_files(rows)[kind]
+    line = row + (12 if kind == "pcd" else 13)
+    with pytest.raises(CloudReadError, match=f"expected 4 numbers in each line.*line {line} has {got}: correct"):
+        reader(content)
+
+
+@pytest.mark.parametrize("kind", ["pcd", "ply"])
+def test_empty_lines_and_blanks_are_no_rows(kind):
+    reader, content = text_files(["", "1 2 3 4 \r", " \t", "\t5 6  7 8\r", "9 9 9 9"])[kind]
+    for text in (content, content + b"3 0 1 2\n", content.replace(b"7\n\n", b"\n7\n"), content.rstrip(b"\n")):
+        cloud = reader(text)
+        assert cloud.points.tolist() == [[1, 2, 3], [5, 6, 7], [9, 9, 9]]
+        assert cloud.columns["w"].tolist() == [4, 8, 9]
+    with pytest.raises(CloudReadError, match="promises 3 points, but 2 rows of numbers follow"):
+        reader(content.replace(b"9 9 9 9\n", b""))
+    with pytest.raises(CloudReadError, match=r"numbers only in the ascii data, got in line 1[67]: .*'nine'"):
+        reader(content.replace(b"9 9 9 9", b"9 9 9 nine"))
+
+
 def test_open3d_files_are_read_and_ours_read_back(tmp_path):
     o3d = pytest.importorskip("open3d")
     points = np.random.default_rng(0).random((50, 3))
