@@ -28,7 +28,8 @@ class Cloud(ShortRepr):
     Attributes
     ----------
     points : (n, 3) or (h, w, 3) float32 or float64, metres, the file's frame
-        Organised when the file is (PCD with HEIGHT > 1). NaN where the sensor saw nothing.
+        Organised when the file is (PCD with HEIGHT > 1). NaN where the sensor saw nothing. Read as float64 where the
+        file has float64, integers of 64 bits, or whole numbers beyond 2**24, which float32 would round.
     colors : same leading shape + (3,), uint8, 0..255, or None
         Red, green, blue.
     normals : same leading shape + (3,), float32 or float64, or None
@@ -94,13 +95,19 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
 
 
 def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.floating]:
-    wide = any(columns[name].dtype.itemsize > 4 for name in names)
-    dtype = np.float64 if wide else np.float32
+    dtype = np.float64 if any(_is_wide(columns[name]) for name in names) else np.float32
     stacked = np.empty((*shape, len(names)), dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         for axis, name in enumerate(names):
             stacked[..., axis] = columns[name].reshape(shape)
     return stacked
+
+
+def _is_wide(column: NDArray[np.generic]) -> bool:
+    """Whether float32 does not hold the column as it is: by its type, or by whole numbers beyond 2**24."""
+    if column.dtype.itemsize > 4:
+        return True
+    return column.dtype.kind in "iu" and max(abs(int(column.min(initial=0))), int(column.max(initial=0))) > 1 << 24
 
 
 def _color_names(columns: Columns) -> tuple[str, ...]:

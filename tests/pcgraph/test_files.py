@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+from fuzz.cloud_files import pcd, ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -157,6 +158,28 @@ def test_empty_lines_and_blanks_are_no_rows(kind):
         reader(content.replace(b"9 9 9 9\n", b""))
     with pytest.raises(CloudReadError, match=r"numbers only in the ascii data, got in line 1[67]: .*'nine'"):
         reader(content.replace(b"9 9 9 9", b"9 9 9 nine"))
+
+
+@pytest.mark.parametrize("code", ["ascii", "binary_little_endian", "binary_big_endian", "pcd ascii", "pcd binary"])
+@pytest.mark.parametrize(
+    ("kind", "x", "dtype"),
+    [
+        ("i4", [2**24, -(2**24), 0], "f4"),
+        ("i4", [2**24 + 1, 0, 0], "f8"),
+        ("i4", [0, -(2**24) - 1, 5], "f8"),
+        ("i4", [-(2**31), 2**31 - 1, 1], "f8"),
+        ("u4", [2**32 - 1, 0, 2**31 + 1], "f8"),
+        ("u4", [7, 0, 2**24], "f4"),
+        ("i2", [-(2**15), 2**15 - 1, 0], "f4"),
+    ],
+)
+def test_whole_coordinates_stay_exact(code, kind, x, dtype):
+    """Beyond 2**24 they were rounded to float32: map coordinates in millimetres, by up to 128 mm."""
+    fields = [("x", kind, np.array(x)[:, None])] + [(name, "f4", np.full((3, 1), 0.1)) for name in "yz"]
+    cloud = read_pcd(pcd(code[4:], fields, 3, 1)) if code.startswith("pcd") else read_ply(ply(code, fields, 3))
+    assert cloud.points.dtype == dtype
+    assert cloud.points[:, 0].tolist() == x
+    assert cloud.points[:, 1:].tolist() == np.full((3, 2), 0.1, np.float32).tolist()
 
 
 def test_open3d_files_are_read_and_ours_read_back(tmp_path):
