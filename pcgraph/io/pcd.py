@@ -81,7 +81,7 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
         end = content.find(b"\n", position, _MAX_HEADER_BYTES)
         if end < 0:
             raise CloudReadError("expected a PCD header that ends in a DATA line, but found none")
-        words = content[position:end].decode("latin-1").split()
+        words = [word.decode("latin-1") for word in content[position:end].split()]  # not at blanks of other codes
         position = end + 1
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]

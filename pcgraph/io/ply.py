@@ -93,8 +93,8 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
         raise CloudReadError("expected a PLY header from 'ply' to 'end_header', but found none")
     code = ""
     elements: list[PlyElement] = []
-    for line in content[:end].decode("latin-1").splitlines()[1:]:
-        words = line.split()
+    for line in content[:end].split(b"\n")[1:]:  # as bytes: text has line ends and blanks that UTF-8 holds in letters
+        words = [word.decode("latin-1") for word in line.split()]
         if words[:1] == ["format"] and len(words) == 3:
             code = words[1]
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
@@ -102,7 +102,7 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
         elif words[:1] == ["property"] and elements:
             _add_property(elements[-1], words)
         elif words and words[0] not in ("comment", "obj_info"):
-            raise CloudReadError(f"PLY header line not understood: {line[:80]!r}")
+            raise CloudReadError(f"PLY header line not understood: {' '.join(words)[:80]!r}")
     if code not in _ORDERS:
         raise CloudReadError(f"expected PLY format {', '.join(_ORDERS)}, got {code!r}")
     return code, elements, content[newline + 1 :]

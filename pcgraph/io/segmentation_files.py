@@ -177,7 +177,7 @@ def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
     """The cloud's columns, checked."""
     shape = cloud.points.shape[:-1]
     for name, column in cloud.columns.items():
-        if not (isinstance(name, str) and name.split() == [name] and all(0 < ord(letter) < 256 for letter in name)):
+        if not (isinstance(name, str) and all(0 < ord(letter) < 256 for letter in name) and _is_word(name)):
             raise CloudWriteError(f"expected names of columns as one word of Latin letters, got {ascii(name)[:80]}")
         if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub":
             kind = column.dtype if isinstance(column, np.ndarray) else type(column).__name__
@@ -185,6 +185,12 @@ def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
         if column.shape[: len(shape)] != shape or column.ndim > len(shape) + 1:
             raise CloudWriteError(f"expected the column {name!r} in the points' shape {shape}, got {column.shape}")
     return cloud.columns
+
+
+def _is_word(name: str) -> bool:
+    """Whether a name of Latin letters has no blank as the readers know it."""
+    encoded = name.encode("latin-1")
+    return encoded.split() == [encoded]
 
 
 def _for_ply(name: str, values: NDArray[np.generic]) -> NDArray[np.generic]:

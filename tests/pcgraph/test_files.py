@@ -182,6 +182,31 @@ def test_whole_coordinates_stay_exact(code, kind, x, dtype):
     assert cloud.points[:, 1:].tolist() == np.full((3, 2), 0.1, np.float32).tolist()
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "cp1252", "cp1251", "cp850"])
+@pytest.mark.parametrize("by", ["Åsa", "Хорхе", "x\x85y", "a\x1cb\x1d\x1e\x0b\x0c", "à\xa0"])
+def test_headers_with_words_of_any_language(encoding, by):
+    """Letters of UTF-8 hold bytes that end lines or words in other codes: a comment broke the header."""
+    name = by.encode(encoding, "replace").replace(b"\n", b"")
+    rows = [f"comment by {i}".encode() + name for i in range(2)] + [b"obj_info " + name]
+    content = PLY.replace(b"element vertex", b"\n".join(rows) + b"\nelement vertex")
+    for text in (content, content.replace(b"comment by", b"comment")):
+        assert np.array_equal(read_ply(text).points, XYZ, equal_nan=True)
+    content = pcd_header("binary").replace(b"WIDTH", b"# by " + name + b"\n#" + name + b"\nWIDTH") + pcd_body()
+    assert np.array_equal(read_pcd(content).points, XYZ.reshape(2, 2, 3), equal_nan=True)
+
+
+def test_names_of_fields_of_any_language():
+    """`Å` was split within the letter, `à` at its second byte, which is a blank in Latin-1."""
+    for word in ("Å", "nà", "Хорхе"):
+        name = word.encode()
+        read = read_ply(PLY.replace(b"float z\n", b"float z\nproperty uchar " + name + b"\n") + bytes(4))
+        assert list(read.columns) == [name.decode("latin-1")]
+        columns = {"x": np.zeros(4), "y": np.ones(4), "z": np.ones(4), name.decode("latin-1"): np.arange(4.0)}
+        assert_same_columns(read_ply(encode_ply(columns)).columns, dict(list(columns.items())[3:]))
+        content = pcd_header("binary", fields="x y z rgb label w").replace(b" w\n", b" " + name + b"\n")
+        assert list(read_pcd(content + bytes(6 * 4 * 4)).columns) == [name.decode("latin-1")]
+
+
 def test_open3d_files_are_read_and_ours_read_back(tmp_path):
     o3d = pytest.importorskip("open3d")
     points = np.random.default_rng(0).random((50, 3))
@@ -468,9 +493,20 @@ def test_a_result_is_read_and_written_again(scene, tmp_path):
     assert_same_columns({n: twice.columns[n] for n in COLUMNS}, {n: again.columns[n] for n in COLUMNS})
 
 
+def test_columns_of_any_language_are_written_back(scene, tmp_path):
+    points, column = scene[0].points, np.arange(2800, dtype=np.int32)
+    names = [word.encode().decode("latin-1") for word in ("Å", "nà", "Хорхе")]
+    cloud = pcgraph.Cloud(points, columns=dict.fromkeys(names, column))
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, scene[1])
+    read = pcgraph.read_cloud(tmp_path / "a.ply").columns
+    assert list(read) == ["supervoxels", *names]
+    assert all(np.array_equal(read[name], np.delete(column, 7)) for name in names)
+
+
 @pytest.mark.parametrize(
     ("name", "column", "message"),
     [
+        ("two\x0bwords", np.zeros(2800), "one word of Latin letters"),
         ("two words", np.zeros(2800), "one word of Latin letters, got 'two words'"),
         ("", np.zeros(2800), "one word of Latin letters"),
         ("∂", np.zeros(2800), "one word of Latin letters"),
