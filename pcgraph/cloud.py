@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from pcgraph.errors import CloudReadError
 from pcgraph.short_repr import ShortRepr
@@ -17,7 +17,11 @@ from pcgraph.short_repr import ShortRepr
 Columns = Mapping[str, NDArray[np.generic]]
 """One array per field of a file."""
 
+TextField = tuple[str, DTypeLike, int]
+"""Name, type and numbers of each point in a field of a text."""
+
 _NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
+_PACKED_NAMES = ("rgb", "rgba")
 _LABEL_NAMES = ("label", "labels")
 
 
@@ -31,7 +35,7 @@ class Cloud(ShortRepr):
         Organised when the file is (PCD with HEIGHT > 1). NaN where the sensor saw nothing. Read as float64 where the
         file has float64, integers of 64 bits, or whole numbers beyond 2**24, which float32 would round.
     colors : same leading shape + (3,), uint8, 0..255, or None
-        Red, green, blue.
+        Red, green, blue. Black where a text has nan for a packed colour; None if it has nothing else.
     normals : same leading shape + (3,), float32 or float64, or None
         As stored; not checked for unit length.
     labels : same leading shape, int32, or None
@@ -111,7 +115,7 @@ def _is_wide(column: NDArray[np.generic]) -> bool:
 
 
 def _color_names(columns: Columns) -> tuple[str, ...]:
-    for name in ("rgb", "rgba"):
+    for name in _PACKED_NAMES:
         if name in columns and columns[name].dtype.itemsize == 4:
             return (name,)
     names = ("red", "green", "blue")
@@ -165,6 +169,36 @@ def _first_numbers(column: NDArray[np.generic]) -> NDArray[np.generic]:
 def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:
     """A copy of its own, so that the file's bytes need not stay in memory."""
     return column.reshape(*shape, *column.shape[1:]).copy()
+
+
+def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -> dict[str, NDArray[np.generic]]:
+    """One array per field of the numbers of a text, in the types that the header names.
+
+    A packed colour that is nan says that there is none, as a text does not keep the bits of a nan: it becomes 0, black,
+    and the field is left out where it holds no other.
+
+    Parameters
+    ----------
+    table : (n, m) float64
+        Numbers of each row.
+    fields : (name, dtype, count) of each, whose counts add up to m
+
+    Returns
+    -------
+    dict of field name to (n,) array, (n, c) where the count is above 1
+    """
+    columns: dict[str, NDArray[np.generic]] = {}
+    end = 0
+    for name, dtype, count in fields:
+        first, end = end, end + count
+        numbers = table[:, first] if count == 1 else table[:, first:end]
+        if name.lower() in _PACKED_NAMES and np.dtype(dtype).itemsize == 4 and (none := np.isnan(numbers)).any():
+            if none.all():
+                continue
+            numbers = np.where(none, 0.0, numbers)
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns[name] = numbers.astype(dtype)
+    return columns
 
 
 def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:

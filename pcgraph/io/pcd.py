@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud, cloud_from_columns, numbers_from_text
+from pcgraph.cloud import Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -140,13 +140,12 @@ def _viewpoint(words: list[str]) -> NDArray[np.float64]:
 
 def _ascii_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
     table = numbers_from_text(body, header.n_points, sum(header.counts), header.n_lines + 1)
-    columns: dict[str, NDArray[np.generic]] = {}
+    fields = list(zip(header.names, header.dtypes, header.counts, strict=True))
+    columns = columns_from_text(table, fields)
     first = 0
-    for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
-        with np.errstate(over="ignore", invalid="ignore"):
-            columns[name] = _without_axis(table[:, first : first + count].astype(dtype))
+    for name, dtype, count in fields:
         if dtype.itemsize == 8 and dtype.kind in "iu":
-            columns[name] = _exact(columns[name], body, (first, first + count, sum(header.counts)))
+            columns[name] = _exact(columns[name], body, (first, first + count, table.shape[1]))
         first += count
     return columns
 

@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud, cloud_from_columns, numbers_from_text
+from pcgraph.cloud import Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
 
 _TYPES = {
@@ -135,8 +135,7 @@ def _skip(element: PlyElement, code: str, body: bytes) -> bytes:
 
 def _ascii_columns(element: PlyElement, body: bytes, first_line: int) -> dict[str, NDArray[np.generic]]:
     table = numbers_from_text(body, element.count, len(element.properties), first_line)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return {name: table[:, i].astype(kind) for i, (name, kind) in enumerate(element.properties)}
+    return columns_from_text(table, ((name, kind, 1) for name, kind in element.properties))
 
 
 def _binary_columns(element: PlyElement, code: str, body: bytes) -> dict[str, NDArray[np.generic]]:

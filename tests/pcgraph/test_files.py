@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 
 import numpy as np
@@ -205,6 +206,37 @@ def test_names_of_fields_of_any_language():
         assert_same_columns(read_ply(encode_ply(columns)).columns, dict(list(columns.items())[3:]))
         content = pcd_header("binary", fields="x y z rgb label w").replace(b" w\n", b" " + name + b"\n")
         assert list(read_pcd(content + bytes(6 * 4 * 4)).columns) == [name.decode("latin-1")]
+
+
+def colored_texts(words: list[str], kind: str, name: str) -> list:
+    """Clouds of x, y, z and a packed colour for each word given, as PCD and as PLY of text."""
+    fields = [(axis, "f4", np.ones((len(words), 1))) for axis in "xyz"]
+    fields.append((name, kind, np.full((len(words), 1), 7777)))
+    files = [pcd("ascii", fields, len(words), 1), ply("ascii", fields, len(words))]
+    for word in words:
+        files = [re.sub(rb"7777(\.0)?", word.encode(), content, count=1) for content in files]
+    return [read_pcd(files[0]), read_ply(files[1])]
+
+
+@pytest.mark.parametrize("name", ["rgb", "rgba", "RGB"])
+@pytest.mark.parametrize(("kind", "red"), [("f4", "2.3418052e-38"), ("u4", "16711680"), ("i4", "16711680")])
+def test_packed_colours_of_text_that_are_nan_are_none(kind, red, name):
+    """They were the bits of that number: a dark red, (192, 0, 0)."""
+    for cloud in colored_texts(["nan", red, "NaN", "-nan"], kind, name):
+        assert cloud.colors.tolist() == [[0, 0, 0], [255, 0, 0], [0, 0, 0], [0, 0, 0]]
+    for cloud in colored_texts(["nan", "nan"], kind, name):
+        assert cloud.colors is None
+        assert cloud.columns == {}
+    for cloud in colored_texts([], kind, name):
+        assert cloud.colors.shape == (0, 3)
+
+
+def test_packed_colours_of_bytes_may_be_nan():
+    """Opaque colours with much red are the bits of a nan: PCL keeps them in float32."""
+    packed = np.array([0xFFFF0000, 0xFF800001, 0x7FC00000, 0xFFC01020], np.uint32)
+    assert np.isnan(packed.view(np.float32)).all()
+    cloud = read_pcd(pcd_of({"rgb": packed.view(np.float32)}, "binary"))
+    assert cloud.colors.reshape(-1, 3).tolist() == [[255, 0, 0], [128, 0, 1], [192, 0, 0], [192, 16, 32]]
 
 
 def test_open3d_files_are_read_and_ours_read_back(tmp_path):
