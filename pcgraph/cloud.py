@@ -20,9 +20,10 @@ Columns = Mapping[str, NDArray[np.generic]]
 TextField = tuple[str, DTypeLike, int]
 """Name, type and numbers of each point in a field of a text."""
 
-_NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
-_PACKED_NAMES = ("rgb", "rgba")
-_LABEL_NAMES = ("label", "labels")
+NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
+PACKED_NAMES = ("rgb", "rgba")
+COLOR_NAMES = ("red", "green", "blue")
+LABEL_NAMES = ("label", "labels")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +116,10 @@ def _is_wide(column: NDArray[np.generic]) -> bool:
 
 
 def _color_names(columns: Columns) -> tuple[str, ...]:
-    for name in _PACKED_NAMES:
+    for name in PACKED_NAMES:
         if name in columns and columns[name].dtype.itemsize == 4:
             return (name,)
-    names = ("red", "green", "blue")
-    return names if all(name in columns for name in names) else ()
+    return COLOR_NAMES if all(name in columns for name in COLOR_NAMES) else ()
 
 
 def _colors(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
@@ -147,11 +147,11 @@ def _white(stored: list[NDArray[np.generic]], values: NDArray[np.float64]) -> fl
 
 
 def _normal_names(columns: Columns) -> tuple[str, ...]:
-    return next((names for names in _NORMAL_NAMES if all(name in columns for name in names)), ())
+    return next((names for names in NORMAL_NAMES if all(name in columns for name in names)), ())
 
 
 def _label_name(columns: Columns) -> tuple[str, ...]:
-    return tuple(name for name in _LABEL_NAMES if name in columns and columns[name].dtype.kind in "iu")[:1]
+    return tuple(name for name in LABEL_NAMES if name in columns and columns[name].dtype.kind in "iu")[:1]
 
 
 def _names_by_lower_case(columns: Columns) -> dict[str, str]:
@@ -192,7 +192,7 @@ def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -
     for name, dtype, count in fields:
         first, end = end, end + count
         numbers = table[:, first] if count == 1 else table[:, first:end]
-        if name.lower() in _PACKED_NAMES and np.dtype(dtype).itemsize == 4 and (none := np.isnan(numbers)).any():
+        if name.lower() in PACKED_NAMES and np.dtype(dtype).itemsize == 4 and (none := np.isnan(numbers)).any():
             if none.all():
                 continue
             numbers = np.where(none, 0.0, numbers)

@@ -508,7 +508,8 @@ def test_columns_are_written_back(scene, tmp_path):
     assert np.array_equal(read.columns["seen"], cloud.columns["seen"][finite])
     assert np.array_equal(read.columns["spectrum_2"], cloud.columns["spectrum"][finite, 2])
     assert np.array_equal(read.columns["stamp"], cloud.columns["stamp"][finite].astype(float))
-    assert np.array_equal(read.labels, result.labels[finite])  # the result's own, not the column of that name
+    assert np.array_equal(read.labels, cloud.columns["labels"][finite])  # the column of that name, not the result's own
+    assert np.array_equal(read.columns["segment_labels"], result.labels[finite])
     pcgraph.write_segmentation(tmp_path / "a.npz", cloud, result)
     with np.load(tmp_path / "a.npz") as arrays:
         assert_same_columns({name: arrays[f"column_{name}"] for name in cloud.columns}, cloud.columns)
@@ -523,6 +524,128 @@ def test_a_result_is_read_and_written_again(scene, tmp_path):
     pcgraph.write_segmentation(tmp_path / "b.ply", again, pcgraph.segment(again, voxel_size=0.35))
     twice = pcgraph.read_cloud(tmp_path / "b.ply")
     assert_same_columns({n: twice.columns[n] for n in COLUMNS}, {n: again.columns[n] for n in COLUMNS})
+    second = pcgraph.segment(again, voxel_size=0.5)
+    pcgraph.write_segmentation(tmp_path / "c.ply", twice, second)
+    last = pcgraph.read_cloud(tmp_path / "c.ply")
+    for cloud in (twice, last):  # what the first result said, under its names
+        assert np.array_equal(cloud.colors, again.colors)
+        assert np.array_equal(cloud.labels, again.labels)
+        assert np.array_equal(cloud.columns["supervoxels"], again.columns["supervoxels"])
+    assert np.array_equal(last.columns["segment_labels"], twice.columns["segment_labels"])
+    assert np.array_equal(last.columns["segment2_labels"], second.labels)
+    assert np.array_equal(last.columns["segment2_supervoxels"], second.supervoxels)
+
+
+@pytest.fixture(scope="module")
+def own(scene):
+    """The scene with colours, normals and labels of its own, and where they are finite."""
+    rng, n = np.random.default_rng(5), len(scene[0].points)
+    colors, labels = rng.integers(0, 256, (n, 3), np.uint8), rng.integers(-2, 2**31 - 1, n, np.int32)
+    normals = rng.standard_normal((n, 3)).astype(np.float32)
+    return pcgraph.Cloud(scene[0].points, colors, normals, labels), np.isfinite(scene[0].points[:, 0])
+
+
+def assert_kept(read, cloud, finite):
+    assert np.array_equal(read.colors, cloud.colors[finite])
+    assert np.array_equal(read.normals, cloud.normals[finite])
+    assert read.normals.dtype == cloud.normals.dtype
+    assert np.array_equal(read.labels, cloud.labels[finite])
+
+
+def test_colours_normals_and_labels_of_the_file_are_kept(scene, own, tmp_path):
+    """They were dropped, and the result's labels stood in the place of the file's."""
+    (cloud, finite), result = own, scene[1]
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert_kept(read, cloud, finite)
+    names = ["segment_red", "segment_green", "segment_blue", "segment_labels", "supervoxels"]
+    assert list(read.columns) == names
+    pcgraph.write_segmentation(tmp_path / "plain.ply", cloud.points, result)
+    plain = pcgraph.read_cloud(tmp_path / "plain.ply")  # of points alone: under the short names
+    assert np.array_equal(plain.colors, np.stack([read.columns[name] for name in names[:3]], axis=1))
+    assert np.array_equal(plain.labels, result.labels[finite])
+    assert np.array_equal(read.columns["segment_labels"], plain.labels)
+    pcgraph.write_segmentation(tmp_path / "a.npz", cloud, result)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.array_equal(arrays["cloud_colors"], cloud.colors)
+        assert np.array_equal(arrays["cloud_normals"], cloud.normals)
+        assert np.array_equal(arrays["cloud_labels"], cloud.labels)
+        assert np.array_equal(arrays["labels"], result.labels)
+    pcgraph.write_segmentation(tmp_path / "plain.npz", cloud.points, result)
+    with np.load(tmp_path / "plain.npz") as arrays:
+        assert not [name for name in arrays if name.startswith("cloud_")]
+
+
+@pytest.mark.parametrize("kept", ["colors", "normals", "labels"])
+def test_only_what_the_file_has_changes_the_names(kept, scene, own, tmp_path):
+    (cloud, finite), result = own, scene[1]
+    pcgraph.write_segmentation(tmp_path / "a.ply", pcgraph.Cloud(cloud.points, **{kept: getattr(cloud, kept)}), result)
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert np.array_equal(getattr(read, kept), getattr(cloud, kept)[finite])
+    assert ("segment_red" in read.columns) == (kept == "colors")
+    assert ("segment_labels" in read.columns) == (kept == "labels")
+    assert np.array_equal(read.columns["segment_labels"] if kept == "labels" else read.labels, result.labels[finite])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("red", "Green", "blue"),  # beside packed colours
+        ("red",),
+        ("rgba",),
+        ("nx", "ny", "nz"),  # beside normal_x and so on
+        ("normal_x", "normal_z"),
+        ("labels",),
+        ("supervoxels",),
+        ("segment_red", "segment_labels", "segment_supervoxels"),
+    ],
+)
+def test_columns_of_the_names_that_a_result_has_are_kept(names, scene, own, tmp_path):
+    (cloud, finite), result = own, scene[1]
+    columns = {name: np.arange(len(finite), dtype=np.int32) + i for i, name in enumerate(names)}
+    cloud = pcgraph.Cloud(cloud.points, cloud.colors, cloud.normals, cloud.labels, columns=columns)
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert_kept(read, cloud, finite)
+    assert_same_columns({name: read.columns[name] for name in names}, {n: v[finite] for n, v in columns.items()})
+    ours = "segment2_labels" if "segment_labels" in names else "segment_labels"
+    assert np.array_equal(read.columns[ours], result.labels[finite])
+    ours = {"supervoxels": "segment_supervoxels"}.get(names[0], "supervoxels")
+    assert np.array_equal(read.columns[ours], result.supervoxels[finite])
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "f16"])
+def test_colours_and_normals_of_any_float_and_labels_of_any_integer(dtype, scene, own, tmp_path):
+    (cloud, finite), result = own, scene[1]
+    shades, labels = (cloud.colors / 255).astype(dtype), np.arange(len(finite))
+    pcgraph.write_segmentation(
+        tmp_path / "a.ply", pcgraph.Cloud(cloud.points, shades, cloud.normals.astype(dtype), labels), result
+    )
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert np.array_equal(read.colors, cloud.colors[finite])
+    assert np.array_equal(read.normals, cloud.normals[finite].astype(dtype))
+    assert read.labels.dtype == np.int32
+    assert np.array_equal(read.labels, labels[finite])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"colors": np.zeros((2799, 3), np.uint8)}, r"cloud's colors in the shape \(2800, 3\), got \(2799, 3\)"),
+        ({"normals": np.zeros((2800, 4))}, r"cloud's normals in the shape \(2800, 3\), got \(2800, 4\)"),
+        ({"labels": np.zeros((2800, 1), int)}, r"cloud's labels in the shape \(2800,\), got \(2800, 1\)"),
+        ({"colors": np.full((2800, 3), 1.5)}, "colors as uint8 or as floats within 0..1, got float64"),
+        ({"colors": np.zeros((2800, 3), int)}, "colors as uint8 or as floats within 0..1, got int64"),
+        ({"normals": np.zeros((2800, 3), int)}, "normals as floats, got int64"),
+        ({"labels": np.full(2800, 1 << 40)}, "cloud's own labels: expected labels of 32 bits"),
+        ({"labels": np.full(2800, np.nan)}, "cloud's own labels: expected labels as whole numbers"),
+    ],
+)
+@pytest.mark.parametrize("file", ["a.ply", "a.npz"])
+def test_colours_normals_and_labels_that_cannot_be_written(arrays, message, file, scene, tmp_path):
+    with pytest.raises(pcgraph.CloudWriteError, match=message):
+        pcgraph.write_segmentation(tmp_path / file, pcgraph.Cloud(scene[0].points, **arrays), scene[1])
+    assert not list(tmp_path.iterdir())
 
 
 def test_columns_of_any_language_are_written_back(scene, tmp_path):
