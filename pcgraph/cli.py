@@ -111,7 +111,8 @@ def segment(
     """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.
 
     Writes NAME.segments.ply (points coloured by object, with labels and supervoxels) and NAME.segments.npz
-    (labels in the input's shape, graph and tree).
+    (labels in the input's shape, graph and tree). What the file says of its points is kept under its names: beside
+    colours and labels of its own, the result's are called segment_red and so on, and segment_labels.
 
     Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
     """
@@ -122,10 +123,10 @@ def segment(
             raise ValueError("expected --objects or --altitude, got both: choose one")
         if seed_size is not None and supervoxels is not None:
             raise ValueError("expected --seed-size or --supervoxels, got both: choose one")
-        read = _read(cloud, color)
+        read = pcgraph.read_cloud(cloud)
         result = _segmented(
             cloud,
-            read,
+            read if color else replace(read, colors=None),
             viewpoint=viewpoint,
             features=features or None,
             voxel_size=voxel_size,
@@ -187,11 +188,6 @@ def _check_targets(targets: list[Path]) -> None:
         raise CloudWriteError(f"cannot create the folder {targets[0].parent}: {above} is a file; choose another --out")
     if not os.access(above, os.W_OK | os.X_OK):
         raise CloudWriteError(f"cannot write to {above}: permission denied; choose another --out")
-
-
-def _read(path: Path, color: bool) -> Cloud:
-    cloud = pcgraph.read_cloud(path)
-    return cloud if color else replace(cloud, colors=None)
 
 
 def _linkage(name: str) -> Linkage:

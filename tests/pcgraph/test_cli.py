@@ -59,6 +59,19 @@ def test_number_of_objects_and_one_file(scene, tmp_path):
     assert len(np.unique(pcgraph.read_cloud(tmp_path / "a.ply").labels)) == 7
 
 
+def test_colours_that_are_not_used_are_kept(tmp_path):
+    points, _, _ = two_boxes_on_a_plane()
+    shades = np.random.default_rng(2).integers(0, 256, (len(points), 3), np.uint8)
+    columns = {name: points[:, i] for i, name in enumerate("xyz")}
+    columns |= {name: shades[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    (tmp_path / "a.ply").write_bytes(encode_ply(columns))
+    done = run(tmp_path / "a.ply", "--out", tmp_path / "b.ply", "--no-color", *VIEW)
+    assert done.exit_code == 0, done.output
+    read = pcgraph.read_cloud(tmp_path / "b.ply")
+    assert np.array_equal(read.colors, shades)
+    assert np.array_equal(read.labels, pcgraph.segment(points, viewpoint=(0.8, -1, 3)).labels)
+
+
 @pytest.mark.parametrize("points", [[[1, 2, 3]], [[1, 2, 3], [4, 5, 6]], np.ones((9, 3))])
 def test_few_points_work(points, tmp_path):
     path = tmp_path / "few.ply"
