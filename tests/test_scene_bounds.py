@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import rangesim
 from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import write_grey
@@ -355,3 +356,53 @@ def test_a_bitmap_without_a_file_is_refused() -> None:
     }
     with pytest.raises(FileFormatError, match="expected a filename, found none"):
         load_scene(scene)
+
+
+HOT = {"type": "blackbody", "temperature": 3000.0}
+CHECKS = {"type": "checkerboard"}
+WITHOUT_A_BAND: dict[str, tuple[Any, str]] = {
+    "blackbody sky": (lambda: ball() | {"light": {"type": "constant", "radiance": HOT}}, "'blackbody'"),
+    "blackbody lamp": (lambda: ball(glow={"type": "area", "radiance": HOT}), "'blackbody' needs a spectrum"),
+    "blackbody paint": (lambda: ball({"type": "diffuse", "reflectance": HOT}), "'blackbody' needs a spectrum"),
+    "hair": (lambda: ball({"type": "hair"}), "'hair' needs a spectrum"),
+    "nested hair": (lambda: ball({"type": "mask", "opacity": 0.5, "b": {"type": "hair"}}), "'hair' needs a spectrum"),
+    "regular": (
+        lambda: ball({"type": "diffuse", "reflectance": {"type": "regular", "wavelength_min": 400.0,
+                      "wavelength_max": 900.0, "values": "0.5,0.6"}}),
+        "'regular' needs a spectrum",
+    ),
+    "irregular": (
+        lambda: ball(glow={"type": "area", "radiance": {"type": "irregular", "wavelengths": "400,900",
+                           "values": "0.5,0.6"}}),
+        "'irregular' needs a spectrum",
+    ),
+    "bumps of checks": (
+        lambda: ball({"type": "bumpmap", "t": CHECKS, "b": {"type": "diffuse"}}), "expected a texture with slopes"
+    ),
+    "normals of checks": (
+        lambda: ball({"type": "normalmap", "normalmap": CHECKS, "b": {"type": "diffuse"}}),
+        "expected a texture with three channels",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WITHOUT_A_BAND)
+def test_what_needs_a_spectrum_is_refused_at_load_and_breaks_no_other_scene(case: str) -> None:
+    good = load_scene(ball())
+    rig = good.rig(width=16)
+    before = rangesim.transport(good, rig, [], spp=1, seed=1).energy.direct
+    make, message = WITHOUT_A_BAND[case]
+    with pytest.raises(FileFormatError, match=message) as kept:
+        load_scene(make())
+    assert kept.value is not None  # alive, with all that its traceback holds
+    np.testing.assert_array_equal(rangesim.transport(good, rig, [], spp=1, seed=1).energy.direct, before)
+    assert before.max() > 0
+
+
+def test_a_loaded_object_that_needs_a_spectrum_is_refused_too() -> None:
+    load_scene(ball())  # selects the variant
+    for plugin, message in (({"type": "hair"}, "'hair' needs a spectrum"), (HOT, "'blackbody' needs a spectrum")):
+        loaded = mi.load_dict(plugin)
+        paint = loaded if plugin is not HOT else {"type": "diffuse", "reflectance": loaded}
+        with pytest.raises(FileFormatError, match=message):
+            load_scene(ball(paint))

@@ -38,7 +38,14 @@ from rangesim.scene.origin import (
     warn_of_coarse_transform,
     warn_of_loaded_camera,
 )
-from rangesim.scene.properties import PLUGINS, check_depth, check_dictionary, check_properties, check_vertices
+from rangesim.scene.properties import (
+    PLUGINS,
+    check_depth,
+    check_dictionary,
+    check_evaluable,
+    check_properties,
+    check_vertices,
+)
 from rangesim.scene.scene import Instance, Scene
 from rangesim.scene.spectral_reflectance import (
     coloured_materials,
@@ -134,6 +141,7 @@ def _instantiate(
         ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
         take_sensor_reflectances(state, label)
         check_properties(state, label)
+        check_evaluable(state, label)
         return state, ids, classes
 
     def made_of(state: Any) -> Any:

@@ -48,6 +48,11 @@ def is_cutout(bsdf: Any) -> bool:
     return holes(bsdf) != 0
 
 
+def is_closed_mask(bsdf: Any) -> bool:
+    """Whether the surface is a `mask` whose opacity is 1 everywhere, over what lets nothing through unchanged."""
+    return bool(bsdf.class_name() == "MaskBSDF" and not _has_thin_glass(bsdf) and _numbers(bsdf).get("opacity") == 1)
+
+
 def holes(bsdf: Any) -> int:
     """Bits of the components of a mitsuba.BSDF that are holes: light passes there as if nothing were there."""
     if not _has(bsdf, "Null"):

@@ -65,6 +65,28 @@ NOT_OF_MEDIA = ("sigma_a", "sigma_s", "material")
 """Ways to state a medium that Mitsuba 3.9 does not know, and says nothing about."""
 BITMAP_SOURCES = ("filename", "bitmap", "data")
 """What a bitmap texture may be made of; without any, Mitsuba 3.9 crashes."""
+FAIL_IN_ONE_BAND = {
+    "blackbody": "give the emission at the sensor's wavelength as a number",
+    "regular": "give the value at the sensor's wavelength as a number",
+    "irregular": "give the value at the sensor's wavelength as a number",
+    "hair": "give a roughplastic, principled or diffuse BSDF instead",
+}
+"""Plugins that load but cannot be evaluated without a spectrum, and what to do.
+
+One of them stops the light transport of every scene that is in memory at the same time.
+"""
+LOADED_CLASSES = {
+    "BlackBodySpectrum": "blackbody",
+    "RegularSpectrum": "regular",
+    "IrregularSpectrum": "irregular",
+    "Hair": "hair",
+}
+"""The plugin of a loaded object, by the name of its class."""
+TEXTURES_WITHOUT = {
+    "bumpmap": ("slopes", ("checkerboard", "mesh_attribute", "rawconstant", "srgb", "volume")),
+    "normalmap": ("three channels", ("checkerboard",)),
+}
+"""What the map of a BSDF needs, and the textures of Mitsuba 3.9 that do not have it and stop the light transport."""
 PLUGINS = Path(mi.__file__).resolve().parent / "plugins"
 """Where the plugins that come with Mitsuba are."""
 LIBRARIES = (".so", ".dylib", ".dll")
@@ -135,6 +157,27 @@ def check_plugin(name: str, label: str) -> None:
                 f"{label}: type {shown(name)} is no plugin of Mitsuba, and native code beside a scene is not run; "
                 f"remove {found.name} or use another type."
             )
+
+
+def check_evaluable(state: Any, label: str) -> None:
+    """Raise FileFormatError if a node would load, but not be evaluated with the one band of the light transport."""
+    parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
+    for index, node in enumerate(state.nodes):
+        names = [node.props.plugin_name()]
+        names += [LOADED_CLASSES.get(value.class_name(), "") for value in _loaded(node)]
+        for name in names:
+            if name in FAIL_IN_ONE_BAND:
+                raise FileFormatError(
+                    f"{label}: {_place(state, parents, index)}: {name!r} needs a spectrum, and the light has one band, "
+                    f"that of the sensor; {FAIL_IN_ONE_BAND[name]}."
+                )
+        need, lacking = TEXTURES_WITHOUT.get(node.props.plugin_name(), ("", ()))
+        for _, value in _references(node):
+            if (kind := state.nodes[value.index()].props.plugin_name()) in lacking:
+                raise FileFormatError(
+                    f"{label}: {_place(state, parents, index)}: expected a texture with {need}, got {kind!r}; "
+                    "give a bitmap instead."
+                )
 
 
 def check_properties(state: Any, label: str) -> None:
@@ -301,6 +344,11 @@ def _children(node: Any, by_id: dict[str, int]) -> list[int]:
 
 def _references(node: Any) -> Iterator[tuple[str, Any]]:
     return ((key, value) for key, value in node.props.items() if isinstance(value, mi.Properties.ResolvedReference))
+
+
+def _loaded(node: Any) -> Iterator[Any]:
+    """Mitsuba objects among the properties of a node, which a dictionary may hold in place of a description."""
+    return (value for _, value in node.props.items() if isinstance(value, (mi.BSDF, mi.Texture)))
 
 
 def _place(state: Any, parents: dict[int, int], index: int) -> str:

@@ -16,6 +16,8 @@ import mitsuba as mi
 
 from rangesim.errors import FileFormatError, warn
 from rangesim.files.image_files import is_coloured
+from rangesim.scene.materials import is_closed_mask
+from rangesim.scene.media import is_boundary
 from rangesim.settings.config import shown
 
 REFLECTANCE_KEY = "sensor_reflectance"
@@ -71,16 +73,24 @@ def warn_of_colours(names: list[str], label: str) -> None:
 
 
 def warn_of_lamps_behind_glass(scene: Any, label: str) -> None:
-    """Warn once if there are lamps without extent, and glass that keeps paths from them."""
+    """Warn once if there are lamps without extent, and clear surfaces or holes that keep paths from them."""
     without_extent = mi.EmitterFlags.DeltaPosition.value | mi.EmitterFlags.DeltaDirection.value
-    glass = mi.BSDFFlags.DeltaTransmission
-    if any(e.flags() & without_extent for e in scene.emitters()) and any(
-        mi.has_flag(shape.bsdf().flags(), glass) for shape in scene.shapes()
-    ):
+    if any(e.flags() & without_extent for e in scene.emitters()) and any(map(_hides_lamps, scene.shapes())):
         warn(
-            f"{label}: light of directional, point and spot emitters does not pass glass and is missing behind it; "
-            "give the lamp an extent (an area emitter, an envmap)."
+            f"{label}: light of directional, point and spot emitters does not pass glass or holes (mask, null) and is "
+            "missing behind it; give the lamp an extent (an area emitter, an envmap)."
         )
+
+
+def _hides_lamps(shape: Any) -> bool:
+    """Whether light passes a shape that a straight line to a lamp does not: through glass, thin glass or holes.
+
+    Boundaries of media are passed on the way to a lamp (`rangesim.light_transport.scattering`).
+    """
+    bsdf = shape.bsdf()
+    if mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission):
+        return True
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_boundary(shape) and not is_closed_mask(bsdf)
 
 
 def _coloured(state: Any) -> Iterator[str]:
