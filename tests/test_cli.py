@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -359,3 +360,16 @@ def test_names_of_directories_give_no_orders_to_a_terminal(command: Command, tmp
     )
     answer = command("verify", place)
     assert answer.out.startswith(f"{tmp_path}/a\\u001b[2J\\u202e\\nb: all ")
+
+
+@pytest.mark.parametrize(
+    "poses", [[], 3, "x", None, {"T_world_camera": 5}, [[1, 2]], [[[float("nan")] * 4] * 4], [[[2.0] * 4] * 4]]
+)
+def test_a_wrong_list_of_poses_is_named(tmp_path: Path, poses: Any) -> None:
+    from rangesim.cli.scan import _path
+    from rangesim.fusion.paths import Dome
+
+    place = tmp_path / "poses.json"
+    place.write_text(json.dumps(poses))
+    with pytest.raises(ValueError, match=re.escape(f"{place}: expected ")):
+        _path(Dome(), str(place), None)

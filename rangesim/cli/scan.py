@@ -120,7 +120,10 @@ def _path(before: ScanPath, name: str | None, views: int | None) -> ScanPath:
         data = read_json(Path(name))
         if isinstance(data, dict) and "T_world_camera" not in data:
             raise ValueError(f"{name}: expected a list of poses, or the key 'T_world_camera', got {shown(list(data))}.")
-        return PoseList(data["T_world_camera"] if isinstance(data, dict) else data)
+        try:
+            return PoseList(data["T_world_camera"] if isinstance(data, dict) else data)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
     if name is not None and name not in PATHS:
         raise ValueError(
             f"expected --path out of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
