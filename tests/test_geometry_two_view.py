@@ -358,6 +358,42 @@ def test_chance_is_no_scene() -> None:
             find_relative_pose(a, b, K, K, NOISE)
 
 
+def plane_and_more(seed: int, n: int, off: int) -> tuple[np.ndarray, np.ndarray]:
+    """n noisy pairs, all but `off` of one plane."""
+    random = np.random.default_rng(seed)
+    X = points(random, n, plane=True)
+    X[:off] = points(random, off)
+    a, b = project(FIRST, X), project(SECOND, X)
+    return a + random.normal(0, NOISE, a.shape), b + random.normal(0, NOISE, b.shape)
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["noise known", "noise unknown"])
+@pytest.mark.parametrize("n", [12, 30, 80, 400])
+def test_a_plane_and_one_point_off_it_leave_the_epipole_open(n: int, known: bool) -> None:
+    """Its line of epipoles is a family of F; a fifth of them passed, with epipoles 75 degrees off."""
+    for seed in range(30):
+        with pytest.raises(ValueError, match="expected"):
+            fit_fundamental(*plane_and_more(seed, n, 1), noise_px=NOISE if known else None)
+
+
+@pytest.mark.parametrize(("n", "off", "fewest"), [(12, 2, 8), (80, 2, 4), (400, 2, 6), (30, 3, 16), (80, 30, 30)])
+def test_a_plane_and_some_points_off_it_are_as_exact_as_their_covariance_or_refused(
+    n: int, off: int, fewest: int
+) -> None:
+    found = []
+    for seed in range(30):
+        try:
+            fit = fit_fundamental(*plane_and_more(seed, n, off), noise_px=NOISE)
+        except ValueError:
+            continue
+        values, axes = np.linalg.eigh(fit.covariance)
+        error = (alike(fit.matrix, F) - F).ravel() @ axes[:, -7:] / np.sqrt(values[-7:])
+        found.append(np.sqrt((error**2).mean()))
+    assert len(found) >= fewest
+    assert max(found) < 2.5
+    assert np.median(found) < 1.5
+
+
 def test_a_surface_through_both_centres_is_refused() -> None:
     """A ruled quadric that contains the centres and the points leaves F open (HZ 22.2)."""
     random = np.random.default_rng(14)
