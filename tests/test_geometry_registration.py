@@ -136,6 +136,26 @@ def test_plates_with_their_waves_across_each_other_are_refused(turn: float, seed
     assert icp(source, target, TRUE).agreement > 0.85
 
 
+@pytest.mark.parametrize(("pitch", "studs"), [(0.02, 12), (0.03, 8)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_guess_off_by_one_stud_of_many_is_refused(pitch: float, studs: int, seed: int) -> None:
+    """A prism with studs in a row; from half a pitch the right pose is found, from one and more the next one fits."""
+
+    def prism(random: np.random.Generator, n: int) -> np.ndarray:
+        row = (np.arange(studs) - (studs - 1) / 2) * pitch
+        parts = [box(random, n // 2 // studs, (0.008, 0.008, 0.02), (x, 0.01, 0.03)) for x in row]
+        return np.concatenate([box(random, n // 2, (0.3, 0.06, 0.05)), *parts])
+
+    source, target = pair(prism, 2e-4, n=6000, seed=seed)
+    for steps in (-1.5, 1.0, 1.5):
+        with pytest.raises(ValueError, match=r"one way, got two poses 0 degrees and 0\.0"):
+            icp(source, target, rigid((0.01, 0, 0.02), (steps * pitch, 0.001, 0.002)) @ TRUE)
+    for steps in (0.0, 0.4):
+        found = icp(source, target, rigid((0.01, 0, 0.02), (steps * pitch, 0.001, 0.002)) @ TRUE)
+        assert off(found)[0] < 0.2
+        assert off(found)[1] < 2e-4
+
+
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_a_part_of_another_scale_is_refused(scale: float) -> None:
     source, target = pair(part, 3e-4, n=2000)

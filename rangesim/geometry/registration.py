@@ -44,6 +44,8 @@ Of right poses 0.47 to 0.96, but 0.37 of a scan ten times as dense as the target
 -0.1 to 0.44 of corrugated plates that lie askew and of parts 5 or 10 % off in scale (measured)."""
 FAR_EXTENTS = 5.0
 """Clouds further than this from the origin, in units of their extent, are moved there before they are solved."""
+SLIDE_SPACINGS, MAX_SLIDES = 6.0, 6
+"""Steps, and how many to either side, by which a result of `icp` is slid along the surface to look for others."""
 AS_GOOD = 0.95
 """Fraction of the best agreement at which another pose fits alike."""
 
@@ -82,7 +84,7 @@ def icp(
     Minimises the distances of source points to the tangent planes of their nearest target points, within a distance
     that is halved from `max_distance_m` to 1.5 spacings of the target; then again from half of it, a quarter and so
     on. The result that agrees best counts: a large distance reaches far, but pulls clouds that overlap in part over
-    each other.
+    each other. It is slid along the surface, then, to see whether it fits there as well: by one rib of many.
 
     Parameters
     ----------
@@ -111,6 +113,7 @@ def icp(
     _refuse_failure(found, min_fitness, "start nearer to the right pose, with a larger max_distance_m, or by register")
     _refuse_disagreement(found, moving, surface)
     _refuse_others(found, results, moving, surface)
+    _refuse_slid(found, start, moving, surface, surface.halved(max_distance_m)[0])
     return replace(found, T_target_source=middles.from_middles(found.T_target_source))
 
 
@@ -290,6 +293,42 @@ def _refuse_disagreement(found: Registration, source: Array, surface: _Surface) 
         )
 
 
+def _refuse_slid(found: Registration, guess: Array, source: Array, surface: _Surface, reach: float) -> None:
+    """Raise ValueError where the source, slid along the surface, comes to lie as well, or better beyond the reach.
+
+    It is slid in the two directions in which the surface holds it least, by up to twice the reach: a guess that is off
+    by one rib of many ends at a neighbour of the right one.
+    """
+    T = found.T_target_source
+    few = source[np.random.default_rng(0).permutation(len(source))[:COMPARED_POINTS]]
+    best = _judged(few, surface, T)
+    if best.agreement <= 0:  # noise above the spacing: without a partner a point agrees better
+        return
+    moved = few @ T[:3, :3].T + T[:3, 3]
+    distance, partner = surface.tree.query(moved, distance_upper_bound=PARTNER_SPACINGS * surface.spacing)
+    n = np.asarray(surface.cloud.normals)[partner[np.isfinite(distance)]]
+    steps = min(MAX_SLIDES, int(np.ceil(2 * reach / (SLIDE_SPACINGS * surface.spacing))))
+    others = []
+    for axis in np.linalg.eigh(n.T @ n)[1].T[:2]:
+        for part in np.arange(-steps, steps + 1) / steps:
+            slid = T.copy()
+            slid[:3, 3] += 2 * part * reach * axis
+            if part:
+                others.append(_refined(few, surface, slid, SLIDE_SPACINGS * surface.spacing))
+    given = _judged(few, surface, guess)
+    _refuse_others(
+        best,
+        [
+            other
+            for other in others
+            if other.fitness >= AS_GOOD * best.fitness
+            and (other.agreement > best.agreement / AS_GOOD or _distance(given, other, few) <= reach)
+        ],
+        few,
+        surface,
+    )
+
+
 def _roughness(points: Array, spacing: float) -> float:
     """Distance in metres of neighbours along the normals of their cloud, thinned to a spacing: noise, or curvature."""
     import open3d as o3d
@@ -312,7 +351,7 @@ def _refuse_others(best: Registration, tried: list[Registration], source: Array,
             angle = np.degrees(Rotation.from_matrix(relative[:3, :3]).magnitude())
             raise ValueError(
                 f"expected clouds that fit in one way, got two poses {angle:.0f} degrees and "
-                f"{_distance(best, other, source):.3g} m apart that fit alike (agreement {best.agreement:.3f} and "
+                f"{_distance(best, other, source):.3g} m apart that both fit (agreement {best.agreement:.3f} and "
                 f"{other.agreement:.3f}): what both clouds show is symmetric, or too little; scan with more overlap, "
                 "or give icp a nearer guess and a smaller max_distance_m."
             )
