@@ -39,7 +39,6 @@ from rangesim.scene.origin import (
     warn_of_loaded_camera,
 )
 from rangesim.scene.properties import (
-    PLUGINS,
     check_depth,
     check_dictionary,
     check_evaluable,
@@ -183,7 +182,6 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
     resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
-    resolver.prepend(str(PLUGINS.parent))  # type: ignore[attr-defined]  # no plugin of a scene goes first
     try:
         check_xml(path, resolve=lambda name: Path(str(mi.file_resolver().resolve(name))))
     except FileFormatError as error:
@@ -195,9 +193,7 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
 def _own_file_resolver() -> Iterator[None]:
     """Search paths of this scene, forgotten afterwards, so that no scene finds another's files."""
     before = mi.file_resolver()
-    own = mi.FileResolver(before)
-    own.prepend(str(PLUGINS.parent))  # type: ignore[attr-defined]  # no plugin of the working directory goes first
-    mi.set_file_resolver(own)
+    mi.set_file_resolver(mi.FileResolver(before))
     try:
         yield
     finally:

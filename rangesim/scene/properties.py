@@ -7,8 +7,6 @@ Mitsuba takes most numbers as they come; a reflectance of 2 or a radius of NaN s
 from __future__ import annotations
 
 import math
-import os
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -87,10 +85,6 @@ TEXTURES_WITHOUT = {
     "normalmap": ("three channels", ("checkerboard",)),
 }
 """What the map of a BSDF needs, and the textures of Mitsuba 3.9 that do not have it and stop the light transport."""
-PLUGINS = Path(mi.__file__).resolve().parent / "plugins"
-"""Where the plugins that come with Mitsuba are."""
-LIBRARIES = (".so", ".dylib", ".dll")
-"""Suffixes of native code on Linux, macOS and Windows."""
 FLOAT_IMAGES = (".exr", ".pfm", ".hdr", ".rgbe")
 """Texture files whose values may lie outside 0..1."""
 
@@ -136,48 +130,6 @@ def check_dictionary(scene: Any, label: str) -> None:
                 raise FileFormatError(f"{label}: expected {name} to be a value of 64 bits, got {shown(value)}.")
             if not isinstance(key, str):
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
-            if key == "type" and isinstance(value, str):
-                check_plugin(value, label)
-
-
-def check_plugin(name: str, label: str) -> None:
-    """Raise FileFormatError if Mitsuba would run native code from outside itself for a plugin of this name.
-
-    Mitsuba loads `plugins/NAME.so` from wherever its file resolver finds it: from the folder of a scene, too. What is
-    registered in Python has no such file.
-    """
-    if re.fullmatch(r"[A-Za-z0-9_-]*", name) is None:
-        raise FileFormatError(
-            f"{label}: expected a type to be the plain name of a plugin of Mitsuba, got {shown(name)}."
-        )
-    for suffix in LIBRARIES:
-        found = Path(str(mi.file_resolver().resolve(f"plugins/{name}{suffix}")))
-        if os.path.lexists(found) and found.resolve().parent != PLUGINS:
-            raise FileFormatError(
-                f"{label}: type {shown(name)} is no plugin of Mitsuba, and native code beside a scene is not run; "
-                f"remove {found.name} or use another type."
-            )
-
-
-def check_evaluable(state: Any, label: str) -> None:
-    """Raise FileFormatError if a node would load, but not be evaluated with the one band of the light transport."""
-    parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
-    for index, node in enumerate(state.nodes):
-        names = [node.props.plugin_name()]
-        names += [LOADED_CLASSES.get(value.class_name(), "") for value in _loaded(node)]
-        for name in names:
-            if name in FAIL_IN_ONE_BAND:
-                raise FileFormatError(
-                    f"{label}: {_place(state, parents, index)}: {name!r} needs a spectrum, and the light has one band, "
-                    f"that of the sensor; {FAIL_IN_ONE_BAND[name]}."
-                )
-        need, lacking = TEXTURES_WITHOUT.get(node.props.plugin_name(), ("", ()))
-        for _, value in _references(node):
-            if (kind := state.nodes[value.index()].props.plugin_name()) in lacking:
-                raise FileFormatError(
-                    f"{label}: {_place(state, parents, index)}: expected a texture with {need}, got {kind!r}; "
-                    "give a bitmap instead."
-                )
 
 
 def check_properties(state: Any, label: str) -> None:
@@ -185,8 +137,6 @@ def check_properties(state: Any, label: str) -> None:
 
     The message names the node and the property: 'shape "ball": expected radius to be positive and finite, got nan'.
     """
-    for node in state.nodes:
-        check_plugin(node.props.plugin_name(), label)
     parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
     for index, node in enumerate(state.nodes):
         bounds = PROPERTIES.get(node.type.name, {})
