@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -20,6 +21,7 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import write_grey
 from rangesim.scene import load_scene
+from rangesim.scene.nodes import check_type, shipped_types
 
 CAMERA: dict[str, Any] = {
     "type": "perspective",
@@ -355,3 +357,95 @@ def test_a_bitmap_without_a_file_is_refused() -> None:
     }
     with pytest.raises(FileFormatError, match="expected a filename, found none"):
         load_scene(scene)
+
+
+# ---- Native code ---------------------------------------------------------------------------------------------------
+
+
+def library(folder: Path) -> tuple[Path, Path]:
+    """A library that does nothing but write a file when it is loaded, and the path of that file."""
+    compiler = shutil.which("cc")
+    if compiler is None or sys.platform != "linux":
+        pytest.skip("needs a C compiler, on Linux")
+    mark, source, target = folder / "it-ran", folder / "mark.c", folder / "mark.so"
+    source.write_text(
+        "#include <stdio.h>\n__attribute__((constructor)) static void mark(void)"
+        f'{{ FILE *file = fopen("{mark}", "w"); if (file) fclose(file); }}\n'
+    )
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", target, source], check=True)
+    return target, mark
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "plugins/evil", "/tmp/evil", "evil.so", "a b", "..", "a\\b", "diffuse.", "é", "a" * 5000, "a\0"]
+)
+def test_a_plugin_type_is_a_plain_name(name: str) -> None:
+    with pytest.raises(FileFormatError, match="expected types of plugins that come with Mitsuba") as caught:
+        load_scene(ball({"type": name}))
+    assert len(str(caught.value)) < 400
+
+
+def test_plugin_types_of_mitsuba_and_of_python_pass() -> None:
+    assert {"diffuse", "ply", "hdrfilm", "perspective"} <= shipped_types()
+    for name in ("diffuse", "retroreflector", "rgb", "my_bsdf"):
+        check_type(name, "the scene")
+    paint = {"type": "retroreflector", "nested": {"type": "conductor"}}
+    assert load_scene(ball(paint)).instances[0].name == "ball"
+
+
+@pytest.mark.parametrize("form", ["xml", "parameter", "include", "path", "texture", "dictionary", "cwd"])
+def test_a_scene_brings_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str) -> None:
+    """Mitsuba takes plugins/TYPE.so from beside the scene, or from the working directory."""
+    code, mark = library(tmp_path)
+    home = tmp_path / "home"
+    (home / "plugins").mkdir(parents=True)
+    name = f"brought_{form}"  # Mitsuba keeps a library that it has loaded
+    shutil.copy(code, home / "plugins" / f"{name}.so")
+    paint, before = f'<bsdf type="{name}"/>', ""
+    path = home / "a.xml"
+    if form == "parameter":
+        before, paint = f'<default name="kind" value="{name}"/>', '<bsdf type="$kind"/>'
+    if form == "include":
+        (home / "b.xml").write_text(f'<scene version="3.0.0"><bsdf id="paint" type="{name}"/></scene>')
+        before, paint = '<include filename="b.xml"/>', '<ref id="paint"/>'
+    if form == "path":
+        before, path = '<path value="home"/>', tmp_path / "a.xml"
+    if form == "texture":
+        paint = f'<bsdf type="diffuse"><texture name="reflectance" type="{name}"/></bsdf>'
+    path.write_text(
+        f'<scene version="3.0.0">{before}{XML_CAMERA}<shape type="sphere" id="ball">{paint}</shape></scene>'
+    )
+    if form in ("dictionary", "cwd"):
+        monkeypatch.chdir(home)
+    with pytest.raises(FileFormatError, match=f"got '{name}'.*; a scene may bring no library of its own"):
+        load_scene(ball({"type": name}) if form == "dictionary" else path)
+    assert not mark.exists()
+
+
+def test_libraries_named_as_mitsubas_own_are_not_run(tmp_path: Path) -> None:
+    """Beside a scene and in the working directory, for every form of a scene, and for the estimate of a run."""
+    code, mark = library(tmp_path)
+    (tmp_path / "plugins").mkdir()
+    for name in shipped_types():
+        (tmp_path / "plugins" / f"{name}.so").symlink_to(code)
+    (tmp_path / "a.xml").write_text(
+        f'<scene version="3.0.0"><path value="."/>{XML_CAMERA}<shape type="sphere" id="ball"/></scene>'
+    )
+    (tmp_path / "b.obj").write_bytes(MESHES["good.obj"][0])
+    script = f"""
+import sys
+import rangesim
+from rangesim.cli import main
+print([i.name for i in rangesim.load_scene("a.xml").instances], len(rangesim.load_scene("b.obj").instances))
+print([i.name for i in rangesim.load_scene({ball()}).instances])
+sys.argv = ["rangesim", "run", "--estimate", "tabletop", "--out", "out"]
+main()
+"""
+    root = str(Path(__file__).resolve().parents[1])
+    environment = os.environ | {"PYTHONPATH": root}
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert "['ball'] 2\n['ball']\n" in done.stdout
+    assert "light paths" in done.stdout  # of the estimate
+    assert not mark.exists()

@@ -20,6 +20,7 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
+from rangesim.scene.nodes import check_type
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
 
@@ -108,6 +109,8 @@ def check_dictionary(scene: Any, label: str) -> None:
                 raise FileFormatError(f"{label}: expected {name} to be a value of 64 bits, got {shown(value)}.")
             if not isinstance(key, str):
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
+            if key == "type" and isinstance(value, str):
+                check_type(value, label)
 
 
 def check_properties(state: Any, label: str) -> None:
