@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import time
@@ -196,6 +197,18 @@ end_header
 %s
 3 0 1 2
 """
+
+
+def binary_ply(index: int, order: str = "<", kind: str = "int", extra: int = 0) -> bytes:
+    """Three vertices, as many more as `extra`, and a face of the first two and of vertex `index`."""
+    name = {"<": b"binary_little_endian", ">": b"binary_big_endian"}[order]
+    head = PLY.partition(b"end_header\n")[0] % (b"%d" % (3 + extra)) + b"end_header\n"
+    head = head.replace(b"ascii", name).replace(b"uchar int", b"uchar " + kind.encode())
+    places = [0, 0, 3, 1, 0, 3, 0, 1, 3] + [0.5, 0.5, 3] * extra
+    code = {"int": "i", "uint": "I", "short": "h", "ushort": "H", "uchar": "B"}[kind]
+    return head + struct.pack(f"{order}{len(places)}f", *places) + struct.pack(f"{order}B3{code}", 3, 0, 1, index)
+
+
 MESHES = {
     "good.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ""),
     "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "."),
@@ -211,9 +224,14 @@ MESHES = {
     "large.ply": (PLY % (b"4000000000000", b"0 0 0\n1 0 0\n0 1 0"), "."),
     "index.ply": (
         (PLY % (b"3", b"0 0 0\n1 0 0\n0 1 0")).replace(b"3 0 1 2", b"3 0 1 9"),
-        "got vertex 9|be read",
+        "expected faces of its 3 vertices, 0 to 2, got vertex 9|be read|repair",
     ),
+    "binary.ply": (binary_ply(2), ""),
+    "big.ply": (binary_ply(2, ">", "ushort", 70), ""),
+    "short.ply": (binary_ply(2)[:-1], "ends early|."),
+    "none.ply": (b"plyformat", "end_header|."),
 }
+INDICES = [3, 100_000, 1_000_000, 2_000_000_000, -1, -3, -(2**31)]
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -225,6 +243,45 @@ def test_meshes_in_scenes_are_read_or_refused(tmp_path: Path, name: str) -> None
         return
     with pytest.raises(FileFormatError, match=message):
         load_scene(path)
+
+
+@pytest.mark.parametrize("order", ["ascii", "<", ">"])
+@pytest.mark.parametrize("index", INDICES)
+def test_faces_of_vertices_that_are_not_there_are_refused(tmp_path: Path, order: str, index: int) -> None:
+    """Mitsuba 3.9 crashes on large ones, where it computes normals, and makes vertex 0 of -1."""
+    text = (PLY % (b"3", b"0 0 3\n1 0 3\n0 1 3")).replace(b"3 0 1 2", b"3 0 1 %d" % index)
+    path = mesh(tmp_path, "a.ply", text if order == "ascii" else binary_ply(index, order))
+    with pytest.raises(FileFormatError, match=f"faces of its 3 vertices, 0 to 2, got vertex {index}; repair"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize("kind", ["int", "uint", "short", "ushort", "uchar"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_faces_of_ply_are_those_of_the_file(tmp_path: Path, order: str, kind: str) -> None:
+    path = mesh(tmp_path, "a.ply", binary_ply(72, order, kind, extra=70))
+    (shape,) = load_scene(path).mitsuba.shapes()
+    np.testing.assert_array_equal(np.array(mi.traverse(shape)["faces"]), [0, 1, 72])
+    mesh(tmp_path, "a.ply", binary_ply(73, order, kind, extra=70))
+    with pytest.raises(FileFormatError, match="0 to 72, got vertex 73"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"vertex 3", b"vertex 3x"),
+        (b"vertex 3", b"vertex -3"),
+        (b"face 1", b"vertex 1"),
+        (b"float x", b"int x"),  # Mitsuba would read 0 and then .5
+        (b"0.5 0 3", b"0.5.5 0"),
+        (b"format ascii", b"format text"),
+    ],
+)
+def test_ply_that_may_be_read_in_two_ways_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
+    text = PLY % (b"3", b"0.5 0 3\n1 0 3\n0 1 3")
+    assert load_scene(mesh(tmp_path, "a.ply", text)).instances[0].name == "part"
+    with pytest.raises(FileFormatError, match=r"a\.ply cannot be read as a PLY file of triangles"):
+        load_scene(mesh(tmp_path, "a.ply", text.replace(old, new)))
 
 
 @pytest.mark.parametrize("name", [name for name in MESHES if MESHES[name][1]])

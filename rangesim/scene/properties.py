@@ -20,6 +20,7 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
+from rangesim.scene.mesh_files import check_ply
 from rangesim.scene.nodes import check_type
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
@@ -130,6 +131,8 @@ def check_properties(state: Any, label: str) -> None:
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
         if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
+        if node.props.plugin_name() == "ply" and isinstance(name := node.props.get("filename"), str):
+            check_ply(Path(str(mi.file_resolver().resolve(name))))
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
