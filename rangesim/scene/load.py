@@ -25,7 +25,7 @@ from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
-from rangesim.scene.nodes import ids_of_shapes, take_material_classes
+from rangesim.scene.nodes import OF_MITSUBA, check_types, ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
 from rangesim.scene.origin import (
     AS_FAR,
@@ -135,6 +135,8 @@ def _instantiate(
 
     def parsed(folder: str, advises: bool) -> tuple[Any, set[str], dict[str, str]]:
         state = _parse(config, source, material, unit_m, Path(folder), advises)
+        mi.file_resolver().prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]  # again: a scene adds paths
+        check_types(state, label)
         check_depth(state, label)
         mi.parser.transform_all(config, state)
         ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
@@ -194,6 +196,7 @@ def _own_file_resolver() -> Iterator[None]:
     """Search paths of this scene, forgotten afterwards, so that no scene finds another's files."""
     before = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(before))
+    mi.file_resolver().prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]
     try:
         yield
     finally:

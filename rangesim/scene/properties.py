@@ -20,6 +20,8 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
+from rangesim.scene.mesh_files import check_ply
+from rangesim.scene.nodes import check_type
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
 
@@ -130,6 +132,29 @@ def check_dictionary(scene: Any, label: str) -> None:
                 raise FileFormatError(f"{label}: expected {name} to be a value of 64 bits, got {shown(value)}.")
             if not isinstance(key, str):
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
+            if key == "type" and isinstance(value, str):
+                check_type(value, label)
+
+
+def check_evaluable(state: Any, label: str) -> None:
+    """Raise FileFormatError if a node would load, but not be evaluated with the one band of the light transport."""
+    parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
+    for index, node in enumerate(state.nodes):
+        names = [node.props.plugin_name()]
+        names += [LOADED_CLASSES.get(value.class_name(), "") for value in _loaded(node)]
+        for name in names:
+            if name in FAIL_IN_ONE_BAND:
+                raise FileFormatError(
+                    f"{label}: {_place(state, parents, index)}: {name!r} needs a spectrum, and the light has one band, "
+                    f"that of the sensor; {FAIL_IN_ONE_BAND[name]}."
+                )
+        need, lacking = TEXTURES_WITHOUT.get(node.props.plugin_name(), ("", ()))
+        for _, value in _references(node):
+            if (kind := state.nodes[value.index()].props.plugin_name()) in lacking:
+                raise FileFormatError(
+                    f"{label}: {_place(state, parents, index)}: expected a texture with {need}, got {kind!r}; "
+                    "give a bitmap instead."
+                )
 
 
 def check_properties(state: Any, label: str) -> None:
@@ -149,6 +174,8 @@ def check_properties(state: Any, label: str) -> None:
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
         if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
+        if node.props.plugin_name() == "ply" and isinstance(name := node.props.get("filename"), str):
+            check_ply(Path(str(mi.file_resolver().resolve(name))))
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
