@@ -26,6 +26,7 @@ from rangesim.light_transport.truncation import estimate_truncation, warn_of_tru
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
+from rangesim.scene.media import body_around
 from rangesim.sensor import Sensor
 from rangesim.settings.config import shown
 from rangesim.settings.seeds import derived_seed
@@ -95,8 +96,8 @@ def transport(
     Raises
     ------
     ValueError
-        A number out of its range, patterns that do not fit the projector, too little memory, or rigs of different
-        emitters.
+        A number out of its range, patterns that do not fit the projector, too little memory, rigs of different
+        emitters, or a camera or projector inside fog, water or another medium.
 
     Warns
     -----
@@ -243,6 +244,8 @@ def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Respons
         raise ValueError(f"expected a Rig, as scene.rig() returns, or a list of them, got {type(rigs).__name__}.")
     if not rigs or not all(isinstance(rig, Rig) for rig in rigs):
         raise ValueError(f"expected one Rig or more, got {shown(list(rigs))}.")
+    for rig in rigs:
+        _check_in_air(scene, rig)
     for number, rig in enumerate(rigs):
         if differ := rigs[0].differences_of_emitter(rig):
             raise ValueError(
@@ -255,3 +258,15 @@ def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Respons
         raise ValueError(f"expected a list of sensors, for example [StructuredLight()], got {sensors!r}.")
     for sensor in sensors:
         sensor.check(rigs[0].projector.width, rigs[0].projector.height)
+
+
+def _check_in_air(scene: Scene, rig: Rig) -> None:
+    """Raise ValueError if the camera or the projector is inside a body of a medium: its light would start outside."""
+    T_camera = scene.in_renderer(rig).T_world_camera
+    for name, T in (("camera", T_camera), ("projector", T_camera @ rig.T_camera_projector)):
+        body = body_around(scene.mitsuba, T[:3, 3])
+        if body is not None:
+            raise ValueError(
+                f"expected the {name} to stand in air, but it is inside the medium of shape {body!r}; move it out, or "
+                "let the body begin in front of it."
+            )
