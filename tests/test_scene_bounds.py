@@ -557,3 +557,66 @@ main()
     assert "['ball'] 2\n['ball']\n" in done.stdout
     assert "light paths" in done.stdout  # of the estimate
     assert not mark.exists()
+
+
+FOG = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.5}
+SMOKE = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.0}
+MATCHED: dict[str, Any] = {"bsdf": {"type": "null"}}
+
+
+def wall_behind(**bodies: Any) -> dict[str, Any]:
+    paint = {"type": "twosided", "b": {"type": "diffuse"}}
+    return scene(wall={"type": "rectangle", "to_world": look(5.0, 6.0), "bsdf": paint}) | bodies
+
+
+@pytest.mark.parametrize("medium", [FOG, SMOKE], ids=["fog", "smoke"])
+def test_a_medium_in_the_sensor_is_refused(medium: dict[str, Any]) -> None:
+    with pytest.raises(FileFormatError, match="expected the camera to stand in air, got a medium in its sensor"):
+        load_scene(ball() | {"camera": CAMERA | {"medium": medium}})
+
+
+def test_a_medium_in_the_sensor_of_a_file_is_refused(tmp_path: Path) -> None:
+    fog = '<medium type="homogeneous" id="fog"/>'
+    second = XML_CAMERA.replace("<film", '<ref id="fog"/><film', 1)
+    body = f'{fog}{XML_CAMERA}{second}<shape type="sphere" id="ball"/>'
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{body}</scene>')
+    assert load_scene(tmp_path / "a.xml").instances[0].name == "ball"  # the sensor in fog is not the camera
+    with pytest.raises(FileFormatError, match="expected the camera to stand in air"):
+        load_scene(tmp_path / "a.xml", sensor=1)
+
+
+@pytest.mark.parametrize(
+    ("fog", "who"),
+    [
+        ({"type": "sphere", "radius": 2.0}, "camera"),
+        ({"type": "sphere", "radius": 50.0}, "camera"),
+        ({"type": "cube"}, "camera"),
+        ({"type": "sphere", "radius": 0.3, "center": [-0.6, 0.0, 0.0]}, "projector"),
+        ({"type": "sphere", "radius": 0.3, "center": [0.6, 0.0, 0.0]}, ""),
+        ({"type": "sphere", "radius": 1.0, "center": [0.0, 0.0, 3.0]}, ""),
+        ({"type": "sphere", "radius": 1.0, "center": [0.0, 0.0, -3.0]}, ""),
+    ],
+)
+@pytest.mark.parametrize("medium", [FOG, SMOKE], ids=["fog", "smoke"])
+@pytest.mark.parametrize("shell", [False, True])
+def test_a_device_inside_a_medium_is_refused(
+    fog: dict[str, Any], who: str, medium: dict[str, Any], shell: bool
+) -> None:
+    """Also behind another surface: the shell is a ball of glass around the camera alone."""
+    bodies: dict[str, Any] = {"fog": fog | MATCHED | {"interior": medium}}
+    if shell:
+        bodies["shell"] = {"type": "sphere", "radius": 0.05, "bsdf": {"type": "thindielectric"}}
+    loaded = load_scene(wall_behind(**bodies))
+    rig = loaded.rig(baseline_m=0.6, width=8)  # at x = -0.6: Mitsuba's x is to the left
+    if not who:
+        assert rangesim.transport(loaded, rig, [], spp=1, photons=0).energy.ambient.max() > 0
+        return
+    with pytest.raises(ValueError, match=f"expected the {who} to stand in air, .* medium of shape 'fog'"):
+        rangesim.transport(loaded, rig, [], spp=1)
+
+
+def test_a_camera_inside_absorbing_glass_is_refused() -> None:
+    water = {"type": "sphere", "radius": 2.0, "bsdf": {"type": "dielectric"}, "interior": SMOKE}
+    loaded = load_scene(wall_behind(water=water))
+    with pytest.raises(ValueError, match=r"expected the camera to stand in air, .* medium of shape 'water'"):
+        rangesim.transport(loaded, loaded.rig(width=8), [], spp=1)

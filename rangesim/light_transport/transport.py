@@ -13,7 +13,6 @@ import numpy as np
 from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.caustics import caustic_maps, caustic_photons
 from rangesim.light_transport.device import Device
-from rangesim.light_transport.devices_in_media import check_devices
 from rangesim.light_transport.glint import Glint, trace_glint
 from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
@@ -27,6 +26,7 @@ from rangesim.light_transport.truncation import estimate_truncation, warn_of_tru
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
+from rangesim.scene.media import body_around
 from rangesim.sensor import Sensor
 from rangesim.settings.config import shown
 from rangesim.settings.seeds import derived_seed
@@ -97,7 +97,7 @@ def transport(
     ------
     ValueError
         A number out of its range, patterns that do not fit the projector, too little memory, rigs of different
-        emitters, or a camera or projector inside a medium that fills a shape.
+        emitters, or a camera or projector inside fog, water or another medium.
 
     Warns
     -----
@@ -110,7 +110,6 @@ def transport(
     report, launches = Progress(progress), Launches(is_watched=progress is not None)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     adaptive = _adaptive(settings, sensors, responses)
-    check_devices(scene.mitsuba, [scene.in_renderer(one) for one in rigs])
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     views = [_CameraPass(scene, traced, one, settings, adaptive, number) for number, one in enumerate(rigs)]
     fewest = min(int(view.samples.min()) for view in views)
@@ -245,6 +244,8 @@ def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Respons
         raise ValueError(f"expected a Rig, as scene.rig() returns, or a list of them, got {type(rigs).__name__}.")
     if not rigs or not all(isinstance(rig, Rig) for rig in rigs):
         raise ValueError(f"expected one Rig or more, got {shown(list(rigs))}.")
+    for rig in rigs:
+        _check_in_air(scene, rig)
     for number, rig in enumerate(rigs):
         if differ := rigs[0].differences_of_emitter(rig):
             raise ValueError(
@@ -257,3 +258,15 @@ def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Respons
         raise ValueError(f"expected a list of sensors, for example [StructuredLight()], got {sensors!r}.")
     for sensor in sensors:
         sensor.check(rigs[0].projector.width, rigs[0].projector.height)
+
+
+def _check_in_air(scene: Scene, rig: Rig) -> None:
+    """Raise ValueError if the camera or the projector is inside a body of a medium: its light would start outside."""
+    T_camera = scene.in_renderer(rig).T_world_camera
+    for name, T in (("camera", T_camera), ("projector", T_camera @ rig.T_camera_projector)):
+        body = body_around(scene.mitsuba, T[:3, 3])
+        if body is not None:
+            raise ValueError(
+                f"expected the {name} to stand in air, but it is inside the medium of shape {body!r}; move it out, or "
+                "let the body begin in front of it."
+            )

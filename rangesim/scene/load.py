@@ -25,10 +25,11 @@ from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
-from rangesim.scene.nodes import OF_MITSUBA, check_types, ids_of_shapes, take_material_classes
+from rangesim.scene.nodes import OF_MITSUBA, check_camera, check_types, ids_of_shapes, take_material_classes
 from rangesim.scene.normals import repeat_normals
 from rangesim.scene.origin import (
     AS_FAR,
+    camera_node,
     camera_place,
     coarsest_mesh,
     coarsest_transform,
@@ -143,6 +144,8 @@ def _instantiate(
         take_sensor_reflectances(state, label)
         check_properties(state, label)
         check_evaluable(state, label)
+        if (camera := camera_node(state, sensor)) is not None:
+            check_camera(state, camera, label)
         return state, ids, classes
 
     def made_of(state: Any) -> Any:

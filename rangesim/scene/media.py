@@ -9,6 +9,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+_OBLIQUE = np.array(
+    [
+        *([0.83, 0.47, 0.31], [-0.71, 0.59, 0.39], [0.37, -0.89, 0.27], [-0.43, -0.61, 0.67]),
+        *([0.23, 0.41, -0.88], [-0.57, 0.33, -0.75], [0.19, -0.53, -0.83]),
+    ]
+)
+DIRECTIONS = _OBLIQUE / np.linalg.norm(_OBLIQUE, axis=1, keepdims=True)
+"""(7, 3) float64, unit vectors to all sides, oblique to the axes, along which edges of shapes like to lie."""
+MAX_SURFACES = 64
+"""Surfaces, one behind another, that are looked through for the bodies a place is in."""
+
 
 def is_boundary(shape: Any) -> bool:
     """Whether a medium fills the shape behind a boundary of matched index, so that light walks through it."""
@@ -46,6 +57,32 @@ def why_not_traced(shape: Any) -> str | None:
     if interior.phase_function().class_name() not in ("IsotropicPhaseFunction", "HGPhaseFunction"):
         return f"scatters by a {interior.phase_function().class_name()}; only isotropic and hg are traced"
     return None
+
+
+def body_around(scene: Any, place: np.ndarray) -> str | None:
+    """The id of a shape that is filled with a medium and has a place (3,), metres, inside; None if there is none.
+
+    Rays in several directions count how often each such shape is left and entered, by the side of its normals. The
+    place is inside where most of them leave it more often than they enter it.
+    """
+    filled = [shape for shape in scene.shapes() if shape.interior_medium() is not None]
+    filled = [shape for shape in filled if medium_numbers(shape.interior_medium())[0] > 0]
+    if not filled:
+        return None
+    ray = mi.Ray3f(o=mi.Point3f(*map(float, place)), d=mi.Vector3f(DIRECTIONS.T.astype(np.float32)))
+    left = np.zeros((len(filled), len(DIRECTIONS)), np.int64)
+    active = mi.Bool(True)
+    for _ in range(MAX_SURFACES):
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        active = si.is_valid()
+        if not dr.any(active):
+            break
+        outward = np.sign(dr.dot(ray.d, si.n).numpy()) * active.numpy()
+        for count, shape in zip(left, filled, strict=True):
+            count += np.where((si.shape == mi.ShapePtr(shape)).numpy(), outward, 0).astype(np.int64)
+        ray = si.spawn_ray(ray.d)
+    inside = (left > 0).sum(axis=1) > len(DIRECTIONS) / 2
+    return next((str(shape.id()) for shape, is_in in zip(filled, inside, strict=True) if is_in), None)
 
 
 def _why_not_homogeneous(medium: Any) -> str | None:

@@ -96,6 +96,20 @@ def _check_media(state: Any, node: Any, place: str) -> None:
             raise FileFormatError(f'{place} refers to a medium without saying where: add name="interior".')
 
 
+def check_camera(state: Any, node: Any, label: str) -> None:
+    """Raise FileFormatError if the node of a sensor states what the light transport does not take into account."""
+    for _, value in node.props.items():
+        is_medium = (
+            isinstance(value, mi.Properties.ResolvedReference)
+            and state.nodes[value.index()].type == mi.ObjectType.Medium
+        )
+        if is_medium or isinstance(value, mi.Medium):
+            raise FileFormatError(
+                f"{label}: expected the camera to stand in air, got a medium in its sensor; remove it, and let the "
+                "medium fill a closed shape in front of the camera."
+            )
+
+
 def take_material_classes(state: Any, label: str) -> dict[str, str]:
     """Shape id -> class, where the shape or its BSDF states one; removes the entries, which Mitsuba does not know."""
     stated: dict[int, str] = {}

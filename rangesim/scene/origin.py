@@ -31,11 +31,17 @@ ENDS = {"sphere": ("center",), "cylinder": ("p0", "p1")}
 
 def camera_place(state: Any, sensor: int) -> np.ndarray:
     """(3,) float64, metres, world: the place of one of the sensors of a parsed scene; 0 if it is a loaded object."""
+    node = camera_node(state, sensor)
+    return np.zeros(3) if node is None else _matrix(node.props.get("to_world"))[:3, 3]
+
+
+def camera_node(state: Any, sensor: int) -> Any:
+    """The node of one of the sensors of a parsed scene; None if there is no such sensor, or it is a loaded object."""
     children = [value for _, value in state.nodes[0].props.items()]
     sensors = [v for v in children if isinstance(v, mi.Sensor) or _type_of(state, v) == mi.ObjectType.Sensor]
     if not 0 <= sensor < len(sensors) or isinstance(sensors[sensor], mi.Sensor):
-        return np.zeros(3)
-    return _matrix(state.nodes[sensors[sensor].index()].props.get("to_world"))[:3, 3]
+        return None
+    return state.nodes[sensors[sensor].index()]
 
 
 def is_far(place: np.ndarray) -> bool:

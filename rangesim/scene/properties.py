@@ -175,7 +175,11 @@ def check_properties(state: Any, label: str) -> None:
         if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
         if node.props.plugin_name() == "ply" and isinstance(name := node.props.get("filename"), str):
-            check_ply(Path(str(mi.file_resolver().resolve(name))))
+            path = Path(str(mi.file_resolver().resolve(name)))
+            try:
+                check_ply(path)
+            except FileFormatError as error:
+                raise FileFormatError(f"{label}: {error}") from error
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
