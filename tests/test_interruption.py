@@ -246,9 +246,7 @@ def test_runs_of_pixels_are_dealt_out_once_each_and_evenly(n: int) -> None:
 
 
 def test_progress_grows_to_one(tabletop: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        kernel_launches.Launches, "learn", lambda *_: None
-    )  # launches of one size
+    monkeypatch.setattr(kernel_launches.Launches, "learn", lambda *_: None)  # launches of one size
     monkeypatch.setattr(kernel_launches, "FIRST_UNITS", 1 << 17)
     monkeypatch.setattr(kernel_launches, "REPORT_S", 0.0)
     fractions: list[float] = []

@@ -408,7 +408,7 @@ def test_a_device_inside_a_medium_is_refused(
 ) -> None:
     """Its light would be weakened one way alone: exp(-0.3) for exp(-0.6), 0.2 m of fog there and back."""
     scene, rig = fog(shape, 0.0, absorbs), rig_above(x, baseline_m)
-    with pytest.raises(ValueError, match=f"expected the {inside} to stand in air, but it is inside the medium of shape 'fog'"):
+    with pytest.raises(ValueError, match=f"the {inside} to stand in air, but it is inside the medium of shape 'fog'"):
         transport(scene, rig, [], spp=1, photons=0)
 
 
