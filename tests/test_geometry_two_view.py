@@ -293,6 +293,26 @@ def test_the_pose_agrees_with_opencv_on_exact_pairs() -> None:
     np.testing.assert_allclose(T[:3, 3], t.ravel(), atol=1e-5)
 
 
+@pytest.mark.parametrize("seed", [478, 2917, 8796, 13017, 10711, 11617, 14164])
+def test_a_poor_candidate_of_the_five_points_stops_no_pose(seed: int) -> None:
+    """One of the solver's matrices has singular values that differ by more than 1e-3; the right one is among them."""
+    random = np.random.default_rng(seed)
+    focal = 10 ** random.uniform(2.2, 4.3)
+    camera = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1.0]])
+    turn = random.normal(size=3) * 10 ** random.uniform(-4, 0)
+    T = rigid(turn, random.normal(size=3) * 10 ** random.uniform(-3, 0.5))
+    n = int(random.integers(6, 40))
+    z = random.uniform(2, 2 + 10 ** random.uniform(-1, 1.5), n)
+    a = np.stack([random.uniform(0, 640, n), random.uniform(0, 480, n)], axis=-1)
+    b = project(projection_matrix(camera, T), np.c_[(a - [320, 240]) / focal, np.ones(n)] * z[:, None])
+    noise = random.choice([0, 0.1, 0.5, 2, 10])
+    a, b = a + random.normal(size=a.shape) * noise, b + random.normal(size=b.shape) * noise
+    found = fit_relative_pose(a, b, camera, camera, noise_px=noise or None).T_second_first
+    off = 2e-3 if noise else 1e-9  # seed 10711 has noise of 0.1 px
+    np.testing.assert_allclose(found[:3, :3], T[:3, :3], atol=off)
+    np.testing.assert_allclose(found[:3, 3], T[:3, 3] / np.linalg.norm(T[:3, 3]), atol=5 * off)
+
+
 # ------------------------------------------------------------------------------------- degenerate views
 
 ROTATED = rigid((0.05, -0.2, 0.03), (0, 0, 0))

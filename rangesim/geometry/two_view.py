@@ -348,9 +348,16 @@ def poses_from_essential(E: ArrayLike) -> Array:
     ValueError
         The singular values are not (s, s, 0), to 1e-3: it is no essential matrix.
     """
-    u, values, vt = np.linalg.svd(checked_array("E", E, 3, 3))
+    matrix = checked_array("E", E, 3, 3)
+    values = np.linalg.svd(matrix, compute_uv=False)
     if not (values[0] > 0 and values[0] - values[1] <= 1e-3 * values[0] and values[2] <= 1e-3 * values[0]):
         raise ValueError(f"expected an essential matrix with singular values (s, s, 0), got {values.tolist()}.")
+    return _poses_of(matrix)
+
+
+def _poses_of(E: Array) -> Array:
+    """(4, 4, 4) the same of the essential matrix nearest to E."""
+    u, _, vt = np.linalg.svd(E)
     u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     result = np.tile(np.eye(4), (4, 1, 1))
@@ -731,12 +738,12 @@ def _starting_poses(a: Array, b: Array, K_first: Array, K_second: Array) -> list
         five = random.choice(len(xa), 5, replace=False)
         E, _ = cv2.findEssentialMat(xa[five], xb[five], np.eye(3), cv2.RANSAC, 0.999, 1e-9)
         if E is not None:
-            found += list(E.reshape(-1, 3, 3))
+            found += [one for one in E.reshape(-1, 3, 3) if np.isfinite(one).all()]
     ha, hb = homogeneous(xa), homogeneous(xb)
     found.sort(key=lambda E: float(np.nansum(np.minimum(_sampson(E, ha, hb)[0] ** 2, 1e-2))))
     starts: list[Array] = []
     for E in found:
-        T = poses_from_essential(E)[0]
+        T = _poses_of(E)[0]  # the solver's are essential to some digits only; a start need not be exact
         if all(
             np.abs(essential_from_pose(T) - s * essential_from_pose(other)).max() > 0.02
             for other in starts
