@@ -25,7 +25,7 @@ from rangesim.scene.camera import camera_of
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
-from rangesim.scene.nodes import check_camera, ids_of_shapes, take_material_classes
+from rangesim.scene.nodes import check_camera, ids_of_shapes, replace_ignored_plugins, take_material_classes
 from rangesim.scene.normals import repeat_normals
 from rangesim.scene.origin import (
     AS_FAR,
@@ -56,6 +56,8 @@ from rangesim.scene.spectral_reflectance import (
 )
 from rangesim.settings.bounds import Bounds, check_number
 
+IGNORED_ELEMENTS = ("integrator", "sampler", "rfilter")
+"""Elements of a scene file that do not matter, so that a parameter without a value there needs none."""
 Source = str | Path | Mapping[str, Any]
 
 
@@ -143,6 +145,7 @@ def _instantiate(
         take_sensor_reflectances(state, label)
         check_properties(state, label)
         check_evaluable(state, label)
+        replace_ignored_plugins(state)
         if (camera := camera_node(state, sensor)) is not None:
             check_camera(state, camera, label)
         return state, ids, classes
@@ -188,10 +191,18 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
     resolver.prepend(str(PLUGINS.parent))  # type: ignore[attr-defined]  # no plugin of a scene goes first
     try:
-        check_xml(path, resolve=lambda name: Path(str(mi.file_resolver().resolve(name))))
+        fillers = check_xml(path, lambda name: Path(str(mi.file_resolver().resolve(name))), IGNORED_ELEMENTS)
     except FileFormatError as error:
         raise FileFormatError(f"{path} is no scene Mitsuba can load: {error}") from error
-    return mi.parser.parse_file(config, str(path))
+    try:
+        return mi.parser.parse_file(config, str(path), **fillers)
+    except RuntimeError as error:
+        if (missing := re.search(r"undefined parameter: \$(\w+)", str(error))) is None:
+            raise
+        raise FileFormatError(
+            f"{path}: the parameter ${missing[1]} has no value; put "
+            f'<default name="{missing[1]}" value="..."/> before it in the scene.'
+        ) from error
 
 
 @contextmanager

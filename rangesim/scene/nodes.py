@@ -10,11 +10,17 @@ import mitsuba as mi
 
 from rangesim.errors import FileFormatError
 from rangesim.scene.materials import MATERIAL_CLASSES
+from rangesim.scene.properties import LIBRARIES, PLUGINS
 from rangesim.settings.config import nearest, shown
 
 CLASS_KEY = "material_class"
 COMPOSITES = ("instance", "shapegroup", "merge")
 """Shapes that stand for others, whose parts would have neither name nor material."""
+
+IGNORED_PLUGINS = {"Integrator": "path", "Film": "hdrfilm", "Sampler": "independent", "ReconstructionFilter": "box"}
+"""What stands in for a plugin that Mitsuba lacks, by the kind of node, where the kind does not matter."""
+FILM_SIZES = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+"""What of a film matters."""
 
 
 def ids_of_shapes(state: Any, label: str) -> set[str]:
@@ -67,6 +73,24 @@ def check_camera(state: Any, node: Any, label: str) -> None:
                 f"{label}: expected the camera to stand in air, got a medium in its sensor; remove it, and let the "
                 "medium fill a closed shape in front of the camera."
             )
+
+
+def replace_ignored_plugins(state: Any) -> None:
+    """Put Mitsuba's own in place of integrators, films and samplers that it does not have.
+
+    They belong to a renderer built on Mitsuba, such as mitransient, and what they do is ignored. The size of the image
+    stays.
+    """
+    for node in state.nodes:
+        own = IGNORED_PLUGINS.get(node.type.name)
+        if own is None or any((PLUGINS / f"{node.props.plugin_name()}{suffix}").exists() for suffix in LIBRARIES):
+            continue
+        props = mi.Properties(own)
+        props.set_id(node.props.id())
+        for key in FILM_SIZES if node.type == mi.ObjectType.Film else ():
+            if key in node.props:
+                props[key] = node.props[key]
+        node.props = props
 
 
 def take_material_classes(state: Any, label: str) -> dict[str, str]:
