@@ -404,3 +404,15 @@ def test_a_parameter_without_a_value_matters_only_where_it_counts(tmp_path: Path
     (tmp_path / "part.xml").write_text(f'<scene version="3.0.0">{sampled}</scene>')
     included = rendered(tmp_path / "d.xml", '<include filename="part.xml"/>')[1]
     np.testing.assert_array_equal(included, expected)
+
+
+@pytest.mark.parametrize(("radius", "focus"), [(0.05, 2.0), (0.002, 0.5), (0.2, 40.0)])
+def test_an_aperture_that_is_left_out_is_told(tmp_path: Path, radius: float, focus: float) -> None:
+    def lens(radius: float) -> str:
+        numbers = f'<float name="aperture_radius" value="{radius}"/><float name="focus_distance" value="{focus}"/>'
+        return SENSOR.replace('"perspective">', f'"thinlens">{numbers}')
+
+    sharp, _ = rendered(tmp_path / "a.xml", lens(1e-6))
+    with pytest.warns(RangesimWarning, match=rf"aperture of {radius:g} m is left out.*focus_m={focus:g}\)"):
+        wide, _ = rendered(tmp_path / "b.xml", lens(radius))
+    assert wide.camera == sharp.camera

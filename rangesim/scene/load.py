@@ -21,7 +21,7 @@ from rangesim.files.bundled_scenes import CATALOGUE, scene_file
 from rangesim.files.text_files import check_xml
 from rangesim.rig import Intrinsics, translation
 from rangesim.scene import retroreflector
-from rangesim.scene.camera import camera_of
+from rangesim.scene.camera import camera_of, warn_of_aperture
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
@@ -114,13 +114,15 @@ def load_scene(
     warn_of_lamps_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)
+    working_distance_m = _median_depth(loaded, camera, T_camera)
+    warn_of_aperture(loaded.sensors()[sensor], camera, working_distance_m, label)
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
         mitsuba=loaded,
         instances=tuple(Instance(s.id(), classes.get(s.id()) or _class_of(s)) for s in loaded.shapes()),
         camera=camera,
         T_world_camera=translation(*origin_m) @ T_camera,
-        working_distance_m=_median_depth(loaded, camera, T_camera),
+        working_distance_m=working_distance_m,
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
         has_matte_textures=any(map(has_texture, {s.bsdf() for s in loaded.shapes() if is_matte(s)})),
         source=None if isinstance(source, Mapping) else scene_file(source),
