@@ -305,3 +305,65 @@ def test_principled_roughness_is_the_root_of_alpha() -> None:
     select_variant()
     for roughness, kind in ((0.2, "mirror"), (0.3, "glossy")):  # alpha 0.04 and 0.09
         assert material_class(mi.load_dict({"type": "principled", "metallic": 1.0, "roughness": roughness})) == kind
+
+
+# ---- Roughness by a texture --------------------------------------------------------------------------
+
+
+def grey(*values: float) -> dict[str, object]:
+    """A bitmap of these pixels, one row."""
+    import mitsuba as mi
+
+    pixels = np.array(values, np.float32).reshape(1, -1, 1)
+    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(pixels)}
+
+
+def checks(first: float, second: float) -> dict[str, object]:
+    colours = {"color0": {"type": "uniform", "value": first}, "color1": {"type": "uniform", "value": second}}
+    return {"type": "checkerboard", **colours}
+
+
+@pytest.mark.parametrize("texture", [lambda low, high: grey(low, high, low, high), checks], ids=["bitmap", "checks"])
+@pytest.mark.parametrize(
+    ("kind", "key", "low", "high", "expected"),
+    [
+        ("roughconductor", "alpha", 0.2, 0.4, "glossy"),
+        ("roughconductor", "alpha", 0.01, 0.4, "glossy"),
+        ("roughconductor", "alpha", 0.01, 0.02, "mirror"),
+        ("roughconductor", "alpha_u", 0.2, 0.4, "glossy"),
+        ("roughdielectric", "alpha", 0.2, 0.4, "translucent"),
+        ("roughdielectric", "alpha", 0.01, 0.02, "transparent"),
+        ("principled", "roughness", 0.3, 0.5, "glossy"),
+        ("principled", "roughness", 0.1, 0.2, "mirror"),
+    ],
+)
+def test_roughness_by_a_texture_counts_as_its_mean(
+    texture: object, kind: str, key: str, low: float, high: float, expected: str
+) -> None:
+    import mitsuba as mi
+
+    select_variant()
+    bsdf: dict[str, object] = {"type": kind, key: texture(low, high)}  # type: ignore[operator]
+    bsdf |= {"alpha_v": 0.01} if key == "alpha_u" else {}
+    bsdf |= {"metallic": 1.0} if kind == "principled" else {}
+    assert material_class(mi.load_dict(bsdf)) == expected
+    wrapped = {"type": "mask", "opacity": 0.5, "bsdf": bsdf | {key: texture(low, high)}}  # type: ignore[operator]
+    assert material_class(mi.load_dict(wrapped)) == expected
+
+
+def test_roughness_by_the_corners_of_a_mesh_is_not_taken_for_polished() -> None:
+    import mitsuba as mi
+
+    select_variant()
+    attribute = {"type": "mesh_attribute", "name": "vertex_roughness"}
+    assert material_class(mi.load_dict({"type": "roughconductor", "alpha": attribute})) == "glossy"
+    assert material_class(mi.load_dict({"type": "roughconductor", "alpha": 0.01})) == "mirror"
+
+
+def test_a_texture_says_how_metallic_a_surface_is() -> None:
+    import mitsuba as mi
+
+    select_variant()
+    for low, high, expected in ((0.9, 1.0, "mirror"), (0.0, 0.2, "glossy")):
+        bsdf = {"type": "principled", "roughness": 0.1, "metallic": checks(low, high)}
+        assert material_class(mi.load_dict(bsdf)) == expected

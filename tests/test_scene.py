@@ -361,3 +361,58 @@ def test_a_face_without_an_area_leaves_the_normals_of_its_corners(tmp_path: Path
     scene = rangesim.load_scene(write(tmp_path / "scene.xml", xml))
     normals = np.array(mi.traverse(scene.mitsuba)["square.vertex_normals"]).reshape(-1, 3)
     np.testing.assert_allclose(normals, [[0, 0, 1]] * 4, atol=1e-6)
+
+
+# ---- What a scene of another renderer holds beside ---------------------------------------------------
+
+BALL = '<shape type="sphere"><point name="center" x="0" y="1" z="0"/></shape>'
+SAMPLER = '<sampler type="independent"><integer name="sample_count" value="{}"/></sampler>'
+
+
+def rendered(path: Path, sensor: str, before: str = "") -> Any:
+    scene = rangesim.load_scene(write(path, f'<scene version="3.0.0">{before}{sensor}{BALL}</scene>'))
+    return scene, rangesim.transport(scene, scene.rig(width=16), [], spp=2, seed=3).energy.direct
+
+
+def test_an_integrator_and_a_film_that_mitsuba_lacks_are_ignored(tmp_path: Path) -> None:
+    """As of mitransient; the size of the film counts."""
+    plain, expected = rendered(tmp_path / "plain.xml", SENSOR)
+    integrator = '<integrator type="transient_path"><integer name="max_depth" value="4"/></integrator>'
+    bins = '<integer name="temporal_bins" value="400"/><float name="start_opl" value="3.5"/><rfilter type="own"/>'
+    film = SENSOR.replace('"hdrfilm">', f'"transient_hdr_film">{bins}').replace("<film", SAMPLER.format(4) + "<film")
+    foreign, light = rendered(tmp_path / "foreign.xml", film.replace('"independent"', '"own"'), integrator)
+    assert foreign.camera == plain.camera
+    np.testing.assert_array_equal(light, expected)
+    assert light.max() > 0
+    for wrong in ("<emitter type='transient_lamp'/>", "<bsdf type='own'/>"):
+        with pytest.raises(FileFormatError, match=r"transient_lamp|own"):
+            rendered(tmp_path / "wrong.xml", SENSOR, wrong)
+
+
+def test_a_parameter_without_a_value_matters_only_where_it_counts(tmp_path: Path) -> None:
+    _, expected = rendered(tmp_path / "plain.xml", SENSOR)
+    sampled = SENSOR.replace("<film", SAMPLER.format("$spp") + "<film")
+    integrator = '<integrator type="path"><boolean name="hide_emitters" value="$hide"/></integrator>'
+    np.testing.assert_array_equal(rendered(tmp_path / "a.xml", sampled, integrator)[1], expected)
+    given = '<default name="spp" value="64"/>'
+    np.testing.assert_array_equal(rendered(tmp_path / "b.xml", sampled, given)[1], expected)
+    for sensor in (SENSOR.replace('"64"', '"$width"'), sampled.replace("$spp", "$width").replace('"64"', '"$width"')):
+        with pytest.raises(FileFormatError, match=r'parameter \$width has no value; put <default name="width" value'):
+            rendered(tmp_path / "c.xml", sensor)
+    with pytest.raises(FileFormatError, match=r"parameter \$spp has no value; put <default"):  # before it
+        rendered(tmp_path / "e.xml", sampled + '<default name="spp" value="64"/>')
+    (tmp_path / "part.xml").write_text(f'<scene version="3.0.0">{sampled}</scene>')
+    included = rendered(tmp_path / "d.xml", '<include filename="part.xml"/>')[1]
+    np.testing.assert_array_equal(included, expected)
+
+
+@pytest.mark.parametrize(("radius", "focus"), [(0.05, 2.0), (0.002, 0.5), (0.2, 40.0)])
+def test_an_aperture_that_is_left_out_is_told(tmp_path: Path, radius: float, focus: float) -> None:
+    def lens(radius: float) -> str:
+        numbers = f'<float name="aperture_radius" value="{radius}"/><float name="focus_distance" value="{focus}"/>'
+        return SENSOR.replace('"perspective">', f'"thinlens">{numbers}')
+
+    sharp, _ = rendered(tmp_path / "a.xml", lens(1e-6))
+    with pytest.warns(RangesimWarning, match=rf"aperture of {radius:g} m is left out.*focus_m={focus:g}\)"):
+        wide, _ = rendered(tmp_path / "b.xml", lens(radius))
+    assert wide.camera == sharp.camera

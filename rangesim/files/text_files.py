@@ -83,22 +83,35 @@ def _is_container(value: Any) -> bool:
     return isinstance(value, (Mapping, list, tuple))
 
 
-def check_xml(path: str | Path, resolve: Callable[[str], Path] | None = None) -> None:
-    """Raise FileFormatError if an XML file is missing, too large, nested too deep, no XML, or declares entities.
+def check_xml(
+    path: str | Path, resolve: Callable[[str], Path] | None = None, ignored: tuple[str, ...] = ()
+) -> dict[str, str]:
+    """Values for the parameters (`$name`) without a default that stand inside elements which are ignored alone.
 
     resolve : finds the file that an `<include filename="..."/>` names; each is checked in its place. None: includes
         mean nothing.
+    ignored : names of elements whose contents do not matter.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing, too large, nested too deep, no XML, or declares entities.
     """
-    _Xml(resolve).read(Path(path), 0, ())
+    xml = _Xml(resolve, ignored)
+    xml.read(Path(path), 0, ())
+    return {name: value for name, value in xml.fillers.items() if name not in xml.needed | set(xml.defaults)}
 
 
 class _Xml:
     """Depth and size of an XML file with what it includes."""
 
-    def __init__(self, resolve: Callable[[str], Path] | None) -> None:
-        self.resolve = resolve
+    def __init__(self, resolve: Callable[[str], Path] | None, ignored: tuple[str, ...]) -> None:
+        self.resolve, self.ignored = resolve, ignored
         self.size = 0
         self.defaults: dict[str, str] = {}
+        self.open: list[str] = []  # elements around the present place
+        self.fillers: dict[str, str] = {}  # for parameters without a default inside ignored elements
+        self.needed: set[str] = set()  # parameters without a default elsewhere
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
         """Check a file that stands `depth` levels deep inside the files `within`."""
@@ -119,6 +132,8 @@ class _Xml:
             level += 1
             if level > deepest:
                 raise _too_deep(path)
+            self.open.append(name)
+            self.note_parameters(name, attributes)
             if name == "default" and "name" in attributes:
                 self.defaults.setdefault(attributes["name"], attributes.get("value", ""))
             if name == "include" and self.resolve is not None:
@@ -130,6 +145,7 @@ class _Xml:
         def end(_: str) -> None:
             nonlocal level
             level -= 1
+            self.open.pop()
 
         def entity(name: str, *_: Any) -> None:
             raise FileFormatError(f"expected no entities in {path}, got {name[:40]!r}.")
@@ -140,6 +156,14 @@ class _Xml:
             parser.Parse(data, True)
         except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: of an unknown encoding
             raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
+
+    def note_parameters(self, name: str, attributes: Mapping[str, str]) -> None:
+        """Keep the parameters of an element that have no default yet: a value where it is ignored, else the name."""
+        missing = {match for text in attributes.values() for match in _PARAMETER.findall(text)} - set(self.defaults)
+        if any(element in self.ignored for element in self.open):
+            self.fillers |= dict.fromkeys(missing, "false" if name == "boolean" else "1")
+        else:
+            self.needed |= missing
 
 
 def _too_deep(path: str | Path) -> FileFormatError:

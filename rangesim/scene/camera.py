@@ -8,11 +8,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from rangesim.errors import FileFormatError
+from rangesim.errors import FileFormatError, warn
 from rangesim.rig import Intrinsics
 
 # Mitsuba's camera looks along +z with x to the left and y up; ours has x to the right and y down.
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+VISIBLE_BLUR = 0.1
+"""Diameter of a lens' blur, in pixels, that is worth a warning."""
 
 
 def camera_of(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
@@ -39,6 +42,23 @@ def camera_of(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
     if np.linalg.det(matrix[:3, :3]) < 0:
         raise FileFormatError(f"the sensor of {label} is mirrored; remove the negative scale from its to_world.")
     return camera, matrix
+
+
+def warn_of_aperture(sensor: Any, camera: Intrinsics, distance_m: float, label: str) -> None:
+    """Warn if a `thinlens` sensor would blur what is out of focus by more than `VISIBLE_BLUR`: here it is a pinhole.
+
+    distance_m : metres, depth of what the camera sees.
+    """
+    params = dict(mi.traverse(sensor))
+    if "aperture_radius" not in params:
+        return
+    radius, focus = (_number(params[name]) for name in ("aperture_radius", "focus_distance"))
+    blur = 2 * radius * camera.fx / min(focus, distance_m)  # pixels, of what is far off
+    if blur > VISIBLE_BLUR:
+        warn(
+            f"{label}: the camera's aperture of {radius:g} m is left out, so the image is sharp everywhere; state it "
+            f"in the rig: camera_lens=Lens(aperture_radius_m={radius:g}, focus_m={focus:g})."
+        )
 
 
 def _number(value: Any) -> float:

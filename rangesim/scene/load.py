@@ -21,11 +21,18 @@ from rangesim.files.bundled_scenes import CATALOGUE, scene_file
 from rangesim.files.text_files import check_xml
 from rangesim.rig import Intrinsics, translation
 from rangesim.scene import retroreflector
-from rangesim.scene.camera import camera_of
+from rangesim.scene.camera import camera_of, warn_of_aperture
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
-from rangesim.scene.nodes import OF_MITSUBA, check_camera, check_types, ids_of_shapes, take_material_classes
+from rangesim.scene.nodes import (
+    OF_MITSUBA,
+    check_camera,
+    check_types,
+    ids_of_shapes,
+    replace_ignored_plugins,
+    take_material_classes,
+)
 from rangesim.scene.normals import repeat_normals
 from rangesim.scene.origin import (
     AS_FAR,
@@ -55,6 +62,8 @@ from rangesim.scene.spectral_reflectance import (
 )
 from rangesim.settings.bounds import Bounds, check_number
 
+IGNORED_ELEMENTS = ("integrator", "sampler", "rfilter")
+"""Elements of a scene file that do not matter, so that a parameter without a value there needs none."""
 Source = str | Path | Mapping[str, Any]
 
 
@@ -111,13 +120,15 @@ def load_scene(
     warn_of_lamps_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)
+    working_distance_m = _median_depth(loaded, camera, T_camera)
+    warn_of_aperture(loaded.sensors()[sensor], camera, working_distance_m, label)
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
         mitsuba=loaded,
         instances=tuple(Instance(s.id(), classes.get(s.id()) or _class_of(s)) for s in loaded.shapes()),
         camera=camera,
         T_world_camera=translation(*origin_m) @ T_camera,
-        working_distance_m=_median_depth(loaded, camera, T_camera),
+        working_distance_m=working_distance_m,
         has_cutouts=any(is_cutout(s.bsdf()) for s in loaded.shapes()),
         has_matte_textures=any(map(has_texture, {s.bsdf() for s in loaded.shapes() if is_matte(s)})),
         source=None if isinstance(source, Mapping) else scene_file(source),
@@ -144,6 +155,7 @@ def _instantiate(
         take_sensor_reflectances(state, label)
         check_properties(state, label)
         check_evaluable(state, label)
+        replace_ignored_plugins(state)
         if (camera := camera_node(state, sensor)) is not None:
             check_camera(state, camera, label)
         return state, ids, classes
@@ -188,10 +200,18 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
     resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
     try:
-        check_xml(path, resolve=lambda name: Path(str(mi.file_resolver().resolve(name))))
+        fillers = check_xml(path, lambda name: Path(str(mi.file_resolver().resolve(name))), IGNORED_ELEMENTS)
     except FileFormatError as error:
         raise FileFormatError(f"{path} is no scene Mitsuba can load: {error}") from error
-    return mi.parser.parse_file(config, str(path))
+    try:
+        return mi.parser.parse_file(config, str(path), **fillers)
+    except RuntimeError as error:
+        if (missing := re.search(r"undefined parameter: \$(\w+)", str(error))) is None:
+            raise
+        raise FileFormatError(
+            f"{path}: the parameter ${missing[1]} has no value; put "
+            f'<default name="{missing[1]}" value="..."/> before it in the scene.'
+        ) from error
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import mitsuba as mi
@@ -17,6 +18,8 @@ SMOOTH = 0.05
 
 ALL_COMPONENTS = 0xFFFFFFFF
 
+_TEXTURE_PARTS = re.compile(r"(\.color[01])*(\.value|\.data)?$")
+"""The end of a parameter's name that tells which part of a texture it is."""
 _ALPHAS = ("alpha", "alpha_u", "alpha_v")
 
 
@@ -89,14 +92,22 @@ def _has(bsdf: Any, *lobes: str) -> bool:
 
 
 def _numbers(bsdf: Any) -> dict[str, float]:
-    """Parameters that hold one number, by their last name: `nested_bsdf.alpha.value` is `alpha`."""
-    result: dict[str, float] = {}
+    """Parameters that hold one number, by their last name: `nested_bsdf.alpha.value` is `alpha`.
+
+    A texture counts as its mean; one whose values are not its own (`mesh_attribute`) as NaN.
+    """
+    values: dict[str, list[float]] = {}
     try:
         parameters = list(mi.traverse(bsdf))
     except TypeError:  # Mitsuba 3.9 cannot list those of `hair` in a variant of one wavelength
-        return result
+        return {}
     for key, value in parameters:
-        array = np.array(value, dtype=np.float64).ravel() if isinstance(value, (float, mi.Float)) else np.empty(0)
-        if array.size == 1:
-            result[key.removesuffix(".value").rsplit(".", 1)[-1]] = float(array[0])
-    return result
+        if isinstance(value, (float, mi.Float, mi.TensorXf)):
+            array = np.array(value, dtype=np.float64)
+            if array.size == 1 or isinstance(value, mi.TensorXf):
+                owner, _, last = key.rpartition(".")
+                is_attribute = last == "scale"
+                values.setdefault(owner if is_attribute else _TEXTURE_PARTS.sub("", key), []).append(
+                    np.nan if is_attribute else float(array.mean())
+                )
+    return {key.rsplit(".", 1)[-1]: float(np.mean(means)) for key, means in values.items()}

@@ -21,6 +21,10 @@ COMPOSITES = ("instance", "shapegroup", "merge")
 """Shapes that stand for others, whose parts would have neither name nor material."""
 OF_MITSUBA = Path(mi.__file__).resolve().parent
 """Mitsuba's own directory: its plugins are in `plugins`."""
+IGNORED_PLUGINS = {"Integrator": "path", "Film": "hdrfilm", "Sampler": "independent", "ReconstructionFilter": "box"}
+"""What stands in for a plugin that Mitsuba lacks, by the kind of node, where the kind does not matter."""
+FILM_SIZES = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+"""What of a film matters."""
 _LIBRARIES = (".so", ".dylib", ".dll")
 _PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
 
@@ -108,6 +112,24 @@ def check_camera(state: Any, node: Any, label: str) -> None:
                 f"{label}: expected the camera to stand in air, got a medium in its sensor; remove it, and let the "
                 "medium fill a closed shape in front of the camera."
             )
+
+
+def replace_ignored_plugins(state: Any) -> None:
+    """Put Mitsuba's own in place of integrators, films and samplers that it does not have.
+
+    They belong to a renderer built on Mitsuba, such as mitransient, and what they do is ignored. The size of the image
+    stays.
+    """
+    for node in state.nodes:
+        own = IGNORED_PLUGINS.get(node.type.name)
+        if own is None or node.props.plugin_name() in shipped_types():
+            continue
+        props = mi.Properties(own)
+        props.set_id(node.props.id())
+        for key in FILM_SIZES if node.type == mi.ObjectType.Film else ():
+            if key in node.props:
+                props[key] = node.props[key]
+        node.props = props
 
 
 def take_material_classes(state: Any, label: str) -> dict[str, str]:
