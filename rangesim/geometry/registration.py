@@ -46,6 +46,8 @@ FAR_EXTENTS = 5.0
 """Clouds further than this from the origin, in units of their extent, are moved there before they are solved."""
 SLIDE_SPACINGS, MAX_SLIDES = 6.0, 6
 """Steps, and how many to either side, by which a result of `icp` is slid along the surface to look for others."""
+SLID_POINTS = 800
+"""Of the source, that are slid: a pose that fits as well does so by few points, too."""
 AS_GOOD = 0.95
 """Fraction of the best agreement at which another pose fits alike."""
 
@@ -300,7 +302,7 @@ def _refuse_slid(found: Registration, guess: Array, source: Array, surface: _Sur
     by one rib of many ends at a neighbour of the right one.
     """
     T = found.T_target_source
-    few = source[np.random.default_rng(0).permutation(len(source))[:COMPARED_POINTS]]
+    few = source[np.random.default_rng(0).permutation(len(source))[:SLID_POINTS]]
     best = _judged(few, surface, T)
     if best.agreement <= 0:  # noise above the spacing: without a partner a point agrees better
         return
