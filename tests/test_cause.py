@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from rangesim.causes.cause import DEFINITIONS, TITLES
 from rangesim.causes.light_budget import light_budget, white_radiance
 from rangesim.causes.reference_frames import single_path_frames
 from rangesim.decoding.status import Status
+from rangesim.report.tables import parts
 from rangesim.response import (
     CAUSTIC,
     DIRECT,
@@ -303,11 +305,44 @@ def test_shares_are_of_the_pixels_of_a_material() -> None:
         projector_visible=np.ones((2, 4), bool),
         material_names=("matte", "mirror"),
     )
-    matte, mirror, everything = CauseMap(cause, 0.01).fractions(truth)
+    fractions = CauseMap(cause, 0.01).fractions(truth)
+    matte, mirror, everything = fractions
     assert matte == {"material": "matte", "failed": 4 / 6, "causes": {"multipath": 3 / 6, "shadowed": 1 / 6}}
     assert mirror == {"material": "mirror", "failed": 1.0, "causes": {"specular_away": 1.0}}
     assert everything["failed"] == 5 / 7
     assert list(everything["causes"]) == ["multipath", "shadowed", "specular_away"]
+    assert str(fractions).splitlines() == [
+        "| material | failed (%) | because (% of the pixels) |",
+        "| --- | --- | --- |",
+        "| matte | 66.7 | multipath 50.0, shadowed from projector 16.7 |",
+        "| mirror | 100.0 | specular away 100.0 |",
+        "| all | 71.4 | multipath 42.9, shadowed from projector 14.3, specular away 14.3 |",
+    ]
+    assert json.loads(json.dumps(fractions)) == list(fractions)
+    nowhere = replace(truth, z=np.full((2, 4), np.nan, np.float32))
+    nothing = CauseMap(np.zeros((2, 4), np.uint8), 0.01).fractions(nowhere)
+    assert str(nothing).splitlines()[2:] == ["| all | – | – |"]
+
+
+def test_every_cause_is_printed_in_the_words_of_the_page() -> None:
+    """The names were those of the enumeration: seen_through for 'seen through transparent'."""
+    cause = np.repeat(np.arange(len(Cause), dtype=np.uint8), 3)[None]
+    shape = cause.shape
+    truth = GroundTruth(
+        z=np.ones(shape, np.float32),
+        range_m=np.ones(shape, np.float32),
+        normal=np.zeros((*shape, 3), np.float32),
+        instance=np.zeros(shape, np.int32),
+        material=np.zeros(shape, np.int32),
+        projector_uv=np.zeros((*shape, 2), np.float32),
+        projector_visible=np.ones(shape, bool),
+        material_names=("wall",),
+    )
+    fractions = CauseMap(cause, 0.01).fractions(truth)
+    for row in fractions:
+        assert [part.name for part in parts(row)] == [TITLES[c] for c in Cause if c]
+    listed = ", ".join(f"{TITLES[c]} 7.1" for c in Cause if c)
+    assert str(fractions).splitlines()[2:] == [f"| wall | 92.9 | {listed} |", f"| all | 92.9 | {listed} |"]
 
 
 def test_wrong_arguments_are_refused() -> None:

@@ -18,6 +18,7 @@ from rangesim.report.markdown_table import markdown_table
 
 Rows = list[dict[str, Any]]
 
+FAILURE_HEADS = ["failed (%)", "because (% of the pixels)"]
 UNRELIABLE = 0.5
 """Fraction of outliers or of missing pixels from which a sensor is called unreliable on a material."""
 
@@ -149,10 +150,15 @@ def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
     return "\n".join(
         [
             _markdown(tables, heads, lambda row: [number(c, row[c.key]) for c in COLUMNS]),
-            _markdown(tables, ["failed (%)", "because (% of the pixels)"], _failures),
+            _markdown(tables, FAILURE_HEADS, _failures),
             _markdown(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise),
         ]
     )
+
+
+def failures_markdown(rows: Rows) -> str:
+    """What failed and why in Markdown, one row per material."""
+    return markdown_table(["material", *FAILURE_HEADS], [[row["material"], *_failures(row)] for row in rows])
 
 
 def _markdown(
