@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What does a sensor make of an object that moves while it looks? Measures the error on a ball that slides sideways.
 
-Structured light takes one exposure per pattern, so what moves smears; an AMCW camera takes the four taps of a frequency
-in one exposure, or one after another if its pixels have but one tap; a scanning beam sees each line at its own time,
-which shears what moves. Direct light only, to leave other errors out. The errors are against the truth at the middle of
-each acquisition. The picture has a row per speed and a column per sensor; near is bright.
+Structured light takes one exposure per pattern, so what moves smears; an AMCW camera takes the four taps of a
+frequency in one exposure, or one after another if its pixels have but one tap; a flash camera that reads line by line
+sees each at its own time, which shears what moves. Direct light only, to leave other errors out. The errors are
+against the truth at the middle of each acquisition. The picture has a row per speed and a column per sensor; near is
+bright.
 
 Usage: python examples/motion.py [OUT_FOLDER] [--width 160] [--speeds 0 0.1 0.3 1]
 """
@@ -25,7 +26,7 @@ CAMERAS = {
     "structured light, 120 patterns/s": (StructuredLight(), Timing(frame_period_s=1 / 120)),
     "AMCW, four taps, 3 x 2 ms": (AmcwToF(), Timing(frame_period_s=2e-3)),
     "AMCW, single tap, 12 x 2 ms": (AmcwToF(), Timing(frame_period_s=2e-3, single_tap=True)),
-    "dToF scan, 120 lines in 0.1 s": (DirectToF(pulse_fwhm_s=200e-12), Timing(line_period_s=1 / 1200, bands=30)),
+    "dToF read by lines, 120 in 0.1 s": (DirectToF(pulse_fwhm_s=200e-12), Timing(line_period_s=1 / 1200, bands=30)),
 }
 SPEEDS_M_S = (0.0, 0.1, 0.3, 1.0)
 

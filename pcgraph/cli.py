@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import pcgraph
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line
 from pcgraph.families import member
+from pcgraph.plain_files import said
 
 if TYPE_CHECKING:
     import numpy as np
@@ -110,7 +111,8 @@ def segment(
     """Segment a point cloud into objects, and write labels, supervoxels, graph and tree.
 
     Writes NAME.segments.ply (points coloured by object, with labels and supervoxels) and NAME.segments.npz
-    (labels in the input's shape, graph and tree).
+    (labels in the input's shape, graph and tree). What the file says of its points is kept under its names: beside
+    colours and labels of its own, the result's are called segment_red and so on, and segment_labels.
 
     Example: pcgraph segment scan.pcd --out results/ --voxel-size 0.005 --seed-size 0.03
     """
@@ -121,10 +123,10 @@ def segment(
             raise ValueError("expected --objects or --altitude, got both: choose one")
         if seed_size is not None and supervoxels is not None:
             raise ValueError("expected --seed-size or --supervoxels, got both: choose one")
-        read = _read(cloud, color)
+        read = pcgraph.read_cloud(cloud)
         result = _segmented(
             cloud,
-            read,
+            read if color else replace(read, colors=None),
             viewpoint=viewpoint,
             features=features or None,
             voxel_size=voxel_size,
@@ -139,9 +141,10 @@ def segment(
         level = result.object_altitude if objects is None else None
         labels = result.labels if level is not None and min_size == 1 else result.cut(objects, level, min_size)
         _write(targets, read, result, labels)
-    except (PcgraphError, ValueError, MemoryError) as error:
-        message = " ".join(str(error).split()) or "the cloud does not fit into memory: choose a larger voxel size"
-        typer.echo(f"pcgraph: {message.rstrip('.')}.", err=True)
+    except (PcgraphError, ValueError, MemoryError, OSError) as error:
+        message = said(error) if isinstance(error, OSError) else str(error)
+        message = " ".join(message.split()) or "the cloud does not fit into memory: choose a larger voxel size"
+        typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
     _print_summary(result, labels, targets, time.perf_counter() - start)
 
@@ -159,7 +162,7 @@ def _targets(cloud: Path, out: Path | None) -> list[Path]:
             raise CloudWriteError(f"expected --out as a .ply or .npz file or a folder, got {out.name!r}")
         if not out.parent.is_dir():
             raise CloudWriteError(f"cannot write {out}: there is no folder {out.parent}; create it first")
-        if out.resolve() == cloud.resolve():
+        if os.path.realpath(out) == os.path.realpath(cloud):
             raise CloudWriteError(f"--out is the input itself, {out}: choose another name")
         targets = [out]
     else:
@@ -187,11 +190,6 @@ def _check_targets(targets: list[Path]) -> None:
         raise CloudWriteError(f"cannot write to {above}: permission denied; choose another --out")
 
 
-def _read(path: Path, color: bool) -> Cloud:
-    cloud = pcgraph.read_cloud(path)
-    return cloud if color else replace(cloud, colors=None)
-
-
 def _linkage(name: str) -> Linkage:
     return pcgraph.LearnedLinkage.load(name) if name.lower().endswith(".json") else member("Linkage", name)
 
@@ -209,7 +207,7 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
             raise CloudReadError(f"cannot segment {path}: {error}") from None
     for warning in caught:
         if issubclass(warning.category, pcgraph.CloudWarning):
-            typer.echo(f"pcgraph: warning: {warning.message}.", err=True)
+            typer.echo(f"pcgraph: warning: {one_line(warning.message)}.", err=True)
         else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     return result
@@ -234,6 +232,6 @@ def _print_summary(result: Segmentation, labels: NDArray[np.int32], targets: lis
         ("edges", str(len(result.graph.edges))),
         ("objects", str(int(labels.max()) + 1)),
         ("seconds", f"{seconds:.2f}"),
-        *(("written", str(target)) for target in targets),
+        *(("written", one_line(target)) for target in targets),
     ):
         typer.echo(f"{name:<12} {value}")

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from pcgraph.errors import CloudReadError
 from pcgraph.short_repr import ShortRepr
@@ -15,8 +17,13 @@ from pcgraph.short_repr import ShortRepr
 Columns = Mapping[str, NDArray[np.generic]]
 """One array per field of a file."""
 
-_NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
-_LABEL_NAMES = ("label", "labels")
+TextField = tuple[str, DTypeLike, int]
+"""Name, type and numbers of each point in a field of a text."""
+
+NORMAL_NAMES = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
+PACKED_NAMES = ("rgb", "rgba")
+COLOR_NAMES = ("red", "green", "blue")
+LABEL_NAMES = ("label", "labels")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +33,10 @@ class Cloud(ShortRepr):
     Attributes
     ----------
     points : (n, 3) or (h, w, 3) float32 or float64, metres, the file's frame
-        Organised when the file is (PCD with HEIGHT > 1). NaN where the sensor saw nothing.
+        Organised when the file is (PCD with HEIGHT > 1). NaN where the sensor saw nothing. Read as float64 where the
+        file has float64, integers of 64 bits, or whole numbers beyond 2**24, which float32 would round.
     colors : same leading shape + (3,), uint8, 0..255, or None
-        Red, green, blue.
+        Red, green, blue. Black where a text has nan for a packed colour; None if it has nothing else.
     normals : same leading shape + (3,), float32 or float64, or None
         As stored; not checked for unit length.
     labels : same leading shape, int32, or None
@@ -92,8 +100,7 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
 
 
 def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.floating]:
-    wide = any(columns[name].dtype.itemsize > 4 for name in names)
-    dtype = np.float64 if wide else np.float32
+    dtype = np.float64 if any(_is_wide(columns[name]) for name in names) else np.float32
     stacked = np.empty((*shape, len(names)), dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         for axis, name in enumerate(names):
@@ -101,12 +108,18 @@ def _stack(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> 
     return stacked
 
 
+def _is_wide(column: NDArray[np.generic]) -> bool:
+    """Whether float32 does not hold the column as it is: by its type, or by whole numbers beyond 2**24."""
+    if column.dtype.itemsize > 4:
+        return True
+    return column.dtype.kind in "iu" and max(abs(int(column.min(initial=0))), int(column.max(initial=0))) > 1 << 24
+
+
 def _color_names(columns: Columns) -> tuple[str, ...]:
-    for name in ("rgb", "rgba"):
+    for name in PACKED_NAMES:
         if name in columns and columns[name].dtype.itemsize == 4:
             return (name,)
-    names = ("red", "green", "blue")
-    return names if all(name in columns for name in names) else ()
+    return COLOR_NAMES if all(name in columns for name in COLOR_NAMES) else ()
 
 
 def _colors(columns: Columns, names: tuple[str, ...], shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
@@ -134,11 +147,11 @@ def _white(stored: list[NDArray[np.generic]], values: NDArray[np.float64]) -> fl
 
 
 def _normal_names(columns: Columns) -> tuple[str, ...]:
-    return next((names for names in _NORMAL_NAMES if all(name in columns for name in names)), ())
+    return next((names for names in NORMAL_NAMES if all(name in columns for name in names)), ())
 
 
 def _label_name(columns: Columns) -> tuple[str, ...]:
-    return tuple(name for name in _LABEL_NAMES if name in columns and columns[name].dtype.kind in "iu")[:1]
+    return tuple(name for name in LABEL_NAMES if name in columns and columns[name].dtype.kind in "iu")[:1]
 
 
 def _names_by_lower_case(columns: Columns) -> dict[str, str]:
@@ -158,8 +171,46 @@ def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.gen
     return column.reshape(*shape, *column.shape[1:]).copy()
 
 
-def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.float64]:
-    """First `n_rows` x `n_columns` numbers of a text, in reading order.
+def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -> dict[str, NDArray[np.generic]]:
+    """One array per field of the numbers of a text, in the types that the header names.
+
+    A packed colour that is nan says that there is none, as a text does not keep the bits of a nan: it becomes 0, black,
+    and the field is left out where it holds no other.
+
+    Parameters
+    ----------
+    table : (n, m) float64
+        Numbers of each row.
+    fields : (name, dtype, count) of each, whose counts add up to m
+
+    Returns
+    -------
+    dict of field name to (n,) array, (n, c) where the count is above 1
+    """
+    columns: dict[str, NDArray[np.generic]] = {}
+    end = 0
+    for name, dtype, count in fields:
+        first, end = end, end + count
+        numbers = table[:, first] if count == 1 else table[:, first:end]
+        if name.lower() in PACKED_NAMES and np.dtype(dtype).itemsize == 4 and (none := np.isnan(numbers)).any():
+            if none.all():
+                continue
+            numbers = np.where(none, 0.0, numbers)
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns[name] = numbers.astype(dtype)
+    return columns
+
+
+def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
+    """First `n_rows` rows of numbers of a text, a row in each line; empty lines do not count.
+
+    Parameters
+    ----------
+    body : bytes
+        Lines that end in a line feed. What follows the last row is not read.
+    n_rows, n_columns : int
+    first_line : int
+        Number of the body's first line in its file, from 1, for messages.
 
     Returns
     -------
@@ -169,16 +220,36 @@ def numbers_from_text(body: bytes, n_rows: int, n_columns: int) -> NDArray[np.fl
     Raises
     ------
     CloudReadError
-        Too few numbers, or a word that is not a number.
+        Too few rows, a row of more or fewer words than columns, or a word that is not a number.
     """
     needed = n_rows * n_columns
     if needed > len(body):  # a number takes a byte at least: refuse before allocating what a header invents
         raise CloudReadError(f"the header promises {needed} numbers, but only {len(body)} bytes follow")
-    words = body.split(None, needed)[:needed]
-    if len(words) < needed:
-        raise CloudReadError(f"the header promises {n_rows} points ({needed} numbers), but {len(words)} follow")
-    try:
-        # Not through an array of the words: each would take as many bytes as the longest.
-        return np.fromiter(map(float, words), np.float64, needed).reshape(n_rows, n_columns)
-    except ValueError as error:
-        raise CloudReadError(f"expected numbers only in the ascii data: {str(error)[:120]}") from None
+    rows = _rows_of_text(body, n_rows, n_columns, first_line)
+    # Not through an array of the words: each would take as many bytes as the longest.
+    return np.fromiter(chain.from_iterable(rows), np.float64, needed).reshape(n_rows, n_columns)
+
+
+def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> Iterator[list[float]]:
+    """Numbers of each row."""
+    left = n_rows
+    lines = enumerate(BytesIO(body), first_line)
+    while left:
+        number, line = next(lines, (0, b""))
+        if not number:
+            raise CloudReadError(f"the header promises {n_rows} points, but {n_rows - left} rows of numbers follow")
+        words = line.split(None, n_columns)
+        if not words:
+            continue
+        if len(words) != n_columns:
+            got = f"more than {n_columns}" if len(words) > n_columns else f"{len(words)}"
+            raise CloudReadError(
+                f"expected {n_columns} numbers in each line, one for each field of the header, "
+                f"but line {number} has {got}: correct the line or the header"
+            )
+        try:
+            yield [float(word) for word in words]
+        except ValueError as error:
+            reason = str(error)[:120]
+            raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {reason}") from None
+        left -= 1

@@ -28,6 +28,8 @@ DISK = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "the disk quo
         errno.EIO: "the device fails"}  # fmt: skip
 """Why a disk takes no more, by error number."""
 _LONGEST_NAME = 255
+_SEALED_WITHIN = 400  # bytes
+_BLOCK = 1 << 20
 _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.part")
 
 
@@ -63,6 +65,44 @@ def is_plain_file(path: Path) -> bool:
         return stat.S_ISREG(path.lstat().st_mode)
     except OSError:
         return False
+
+
+# ---- Seals ---------------------------------------------------------------------------------------------------------
+
+
+def unsealed(mark: str) -> str:
+    """The text, of letters that any format takes, by which `sealed` finds where the seal of a file goes."""
+    return f"{mark} sha256 {'0' * 64}"
+
+
+def sealed(content: bytes, mark: str, at_end: bool = False) -> bytes:
+    """The bytes of a file with their SHA-256 in place of the zeros of the first `unsealed`, or the last.
+
+    The sum is that of the file with zeros in place of the sum.
+    """
+    empty = unsealed(mark).encode()
+    start = (content.rindex(empty) if at_end else content.index(empty)) + len(empty) - 64
+    return content[:start] + hashlib.sha256(content).hexdigest().encode() + content[start + 64 :]
+
+
+def is_sealed(path: Path, mark: str, at_end: bool = False) -> bool:
+    """Whether a file has its seal within the first 400 bytes, or the last, and nobody changed it."""
+    with path.open("rb") as stream:
+        start = max(0, stream.seek(0, os.SEEK_END) - _SEALED_WITHIN) if at_end else 0
+        stream.seek(start)
+        seals = list(re.finditer(rb"%s sha256 ([0-9a-f]{64})" % re.escape(mark.encode()), stream.read(_SEALED_WITHIN)))
+        if not seals:
+            return False
+        seal = seals[-1 if at_end else 0]
+        stream.seek(0)
+        sha256, left = hashlib.sha256(), start + seal.start(1)
+        while left and (block := stream.read(min(left, _BLOCK))):
+            sha256.update(block)
+            left -= len(block)
+        sha256.update(b"0" * len(stream.read(64)))
+        while block := stream.read(_BLOCK):
+            sha256.update(block)
+    return sha256.hexdigest().encode() == seal[1]
 
 
 # ---- Writing -------------------------------------------------------------------------------------------------------
@@ -218,6 +258,19 @@ def clear_parts(folder: Path, names: Set[str]) -> None:
 def why(problem: OSError) -> str:
     """What an operating system's error says, in words."""
     return DISK.get(problem.errno or 0) or problem.strerror or str(problem)
+
+
+def said(problem: OSError) -> str:
+    """What an operating system's error says, for people: of which file, and why."""
+    if problem.errno is None:
+        return str(problem)
+    if problem.filename is not None:
+        return f"cannot use {os.fsdecode(problem.filename)}: {why(problem)}"
+    try:
+        os.getcwd()
+    except OSError:
+        return "expected a working directory, but this one is gone: change to another"
+    return why(problem)
 
 
 def flush(path: Path) -> None:

@@ -7,8 +7,9 @@ command line prints it as it stands.
 
 from __future__ import annotations
 
-import re
 import warnings
+
+from pcgraph.errors import one_line, visible
 
 __all__ = [
     "AlignmentWarning",
@@ -18,6 +19,7 @@ __all__ = [
     "RangesimWarning",
     "SamplingWarning",
     "TruncationWarning",
+    "one_line",
     "sentence",
     "visible",
     "warn",
@@ -73,15 +75,3 @@ def sentence(message: str) -> str:
     if len(line) <= MAX_SENTENCE:
         return line
     return f"{line[: 2 * MAX_SENTENCE // 3]} ... {line[5 - MAX_SENTENCE // 3 :]}"
-
-
-def visible(text: str) -> str:
-    """Text whose control characters are spelt out, as `\\u202e`.
-
-    They would turn round, break or hide the text beside them, or give orders to a terminal; and half a surrogate pair
-    cannot be written at all.
-    """
-    return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
-
-
-_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")

@@ -15,8 +15,10 @@ import numpy as np
 import rangesim
 from rangesim import AmcwToF, Capture, Detector, RangeImage, Rig, Scene, Signals, StructuredLight, transport
 from rangesim.causes import Cause
+from rangesim.electronics.spad import SpadDetector
 from rangesim.environment.backend import select_variant
 from rangesim.motion import ConstantTwist, Motion, Timing, transport_moving
+from rangesim.sensors import DirectToF
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SIZE = {"width": 80, "height": 60}
@@ -281,12 +283,24 @@ def low_signal() -> Case:
     return timed_case(signals, sensor, detector, 0.01, [(healed, Cause.LOW_SIGNAL)])
 
 
+def pile_up() -> Case:
+    """A wall under so strong a laser that every pulse brings photons before the peak; healed by less power."""
+    scene = room(wall=board(0, 0, 1.5, 2))
+    sensor, detector = DirectToF(), SpadDetector(bits=16)
+    rig = replace(scene.rig(0.02, **SIZE), projector_power_w=100.0)
+    signals, weak = (
+        transport(scene, replace(rig, projector_power_w=power_w), [sensor], spp=64) for power_w in (100.0, 1.0)
+    )
+    healed = right(measure(weak, sensor, detector, 1e-3)[1], weak)
+    return timed_case(signals, sensor, detector, 1e-3, [(healed, Cause.PILE_UP)])
+
+
 def ambient() -> Case:
     """A wall in sunlight; healed in the dark, with the same exposure."""
     lamp = {"type": "constant", "radiance": 60.0}
     scene, dark_scene = room(wall=board(0, 0, 1.5, 2), sun=lamp), room(wall=board(0, 0, 1.5, 2))
     sensor, detector = AmcwToF(), Detector.time_of_flight()
-    exposure_s = 4e-4
+    exposure_s = 8e-4
     signals, dark = (transport(s, s.rig(0.03, **SIZE), [sensor], spp=64) for s in (scene, dark_scene))
     healed = right(measure(dark, sensor, detector, exposure_s)[1], dark)
     return timed_case(signals, sensor, detector, exposure_s, [(healed, Cause.AMBIENT)])

@@ -521,6 +521,36 @@ def test_a_rig_for_opencv_is_read_back_and_decodes(rendered, tmp_path):
         assert np.allclose(z, expected, atol=1e-5, equal_nan=True)
 
 
+def test_a_calibration_for_opencv_may_be_in_any_unit(rendered, tmp_path):
+    from rangesim.calibration.opencv_files import load_opencv, save_opencv
+    from rangesim.cli import app
+    from rangesim.decoding.range_image_files import load_range_image
+    from rangesim.rig.calibration_files import save_calibration
+
+    captures, rig = rendered
+    captures[0].save(tmp_path / "capture")
+    expected = rangesim.decode(captures[0]).z
+    for k, (suffix, unit) in enumerate(((".yml", 1e-3), (".xml", 0.0254), (".yaml", 1.0))):
+        place = tmp_path / f"rig{k}{suffix}"
+        T = np.array(rig.T_camera_projector)
+        T[:3, 3] /= unit
+        save_opencv(replace(rig, T_camera_projector=T), place)
+        assert np.allclose(load_opencv(place, unit).T_camera_projector, rig.T_camera_projector, atol=1e-12)
+        assert np.allclose(load_opencv(place).T_camera_projector[:3, 3], T[:3, 3], rtol=1e-12)
+        arguments = ["decode", str(tmp_path / "capture"), "--calibration", str(place)]
+        app([*arguments, "--unit", str(unit), "--out", str(tmp_path / str(k))], standalone_mode=False)
+        z = load_range_image(tmp_path / str(k) / "range.npz").z
+        assert np.allclose(z, expected, atol=1e-5, equal_nan=True)
+        with pytest.raises(ValueError, match=r"--code-step with --calibration FILE\.xml of procam"):
+            app([*arguments, "--code-step", "2", "--out", str(tmp_path / "no")], standalone_mode=False)
+    with pytest.raises(ValueError, match="unit_m"):
+        load_opencv(place, 0.0)
+    save_calibration(rig, tmp_path / "rig.json")
+    arguments = ["decode", str(tmp_path / "capture"), "--calibration", str(tmp_path / "rig.json")]
+    with pytest.raises(ValueError, match=r"FILE\.yml with --unit; others are in metres"):
+        app([*arguments, "--unit", "0.001", "--out", str(tmp_path / "no")], standalone_mode=False)
+
+
 def test_broken_files_of_opencv_are_refused(rendered, tmp_path):
     from rangesim.calibration.opencv_files import load_opencv, save_opencv, save_opencv_camera
     from rangesim.errors import FileFormatError

@@ -124,6 +124,54 @@ def test_a_file_of_the_users_is_not_replaced(tmp_path: Path, name: str):
         check_places(place, None)
 
 
+@pytest.mark.parametrize("name", ["a.json", "a.yml", "a.yaml", "a.xml", "camera.yml", "page.html", "tof.npz"])
+def test_what_somebody_changed_since_is_theirs(tmp_path: Path, name: str):
+    from rangesim.calibration.opencv_files import save_opencv, save_opencv_camera
+    from rangesim.files.array_files import write_arrays
+    from rangesim.rig.calibration_files import SEAL, load_calibration, save_calibration
+
+    place, rig = tmp_path / name, default_rig()
+    if name == "a.json":
+        save_calibration(rig, place)
+        assert load_calibration(place) == rig
+    elif name == "camera.yml":
+        save_opencv_camera(rig.camera, place)
+    elif name == "page.html":
+        place.write_text(render_calibration(calibrated(), NAMES))
+    elif name == "tof.npz":
+        write_arrays(place, {"cosines_m": np.zeros((1, 3)), "offset_m": np.zeros((48, 64), np.float32)}, SEAL)
+        assert np.load(place)["offset_m"].shape == (48, 64)
+    else:
+        save_opencv(rig, place)
+    content = place.read_bytes()
+    check_places(place, None)
+    for k in range(40, len(content), max(1, len(content) // 30)):
+        place.write_bytes(content[:k] + bytes([content[k] ^ 1]) + content[k + 1 :])
+        with pytest.raises(FileFormatError, match="changed since, and would be lost"):
+            check_places(place, None)
+    for theirs in (content + b"\n", content[:-1], content.replace(b"sha256", b"sha512"), content[40:]):
+        place.write_bytes(theirs)
+        with pytest.raises(FileFormatError, match="would be lost"):
+            check_places(place, None)
+    place.write_bytes(content)
+    check_places(place, None)
+
+
+def test_a_calibration_corrected_by_hand_is_read_and_kept(tmp_path: Path):
+    from rangesim.calibration.opencv_files import load_opencv, save_opencv
+    from rangesim.rig.calibration_files import load_calibration, save_calibration
+
+    rig = default_rig()
+    for name, save, load in (("a.json", save_calibration, load_calibration), ("a.yml", save_opencv, load_opencv)):
+        save(rig, tmp_path / name)
+        text = (tmp_path / name).read_text()
+        width = str(rig.camera.width)
+        (tmp_path / name).write_text(text.replace(width, "1234", 1))
+        assert load(tmp_path / name).camera.width == 1234
+        with pytest.raises(FileFormatError, match="would be lost"):
+            check_places(tmp_path / name, None)
+
+
 def test_what_the_command_wrote_is_replaced(tmp_path: Path):
     from rangesim.calibration.opencv_files import save_opencv
     from rangesim.rig.calibration_files import save_calibration

@@ -238,6 +238,28 @@ def test_a_detector_that_the_sun_fills_is_swamped_and_one_that_the_projector_fil
         assert (found.cause[seen] == cause).all()
 
 
+@pytest.mark.parametrize("wall_m", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("photons", [5.0, 11.0, 100.0])
+def test_too_many_photons_a_pulse_are_pile_up_and_a_tenth_of_them_is_read(wall_m: float, photons: float) -> None:
+    sensor, detector = DirectToF(), SpadDetector(bits=16)
+    rig = stereo_rig(32, 24, baseline_m=0.0)
+    one = plane_signals(rig, sensor, distance_m=wall_m)
+    radiance = one.frames(sensor).sum(axis=0)
+    mean = detector.mean_electrons(radiance, sensor.gate, rig, 1e-5) / detector.pulses(sensor.gate, 1e-5)
+    scale = photons / np.median(mean[one.truth.projector_visible])
+    failed = []
+    for factor in (scale, scale / 10):
+        signals = plane_signals(replace(rig, projector_power_w=factor), sensor, distance_m=wall_m)
+        capture = expose(signals, sensor, detector, 1e-5)
+        found = explain(decode(capture), capture, signals)
+        seen = signals.truth.projector_visible & found.failed
+        failed.append(seen.sum() / signals.truth.projector_visible.sum())
+        if factor == scale:
+            assert (found.cause[seen] == Cause.PILE_UP).all()
+    assert failed[0] > 0.5
+    assert photons > 20 or failed[1] < 0.1
+
+
 def test_the_lens_in_a_mirror_is_glint_where_the_law_of_reflection_puts_it() -> None:
     """A mirror square to the camera shows the lens, 5 cm wide for once, as far behind it as it is before."""
     scene = cause_scenes.room(mirror=cause_scenes.board(0, 0, 1.0, 0.5, cause_scenes.SILVER))

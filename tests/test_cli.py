@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -10,6 +11,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -221,7 +224,10 @@ def _write_bad_files(folder: Path) -> None:
         (["decode", "empty", "--projector", "64x64"], "expected 26 images .* got 0"),
         (["decode", "gap"], "white.png is missing"),
         (["decode", "gap", "--axes", "rows", "--bits", "12"], "how it was taken: leave out --axes, --bits"),
-        (["decode", "empty", "--projector", "64x64", "--unit", "1"], "expected --calibration FILE.xml with --unit"),
+        (
+            ["decode", "empty", "--projector", "64x64", "--unit", "1"],
+            "--calibration FILE.xml or FILE.yml with",
+        ),
         (["decode", "crop"], "expected 120 x 90 uint16 .* got 60 x 60"),
     ],
 )
@@ -316,3 +322,54 @@ def test_the_command_line_loads_nothing_heavy() -> None:
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert answer.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("letters", [256, 3000])
+def test_an_operating_systems_error_is_said_in_words(command: Command, letters: int) -> None:
+    name = "n" * letters
+    answer = command("verify", name)
+    assert answer.status == 1
+    assert answer.err.startswith("rangesim: cannot use nnn")
+    assert answer.err.endswith("n/experiment.json: File name too long\n")
+    assert "Errno" not in answer.err
+
+
+@pytest.mark.parametrize("order", ["\x1b[2J", "\u202e", "\n", "\x9b1m"])
+def test_names_of_shapes_give_no_orders_to_a_terminal(order: str) -> None:
+    from rangesim.cli.scan import _table
+
+    name = f"a{order}b"
+    result: Any = SimpleNamespace(
+        things=(name, "sphere"),
+        errors={name: None, "sphere": SimpleNamespace(accuracy_m=1e-3, recall=0.5)},
+        materials={name: order, "sphere": "matte"},
+        seen=None,
+        poses=None,
+    )
+    code = {"\n": "\\n"}.get(order[0], f"\\u{ord(order[0]):04x}") + order[1:]
+    lines = _table(result).split("\n")
+    assert lines[1].split() == [f"a{code}b", code, "-", "-", "-"]
+    assert lines[2].split() == ["sphere", "matte", "1.000", "mm", "50.0%", "-"]
+    assert len(lines) == 3
+
+
+def test_names_of_directories_give_no_orders_to_a_terminal(command: Command, tmp_path: Path) -> None:
+    place = tmp_path / "a\x1b[2J\u202e\nb"
+    assert (
+        command("run", PLANE, *IDEAL, *TINY, "--out", place).out == f"{tmp_path}/a\\u001b[2J\\u202e\\nb/report.html\n"
+    )
+    answer = command("verify", place)
+    assert answer.out.startswith(f"{tmp_path}/a\\u001b[2J\\u202e\\nb: all ")
+
+
+@pytest.mark.parametrize(
+    "poses", [[], 3, "x", None, {"T_world_camera": 5}, [[1, 2]], [[[float("nan")] * 4] * 4], [[[2.0] * 4] * 4]]
+)
+def test_a_wrong_list_of_poses_is_named(tmp_path: Path, poses: Any) -> None:
+    from rangesim.cli.scan import _path
+    from rangesim.fusion.paths import Dome
+
+    place = tmp_path / "poses.json"
+    place.write_text(json.dumps(poses))
+    with pytest.raises(ValueError, match=re.escape(f"{place}: expected ")):
+        _path(Dome(), str(place), None)

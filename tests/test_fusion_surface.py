@@ -175,6 +175,28 @@ def test_sparse_blocks_hold_what_the_plain_reference_says(weights: Any, lookup: 
     assert np.abs(at_vertex).max() < 1e-3  # rounding puts a few projections in another pixel
 
 
+@pytest.mark.parametrize("truncation_voxels", [1, 3, 5])
+@pytest.mark.parametrize("slant", [0.0, 0.4])
+@pytest.mark.parametrize("weights", ["confidence", "uniform"])
+def test_without_a_least_weight_one_plane_is_one_sheet(weights: Any, slant: float, truncation_voxels: int) -> None:
+    """Voxels that nobody saw are not surface: there was a second sheet at the truncation distance behind it."""
+    view, truncation_m = plane(slant, 0.501), 4e-3 * truncation_voxels
+    fused = fuse([view], 4e-3, weights=weights, min_weight=0, truncation_m=truncation_m)
+    x, _, z = fused.mesh.vertices.T
+    off_m = (z - 0.501 - slant * x) / np.hypot(1, slant)
+    assert len(z) > 2000
+    assert np.abs(off_m).max() < 1e-3
+    strict = fuse([view], 4e-3, weights=weights, min_weight=1e-6, truncation_m=truncation_m)
+    assert fused.mesh.face_areas_m2.sum() == pytest.approx(strict.mesh.face_areas_m2.sum(), rel=0.01)
+    assert fused.vertex_weights.min() > 0
+
+
+def test_without_a_least_weight_a_sphere_is_one_sheet() -> None:
+    off = np.linalg.norm(fuse(views(6), 2e-3, min_weight=0).mesh.vertices, axis=1) - RADIUS
+    assert np.abs(off).max() < 6e-3  # no view says anything deeper
+    assert np.percentile(np.abs(off), 95) < 1e-3
+
+
 def test_a_sphere_is_fused_to_a_sphere() -> None:
     fused = fuse(views(12), 2e-3)
     off = np.linalg.norm(fused.mesh.vertices, axis=1) - RADIUS

@@ -42,6 +42,31 @@ def test_parallel_lines_meet_at_a_point_at_infinity() -> None:
     assert np.isnan(euclidean(point)).all()
 
 
+@pytest.mark.parametrize("far", [1e-3, 1.0, 1e3])
+def test_parallel_lines_meet_at_infinity_whatever_multiples_of_their_coefficients_are_given(far: float) -> None:
+    random = np.random.default_rng(0)
+    turns = random.uniform(-np.pi, np.pi, 2000)
+    offsets = far * random.uniform(-1, 1, (2, 2000))
+    first = np.stack([np.cos(turns), np.sin(turns), offsets[0]], axis=-1)
+    opposite = np.stack([np.cos(turns + np.pi), np.sin(turns + np.pi), offsets[1]], axis=-1)  # other roundings
+    scaled = first * [1, 1, 0] + np.stack([0 * turns, 0 * turns, offsets[1]], axis=-1)
+    scaled *= random.uniform(0.1, 10, (2000, 1))
+    for second in (opposite, scaled, scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)):
+        points = meet(first, second)
+        assert is_at_infinity(points).all()
+        assert np.isnan(euclidean(points)).all()
+        direction = points[:, :2] / np.linalg.norm(points[:, :2], axis=-1, keepdims=True)
+        assert np.abs((direction * first[:, :2]).sum(axis=-1)).max() < 1e-10
+    np.testing.assert_array_equal(meet(first, first * random.uniform(0.1, 10, (2000, 1))), 0.0)
+
+
+@pytest.mark.parametrize("angle", [1e-14, 1e-12, 1e-6])
+def test_lines_that_are_nearly_parallel_meet_where_they_do(angle: float) -> None:
+    # y = 0 and y = angle (x - 2): exact in these coefficients
+    np.testing.assert_allclose(euclidean(meet((0, 1, 0), (angle, -1, -2 * angle))), (2, 0), rtol=1e-12)
+    np.testing.assert_allclose(euclidean(meet((0, 1, 0), (angle, -1, 1e-3))), (-1e-3 / angle, 0), rtol=1e-12)
+
+
 def test_images_of_parallel_lines_that_meet_make_the_map_a_projectivity_and_one_pair_is_not_enough() -> None:
     pair = (4, 2, 1), (5, 2, 2)
     np.testing.assert_allclose(euclidean(meet(*pair)), (-1, 1.5))

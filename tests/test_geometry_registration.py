@@ -92,6 +92,89 @@ def test_register_needs_no_first_guess_and_repeats() -> None:
     np.testing.assert_allclose(found.T_target_source, register(source, target).T_target_source, atol=1e-9)
 
 
+@pytest.mark.parametrize("metres", [1.0, 3.0, 30.0, 1000.0, 5e5])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_far_from_the_origin_icp_finds_the_same(metres: float, seed: int) -> None:
+    """The target at an offset, and the source at another: the pose is that of the clouds at the origin, moved."""
+    source, target = pair(part, 3e-4, n=2000, seed=seed)
+    guess = rigid((0.05, 0.04, -0.06), (0.004, 0, 0.003)) @ TRUE
+    near = icp(source, target, guess)
+    by = rigid((0, 0, 0), metres * np.array([1.0, -0.7, 0.1]))
+    before = rigid((0, 0, 0), metres * np.array([-0.3, 0.4, 1.0]))
+    far = icp(source - before[:3, 3], target + by[:3, 3], by @ guess @ before)
+    moved = np.linalg.inv(by) @ far.T_target_source @ np.linalg.inv(before)
+    atol = 1e-8 + 1e-14 * metres
+    np.testing.assert_allclose(moved[:3, :3], near.T_target_source[:3, :3], atol=atol)
+    np.testing.assert_allclose(moved[:3, 3], near.T_target_source[:3, 3], atol=1e-7 + 1e-12 * metres)
+    assert off(near)[1] < 3e-4
+    assert far.agreement == pytest.approx(near.agreement, abs=1e-4)
+
+
+@pytest.mark.parametrize("metres", [1000.0, 5e5])
+def test_far_from_the_origin_register_finds_the_same(metres: float) -> None:
+    source, target = pair(part, 3e-4, n=2000)
+    by = metres * np.array([1.0, -0.7, 0.1])
+    E = register(source + by, target + by).T_target_source
+    E[:3, 3] += E[:3, :3] @ by - by
+    E = E @ np.linalg.inv(TRUE)
+    assert np.degrees(Rotation.from_matrix(E[:3, :3]).magnitude()) < 0.3
+    assert np.linalg.norm(E[:3, 3]) < 5e-4
+
+
+def corrugated(random: np.random.Generator, n: int) -> np.ndarray:
+    """A plate with waves of 30 mm along x, 12 mm from trough to crest."""
+    xy = random.uniform(-0.15, 0.15, (n, 2))
+    return np.column_stack([xy, 0.006 * np.sin(2 * np.pi * xy[:, 0] / 0.03)])
+
+
+@pytest.mark.parametrize(("turn", "seed"), [(0.3, 0), (1.57, 1), (1.0, 2)])
+def test_plates_with_their_waves_across_each_other_are_refused(turn: float, seed: int) -> None:
+    """They lie on each other by nearly all points, with waves through waves."""
+    source, target = pair(corrugated, 2e-4, n=6000, seed=seed)
+    with pytest.raises(ValueError, match="expected surfaces that lie on each other"):
+        icp(source, target, rigid((0, 0, turn), (0.004, 0, 0.003)) @ TRUE)
+    assert icp(source, target, TRUE).agreement > 0.85
+
+
+@pytest.mark.parametrize(("pitch", "studs"), [(0.02, 12), (0.03, 8)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_guess_off_by_one_stud_of_many_is_refused(pitch: float, studs: int, seed: int) -> None:
+    """A prism with studs in a row; from half a pitch the right pose is found, from one and more the next one fits."""
+
+    def prism(random: np.random.Generator, n: int) -> np.ndarray:
+        row = (np.arange(studs) - (studs - 1) / 2) * pitch
+        parts = [box(random, n // 2 // studs, (0.008, 0.008, 0.02), (x, 0.01, 0.03)) for x in row]
+        return np.concatenate([box(random, n // 2, (0.3, 0.06, 0.05)), *parts])
+
+    source, target = pair(prism, 2e-4, n=6000, seed=seed)
+    for steps in (-1.5, 1.0, 1.5):
+        with pytest.raises(ValueError, match=r"one way, got two poses 0 degrees and 0\.0"):
+            icp(source, target, rigid((0.01, 0, 0.02), (steps * pitch, 0.001, 0.002)) @ TRUE)
+    for steps in (0.0, 0.4):
+        found = icp(source, target, rigid((0.01, 0, 0.02), (steps * pitch, 0.001, 0.002)) @ TRUE)
+        assert off(found)[0] < 0.2
+        assert off(found)[1] < 2e-4
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_a_part_of_another_scale_is_refused(scale: float) -> None:
+    source, target = pair(part, 3e-4, n=2000)
+    with pytest.raises(ValueError, match="expected surfaces that lie on each other"):
+        register(scale * source, target)
+
+
+@pytest.mark.parametrize(("noise", "n"), [(2e-3, 20000), (3e-3, 4000)])
+def test_a_noisy_scan_of_a_dense_model_is_not_refused(noise: float, n: int) -> None:
+    """Noise far above the model's spacing lowers the agreement of the right pose too."""
+    random = np.random.default_rng(0)
+    source, target = part(random, n), part(random, 30000)
+    source = (source - TRUE[:3, 3]) @ TRUE[:3, :3] + random.normal(0, noise, source.shape)
+    found = icp(source, target, TRUE)
+    assert found.agreement < 0.45
+    assert off(found)[0] < 0.5
+    assert off(found)[1] < 2e-3
+
+
 def overlap(x: float) -> tuple[np.ndarray, np.ndarray]:
     """The part from -0.15 to x, and from -x to 0.15."""
     source, target = pair(part, 3e-4, n=6000)

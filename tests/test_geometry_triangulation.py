@@ -42,6 +42,25 @@ def test_exact_pixels_give_the_point(method: str, scale: float) -> None:
     np.testing.assert_allclose(found.error_px, 0, atol=1e-8)
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("other", [SECOND, ASIDE, FORWARD], ids=["second", "aside", "forward"])
+@pytest.mark.parametrize("metres", [30.0, 1000.0, 5e5])
+def test_far_from_the_origin_the_points_are_the_same(method: str, other: np.ndarray, metres: float) -> None:
+    """Cameras at an offset give the points at the origin, moved, and the same errors."""
+    _, a, b = noisy_pixels(other, 200, 0.3)
+    offset = metres * np.array([1.0, -0.7, 0.1])
+    moved = [np.hstack([P[:, :3], (P[:, 3] - P[:, :3] @ offset)[:, None]]) for P in (FIRST, other)]
+    near, far = METHODS[method](FIRST, other, a, b), METHODS[method](*moved, a, b)
+    firm = ~(np.linalg.norm(near.points, axis=1) > 50)  # the place of points that are almost at infinity is open
+    assert firm.mean() > 0.8
+    np.testing.assert_allclose((far.points - offset)[firm], near.points[firm], atol=1e-8 + 1e-11 * metres)
+    np.testing.assert_allclose(far.error_px[firm], near.error_px[firm], atol=1e-7 + 1e-11 * metres)
+    turned = projection_matrix(K, rigid((0.1, 0.2, 0.3), (0, 0, 0)))
+    together = np.hstack([turned[:, :3], -(turned[:, :3] @ offset)[:, None]])
+    with pytest.raises(ValueError, match="same centre"):
+        METHODS[method](moved[0], together, a, b)
+
+
 @pytest.mark.parametrize("other", [SECOND, ASIDE, FORWARD], ids=["second", "aside", "forward"])
 @pytest.mark.parametrize("noise", [0.1, 2.0, 30.0])
 def test_it_is_the_global_minimum_and_never_worse_than_the_others(other: np.ndarray, noise: float) -> None:

@@ -87,6 +87,46 @@ def test_f_of_cameras_does_not_depend_on_where_they_stand(metres: float, baselin
         fundamental_from_cameras(at(FIRST, offset), at(turned, offset))
 
 
+@pytest.mark.parametrize(
+    ("off", "focal", "single"),
+    [(off, focal, False) for off in (0.0, 1e-17, 1e-12, 1e-7, 1e-4, 1e-2) for focal in (1.0, 30.0, 1000.0, 5000.0)]
+    + [(off, 1.0, True) for off in (0.0, 1e-17, 1e-12, 1e-7, 1e-2)],
+)
+def test_f_and_e_of_forward_motion_are_accepted_and_their_epipoles_are_right(
+    off: float, focal: float, single: bool
+) -> None:
+    calibration = np.diag([focal, focal, 1.0])  # the principal point is the origin
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        turn = [0, 0, random.uniform(-3, 3)]
+        T = rigid(turn, [*(off * random.uniform(0.5, 1, 2)), random.uniform(0.1, 10)])
+        inverse = K @ np.linalg.inv(calibration)
+        matrix = inverse.T @ fundamental_from_pose(K, K, T) @ inverse  # rounded where entries are 0
+        matrix = matrix.astype(np.float32) if single else matrix
+        e, e_ = epipoles(matrix)
+        truth, truth_ = (calibration @ v for v in (T[:3, :3].T @ T[:3, 3] / T[2, 3], T[:3, 3] / T[2, 3]))
+        digits = 1e-5 if single else 1e-9
+        np.testing.assert_allclose(e / e[2], truth, rtol=0, atol=digits * focal)
+        np.testing.assert_allclose(e_ / e_[2], truth_, rtol=0, atol=digits * focal)
+        seen = random.uniform(-1, 1, (5, 2)) * focal
+        assert np.isfinite(lines_in_second(matrix, seen)).all()
+
+
+def test_a_border_of_rounding_tells_no_unit_and_rank_three_is_still_refused() -> None:
+    for rounding in (0.0, 1e-17, 1e-12, 1e-8):
+        for last in (0.0, 1e-17, 1e-12):
+            e, e_ = epipoles([[0, -1, 0], [1, 0, rounding], [0, 0, last]])
+            np.testing.assert_allclose(np.abs([e, e_]), [[0, 0, 1]] * 2, atol=2 * rounding)
+        for last in (1e-3, 1.0, 1e3):
+            with pytest.raises(ValueError, match="rank 2"):
+                epipoles([[0, -1, 0], [1, 0, rounding], [0, 0, last]])
+    for unit in (3e-3, 1.0, 1000.0):  # metres on a sensor, focal lengths, pixels
+        scale = np.diag([1 / unit, 1 / unit, 1.0])
+        for seed in range(20):
+            with pytest.raises(ValueError, match="rank 2"):
+                epipoles(scale @ np.random.default_rng(seed).normal(size=(3, 3)) @ scale)
+
+
 def test_f_has_seven_degrees_of_freedom_and_e_five() -> None:
     def from_camera(v: np.ndarray) -> np.ndarray:
         return alike(fundamental_from_cameras(FIRST, v.reshape(3, 4)), F).ravel()
@@ -316,6 +356,42 @@ def test_chance_is_no_scene() -> None:
             find_fundamental(a, b, NOISE)
         with pytest.raises(ValueError, match="chance"):
             find_relative_pose(a, b, K, K, NOISE)
+
+
+def plane_and_more(seed: int, n: int, off: int) -> tuple[np.ndarray, np.ndarray]:
+    """n noisy pairs, all but `off` of one plane."""
+    random = np.random.default_rng(seed)
+    X = points(random, n, plane=True)
+    X[:off] = points(random, off)
+    a, b = project(FIRST, X), project(SECOND, X)
+    return a + random.normal(0, NOISE, a.shape), b + random.normal(0, NOISE, b.shape)
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["noise known", "noise unknown"])
+@pytest.mark.parametrize("n", [12, 30, 80, 400])
+def test_a_plane_and_one_point_off_it_leave_the_epipole_open(n: int, known: bool) -> None:
+    """Its line of epipoles is a family of F; a fifth of them passed, with epipoles 75 degrees off."""
+    for seed in range(30):
+        with pytest.raises(ValueError, match="expected"):
+            fit_fundamental(*plane_and_more(seed, n, 1), noise_px=NOISE if known else None)
+
+
+@pytest.mark.parametrize(("n", "off", "fewest"), [(12, 2, 8), (80, 2, 4), (400, 2, 6), (30, 3, 16), (80, 30, 30)])
+def test_a_plane_and_some_points_off_it_are_as_exact_as_their_covariance_or_refused(
+    n: int, off: int, fewest: int
+) -> None:
+    found = []
+    for seed in range(30):
+        try:
+            fit = fit_fundamental(*plane_and_more(seed, n, off), noise_px=NOISE)
+        except ValueError:
+            continue
+        values, axes = np.linalg.eigh(fit.covariance)
+        error = (alike(fit.matrix, F) - F).ravel() @ axes[:, -7:] / np.sqrt(values[-7:])
+        found.append(np.sqrt((error**2).mean()))
+    assert len(found) >= fewest
+    assert max(found) < 2.5
+    assert np.median(found) < 1.5
 
 
 def test_a_surface_through_both_centres_is_refused() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
+import struct
 import subprocess
 import sys
 import time
@@ -21,6 +23,7 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import write_grey
 from rangesim.scene import load_scene
+from rangesim.scene.nodes import check_type, shipped_types
 
 CAMERA: dict[str, Any] = {
     "type": "perspective",
@@ -195,6 +198,18 @@ end_header
 %s
 3 0 1 2
 """
+
+
+def binary_ply(index: int, order: str = "<", kind: str = "int", extra: int = 0) -> bytes:
+    """Three vertices, as many more as `extra`, and a face of the first two and of vertex `index`."""
+    name = {"<": b"binary_little_endian", ">": b"binary_big_endian"}[order]
+    head = PLY.partition(b"end_header\n")[0] % (b"%d" % (3 + extra)) + b"end_header\n"
+    head = head.replace(b"ascii", name).replace(b"uchar int", b"uchar " + kind.encode())
+    places = [0, 0, 3, 1, 0, 3, 0, 1, 3] + [0.5, 0.5, 3] * extra
+    code = {"int": "i", "uint": "I", "short": "h", "ushort": "H", "uchar": "B"}[kind]
+    return head + struct.pack(f"{order}{len(places)}f", *places) + struct.pack(f"{order}B3{code}", 3, 0, 1, index)
+
+
 MESHES = {
     "good.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ""),
     "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "."),
@@ -210,9 +225,14 @@ MESHES = {
     "large.ply": (PLY % (b"4000000000000", b"0 0 0\n1 0 0\n0 1 0"), "."),
     "index.ply": (
         (PLY % (b"3", b"0 0 0\n1 0 0\n0 1 0")).replace(b"3 0 1 2", b"3 0 1 9"),
-        "got vertex 9|be read",
+        "expected faces of its 3 vertices, 0 to 2, got vertex 9|be read|repair",
     ),
+    "binary.ply": (binary_ply(2), ""),
+    "big.ply": (binary_ply(2, ">", "ushort", 70), ""),
+    "short.ply": (binary_ply(2)[:-1], "ends early|."),
+    "none.ply": (b"plyformat", "end_header|."),
 }
+INDICES = [3, 100_000, 1_000_000, 2_000_000_000, -1, -3, -(2**31)]
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -224,6 +244,45 @@ def test_meshes_in_scenes_are_read_or_refused(tmp_path: Path, name: str) -> None
         return
     with pytest.raises(FileFormatError, match=message):
         load_scene(path)
+
+
+@pytest.mark.parametrize("order", ["ascii", "<", ">"])
+@pytest.mark.parametrize("index", INDICES)
+def test_faces_of_vertices_that_are_not_there_are_refused(tmp_path: Path, order: str, index: int) -> None:
+    """Mitsuba 3.9 crashes on large ones, where it computes normals, and makes vertex 0 of -1."""
+    text = (PLY % (b"3", b"0 0 3\n1 0 3\n0 1 3")).replace(b"3 0 1 2", b"3 0 1 %d" % index)
+    path = mesh(tmp_path, "a.ply", text if order == "ascii" else binary_ply(index, order))
+    with pytest.raises(FileFormatError, match=f"faces of its 3 vertices, 0 to 2, got vertex {index}; repair"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize("kind", ["int", "uint", "short", "ushort", "uchar"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_faces_of_ply_are_those_of_the_file(tmp_path: Path, order: str, kind: str) -> None:
+    path = mesh(tmp_path, "a.ply", binary_ply(72, order, kind, extra=70))
+    (shape,) = load_scene(path).mitsuba.shapes()
+    np.testing.assert_array_equal(np.array(mi.traverse(shape)["faces"]), [0, 1, 72])
+    mesh(tmp_path, "a.ply", binary_ply(73, order, kind, extra=70))
+    with pytest.raises(FileFormatError, match="0 to 72, got vertex 73"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"vertex 3", b"vertex 3x"),
+        (b"vertex 3", b"vertex -3"),
+        (b"face 1", b"vertex 1"),
+        (b"float x", b"int x"),  # Mitsuba would read 0 and then .5
+        (b"0.5 0 3", b"0.5.5 0"),
+        (b"format ascii", b"format text"),
+    ],
+)
+def test_ply_that_may_be_read_in_two_ways_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
+    text = PLY % (b"3", b"0.5 0 3\n1 0 3\n0 1 3")
+    assert load_scene(mesh(tmp_path, "a.ply", text)).instances[0].name == "part"
+    with pytest.raises(FileFormatError, match=r"a\.ply cannot be read as a PLY file of triangles"):
+        load_scene(mesh(tmp_path, "a.ply", text.replace(old, new)))
 
 
 @pytest.mark.parametrize("name", [name for name in MESHES if MESHES[name][1]])
@@ -406,6 +465,98 @@ def test_a_loaded_object_that_needs_a_spectrum_is_refused_too() -> None:
         paint = loaded if plugin is not HOT else {"type": "diffuse", "reflectance": loaded}
         with pytest.raises(FileFormatError, match=message):
             load_scene(ball(paint))
+
+
+# ---- Native code ---------------------------------------------------------------------------------------------------
+
+
+def library(folder: Path) -> tuple[Path, Path]:
+    """A library that does nothing but write a file when it is loaded, and the path of that file."""
+    compiler = shutil.which("cc")
+    if compiler is None or sys.platform != "linux":
+        pytest.skip("needs a C compiler, on Linux")
+    mark, source, target = folder / "it-ran", folder / "mark.c", folder / "mark.so"
+    source.write_text(
+        "#include <stdio.h>\n__attribute__((constructor)) static void mark(void)"
+        f'{{ FILE *file = fopen("{mark}", "w"); if (file) fclose(file); }}\n'
+    )
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", target, source], check=True)
+    return target, mark
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "plugins/evil", "/tmp/evil", "evil.so", "a b", "..", "a\\b", "diffuse.", "é", "a" * 5000, "a\0"]
+)
+def test_a_plugin_type_is_a_plain_name(name: str) -> None:
+    with pytest.raises(FileFormatError, match="expected types of plugins that come with Mitsuba") as caught:
+        load_scene(ball({"type": name}))
+    assert len(str(caught.value)) < 400
+
+
+def test_plugin_types_of_mitsuba_and_of_python_pass() -> None:
+    assert {"diffuse", "ply", "hdrfilm", "perspective"} <= shipped_types()
+    for name in ("diffuse", "retroreflector", "rgb", "my_bsdf"):
+        check_type(name, "the scene")
+    paint = {"type": "retroreflector", "nested": {"type": "conductor"}}
+    assert load_scene(ball(paint)).instances[0].name == "ball"
+
+
+@pytest.mark.parametrize("form", ["xml", "parameter", "include", "path", "texture", "dictionary", "cwd"])
+def test_a_scene_brings_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str) -> None:
+    """Mitsuba takes plugins/TYPE.so from beside the scene, or from the working directory."""
+    code, mark = library(tmp_path)
+    home = tmp_path / "home"
+    (home / "plugins").mkdir(parents=True)
+    name = f"brought_{form}"  # Mitsuba keeps a library that it has loaded
+    shutil.copy(code, home / "plugins" / f"{name}.so")
+    paint, before = f'<bsdf type="{name}"/>', ""
+    path = home / "a.xml"
+    if form == "parameter":
+        before, paint = f'<default name="kind" value="{name}"/>', '<bsdf type="$kind"/>'
+    if form == "include":
+        (home / "b.xml").write_text(f'<scene version="3.0.0"><bsdf id="paint" type="{name}"/></scene>')
+        before, paint = '<include filename="b.xml"/>', '<ref id="paint"/>'
+    if form == "path":
+        before, path = '<path value="home"/>', tmp_path / "a.xml"
+    if form == "texture":
+        paint = f'<bsdf type="diffuse"><texture name="reflectance" type="{name}"/></bsdf>'
+    path.write_text(
+        f'<scene version="3.0.0">{before}{XML_CAMERA}<shape type="sphere" id="ball">{paint}</shape></scene>'
+    )
+    if form in ("dictionary", "cwd"):
+        monkeypatch.chdir(home)
+    with pytest.raises(FileFormatError, match=f"got '{name}'.*; a scene may bring no library of its own"):
+        load_scene(ball({"type": name}) if form == "dictionary" else path)
+    assert not mark.exists()
+
+
+def test_libraries_named_as_mitsubas_own_are_not_run(tmp_path: Path) -> None:
+    """Beside a scene and in the working directory, for every form of a scene, and for the estimate of a run."""
+    code, mark = library(tmp_path)
+    (tmp_path / "plugins").mkdir()
+    for name in shipped_types():
+        (tmp_path / "plugins" / f"{name}.so").symlink_to(code)
+    (tmp_path / "a.xml").write_text(
+        f'<scene version="3.0.0"><path value="."/>{XML_CAMERA}<shape type="sphere" id="ball"/></scene>'
+    )
+    (tmp_path / "b.obj").write_bytes(MESHES["good.obj"][0])
+    script = f"""
+import sys
+import rangesim
+from rangesim.cli import main
+print([i.name for i in rangesim.load_scene("a.xml").instances], len(rangesim.load_scene("b.obj").instances))
+print([i.name for i in rangesim.load_scene({ball()}).instances])
+sys.argv = ["rangesim", "run", "--estimate", "tabletop", "--out", "out"]
+main()
+"""
+    root = str(Path(__file__).resolve().parents[1])
+    environment = os.environ | {"PYTHONPATH": root}
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert "['ball'] 2\n['ball']\n" in done.stdout
+    assert "light paths" in done.stdout  # of the estimate
+    assert not mark.exists()
 
 
 FOG = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.5}

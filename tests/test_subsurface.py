@@ -22,6 +22,7 @@ from rangesim.errors import FileFormatError
 from rangesim.light_transport.photons import trace_photons
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import SPEED_OF_LIGHT, Fringes, Images, Phasor
+from rangesim.rig import translation
 
 ROOT = Path(__file__).resolve().parent.parent
 TOP_M = 0.02
@@ -374,3 +375,46 @@ def test_a_medium_that_fills_nothing_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(FileFormatError, match="shape 'candle' refers to a medium without saying where"):
         rangesim.load_scene(scene)
+
+
+def fog(shape: str, x: float, absorbs: bool) -> Any:
+    """A body of fog or of glass that absorbs, 0.2 m around (x, 0, 0), and a floor below it."""
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f().translate([x, 0, 0]).scale(0.2)
+    bsdf = {"type": "dielectric", "int_ior": 1.0001} if absorbs else {"type": "null"}
+    body = {"type": shape, "to_world": place, "bsdf": bsdf, "interior": medium(1.5, 0.0 if absorbs else 0.5)}
+    down = mi.ScalarTransform4f().translate([0, 0, -1]).scale(3)
+    floor = {"type": "rectangle", "to_world": down, "bsdf": {"type": "diffuse"}}
+    camera = {"type": "perspective", "fov": 30.0}
+    return rangesim.load_scene({"type": "scene", "camera": camera, "fog": body, "floor": floor})
+
+
+def rig_above(x: float, baseline_m: float) -> rangesim.Rig:
+    """A camera at (x, 0, 0) that looks down, and a projector beside it."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[0, 3] = x
+    lens = rangesim.Intrinsics.from_fov(8, 6, 30)
+    return rangesim.Rig(lens, lens, T_camera_projector=translation(baseline_m, 0, 0), T_world_camera=T)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cube"])
+@pytest.mark.parametrize("absorbs", [False, True])
+@pytest.mark.parametrize(
+    ("x", "baseline_m", "inside"), [(0.0, 0.5, "camera"), (0.5, -0.5, "projector"), (0.17, 0.0, "camera")]
+)
+def test_a_device_inside_a_medium_is_refused(
+    shape: str, absorbs: bool, x: float, baseline_m: float, inside: str
+) -> None:
+    """Its light would be weakened one way alone: exp(-0.3) for exp(-0.6), 0.2 m of fog there and back."""
+    scene, rig = fog(shape, 0.0, absorbs), rig_above(x, baseline_m)
+    with pytest.raises(ValueError, match=f"the {inside} to stand in air, but it is inside the medium of shape 'fog'"):
+        transport(scene, rig, [], spp=1, photons=0)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cube"])
+@pytest.mark.parametrize("absorbs", [False, True])
+@pytest.mark.parametrize("x", [0.23, -0.23, 1.0])
+def test_a_device_beside_a_medium_is_not(shape: str, absorbs: bool, x: float) -> None:
+    scene = fog(shape, 0.0, absorbs)
+    assert transport(scene, rig_above(x, 0.0), [], spp=1, photons=0).energy.direct.any()

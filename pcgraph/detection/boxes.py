@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,6 +50,13 @@ class OrientedBox(ShortRepr):
         """Corners, (8, 3) float64, metres; corner 4 a + 2 b + c lies on side a, b, c (0 or 1) of the three axes."""
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
         return self.center + (signs * self.size) @ self.axes
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """Centre, axes and size as lists of plain numbers, which `json.dumps` takes; ``OrientedBox`` reads them back.
+
+        ``OrientedBox(**{name: numpy.array(value) for name, value in box.to_dict().items()})``
+        """
+        return {"center": self.center.tolist(), "axes": self.axes.tolist(), "size": self.size.tolist()}
 
     def local(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points, (..., 3), in the box's own frame: from its centre along its axes, metres."""

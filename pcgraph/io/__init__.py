@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from os import PathLike
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
         No such file, a directory, another extension, or content that is truncated or contradicts its header.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):  # also of a name that cannot be
         raise CloudReadError(f"{path} is a directory: expected a file ending in {' or '.join(_READERS)}")
     reader = _READERS.get(path.suffix.lower())
     if reader is None:

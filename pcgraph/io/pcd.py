@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud, cloud_from_columns, numbers_from_text
+from pcgraph.cloud import Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -34,6 +34,8 @@ class PcdHeader:
         Sensor position.
     data : str
         ``ascii``, ``binary`` or ``binary_compressed``.
+    n_lines : int
+        Lines that the header takes in its file.
     """
 
     names: tuple[str, ...]
@@ -43,6 +45,7 @@ class PcdHeader:
     height: int
     viewpoint: NDArray[np.float64]
     data: str
+    n_lines: int
 
     @property
     def n_points(self) -> int:
@@ -61,7 +64,8 @@ def read_pcd(content: bytes) -> Cloud:
     Raises
     ------
     CloudReadError
-        The header is incomplete or contradicts itself, or the data is shorter than the header says.
+        The header is incomplete or contradicts itself, the data is shorter than the header says, or a row of text has
+        more or fewer numbers than the header has fields.
     """
     header, body = _parse_header(content)
     readers = {"ascii": _ascii_columns, "binary": _binary_columns, "binary_compressed": _compressed_columns}
@@ -77,7 +81,7 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
         end = content.find(b"\n", position, _MAX_HEADER_BYTES)
         if end < 0:
             raise CloudReadError("expected a PCD header that ends in a DATA line, but found none")
-        words = content[position:end].decode("latin-1").split()
+        words = [word.decode("latin-1") for word in content[position:end].split()]  # not at blanks of other codes
         position = end + 1
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
@@ -86,10 +90,10 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
         raise CloudReadError(
             f"expected PCD header lines {', '.join(_REQUIRED)}; missing or empty: {', '.join(missing)}"
         )
-    return _checked_header(entries), content[position:]
+    return _checked_header(entries, content.count(b"\n", 0, position)), content[position:]
 
 
-def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
+def _checked_header(entries: dict[str, list[str]], n_lines: int) -> PcdHeader:
     names = tuple(entries["FIELDS"])
     counts = _integers(entries, "COUNT", default=[1] * len(names))
     sizes = _integers(entries, "SIZE")
@@ -109,7 +113,7 @@ def _checked_header(entries: dict[str, list[str]]) -> PcdHeader:
     if min(width, height) < 0 or points != width * height:
         raise CloudReadError(f"expected POINTS = WIDTH x HEIGHT, got {points} != {width} x {height}")
     viewpoint = _viewpoint(entries.get("VIEWPOINT", []))
-    return PcdHeader(names, tuple(dtypes), tuple(counts), width, height, viewpoint, entries["DATA"][0].lower())
+    return PcdHeader(names, tuple(dtypes), tuple(counts), width, height, viewpoint, entries["DATA"][0].lower(), n_lines)
 
 
 def _integers(entries: dict[str, list[str]], key: str, default: list[int] | None = None) -> list[int]:
@@ -135,14 +139,13 @@ def _viewpoint(words: list[str]) -> NDArray[np.float64]:
 
 
 def _ascii_columns(header: PcdHeader, body: bytes) -> dict[str, NDArray[np.generic]]:
-    table = numbers_from_text(body, header.n_points, sum(header.counts))
-    columns: dict[str, NDArray[np.generic]] = {}
+    table = numbers_from_text(body, header.n_points, sum(header.counts), header.n_lines + 1)
+    fields = list(zip(header.names, header.dtypes, header.counts, strict=True))
+    columns = columns_from_text(table, fields)
     first = 0
-    for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
-        with np.errstate(over="ignore", invalid="ignore"):
-            columns[name] = _without_axis(table[:, first : first + count].astype(dtype))
+    for name, dtype, count in fields:
         if dtype.itemsize == 8 and dtype.kind in "iu":
-            columns[name] = _exact(columns[name], body, (first, first + count, sum(header.counts)))
+            columns[name] = _exact(columns[name], body, (first, first + count, table.shape[1]))
         first += count
     return columns
 

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcgraph.cloud import Cloud, cloud_from_columns, numbers_from_text
+from pcgraph.cloud import Cloud, cloud_from_columns, columns_from_text, numbers_from_text
 from pcgraph.errors import CloudReadError
 
 _TYPES = {
@@ -37,7 +40,8 @@ def read_ply(content: bytes) -> Cloud:
     Raises
     ------
     CloudReadError
-        The header is broken, there are no vertices' coordinates, or the data is shorter than the header says.
+        The header is broken, there are no vertices' coordinates, the data is shorter than the header says, or a row of
+        text has more or fewer numbers than the header has properties.
     """
     code, elements, body = _parse_header(content)
     for element in elements:
@@ -51,7 +55,10 @@ def read_ply(content: bytes) -> Cloud:
     names = [name for name, _ in element.properties]
     if len(set(names)) != len(names) or not names:
         raise CloudReadError(f"expected distinct vertex properties, got {names}")
-    columns = _ascii_columns(element, body) if code == "ascii" else _binary_columns(element, code, body)
+    if code == "ascii":
+        columns = _ascii_columns(element, body, first_line=content.count(b"\n", 0, len(content) - len(body)) + 1)
+    else:
+        columns = _binary_columns(element, code, body)
     return cloud_from_columns(columns, (element.count,))
 
 
@@ -86,8 +93,8 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
         raise CloudReadError("expected a PLY header from 'ply' to 'end_header', but found none")
     code = ""
     elements: list[PlyElement] = []
-    for line in content[:end].decode("latin-1").splitlines()[1:]:
-        words = line.split()
+    for line in content[:end].split(b"\n")[1:]:  # as bytes: text has line ends and blanks that UTF-8 holds in letters
+        words = [word.decode("latin-1") for word in line.split()]
         if words[:1] == ["format"] and len(words) == 3:
             code = words[1]
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
@@ -95,7 +102,7 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
         elif words[:1] == ["property"] and elements:
             _add_property(elements[-1], words)
         elif words and words[0] not in ("comment", "obj_info"):
-            raise CloudReadError(f"PLY header line not understood: {line[:80]!r}")
+            raise CloudReadError(f"PLY header line not understood: {' '.join(words)[:80]!r}")
     if code not in _ORDERS:
         raise CloudReadError(f"expected PLY format {', '.join(_ORDERS)}, got {code!r}")
     return code, elements, content[newline + 1 :]
@@ -115,17 +122,20 @@ def _record(element: PlyElement, code: str) -> np.dtype[np.void]:
 
 
 def _skip(element: PlyElement, code: str, body: bytes) -> bytes:
+    """The bytes behind an element; in a text, the lines behind its rows, and empty lines are no rows."""
     if code == "ascii":
-        lines = body.split(b"\n", element.count)
-        return lines[-1] if len(lines) > element.count else b""
+        lines = BytesIO(body)
+        rows = (line for line in lines if line.strip())
+        has_rows = element.has_list or bool(element.properties)
+        deque(islice(rows, element.count if has_rows else 0), maxlen=0)
+        return body[lines.tell() :]
     size = sum(int(kind[1]) for _, kind in element.properties)
     return body[element.count * size :]
 
 
-def _ascii_columns(element: PlyElement, body: bytes) -> dict[str, NDArray[np.generic]]:
-    table = numbers_from_text(body, element.count, len(element.properties))
-    with np.errstate(over="ignore", invalid="ignore"):
-        return {name: table[:, i].astype(kind) for i, (name, kind) in enumerate(element.properties)}
+def _ascii_columns(element: PlyElement, body: bytes, first_line: int) -> dict[str, NDArray[np.generic]]:
+    table = numbers_from_text(body, element.count, len(element.properties), first_line)
+    return columns_from_text(table, ((name, kind, 1) for name, kind in element.properties))
 
 
 def _binary_columns(element: PlyElement, code: str, body: bytes) -> dict[str, NDArray[np.generic]]:

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
-import os
-import re
 import warnings
 import zipfile
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.cloud import Cloud
+from pcgraph.cloud import COLOR_NAMES, LABEL_NAMES, NORMAL_NAMES, PACKED_NAMES, Cloud
 from pcgraph.errors import CloudWriteError
 from pcgraph.io.ply import encode_ply
-from pcgraph.plain_files import write_file
+from pcgraph.plain_files import is_sealed, sealed, unsealed, write_file
 
 if TYPE_CHECKING:
     from pcgraph.segmentation import Segmentation
@@ -30,35 +28,12 @@ FORMAT = "pcgraph-segmentation"
 
 The sum is that of the file with zeros in place of the sum. Who corrects labels by hand makes the file their own.
 """
-_SEAL = re.compile(rf"{FORMAT} sha256 (?P<sum>[0-9a-f]{{64}})(?:\n|\Z)".encode())
-_UNSEALED = f"{FORMAT} sha256 {'0' * 64}"
-_BLOCK = 1 << 20
 _INSTEAD = {"i8": "f8", "u8": "f8", "f2": "f4", "f16": "f8", "b1": "u1"}  # of types that PLY has not
 
 
 def is_segmentation(path: Path) -> bool:
     """Whether a file is one that `write_segmentation` wrote, and nobody changed."""
-    with path.open("rb") as stream:
-        start = 0 if path.suffix.lower() == ".ply" else max(0, stream.seek(0, os.SEEK_END) - len(_UNSEALED))
-        stream.seek(start)
-        seal = _SEAL.search(stream.read(200))
-        if seal is None:
-            return False
-        stream.seek(0)
-        sha256, left = hashlib.sha256(), start + seal.start("sum")
-        while left and (block := stream.read(min(left, _BLOCK))):
-            sha256.update(block)
-            left -= len(block)
-        sha256.update(b"0" * len(stream.read(64)))
-        while block := stream.read(_BLOCK):
-            sha256.update(block)
-    return sha256.hexdigest().encode() == seal["sum"]
-
-
-def _sealed(content: bytes, place: int) -> bytes:
-    """The bytes of a file with its sum in place of the zeros after `place`."""
-    start = content.index(_UNSEALED.encode(), place) + len(_UNSEALED) - 64
-    return content[:start] + hashlib.sha256(content).hexdigest().encode() + content[start + 64 :]
+    return is_sealed(path, FORMAT, at_end=path.suffix.lower() != ".ply")
 
 
 def write_segmentation(
@@ -73,12 +48,17 @@ def write_segmentation(
     ----------
     path : str or path
         ``.ply``: the finite points, in input order, with a colour per label, the properties ``labels`` and
-        ``supervoxels`` (int32), and the cloud's further columns, vectors as ``name_0``, ``name_1`` and so on; PLY has
-        no integers of 64 bits, so those become doubles. ``.npz``: everything, in the input's shape: ``format``,
-        ``labels``, ``supervoxels``; ``edges`` and ``edge_<feature>``; ``node_<feature>``; ``tree_parents``,
-        ``tree_altitudes``; ``voxel_size``, ``seed_size``, ``viewpoint``; ``column_<name>``, the further columns.
+        ``supervoxels`` (int32), the cloud's own colours, normals and labels (``red`` and so on, ``nx`` and so on,
+        ``label``), and its further columns, vectors as ``name_0``, ``name_1`` and so on; PLY has no integers of 64
+        bits, so those become doubles. What the cloud has keeps its name: beside its own colours, labels or column
+        ``supervoxels``, the result's are called ``segment_red`` and so on, ``segment_labels``,
+        ``segment_supervoxels``; beside those, ``segment2_red`` and so on. ``.npz``: everything, in the input's shape:
+        ``format``, ``labels``, ``supervoxels``; ``edges`` and ``edge_<feature>``; ``node_<feature>``;
+        ``tree_parents``, ``tree_altitudes``; ``voxel_size``, ``seed_size``, ``viewpoint``; ``cloud_colors``,
+        ``cloud_normals``, ``cloud_labels``, the cloud's own if it has them; ``column_<name>``, the further columns.
     cloud : Cloud, or points (n, 3) or (h, w, 3)
-        What was segmented. A column of a name that the result itself has, such as ``supervoxels``, is left out.
+        What was segmented. A further column called as a coordinate or as what the cloud has besides, ``x`` or ``X``
+        for example, is left out of the ``.ply``.
     segmentation : Segmentation
     labels : the points' leading shape, whole numbers within 32 bits, optional
         Labels to write instead of the default cut.
@@ -87,7 +67,7 @@ def write_segmentation(
     ------
     CloudWriteError
         Another extension, or the place cannot be written; or a column is not of the points' shape, not of numbers, or
-        has a name that is not one word.
+        has a name that is not one word; or the cloud's colours, normals or labels are not what `Cloud` says of them.
     ValueError
         Points or labels are not of the shape of what was segmented, or labels no whole numbers within 32 bits.
     """
@@ -140,17 +120,92 @@ def _ply(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     points = cloud.points.reshape(-1, 3)[finite]
     points = _for_ply("points", points.astype(np.result_type(points, np.float32), copy=False))
     kept = labels.reshape(-1)[finite]
-    colors = label_colors(kept)
     columns: dict[str, NDArray[np.generic]] = {name: points[:, i] for i, name in enumerate("xyz")}
-    columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
-    columns |= {"labels": kept, "supervoxels": segmentation.supervoxels.reshape(-1)[finite]}
-    ours = set(columns)
+    further = _ply_parts(cloud, finite)
+    columns |= _ply_own(cloud, finite, {part.lower() for part in further})
+    own = set(columns)
+    further = {part: values for part, values in further.items() if part.lower() not in own}
+    taken = own | {part.lower() for part in further}
+    color_names = (*COLOR_NAMES, *own.intersection(PACKED_NAMES))
+    columns |= _beside(taken, dict(zip(COLOR_NAMES, label_colors(kept).T, strict=True)), color_names)
+    columns |= _beside(taken, {"labels": kept}, LABEL_NAMES)
+    columns |= _beside(taken, {"supervoxels": segmentation.supervoxels.reshape(-1)[finite]}, ("supervoxels",))
+    columns |= further
+    return sealed(encode_ply(columns, unsealed(FORMAT)), FORMAT)
+
+
+def _ply_parts(cloud: Cloud, finite: NDArray[np.bool_]) -> dict[str, NDArray[np.generic]]:
+    """The cloud's further columns at the finite points, vectors in parts."""
+    parts: dict[str, NDArray[np.generic]] = {}
     for name, stored in _further_columns(cloud).items():
         rows = _for_ply(name, stored.reshape(len(finite), -1)[finite])
         vector = stored.ndim > cloud.points.ndim - 1
-        parts = {f"{name}_{i}" if vector else name: rows[:, i] for i in range(rows.shape[1])}
-        columns |= {part: values for part, values in parts.items() if part.lower() not in ours and part not in columns}
-    return _sealed(encode_ply(columns, _UNSEALED), 0)
+        for i in range(rows.shape[1]):
+            parts.setdefault(f"{name}_{i}" if vector else name, rows[:, i])
+    return parts
+
+
+def _ply_own(cloud: Cloud, finite: NDArray[np.bool_], taken: set[str]) -> dict[str, NDArray[np.generic]]:
+    """The cloud's own colours, normals and labels at the finite points, under names that `read_cloud` knows.
+
+    Of the names for each, the first that no further column has; `taken` are those of the columns, in lower case.
+    """
+    rows = {
+        name: _for_ply(name, stored.reshape(len(finite), -1)[finite]) for name, stored in _own_arrays(cloud).items()
+    }
+    if "colors" in rows and not taken.isdisjoint((*COLOR_NAMES, *PACKED_NAMES)):  # read_cloud prefers packed ones
+        rows["packed"] = rows.pop("colors").astype(np.uint32) @ np.array([[1 << 16], [1 << 8], [1]], np.uint32)
+    choices: dict[str, Sequence[tuple[str, ...]]] = {
+        "colors": [COLOR_NAMES],
+        "packed": [PACKED_NAMES[:1]],
+        "normals": NORMAL_NAMES[::-1],
+        "labels": [(name,) for name in LABEL_NAMES],
+    }
+    columns: dict[str, NDArray[np.generic]] = {}
+    for name, values in rows.items():
+        names = next((names for names in choices[name] if taken.isdisjoint(names)), choices[name][0])
+        columns |= dict(zip(names, values.T, strict=True))
+    return columns
+
+
+def _own_arrays(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
+    """The cloud's own colours (uint8), normals and labels (int32), those that there are, checked."""
+    shape = cloud.points.shape[:-1]
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for name, wanted in (("colors", (*shape, 3)), ("normals", (*shape, 3)), ("labels", shape)):
+        if getattr(cloud, name) is None:
+            continue
+        given = np.asarray(getattr(cloud, name))
+        if given.shape != wanted:
+            raise CloudWriteError(f"expected the cloud's {name} in the shape {wanted}, got {given.shape}")
+        arrays[name] = given
+    if "colors" in arrays and arrays["colors"].dtype != np.uint8:
+        arrays["colors"] = _bytes_of(arrays["colors"])
+    if "normals" in arrays and arrays["normals"].dtype.kind != "f":
+        raise CloudWriteError(f"expected the cloud's normals as floats, got {arrays['normals'].dtype}")
+    if "labels" in arrays:
+        try:
+            arrays["labels"] = _whole_labels(arrays["labels"])
+        except ValueError as error:
+            raise CloudWriteError(f"the cloud's own labels: {error}") from None
+    return arrays
+
+
+def _bytes_of(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Colours in floats from 0 to 1, as `segment` takes them too, as uint8; black where they are NaN."""
+    shades = np.nan_to_num(colors.astype(np.float64)) if colors.dtype.kind == "f" else np.array([np.inf])
+    if not ((shades >= 0.0) & (shades <= 1.0)).all():
+        raise CloudWriteError(f"expected the cloud's colors as uint8 or as floats within 0..1, got {colors.dtype}")
+    return np.rint(255.0 * shades).astype(np.uint8)
+
+
+def _beside(
+    taken: set[str], ours: dict[str, NDArray[np.generic]], names: tuple[str, ...]
+) -> dict[str, NDArray[np.generic]]:
+    """Columns of ours; where one of `names` is taken, with ``segment_`` before each name, or else ``segment2_`` ..."""
+    prefixes = ("", "segment_", *(f"segment{i}_" for i in range(2, len(taken) + 2)))
+    free = next(prefix for prefix in prefixes if taken.isdisjoint(prefix + name for name in names))
+    return {free + name: column for name, column in ours.items()}
 
 
 def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) -> bytes:
@@ -164,20 +219,20 @@ def _npz(cloud: Cloud, segmentation: Segmentation, labels: NDArray[np.int32]) ->
     arrays["voxel_size"] = np.array(segmentation.voxel_size)
     arrays["seed_size"] = np.array(segmentation.seed_size)
     arrays["viewpoint"] = segmentation.viewpoint
+    arrays |= {f"cloud_{name}": array for name, array in _own_arrays(cloud).items()}
     arrays |= {f"column_{name}": column for name, column in _further_columns(cloud).items()}
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
     with zipfile.ZipFile(stream, "a") as archive:
-        archive.comment = _UNSEALED.encode()
-    content = stream.getvalue()
-    return _sealed(content, len(content) - len(_UNSEALED))
+        archive.comment = unsealed(FORMAT).encode()
+    return sealed(stream.getvalue(), FORMAT, at_end=True)
 
 
 def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
     """The cloud's columns, checked."""
     shape = cloud.points.shape[:-1]
     for name, column in cloud.columns.items():
-        if not (isinstance(name, str) and name.split() == [name] and all(0 < ord(letter) < 256 for letter in name)):
+        if not (isinstance(name, str) and all(0 < ord(letter) < 256 for letter in name) and _is_word(name)):
             raise CloudWriteError(f"expected names of columns as one word of Latin letters, got {ascii(name)[:80]}")
         if not isinstance(column, np.ndarray) or column.dtype.kind not in "fiub":
             kind = column.dtype if isinstance(column, np.ndarray) else type(column).__name__
@@ -185,6 +240,12 @@ def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
         if column.shape[: len(shape)] != shape or column.ndim > len(shape) + 1:
             raise CloudWriteError(f"expected the column {name!r} in the points' shape {shape}, got {column.shape}")
     return cloud.columns
+
+
+def _is_word(name: str) -> bool:
+    """Whether a name of Latin letters has no blank as the readers know it."""
+    encoded = name.encode("latin-1")
+    return encoded.split() == [encoded]
 
 
 def _for_ply(name: str, values: NDArray[np.generic]) -> NDArray[np.generic]:

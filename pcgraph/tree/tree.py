@@ -247,12 +247,17 @@ class SegmentationTree(ShortRepr):
         return node_features(self.moments)
 
     def to_networkx(self) -> networkx.DiGraph:
-        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features as numbers."""
+        """The tree as ``networkx.DiGraph`` from parent to child; attributes ``altitude`` and features as numbers.
+
+        A node that joins parts across a gap, at infinite altitude, has no ``altitude``: JSON knows no infinity.
+        """
         from networkx import DiGraph
 
         columns = {"altitude": self.altitudes, **self.features().columns()}
         tree = DiGraph()
         tree.add_nodes_from(enumerate(rows(scalar_columns(columns), len(self.parents))))
+        for node in np.flatnonzero(np.isinf(self.altitudes)).tolist():
+            del tree.nodes[node]["altitude"]
         tree.add_edges_from((up, node) for node, up in enumerate(self.parents.tolist()) if up != node)
         return tree
 

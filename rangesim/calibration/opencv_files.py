@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.plain_files import read_file, write_file
+from pcgraph.plain_files import read_file, sealed, unsealed, write_file
 from rangesim.errors import FileFormatError
 from rangesim.geometry.camera_matrix import calibration_matrix
 from rangesim.rig import Intrinsics, Rig, pose
+from rangesim.rig.calibration_files import SEAL
+from rangesim.settings.bounds import Bounds, check_number
 from rangesim.settings.config import brief
 
 SUFFIXES = (".yml", ".yaml", ".xml")
@@ -48,16 +50,21 @@ def save_opencv_camera(camera: Intrinsics, path: str | Path) -> None:
     _write(path, _entries("camera", camera))
 
 
-def load_opencv(path: str | Path) -> Rig:
+def load_opencv(path: str | Path, unit_m: float = 1.0) -> Rig:
     """The rig that `save_opencv` wrote, or whoever else with the same keys; E and F are not looked at.
+
+    `unit_m`, metres, is the unit of length of T: 0.001 where the board was measured in millimetres.
 
     Raises
     ------
+    ValueError
+        `unit_m` is not positive.
     FileFormatError
         The file is missing or broken, or lacks a matrix: that of a camera alone is no rig.
     """
     import cv2
 
+    check_number("unit_m", unit_m, Bounds("metres per unit", 1e-9, 1e6))
     path = Path(path)
     text = read_file(path, FileFormatError)
     if len(text) > MAX_BYTES:
@@ -66,7 +73,7 @@ def load_opencv(path: str | Path) -> Rig:
         storage = cv2.FileStorage(text.decode(), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         T_projector_camera = np.eye(4)
         T_projector_camera[:3, :3] = _matrix(storage, "R", (3, 3))
-        T_projector_camera[:3, 3] = _matrix(storage, "T", (3, 1))[:, 0]
+        T_projector_camera[:3, 3] = unit_m * _matrix(storage, "T", (3, 1))[:, 0]
         camera, projector = (_device(storage, name) for name in ("camera", "projector"))
         return Rig(camera, projector, T_camera_projector=np.linalg.inv(pose(T_projector_camera, "(R, T)")))
     except (cv2.error, UnicodeDecodeError, SystemError) as error:
@@ -131,7 +138,9 @@ def _write(path: str | Path, entries: dict[str, Any]) -> None:
     storage = cv2.FileStorage(path.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for name, value in entries.items():
         storage.write(name, np.ascontiguousarray(value) if isinstance(value, np.ndarray) else value)
-    write_file(path, storage.releaseAndGetString().encode(), FileFormatError, make_parents=True)
+    storage.writeComment(unsealed(SEAL))
+    content = sealed(storage.releaseAndGetString().encode(), SEAL, at_end=True)
+    write_file(path, content, FileFormatError, make_parents=True)
 
 
 def _opencv_matrix(device: Intrinsics) -> np.ndarray:

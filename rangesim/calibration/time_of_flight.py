@@ -36,6 +36,7 @@ from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, checked_array
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import Intrinsics, Rig, pose
+from rangesim.rig.calibration_files import SEAL
 from rangesim.sensor import Decoder
 from rangesim.sensors.amcw import TAPS_DEG, AmcwToF
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
@@ -245,7 +246,7 @@ class ToFCalibration:
             **{name: to_dict(getattr(self, name)) for name in ("orders", "shortest_m", "longest_m", "noise_m")},
         }
         arrays = {name: getattr(self, name) for name in ("cosines_m", "sines_m", "offset_m")}
-        write_arrays(path, {**arrays, "settings": settings_array(settings)})
+        write_arrays(path, {**arrays, "settings": settings_array(settings)}, SEAL)
 
 
 def load_tof_calibration(path: str | Path) -> ToFCalibration:

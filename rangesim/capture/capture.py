@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,32 @@ def bright_level(values: np.ndarray) -> float:
     """Level of bright pixels: the 99th percentile of the positive values; 0 if there are none."""
     positive = values[values > 0]
     return float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 0.0
+
+
+CLIP_SHARE, CLIP_PEAK, CLIP_TAIL, CLIP_LEVELS = 0.005, 10.0, 0.05, 16
+"""Least share of the pixels at the level where they clip; how many times those of an average level below these are at
+least; least share of these that the levels just below hold together; how many levels, of 256 up to there, that is."""
+
+
+def clip_level(brightest: np.ndarray, max_dn: int) -> int:
+    """The digital number at which a camera clips: `max_dn`, unless values pile up at a lower largest one.
+
+    Video levels end at 235 of 255, others at what a converter or a developer of raw images leaves. There the values
+    below go on up to the end, and many stand on it. Images of two values have nothing below, and peaks of fringes no
+    such pile: neither is clipped.
+
+    Parameters
+    ----------
+    brightest : (h, w) integer, the largest value of each pixel in all frames.
+    """
+    top = int(brightest.max())
+    if top >= max_dn or top < 2 * CLIP_LEVELS:
+        return max_dn
+    at_top = int((brightest == top).sum())
+    width = max(1.0, top / 256)
+    below = int(((brightest < top) & (brightest >= top - CLIP_LEVELS * width)).sum())
+    piled = at_top > CLIP_PEAK * below / CLIP_LEVELS and below > CLIP_TAIL * at_top
+    return top if piled and at_top > CLIP_SHARE * brightest.size else max_dn
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,10 +115,18 @@ class Capture(ShortRepr):
         return self.detector.max_dn if self.detector else int(np.iinfo(self.frames.dtype).max)
 
     def saturated(self, frames: np.ndarray) -> np.ndarray:
-        """(h, w) bool, where any of `frames` (k, h, w) of this capture is at the largest digital number."""
+        """(h, w) bool, where any of `frames` (k, h, w) of this capture is at the level where the camera clips.
+
+        That is the largest digital number, or a lower one where an unknown detector's values end, see `clip_level`.
+        """
         if not self.is_digital:
             return np.zeros(frames.shape[1:], dtype=bool)
-        return np.asarray(frames.max(axis=0) >= self._max_dn)
+        level = self._max_dn if self.detector else self._clip_level
+        return np.asarray(frames.max(axis=0) >= level)
+
+    @cached_property
+    def _clip_level(self) -> int:
+        return clip_level(self.frames.max(axis=0), self._max_dn)
 
     def noise(self, frame: np.ndarray) -> np.ndarray | None:
         """Standard deviation of the pixels of a frame, in its units; None if the detector is unknown, or counts."""

@@ -16,7 +16,7 @@ from rangesim.signals import GroundTruth
 class Cause(IntEnum):
     """Why a pixel failed: it has no reading, or one off by more than the tolerance. See `DEFINITIONS`.
 
-    The order is that of the families: geometry, surface, other light, noise, decoder.
+    The order is that of the families: geometry, surface, other light, noise, decoder; what came later stands last.
     """
 
     NONE = 0
@@ -33,6 +33,7 @@ class Cause(IntEnum):
     AMBIENT = 11
     RANGE_AMBIGUITY = 12
     RESOLUTION = 13
+    PILE_UP = 14
 
 
 DEFINITIONS = {
@@ -50,6 +51,7 @@ DEFINITIONS = {
     Cause.AMBIENT: "Enough projector light, but ambient light fills the detector or swamps it with noise.",
     Cause.RANGE_AMBIGUITY: "The distance lies beyond the unambiguous range, or a wrong period was picked.",
     Cause.RESOLUTION: "Neither stray light nor noise: code, bins or baseline are too coarse for this depth.",
+    Cause.PILE_UP: "Photons came in so many of the pulses that the first ones hid the rest; less light would be read.",
 }
 """What each cause means, in a sentence."""
 
@@ -68,6 +70,7 @@ TITLES = {
     Cause.AMBIENT: "ambient-swamped",
     Cause.RANGE_AMBIGUITY: "range ambiguity",
     Cause.RESOLUTION: "too coarse",
+    Cause.PILE_UP: "pile-up",
 }
 """Names for tables and legends."""
 

@@ -16,6 +16,7 @@ from rangesim.causes.reference_frames import clean_frames, points_in_projector, 
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
+from rangesim.electronics.spad import SpadDetector
 from rangesim.evaluation.comparison import neighbours
 from rangesim.evaluation.depth_edges import across, depth_edges
 from rangesim.response import DIRECT, KINDS, MULTIPATH
@@ -31,6 +32,9 @@ DIM = 0.1
 """Less than this fraction of what white paper would return here is little light."""
 DISTURBING = 0.005
 """Fraction of the projector's light, other than direct, from which it can shift a reading by the tolerance."""
+MOST_PULSES = 0.9
+"""Fraction of the pulses with a photon from which less light makes less noise: 2.3 photons a pulse, where Coates'
+estimate is best at 1 to 2."""
 MOTION_FRACTION = 0.1
 """Fraction of the tolerance from which motion counts: triangulation magnifies it by distance over baseline, 5 or
 more."""
@@ -78,8 +82,20 @@ class Evidence:
 
     @cached_property
     def saturated(self) -> np.ndarray:
-        """Some frame at its largest digital number, which the decoder refused or which made the error."""
-        return self.capture.saturated(self.capture.frames) & (self.missing | ~self.optical)
+        """Some frame at its largest digital number, or no pulse left, which the decoder refused or made the error."""
+        full = self.capture.saturated(self.capture.frames) | (self.image.status == Status.SATURATED)
+        return full & (self.missing | ~self.optical)
+
+    @cached_property
+    def piled_up(self) -> np.ndarray:
+        """Of the pulses of which the first photon is counted, more brought one than `MOST_PULSES`, or the decoder says
+        that they ran out though no counter is full."""
+        detector, capture = self.capture.detector, self.capture
+        if not isinstance(detector, SpadDetector) or not detector.pile_up:
+            return np.zeros(self.truth.z.shape, dtype=bool)
+        pulses = detector.pulses(capture.sensor.gate, capture.exposure_s)
+        ran_out = (self.image.status == Status.SATURATED) & ~capture.saturated(capture.frames)
+        return np.asarray(ran_out | (capture.frames.sum(axis=0, dtype=np.float64) > MOST_PULSES * pulses))
 
     # ---- The surface ---------------------------------------------------------------------------------
 

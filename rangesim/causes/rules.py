@@ -79,6 +79,7 @@ def rules(e: Evidence) -> list[Rule]:
     return [
         # ---- The detector, blinded
         (e.saturated & e.mostly_ambient & ~e.mostly(GLINT), Cause.AMBIENT),
+        (e.saturated & e.piled_up & ~e.mostly(GLINT), Cause.PILE_UP),
         (e.saturated | e.mostly(GLINT), Cause.GLINT),
         # ---- Surfaces that pass the light on: whether they are lit does not matter. Direct light is their neighbour's
         (e.is_a("transparent", "mirror") & e.at_edge & e.enough & e.mostly(DIRECT), Cause.DEPTH_EDGE),
@@ -111,5 +112,6 @@ def rules(e: Evidence) -> list[Rule]:
         (e.wrong_period, Cause.RANGE_AMBIGUITY),
         (e.optical, Cause.RESOLUTION),
         (e.swamped, Cause.AMBIENT),
+        (e.piled_up, Cause.PILE_UP),
         (np.ones_like(too_dark), Cause.LOW_SIGNAL),
     ]

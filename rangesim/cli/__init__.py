@@ -11,13 +11,14 @@ from typing import Annotated, Any
 import typer
 
 import rangesim
+from pcgraph.plain_files import said
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command
 from rangesim.cli.run import run_command
 from rangesim.cli.scan import scan_command
 from rangesim.environment.doctor import doctor_command
-from rangesim.errors import RangesimError, RangesimWarning, sentence
+from rangesim.errors import RangesimError, RangesimWarning, one_line, sentence
 
 app = typer.Typer(
     name="rangesim", no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False
@@ -63,7 +64,7 @@ def main() -> None:
     except (RangesimError, ValueError, OSError) as error:
         if "--debug" in sys.argv:
             raise
-        typer.echo(f"rangesim: {sentence(str(error))}", err=True)
+        typer.echo(f"rangesim: {sentence(said(error) if isinstance(error, OSError) else str(error))}", err=True)
         sys.exit(1)
 
 
@@ -72,7 +73,7 @@ def _show_warning(others: Callable[..., None]) -> Callable[..., None]:
 
     def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
         if issubclass(category, RangesimWarning):
-            typer.echo(f"rangesim: {message}", err=True)
+            typer.echo(f"rangesim: {one_line(message)}", err=True)
         else:
             others(message, category, *place)
 

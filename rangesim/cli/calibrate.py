@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rangesim.cli.decode import TOF_SUFFIX, load_frames, structured_light
+from rangesim.errors import one_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,18 +19,6 @@ if TYPE_CHECKING:
     from rangesim.capture import Capture
     from rangesim.rig import Intrinsics
 
-MAX_HEAD = 4096
-"""Bytes of a file that say whose it is."""
-_OPENCV = (b"camera_width", b"camera_matrix")
-MARKS = {
-    ".json": (b'"camera"', b'"projector"', b'"fx"'),
-    ".yml": _OPENCV,
-    ".yaml": _OPENCV,
-    ".xml": _OPENCV,
-    ".npz": (b"cosines_m.npy",),
-    ".html": (b"Calibration of a camera and a projector",),
-}
-"""What the files of this command have in their beginning, by suffix."""
 MAX_BOARD_M = 20.0
 """Larger boards are taken for millimetres."""
 KINDS = ("checkerboard", "charuco", "circles")
@@ -119,13 +108,14 @@ def calibrate_command(
         _time_of_flight(target, taken, [str(path) for path in captures], out)
         return
     found = calibrate_rig(target, taken, coefficients=coefficients, names=[str(path) for path in captures])
+    check_places(out, report)  # the work took its time
     (save_calibration if out.suffix.lower() == ".json" else save_opencv)(found.rig, out)
     typer.echo(_table(found, captures))
     if report is not None:
         page = render_calibration(found, [str(path) for path in captures], [c.frames[WHITE] for c in taken])
         write_file(report, page.encode(), FileFormatError, make_parents=True)
-        typer.echo(f"{report}: written.")
-    typer.echo(f"{out}: written.")
+        typer.echo(f"{one_line(report)}: written.")
+    typer.echo(f"{one_line(out)}: written.")
 
 
 def check_places(out: Path, report: Path | None) -> None:
@@ -134,21 +124,20 @@ def check_places(out: Path, report: Path | None) -> None:
     Raises
     ------
     FileFormatError
-        A place is a directory, or holds a file that is neither a calibration nor a page of this command.
+        A place is a directory, or holds a file that this command did not write, or that somebody changed since.
     """
+    from pcgraph.plain_files import is_sealed
     from rangesim.errors import FileFormatError
+    from rangesim.rig.calibration_files import SEAL
 
     for path in (out, *((report,) if report else ())):
         if not path.exists():
             continue
         if not path.is_file():
             raise FileFormatError(f"cannot write {path}: it exists and is no plain file; choose another path.")
-        with path.open("rb") as file:
-            start = file.read(MAX_HEAD)
-        marks = MARKS[path.suffix.lower()]
-        if start and not all(mark in start for mark in marks):
+        if path.stat().st_size and not is_sealed(path, SEAL, at_end=True):
             raise FileFormatError(
-                f"cannot write {path}: it holds something else than rangesim calibrate writes, and would be lost; "
+                f"cannot write {path}: it was not written by rangesim calibrate, or changed since, and would be lost; "
                 "choose another path or move it."
             )
 
@@ -185,11 +174,12 @@ def _camera_alone(
     found = calibrate_camera(
         board, views, width, height, coefficients=coefficients, names=[str(path) for path in images]
     )
+    check_places(out, None)
     save_opencv_camera(found.camera, out)
     lines = [_device_line("camera", found.camera, found.deviations), "reprojection, pixels, root mean square:"]
     for path, residual in zip(images, found.residuals, strict=True):
-        lines.append(f"  {path}  {(residual**2).sum(axis=1).mean() ** 0.5:.3f}")
-    typer.echo("\n".join([*lines, f"  all  {found.rms_px:.3f}", f"{out}: written."]))
+        lines.append(f"  {one_line(path)}  {(residual**2).sum(axis=1).mean() ** 0.5:.3f}")
+    typer.echo("\n".join([*lines, f"  all  {found.rms_px:.3f}", f"{one_line(out)}: written."]))
 
 
 def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out: Path) -> None:
@@ -199,6 +189,7 @@ def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out
     from rangesim.calibration import calibrate_tof, find_board_ranges
 
     found = calibrate_tof(captures, find_board_ranges(board, captures, names), names=names)
+    check_places(out, None)
     found.save(out)
     lengths = np.linspace(found.shortest_m, found.longest_m, 1000)
     unseen = 100 * float(np.isnan(found.offset_m).mean())
@@ -208,7 +199,7 @@ def _time_of_flight(board: Board, captures: list[Capture], names: list[str], out
         f"noise of a reading {500 * found.noise_m:.2f} mm; ranges from {found.shortest_m / 2:.2f} to "
         f"{found.longest_m / 2:.2f} m."
     )
-    typer.echo(f"{out}: written.")
+    typer.echo(f"{one_line(out)}: written.")
 
 
 def _board(kind: str, points: str, spacing: float, marker: float | None, dictionary: str) -> Board:
@@ -250,7 +241,7 @@ def _table(found: RigCalibration, captures: list[Path]) -> str:
     lines.append(f"{'baseline':10s}{1e3 * found.baseline_m:.4f} ± {1e3 * found.baseline_deviation_m:.2g} mm")
     lines.append("reprojection, pixels, root mean square in camera and projector:")
     for path, *both in zip(captures, found.camera_residuals, found.projector_residuals, strict=True):
-        lines.append(f"  {path}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
+        lines.append(f"  {one_line(path)}  " + "  ".join(f"{np.sqrt((r**2).sum(axis=1).mean()):.3f}" for r in both))
     lines.append(f"  all  {found.camera_rms_px:.3f}  {found.projector_rms_px:.3f}")
     return "\n".join(lines)
 

@@ -21,7 +21,6 @@ OF_PATTERNS = ("code", "projector", "axes", "period", "steps")
 OF_BARE_IMAGES = (*OF_PATTERNS, "bits")
 TOF_SUFFIX = ".npz"
 """Of what `rangesim calibrate` writes of time-of-flight cameras."""
-OF_XML_CALIBRATIONS = ("code_step", "unit")
 
 
 def decode_command(
@@ -42,7 +41,13 @@ def decode_command(
     period: Annotated[float, typer.Option(help="Of gray-phase images: fringe period, projector pixels.")] = 16.0,
     steps: Annotated[int, typer.Option(help="Of gray-phase images: phase steps per axis.")] = 4,
     code_step: Annotated[int, typer.Option(help="Projector pixels per Gray cell when an .xml was calibrated.")] = 1,
-    unit: Annotated[float, typer.Option(help="Metres per unit of length of an .xml calibration.")] = 1e-3,
+    unit: Annotated[
+        float | None,
+        typer.Option(
+            help="Metres per unit of length of a calibration, .xml or .yml. Default: 1 for OpenCV's with "
+            "camera_matrix, 0.001 for procam-calibration's."
+        ),
+    ] = None,
     bits: Annotated[
         int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
     ] = None,
@@ -71,6 +76,7 @@ def decode_command(
     """
     import rangesim
     from pcgraph.output import check_directory
+    from rangesim.cli.decode_summary import summary
     from rangesim.cli.decoded_files import DECODED, write_decoded
 
     _refuse_what_would_be_ignored(context, capture, calibration)
@@ -84,13 +90,15 @@ def decode_command(
     if calibration and calibration.suffix.lower() == TOF_SUFFIX:
         image = _calibrated_tof(loaded, calibration)
     else:
-        image = rangesim.decode(_calibrated(loaded, calibration, code_step, unit) if calibration else loaded)
+        loaded = _calibrated(loaded, calibration, code_step, unit) if calibration else loaded
+        image = rangesim.decode(loaded)
     write_decoded(image, loaded, out)
-    typer.echo(_summary(image, out))
+    typer.echo(summary(image, loaded, out))
 
 
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
     """ValueError if an option was given that has no effect on this input."""
+    from rangesim.calibration.opencv_files import SUFFIXES
     from rangesim.capture.capture_files import SIDECAR
 
     given = {name for name in context.params if _from_command_line(context, name)}
@@ -98,8 +106,11 @@ def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibra
         raise ValueError(f"{capture} is a capture whose {SIDECAR} says how it was taken: leave out {surplus}.")
     if "sensor" in given and (surplus := _options(OF_PATTERNS, given)):
         raise ValueError(f"expected either --sensor or {surplus}.")
-    if calibration is None and (surplus := _options(OF_XML_CALIBRATIONS, given)):
-        raise ValueError(f"expected --calibration FILE.xml with {surplus}.")
+    suffix = "" if calibration is None else calibration.suffix.lower()
+    if "code_step" in given and (calibration is None or suffix != ".xml" or _is_opencv(calibration)):
+        raise ValueError("expected --code-step with --calibration FILE.xml of procam-calibration alone.")
+    if "unit" in given and suffix not in SUFFIXES:
+        raise ValueError("expected --calibration FILE.xml or FILE.yml with --unit; others are in metres.")
 
 
 def _from_command_line(context: typer.Context, name: str) -> bool:
@@ -144,16 +155,16 @@ def _full_scale(capture: Capture, bits: int) -> Capture:
     return replace(capture, frames=np.rint(capture.frames * stretch).astype(dtype))
 
 
-def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float) -> Capture:
+def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: float | None) -> Capture:
     """The capture with the rig of a calibration file."""
     from rangesim.rig.calibration_files import load_calibration
 
     if _is_opencv(calibration):
         from rangesim.calibration.opencv_files import load_opencv
 
-        return replace(capture, rig=load_opencv(calibration))
+        return replace(capture, rig=load_opencv(calibration, 1.0 if unit_m is None else unit_m))
     size = capture.sensor.emitter.size
-    return replace(capture, rig=load_calibration(calibration, size, code_step, unit_m))
+    return replace(capture, rig=load_calibration(calibration, size, code_step, 1e-3 if unit_m is None else unit_m))
 
 
 def _is_opencv(calibration: Path) -> bool:
@@ -205,18 +216,3 @@ def structured_light(code: str, projector: str, axes: str, period: float, steps:
         period_px=period,
         steps=steps,
     )
-
-
-def _summary(image: RangeImage, out: Path) -> str:
-    """What came out, in a line."""
-    from rangesim.decoding.status import Status
-
-    fraction = 100 * float(image.valid.mean())
-    if image.camera is None:
-        return f"{out}: {fraction:.1f} % of the pixels decoded; without --calibration there is no depth."
-    z = image.z[image.valid]
-    depth = f", z from {z.min():.3f} to {z.max():.3f} m" if z.size else ""
-    off = float((image.status == Status.CODE_ERROR).mean())
-    hint = f"; {100 * off:.1f} % of the codes miss their epipolar line or each other" if off > 0.1 else ""
-    doubt = ": check --calibration and --code-step" if hint and off > image.valid.mean() else ""
-    return f"{out}: {fraction:.1f} % of the pixels measured{depth}{hint}{doubt}."

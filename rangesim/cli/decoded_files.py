@@ -11,6 +11,7 @@ import numpy as np
 import rangesim
 from pcgraph.output import DirectoryKind, new_directory
 from rangesim.capture import Capture
+from rangesim.cli.decode_summary import likely_cause, status_fractions
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
 from rangesim.files.schema import write_json
@@ -24,13 +25,15 @@ DECODED = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 
 
 def write_decoded(image: RangeImage, capture: Capture, directory: Path) -> None:
-    """Write range.npz, pictures of its maps, the settings, and cloud.ply if there are points.
+    """Write range.npz, pictures of its maps, the settings, fractions of all statuses and the likely cause if they are
+    bad, and cloud.ply if there are points.
 
     The files appear when all are complete; FileFormatError if the directory exists and holds something else.
     """
     settings = {"sensor": to_dict(capture.sensor), "rig": to_dict(capture.rig), "rangesim": rangesim.__version__}
+    outcome = {"status": status_fractions(image), "likely_cause": likely_cause(image, capture)}
     with new_directory(directory, DECODED) as folder:
-        write_json(folder / SIDECAR, {"format": FORMAT, **settings})
+        write_json(folder / SIDECAR, {"format": FORMAT, **settings, **outcome})
         image.save(folder / "range.npz")
         for name, uri in _pictures(image).items():
             (folder / f"{name}.png").write_bytes(base64.b64decode(uri.partition(",")[2]))

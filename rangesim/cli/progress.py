@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from rangesim.errors import TruncationWarning
+from rangesim.errors import TruncationWarning, one_line
 
 
 @contextmanager
@@ -22,6 +22,7 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
         yield None
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
@@ -32,13 +33,13 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("Starting", total=1.0)
-        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+        yield lambda stage, fraction: bar.update(task, description=escape(one_line(stage)), completed=fraction)
 
 
 def say_where(out: Path, target: Path) -> None:
     """Print a line if the output is reached by a link, and so lies elsewhere than its name says."""
     if out.is_symlink():
-        typer.echo(f"rangesim: {out} is a link; the results go to {target}.", err=True)
+        typer.echo(f"rangesim: {one_line(out)} is a link; the results go to {one_line(target)}.", err=True)
 
 
 @contextmanager
@@ -58,4 +59,4 @@ def light_left_out_in_a_line() -> Iterator[None]:
         warnings.showwarning = keep  # type: ignore[assignment]
         yield
     if left_out:
-        typer.echo(f"rangesim: {max(left_out, key=lambda warning: warning.fraction)}", err=True)
+        typer.echo(f"rangesim: {one_line(max(left_out, key=lambda warning: warning.fraction))}", err=True)

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from rangesim.errors import one_line
+
 
 def compare_command(
     results: Annotated[list[Path], typer.Argument(help="Directories that `rangesim run` wrote.", show_default=False)],
@@ -56,7 +58,7 @@ def report_command(
         sensor_of(name)
     read_settings(result)  # says what it is, if it is no result
     replace_listed_file(result, "report.html", lambda: render_report(load_result(result)).encode(), RESULT)
-    typer.echo(f"{result / 'report.html'}")
+    typer.echo(one_line(result / "report.html"))
 
 
 def verify_command(
@@ -77,7 +79,7 @@ def verify_command(
     from pcgraph.output import verify_directory
     from rangesim.capture.capture_files import CAPTURE
     from rangesim.cli.decoded_files import DECODED
-    from rangesim.errors import FileFormatError, visible
+    from rangesim.errors import FileFormatError
     from rangesim.experiment.result_files import RESULT
     from rangesim.fusion.scan_run import SCAN
 
@@ -91,13 +93,13 @@ def verify_command(
     found = verify_directory(directory, kind)
     for word, names in (("missing", found.missing), ("changed", found.changed), ("not rangesim's", found.foreign)):
         for name in names:
-            typer.echo(visible(f"{word}: {directory / name}").replace("\n", "\\n"))
+            typer.echo(f"{word}: {one_line(directory / name)}")
     if found.missing or found.changed:
         raise FileFormatError(
             f"{directory}: of {found.files} files {len(found.missing)} are missing and {len(found.changed)} hold "
             "something else than was written."
         )
-    typer.echo(f"{directory}: all {found.files} files are as they were written.")
+    typer.echo(f"{one_line(directory)}: all {found.files} files are as they were written.")
 
 
 def _print(markdown: str) -> None:

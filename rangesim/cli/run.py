@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
+from rangesim.errors import one_line
 from rangesim.files.bundled_scenes import scene_names
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def run_command(
     with light_left_out_in_a_line(), progress_bar() as progress:
         pipeline.run(experiment, out, progress, announce=_announce)
     _say_what_measured_nothing(target, experiment.scene)
-    typer.echo(f"{out / 'report.html'}")
+    typer.echo(one_line(out / "report.html"))
 
 
 def _announce(cost: Cost) -> None:
@@ -151,8 +152,8 @@ def _say_what_measured_nothing(out: Path, scene: str) -> None:
         )
         distance = settings.scene.working_distance_m
         typer.echo(
-            f"rangesim: {', '.join(blind)} measured no pixel at all, at a working distance of {distance:g} m; "
-            f"coordinates are metres ({advice}); in the dark, --spp or power helps.",
+            f"rangesim: {one_line(', '.join(blind))} measured no pixel at all, at a working distance of "
+            f"{distance:g} m; coordinates are metres ({advice}); in the dark, --spp or power helps.",
             err=True,
         )
 

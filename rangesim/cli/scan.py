@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
+from rangesim.errors import one_line
 
 if TYPE_CHECKING:
     from rangesim.fusion.paths import Path as ScanPath
@@ -88,7 +89,7 @@ def scan_command(
     with light_left_out_in_a_line(), progress_bar() as progress:
         result = run_scan(settings, out, progress)
     typer.echo(_table(result))
-    typer.echo(f"{out / 'report.html'}")
+    typer.echo(one_line(out / "report.html"))
 
 
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
@@ -119,7 +120,10 @@ def _path(before: ScanPath, name: str | None, views: int | None) -> ScanPath:
         data = read_json(Path(name))
         if isinstance(data, dict) and "T_world_camera" not in data:
             raise ValueError(f"{name}: expected a list of poses, or the key 'T_world_camera', got {shown(list(data))}.")
-        return PoseList(data["T_world_camera"] if isinstance(data, dict) else data)
+        try:
+            return PoseList(data["T_world_camera"] if isinstance(data, dict) else data)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
     if name is not None and name not in PATHS:
         raise ValueError(
             f"expected --path out of {', '.join(PATHS)} or a .json file, got {name!r}{nearest(name, PATHS)}."
@@ -140,7 +144,9 @@ def _table(result: ScanResult) -> str:
         accuracy = "-" if error is None else f"{1e3 * error.accuracy_m:.3f} mm"
         recall = "-" if error is None else f"{error.recall:.1%}"
         seen = "-" if result.seen is None else f"{result.seen.shapes[name].surface:.1%}"
-        lines.append(f"{name[:19]:20s}{result.materials[name]:14s}{accuracy:>10s}{recall:>10s}{seen:>8s}")
+        lines.append(
+            f"{one_line(name)[:19]:20s}{one_line(result.materials[name]):14s}{accuracy:>10s}{recall:>10s}{seen:>8s}"
+        )
     if all(result.errors[name] is None for name in result.things):
         from rangesim.report.scan_page import NOTHING_SEEN
 

@@ -13,7 +13,7 @@ class Status(IntEnum):
     LOW_SIGNAL = 1
     """Modulation too weak against the noise or the quantisation to be decoded."""
     SATURATED = 2
-    """At least one frame is at full well or at the largest digital number."""
+    """At least one frame is at full well, at the largest digital number, or where an unknown camera clips."""
     CODE_ERROR = 3
     """Codes contradict each other, leave the projector, or violate the epipolar geometry."""
     UNWRAPPING_FAILED = 4

@@ -9,9 +9,11 @@ from typing import Annotated
 import numpy as np
 
 from rangesim.capture import Capture
+from rangesim.decoding.contradictions import behind_contradiction
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.row_bands import bands
 from rangesim.decoding.status import Status
+from rangesim.errors import warn
 from rangesim.geometry.camera_projector import triangulate_coordinates
 from rangesim.settings.bounds import Bounds, check_fields
 
@@ -46,20 +48,24 @@ def range_image_from_coordinates(
     confidence: np.ndarray,
     intensity: np.ndarray,
     limits: TriangulationLimits,
+    code_is_doubted: bool = False,
 ) -> RangeImage:
     """Range image of decoded projector coordinates; see `RangeImage` for the arrays.
 
-    Without a rig, z is NaN everywhere and `status` is that of the code.
+    Without a rig, z is NaN everywhere and `status` is that of the code. `RangesimWarning` if many rays meet behind a
+    device.
 
     Parameters
     ----------
     column, row : (h, w) float32, projector pixels; None where not coded. They count where `status` is OK.
+    code_is_doubted : whether a warning said so already, so that rays behind a device have their cause.
     """
     status, decoded = status.copy(), status == Status.OK
     column, row = (None if x is None else np.where(decoded, x, np.float32(np.nan)) for x in (column, row))
     z = np.full(status.shape, np.nan, dtype=np.float32)
     range_m = z.copy()
     if capture.rig is not None:
+        behind_px = []
         for rows in bands(len(status)):
             y, x = np.nonzero(decoded[rows])
             directions = capture.rig.camera.directions(np.stack([x + 0.5, y + rows.start + 0.5], axis=-1))
@@ -69,6 +75,7 @@ def range_image_from_coordinates(
                 None if column is None else column[rows][y, x],
                 None if row is None else row[rows][y, x],
             )
+            behind_px.append(found.behind_px.astype(np.float32))
             outcome = np.zeros(len(directions), dtype=np.uint8)
             usable = found.relative_error * COORDINATE_ERROR_PX <= limits.max_relative_error
             outcome[~(np.isfinite(found.z) & usable)] = Status.OUT_OF_RANGE
@@ -76,6 +83,9 @@ def range_image_from_coordinates(
             depth = np.where(outcome == Status.OK, found.z, np.nan)
             status[rows][y, x], z[rows][y, x] = outcome, depth
             range_m[rows][y, x] = depth * np.linalg.norm(directions, axis=-1)
+        contradiction = behind_contradiction(np.concatenate(behind_px))
+        if contradiction and not code_is_doubted:
+            warn(contradiction)
     return RangeImage(
         z=z,
         range_m=range_m,

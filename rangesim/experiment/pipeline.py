@@ -18,6 +18,7 @@ from pcgraph.output import new_directory
 from rangesim.capture import Capture
 from rangesim.capture.capture_files import write_capture
 from rangesim.causes import explain
+from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
 from rangesim.experiment import Experiment
 from rangesim.experiment.cost import Cost, estimate_cost
@@ -75,6 +76,13 @@ def run(
     ValueError, FileFormatError, EnvironmentProblem
         A setting out of range, more memory than there is, a scene that cannot be loaded, no suitable LLVM, or an `out`
         that cannot take a result (see `pcgraph.output.check_directory`).
+
+    Warns
+    -----
+    RangesimWarning
+        Surfaces outside the range of a sensor (`rangesim.causes.range_limits`).
+    SamplingWarning
+        See `warn_of_sampling`.
     """
     import mitsuba as mi
 
@@ -85,6 +93,7 @@ def run(
     tell = progress or _unwatched
     with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
         times: dict[str, float] = {}
+        beyond: list[tuple[str, float, float]] = []
         tell("Loading the scene", 0.0)
         with timed(times, "load"):
             scene = scene or rangesim.load_scene(
@@ -108,6 +117,7 @@ def run(
                 signals = _trace(experiment, scene, rig, instruments, told)
             write_pass(signals, folder / f"pass_{number}.npz")
             for instrument in instruments:
+                beyond.append((instrument.name, *fraction_beyond_range(instrument.sensor, signals.rig, signals.truth)))
                 tell(f"Measuring with {instrument.name}", _fraction(number, len(passes), 1.0))
                 seed = noise_seed(experiment, instrument)
                 measure(instrument, signals, folder / instrument.name, seed, experiment.ambient)
@@ -117,6 +127,7 @@ def run(
         tables = {m.name: m.rows for m in result.measurements}
         _write_comparison(folder, list(tables.items()))
         write_report(result, folder / "report.html")
+    warn_of_range(beyond)
     warn_of_sampling(tables)
 
 

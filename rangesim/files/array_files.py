@@ -19,7 +19,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from pcgraph.plain_files import check_file, write_file
+from pcgraph.plain_files import check_file, sealed, unsealed, write_file
 from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.settings.config import brief, shown
@@ -37,8 +37,10 @@ _HEADERS = {
 }
 
 
-def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
+def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], seal: str | None = None) -> None:
     """Write arrays to a compressed .npz file; the same arrays give the same bytes.
+
+    `seal` : its mark, see `pcgraph.plain_files.sealed`; None: no seal.
 
     Raises
     ------
@@ -50,7 +52,9 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, np.asarray(values), allow_pickle=False)
-    write_file(Path(path), stream.getvalue(), FileFormatError)
+        archive.comment = unsealed(seal).encode() if seal else b""
+    content = stream.getvalue()
+    write_file(Path(path), sealed(content, seal, at_end=True) if seal else content, FileFormatError)
 
 
 def read_arrays(

@@ -96,6 +96,7 @@ def fuse(
         from both sides. None: three voxels.
     weights : "confidence" or "uniform", see `reading_weights`.
     min_weight : least sum of weights, 1 being a typical reading; None: a twentieth of the number of views, at most 1.
+        0: every voxel that a reading says anything of.
     lookup : see `rangesim.fusion.sdf.depth_at`.
 
     Raises
@@ -280,7 +281,8 @@ class _Blocks:
         )  # fmt: skip
 
     def surface(self, least: float, truncation_m: float) -> tuple[TriangleMesh, np.ndarray]:
-        """Mesh where the average is zero between voxels of weight at least `least`, and the weights of its vertices."""
+        """Mesh where the average is zero between voxels of weight at least `least` and above 0, and the weights of its
+        vertices."""
         import open3d as o3d
 
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -288,7 +290,8 @@ class _Blocks:
             np.divide(self.total, -truncation_m * self.weight, out=self.total)
         np.nan_to_num(self.total, copy=False)
         try:
-            above = float(np.nextafter(np.float32(least), np.float32(-1)))  # Open3D takes what is larger
+            # Open3D takes what is larger; a voxel of weight 0 is one that no view says anything of
+            above = max(float(np.nextafter(np.float32(least), np.float32(-1))), 0.0)
             made = self.grid.extract_triangle_mesh(weight_threshold=above)
         except RuntimeError as error:
             if "Tensor has shape {0}" not in str(error):

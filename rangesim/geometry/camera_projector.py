@@ -27,11 +27,14 @@ class ProjectorTriangulation:
     epipolar_px : (n,) float64, distance in projector pixels between the decoded and the reprojected
         coordinate, to the epipolar line; zero if only one axis was decoded.
     relative_error : (n,) float64, error of z as a fraction of z that one projector pixel of error means, |dz/dx_p| / z.
+    behind_px : (n,) float64, where the rays meet behind a device, about how many projector pixels the coordinate is
+        from one that would make them parallel; 0 elsewhere.
     """
 
     z: np.ndarray
     epipolar_px: np.ndarray
     relative_error: np.ndarray
+    behind_px: np.ndarray
 
 
 def triangulate_coordinates(
@@ -85,7 +88,8 @@ def triangulate_coordinates(
         if both:
             epipolar = np.hypot(projector.fx * (point[0] / point[2] - x), projector.fy * (point[1] / point[2] - y))
         relative_error = z * point[2] / slope
-    return ProjectorTriangulation(z, epipolar, relative_error)
+        behind = np.where(np.isfinite(w) & ((w < 0) | (point[2] < 0)), np.abs(w * slope / point[2]), 0)
+    return ProjectorTriangulation(z, epipolar, relative_error, behind)
 
 
 def _on_epipolar_line(

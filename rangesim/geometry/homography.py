@@ -200,10 +200,16 @@ def transfer_error(H: ArrayLike, first: ArrayLike, second: ArrayLike, noisy: Noi
 
 def homography_error(first: Array, second: Array) -> float:
     """Least sum of squared errors in px^2 of any homography between pairs (n, 2) with noise in both views."""
+    return nearest_homography(first, second)[1]
+
+
+def nearest_homography(first: Array, second: Array) -> tuple[Array, float]:
+    """(3, 3) the homography of maximum likelihood for noise in both views, of pairs (n, 2) in px that need not
+    determine it, and its sum of squared errors in px^2."""
     from_a, from_b = normalising_transform(first), normalising_transform(second)
     a, b = apply_similarity(from_a, first), apply_similarity(from_b, second)
     found = _maximum_likelihood(_null_vector(a, b)[0], a, b, from_b[0, 0] / from_a[0, 0], "both")
-    return found.cost / from_b[0, 0] ** 2
+    return np.linalg.inv(from_b) @ found.state @ from_a, found.cost / from_b[0, 0] ** 2
 
 
 def rotation_homography_error(first: Array, second: Array, K_first: Array, K_second: Array) -> float:

@@ -22,6 +22,10 @@ from rangesim.geometry.correspondences import ROUNDING, Array, checked_array, un
 LINE_AT_INFINITY: tuple[float, float, float] = (0.0, 0.0, 1.0)
 """Meets every line in its point at infinity; fixed by a map if and only if that is an affinity."""
 
+LAST_DIGITS = 1e-15
+"""Relative; a few roundings of double precision: of a homogeneous coordinate that is 0, of parallel directions, in rad.
+"""
+
 
 def homogeneous(points: ArrayLike) -> Array:
     """(..., 3) float64 (x, y, 1) of points (..., 2)."""
@@ -39,7 +43,7 @@ def euclidean(points: ArrayLike) -> Array:
 def is_at_infinity(points: ArrayLike) -> np.ndarray:
     """(...,) bool: the last of the homogeneous coordinates (..., 3) is 0, to 1e-15 of the largest."""
     p = checked_array("points", points, 3)
-    return np.asarray(np.abs(p[..., 2]) <= 1e-15 * np.abs(p).max(axis=-1))
+    return np.asarray(np.abs(p[..., 2]) <= LAST_DIGITS * np.abs(p).max(axis=-1))
 
 
 def join(first: ArrayLike, second: ArrayLike) -> Array:
@@ -50,9 +54,18 @@ def join(first: ArrayLike, second: ArrayLike) -> Array:
 def meet(first: ArrayLike, second: ArrayLike) -> Array:
     """(..., 3) the point on two lines (..., 3): their cross product; 0 where they are the same.
 
-    Parallel lines (l1, l2, l3) and (l1, l2, m3) meet at (m3 - l3) (l2, -l1, 0), at infinity.
+    Parallel lines (l1, l2, l3) and (l1, l2, m3) meet at (m3 - l3) (l2, -l1, 0), at infinity. Lines whose directions
+    differ by less than 1e-15 rad are parallel: this is what rounding of their coefficients leaves, and the last
+    coordinate of the point is then exactly 0.
     """
-    return join(first, second)
+    point = join(first, second)
+    a, b = np.broadcast_arrays(checked_array("first", first, 3), checked_array("second", second, 3))
+    normal_a, normal_b = np.linalg.norm(a[..., :2], axis=-1), np.linalg.norm(b[..., :2], axis=-1)
+    is_parallel = np.abs(point[..., 2]) <= LAST_DIGITS * normal_a * normal_b
+    rounding = LAST_DIGITS * (normal_a * np.abs(b[..., 2]) + normal_b * np.abs(a[..., 2]))
+    is_same = is_parallel & (np.abs(point[..., :2]).max(axis=-1) <= rounding)
+    point[..., 2] = np.where(is_parallel, 0.0, point[..., 2])
+    return np.where(is_same[..., None], 0.0, point)
 
 
 def point_at_infinity(line: ArrayLike) -> Array:

@@ -40,7 +40,7 @@ from rangesim.geometry.correspondences import (
     unit_norm,
 )
 from rangesim.geometry.homography import PARAMETERS as OF_HOMOGRAPHY
-from rangesim.geometry.homography import homography_error, largest_plane, rotation_homography_error
+from rangesim.geometry.homography import homography_error, largest_plane, nearest_homography, rotation_homography_error
 from rangesim.geometry.least_squares import Minimum, minimise
 from rangesim.geometry.projective_plane import homogeneous
 from rangesim.rig import pose
@@ -50,6 +50,14 @@ OF_POSE = 5
 OF_ROTATION = 3
 MAX_PIXELS = 1e5
 """Coordinates of images, about."""
+MAX_LINES = 5
+"""Of pairs off a plane, with the largest parallax, along which other epipoles are looked for."""
+POSITIONS = 90
+"""Of an epipole along such a line, of its directions in normalised coordinates: every 2 degrees."""
+MIN_EXTENT = 0.05
+"""Coordinates of the smallest images, about: those of a lens of 6 degrees in units of its focal length."""
+SINGLE_ROUNDING = 1e-6
+"""Relative; a few roundings of single precision, in which matrices of other programs come."""
 ANOTHER = 0.02
 """Difference of an entry of F, at unit norm in normalised coordinates, from which on it is another one."""
 MAX_STANDARD_DEVIATION = 0.3
@@ -218,7 +226,8 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     ------
     ValueError
         As `eight_point`; or a homography explains the points to their noise: a plane, a rotation alone, one view twice;
-        or the residuals are over three times the stated noise.
+        or it explains all but a few, which leave the epipole open, as one point off a plane does; or the residuals are
+        over three times the stated noise.
     """
     a, b = checked_pairs(first, second, 8, "a fundamental matrix")
     check_noise(noise_px)
@@ -254,6 +263,7 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
                 f"expected points with one fundamental matrix, got {len(a)} pairs that two explain to their noise: "
                 "the points lie on a surface that contains both centres, or are few; add points at other depths."
             )
+    _refuse_open_epipole(a, b, from_a, from_b, found, scale, max(noise, rounding))
     in_tangent = found.covariance(max(noise * scale, 1e-300))
     tangent = _tangent(found.state)
     normal = tangent @ in_tangent @ tangent.T
@@ -490,6 +500,50 @@ def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_p
         )
 
 
+def _refuse_open_epipole(
+    a: Array, b: Array, from_a: Array, from_b: Array, found: Minimum[Array], scale: float, noise_px: float
+) -> None:
+    """Raise ValueError if a plane has most of the pairs and those off it leave the epipole open.
+
+    A plane with the homography H allows F = [e']_x H with any e'. A pair off it puts e' on the line (H x) x x'. One
+    such line leaves a family of F, and so do several that noise does not tell apart. The curvature at one minimum does
+    not show it: it takes the noise of the plane's points for parallax. So e' moves along these lines, and the sum of
+    squares of all pairs says which F of the family they admit.
+
+    Parameters
+    ----------
+    from_a, from_b : (3, 3) similarities from pixels to the coordinates of `found`. scale : of these, per pixel.
+    """
+    plane = largest_plane(a, b, noise_px)
+    off = np.flatnonzero(~plane)
+    if 2 * len(off) >= len(a):
+        return
+    unit_a, unit_b = homogeneous(apply_similarity(from_a, a)), homogeneous(apply_similarity(from_b, b))
+    H = from_b @ nearest_homography(a[plane], b[plane])[0] @ np.linalg.inv(from_a)
+    mapped = unit_a[off] @ H.T
+    parallax = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - unit_b[off, :2], axis=-1)
+    farthest = np.argsort(-parallax)[:MAX_LINES]
+    weights = (from_a[0, 0] / scale, from_b[0, 0] / scale)
+    # the noise of the plane's points alone sets the sums of two members apart by 2 sqrt(n), as two chi^2 of n
+    rise = consensus.chi2_limit(PARAMETERS) + 2 * np.sqrt(len(a))
+    allowed = found.cost + rise * (noise_px * scale) ** 2
+    angles = np.linspace(0, np.pi, POSITIONS, endpoint=False)
+    for line in np.cross(mapped, unit_b[off])[farthest]:
+        axes = np.linalg.svd(line[None])[2][1:]
+        for epipole in np.outer(np.cos(angles), axes[0]) + np.outer(np.sin(angles), axes[1]):
+            F = unit_norm(_cross_matrix(epipole) @ H)
+            apart = min(float(np.linalg.norm(F - sign * found.state)) for sign in (1, -1))
+            if apart <= 2 * MAX_STANDARD_DEVIATION:
+                continue
+            distances = _sampson(F, unit_a, unit_b, weights)[0]
+            if distances @ distances <= allowed:
+                raise ValueError(
+                    f"expected points that determine the fundamental matrix, got {len(a)} pairs of which all but "
+                    f"{len(off)} lie on one plane: these leave the epipole open at a noise of {noise_px:.3g} px, and a "
+                    "family of matrices explains all pairs; add points off the plane."
+                )
+
+
 def _refuse_rotation(a: Array, b: Array, K_first: Array, K_second: Array, cost: float, noise_px: float | None) -> None:
     """Raise ValueError if a rotation alone explains the pairs as well as a pose with `cost` in px^2, to their noise."""
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
@@ -545,7 +599,9 @@ def _checked_F(F: ArrayLike) -> Array:
         raise ValueError(f"expected F of shape (3, 3), got {matrix.shape}.")
     # pixels against ones: in units of some hundred pixels the blocks of F are of one size
     block, border = np.linalg.norm(matrix[:2, :2]), max(np.linalg.norm(matrix[2, :2]), np.linalg.norm(matrix[:2, 2]))
-    unit = min(border / block, MAX_PIXELS) if border > 0 and block > 0 else 1.0
+    # an epipole at the origin, as of forward motion, leaves a border that is rounding and tells no unit
+    has_unit = block > 0 and border > SINGLE_ROUNDING * block
+    unit = min(max(border / block, MIN_EXTENT), MAX_PIXELS) if has_unit else 1.0
     values = np.linalg.svd(matrix * np.outer([unit, unit, 1], [unit, unit, 1]), compute_uv=False)
     if not (values[1] > 1e-12 * values[0] and values[2] <= 1e-6 * values[0]):
         raise ValueError(f"expected F of rank 2, got singular values {values.tolist()} after scaling.")

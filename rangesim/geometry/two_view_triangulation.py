@@ -25,7 +25,7 @@ from pcgraph.parallel import in_blocks, kernel
 from rangesim.geometry.camera_matrix import centre, depth, project, rays
 from rangesim.geometry.correspondences import Array, checked_array
 from rangesim.geometry.projective_plane import homogeneous
-from rangesim.geometry.two_view import fundamental_from_cameras
+from rangesim.geometry.two_view import centred_cameras, fundamental_from_cameras
 
 NEAR_EPIPOLE = 0.25
 """A correction by more than this fraction of a point's distance to its epipole is checked against all minima."""
@@ -63,29 +63,29 @@ def triangulate_linear(
 
     Parameters
     ----------
-    P_first, P_second : (3, 4) camera matrices. first, second : (n, 2) pixels.
+    P_first, P_second : (3, 4) camera matrices, of any world, map coordinates too. first, second : (n, 2) pixels.
 
     Raises
     ------
     ValueError
         The cameras have one centre; arrays of other shapes, or not finite.
     """
-    p, q, x, y = _checked(P_first, P_second, first, second)
-    fundamental_from_cameras(p, q)  # the check of the centres
+    p, q, origin, x, y = _checked(P_first, P_second, first, second)
+    fundamental_from_cameras(P_first, P_second)  # the check of the centres
     rows = [points[:, k, None] * P[2] - P[k] for P, points in ((p, x), (q, y)) for k in (0, 1)]
     design = np.stack(rows, axis=1)
     design /= np.linalg.norm(design, axis=-1, keepdims=True)
     X = np.linalg.svd(design)[2][:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _judged(p, q, x, y, X[:, :3] / X[:, 3:])
+        return _judged(p, q, x, y, X[:, :3] / X[:, 3:], origin)
 
 
 def triangulate_midpoint(
     P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> TriangulatedPoints:
     """Points half way between the two rays where they are nearest to each other; parameters as `triangulate_linear`."""
-    p, q, x, y = _checked(P_first, P_second, first, second)
-    fundamental_from_cameras(p, q)
+    p, q, origin, x, y = _checked(P_first, P_second, first, second)
+    fundamental_from_cameras(P_first, P_second)
     C, D = _centres(p, q)
     d, e = rays(p, x), rays(q, y)
     normal = np.cross(d, e)
@@ -93,7 +93,7 @@ def triangulate_midpoint(
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (np.cross(D - C, e) * normal).sum(-1) / size
         w = (np.cross(D - C, d) * normal).sum(-1) / size
-    return _judged(p, q, x, y, 0.5 * (C + z[:, None] * d + D + w[:, None] * e))
+    return _judged(p, q, x, y, 0.5 * (C + z[:, None] * d + D + w[:, None] * e), origin)
 
 
 def correct_pixels(F: ArrayLike, first: ArrayLike, second: ArrayLike) -> CorrectedPixels:
@@ -140,8 +140,8 @@ def triangulate_optimal(
 
     Parameters and errors are those of `triangulate_linear`.
     """
-    p, q, x, y = _checked(P_first, P_second, first, second)
-    corrected = correct_pixels(fundamental_from_cameras(p, q), x, y)
+    p, q, origin, x, y = _checked(P_first, P_second, first, second)
+    corrected = correct_pixels(fundamental_from_cameras(P_first, P_second), x, y)
     rays_of = _Rays(_world_from_pixel(p), _world_from_pixel(q), *_centres(p, q))
     points, error = np.empty((len(x), 3)), np.empty(len(x))
     in_blocks(
@@ -152,7 +152,7 @@ def triangulate_optimal(
         points,
         error,
     )
-    return TriangulatedPoints(points, error)
+    return TriangulatedPoints(points + origin, error)
 
 
 def point_covariance(
@@ -223,18 +223,22 @@ def _centres(p: Array, q: Array) -> tuple[Array, Array]:
 
 def _checked(
     P_first: ArrayLike, P_second: ArrayLike, first: ArrayLike, second: ArrayLike
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The camera matrices for an origin at the first camera, that origin (3,), and the pixels."""
     p, q = checked_array("P_first", P_first, 3, 4), checked_array("P_second", P_second, 3, 4)
     x, y = checked_array("first", first, None, 2), checked_array("second", second, None, 2)
     if p.ndim != 2 or q.ndim != 2:
         raise ValueError(f"expected camera matrices of shape (3, 4), got {p.shape} and {q.shape}.")
     if x.shape != y.shape or x.ndim != 2:
         raise ValueError(f"expected first and second as corresponding points (n, 2), got {x.shape} and {y.shape}.")
-    return p, q, x, y
+    return *centred_cameras(p, q), x, y
 
 
-def _judged(p: Array, q: Array, x: Array, y: Array, X: Array) -> TriangulatedPoints:
-    """With reprojection errors; NaN where not finite, as far off as parallel rays, or not in front of both cameras."""
+def _judged(p: Array, q: Array, x: Array, y: Array, X: Array, origin: Array) -> TriangulatedPoints:
+    """Points moved by the origin, with reprojection errors.
+
+    NaN where not finite, as far off as parallel rays, or not in front of both cameras.
+    """
     points, error = np.full(X.shape, np.nan), np.full(len(X), np.nan)
     finite = np.asarray(np.isfinite(X).all(axis=-1))
     sound = finite.copy()
@@ -246,7 +250,7 @@ def _judged(p: Array, q: Array, x: Array, y: Array, X: Array) -> TriangulatedPoi
     points[sound] = X[sound]
     parts = [project(P, X[sound]) - measured[sound] for P, measured in ((p, x), (q, y))]
     error[sound] = np.linalg.norm(np.hstack(parts), axis=-1)
-    return TriangulatedPoints(points, error)
+    return TriangulatedPoints(points + origin, error)
 
 
 def _covariances(name: str, noise: ArrayLike, n: int) -> Array:

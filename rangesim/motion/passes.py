@@ -60,7 +60,7 @@ class Pass:
 
     def seed(self, seed: int) -> int:
         """Seed of the pass: the same at all times, so that what stands still has the same noise in all frames, but
-        another one for each place of the window, or every band of a scan would repeat the noise of the first."""
+        another one for each place of the window, or every band of lines would repeat the noise of the first."""
         corner = (self.window.top, self.window.left)
         if not any(corner):
             return seed

@@ -51,12 +51,15 @@ class Timing:
     Parameters
     ----------
     frame_period_s : float >= 0, from one exposure to the next.
-    line_period_s : float >= 0, from one line to the next: of a scanning time-of-flight beam, or of the rolling shutter
-        of a camera. 0: all lines at once (flash, global shutter).
+    line_period_s : float >= 0, from one line to the next as the camera reads them. 0: all lines at once (flash, global
+        shutter). The projector lights its whole field for every line, as it does at once. So this is a rolling shutter,
+        not a scanning beam: a beam would light one line alone, with all of its power and without the multipath of the
+        others.
     lines : "rows" from top to bottom, or "columns" from left to right.
-    bands : int >= 1, the lines of a scan are rendered in so many bands (fewer if there are fewer lines), each at the
-        time of its middle. Every band is a pass of its own.
-    single_tap : bool, an AMCW camera takes its taps one after another.
+    bands : int >= 1, lines that are read one by one are rendered in so many bands (fewer if there are fewer lines),
+        each at the time of its middle. Every band is a pass of its own.
+    single_tap : bool, an AMCW camera takes its taps one after another. That is when they are taken, not how bright they
+        are: a pixel that collects half of the light for each has twice as much as `AmcwToF` gives a tap in an exposure.
     start_s : float, middle of the first exposure.
     exposure_s, exposure_samples : float >= 0 and int >= 1: the exposure is rendered at so many times, evenly spread,
         and averaged. By default the motion within an exposure is neglected.

@@ -31,7 +31,7 @@ def transport_moving(
     progress: Callable[[float], None] | None = None,
     **options: Unpack[TransportOptions],
 ) -> dict[Sensor, Signals]:
-    """Signals of sensors in a world that moves: every exposure, and every band of a scan, at its own time.
+    """Signals of sensors in a world that moves: every exposure, and every band of lines, at its own time.
 
     All that is taken with everything in one and the same place shares a transport pass, whatever the sensor: without
     motion there is one pass, and the frames have the bytes of `transport`. A stack of k patterns of something that

@@ -12,8 +12,10 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
+from pcgraph.plain_files import sealed, unsealed
 from rangesim.report.figures import grey
 from rangesim.report.policy import StyleRules, content_policy, visible_text
+from rangesim.rig.calibration_files import SEAL
 
 if TYPE_CHECKING:
     from rangesim.calibration import BoardView, RigCalibration
@@ -45,7 +47,8 @@ def render_calibration(found: RigCalibration, names: Sequence[str], images: Sequ
         autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string(_asset("calibration.html.j2"))
-    return template.render(context(found, [str(name) for name in names], images))
+    page = template.render(context(found, [str(name) for name in names], images))
+    return sealed(f"{page}<!-- {unsealed(SEAL)} -->\n".encode(), SEAL, at_end=True).decode()
 
 
 def context(found: RigCalibration, names: list[str], images: Sequence[np.ndarray] | None) -> dict[str, Any]:

@@ -46,6 +46,7 @@ OUTCOME_COLORS = np.array(
         (126, 185, 126),
         (138, 103, 242),  # decoder: violets
         (43, 31, 76),
+        (184, 248, 176),  # pile-up: noise
         (203, 206, 210),  # nothing there
     ],
     dtype=np.uint8,

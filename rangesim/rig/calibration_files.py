@@ -15,13 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pcgraph.plain_files import write_file
+from pcgraph.plain_files import sealed, unsealed, write_file
 from rangesim.errors import FileFormatError
 from rangesim.files.text_files import check_xml, read_json
 from rangesim.rig import Intrinsics, Rig
 from rangesim.settings.bounds import Bounds, check_number, whole
 from rangesim.settings.config import shown, to_dict
 
+SEAL = "rangesim-calibration"
+"""By which `rangesim calibrate` knows the files that it may replace; see `pcgraph.plain_files.sealed`."""
 MAX_NUMBER = 1e9
 """Of a number in a calibration file: pixels, millimetres, coefficients."""
 _SHAPES = {
@@ -81,13 +83,20 @@ def load_calibration(
 
 
 def save_calibration(rig: Rig, path: str | Path) -> None:
-    """Write a rig as JSON; `load_calibration` reads it back equal."""
-    write_file(Path(path), (json.dumps(to_dict(rig), indent=1) + "\n").encode(), FileFormatError, make_parents=True)
+    """Write a rig as JSON; `load_calibration` reads it back equal.
+
+    The key "seal" holds the SHA-256 of the file: who corrects the file by hand makes it their own.
+    """
+    text = json.dumps({**to_dict(rig), "seal": unsealed(SEAL)}, indent=1) + "\n"
+    write_file(Path(path), sealed(text.encode(), SEAL, at_end=True), FileFormatError, make_parents=True)
 
 
 def _load_json(path: Path) -> Rig:
     try:
-        return Rig.from_dict(read_json(path))
+        settings = read_json(path)
+        if isinstance(settings, dict):
+            settings.pop("seal", None)
+        return Rig.from_dict(settings)
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
 

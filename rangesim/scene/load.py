@@ -25,7 +25,14 @@ from rangesim.scene.camera import camera_of, warn_of_aperture
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
-from rangesim.scene.nodes import check_camera, ids_of_shapes, replace_ignored_plugins, take_material_classes
+from rangesim.scene.nodes import (
+    OF_MITSUBA,
+    check_camera,
+    check_types,
+    ids_of_shapes,
+    replace_ignored_plugins,
+    take_material_classes,
+)
 from rangesim.scene.normals import repeat_normals
 from rangesim.scene.origin import (
     AS_FAR,
@@ -40,7 +47,6 @@ from rangesim.scene.origin import (
     warn_of_loaded_camera,
 )
 from rangesim.scene.properties import (
-    PLUGINS,
     check_depth,
     check_dictionary,
     check_evaluable,
@@ -141,6 +147,8 @@ def _instantiate(
 
     def parsed(folder: str, advises: bool) -> tuple[Any, set[str], dict[str, str]]:
         state = _parse(config, source, material, unit_m, Path(folder), advises)
+        mi.file_resolver().prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]  # again: a scene adds paths
+        check_types(state, label)
         check_depth(state, label)
         mi.parser.transform_all(config, state)
         ids, classes = ids_of_shapes(state, label), take_material_classes(state, label)
@@ -191,7 +199,6 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
     resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
-    resolver.prepend(str(PLUGINS.parent))  # type: ignore[attr-defined]  # no plugin of a scene goes first
     try:
         fillers = check_xml(path, lambda name: Path(str(mi.file_resolver().resolve(name))), IGNORED_ELEMENTS)
     except FileFormatError as error:
@@ -211,9 +218,8 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
 def _own_file_resolver() -> Iterator[None]:
     """Search paths of this scene, forgotten afterwards, so that no scene finds another's files."""
     before = mi.file_resolver()
-    own = mi.FileResolver(before)
-    own.prepend(str(PLUGINS.parent))  # type: ignore[attr-defined]  # no plugin of the working directory goes first
-    mi.set_file_resolver(own)
+    mi.set_file_resolver(mi.FileResolver(before))
+    mi.file_resolver().prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]
     try:
         yield
     finally:

@@ -3,24 +3,63 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
 from rangesim.errors import FileFormatError
 from rangesim.scene.materials import MATERIAL_CLASSES
-from rangesim.scene.properties import LIBRARIES, PLUGINS
 from rangesim.settings.config import nearest, shown
 
 CLASS_KEY = "material_class"
 COMPOSITES = ("instance", "shapegroup", "merge")
 """Shapes that stand for others, whose parts would have neither name nor material."""
-
+OF_MITSUBA = Path(mi.__file__).resolve().parent
+"""Mitsuba's own directory: its plugins are in `plugins`."""
 IGNORED_PLUGINS = {"Integrator": "path", "Film": "hdrfilm", "Sampler": "independent", "ReconstructionFilter": "box"}
 """What stands in for a plugin that Mitsuba lacks, by the kind of node, where the kind does not matter."""
 FILM_SIZES = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
 """What of a film matters."""
+_LIBRARIES = (".so", ".dylib", ".dll")
+_PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
+
+
+@lru_cache(maxsize=1)
+def shipped_types() -> frozenset[str]:
+    """Names of the plugins that come with Mitsuba."""
+    return frozenset(path.stem for path in (OF_MITSUBA / "plugins").iterdir() if path.suffix in _LIBRARIES)
+
+
+def check_type(name: str, label: str) -> None:
+    """Raise FileFormatError on a plugin type for which Mitsuba would run a library that a scene brings along.
+
+    Mitsuba takes `plugins/NAME.so` out of the first search path that has it. Its own plugins pass (`OF_MITSUBA` has to
+    be the first path, then); of others, plain names that no library has: those that are registered in Python, and those
+    that Mitsuba refuses.
+    """
+    if name in shipped_types():
+        return
+    is_plain = _PLAIN_NAME.fullmatch(name) is not None
+    if is_plain and not any(
+        os.path.lexists(str(mi.file_resolver().resolve(f"plugins/{name}{suffix}"))) for suffix in _LIBRARIES
+    ):
+        return
+    raise FileFormatError(
+        f"{label}: expected types of plugins that come with Mitsuba or are registered in Python, got "
+        f"{shown(name)}{nearest(name, shipped_types())}; a scene may bring no library of its own."
+    )
+
+
+def check_types(state: Any, label: str) -> None:
+    """Raise FileFormatError on the first node whose type `check_type` refuses."""
+    for name in dict.fromkeys(node.props.plugin_name() for node in state.nodes):
+        if name:
+            check_type(name, label)
 
 
 def ids_of_shapes(state: Any, label: str) -> set[str]:
@@ -83,7 +122,7 @@ def replace_ignored_plugins(state: Any) -> None:
     """
     for node in state.nodes:
         own = IGNORED_PLUGINS.get(node.type.name)
-        if own is None or any((PLUGINS / f"{node.props.plugin_name()}{suffix}").exists() for suffix in LIBRARIES):
+        if own is None or node.props.plugin_name() in shipped_types():
             continue
         props = mi.Properties(own)
         props.set_id(node.props.id())

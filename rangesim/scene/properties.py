@@ -7,8 +7,6 @@ Mitsuba takes most numbers as they come; a reflectance of 2 or a radius of NaN s
 from __future__ import annotations
 
 import math
-import os
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -22,6 +20,8 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
+from rangesim.scene.mesh_files import check_ply
+from rangesim.scene.nodes import check_type
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
 
@@ -87,10 +87,6 @@ TEXTURES_WITHOUT = {
     "normalmap": ("three channels", ("checkerboard",)),
 }
 """What the map of a BSDF needs, and the textures of Mitsuba 3.9 that do not have it and stop the light transport."""
-PLUGINS = Path(mi.__file__).resolve().parent / "plugins"
-"""Where the plugins that come with Mitsuba are."""
-LIBRARIES = (".so", ".dylib", ".dll")
-"""Suffixes of native code on Linux, macOS and Windows."""
 FLOAT_IMAGES = (".exr", ".pfm", ".hdr", ".rgbe")
 """Texture files whose values may lie outside 0..1."""
 
@@ -137,26 +133,7 @@ def check_dictionary(scene: Any, label: str) -> None:
             if not isinstance(key, str):
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
             if key == "type" and isinstance(value, str):
-                check_plugin(value, label)
-
-
-def check_plugin(name: str, label: str) -> None:
-    """Raise FileFormatError if Mitsuba would run native code from outside itself for a plugin of this name.
-
-    Mitsuba loads `plugins/NAME.so` from wherever its file resolver finds it: from the folder of a scene, too. What is
-    registered in Python has no such file.
-    """
-    if re.fullmatch(r"[A-Za-z0-9_-]*", name) is None:
-        raise FileFormatError(
-            f"{label}: expected a type to be the plain name of a plugin of Mitsuba, got {shown(name)}."
-        )
-    for suffix in LIBRARIES:
-        found = Path(str(mi.file_resolver().resolve(f"plugins/{name}{suffix}")))
-        if os.path.lexists(found) and found.resolve().parent != PLUGINS:
-            raise FileFormatError(
-                f"{label}: type {shown(name)} is no plugin of Mitsuba, and native code beside a scene is not run; "
-                f"remove {found.name} or use another type."
-            )
+                check_type(value, label)
 
 
 def check_evaluable(state: Any, label: str) -> None:
@@ -185,8 +162,6 @@ def check_properties(state: Any, label: str) -> None:
 
     The message names the node and the property: 'shape "ball": expected radius to be positive and finite, got nan'.
     """
-    for node in state.nodes:
-        check_plugin(node.props.plugin_name(), label)
     parents = {value.index(): parent for parent, node in enumerate(state.nodes) for _, value in _references(node)}
     for index, node in enumerate(state.nodes):
         bounds = PROPERTIES.get(node.type.name, {})
@@ -199,6 +174,12 @@ def check_properties(state: Any, label: str) -> None:
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
         if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
+        if node.props.plugin_name() == "ply" and isinstance(name := node.props.get("filename"), str):
+            path = Path(str(mi.file_resolver().resolve(name)))
+            try:
+                check_ply(path)
+            except FileFormatError as error:
+                raise FileFormatError(f"{label}: {error}") from error
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)

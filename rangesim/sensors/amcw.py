@@ -26,6 +26,8 @@ MAX_RANGE_M = 100.0
 """Ranges beyond are not searched by phase unwrapping, even if the frequencies were unambiguous farther out."""
 TAPS_DEG = (0, 90, 180, 270)
 """Delays of the taps of each frequency, in degrees of its phase; `frames` and `tap_phase` are for quarter turns."""
+SHARE = 1 / len(TAPS_DEG)
+"""Of the light of an exposure that each tap collects on average: its taps share it, and none is lost."""
 RELATIVE_SIGNAL = 1e-4
 """Light of noise-free captures that counts as none, as a fraction of that of the bright pixels."""
 
@@ -34,8 +36,10 @@ RELATIVE_SIGNAL = 1e-4
 class AmcwToF(Sensor):
     """Amplitude-modulated continuous wave camera with four taps per frequency (0, 90, 180, 270 degrees).
 
-    The mean of tap theta is (A + contrast * B cos(phi - theta)) / 2 with phi = 2 pi f l / c over the path length
-    l (there and back); A holds white and ambient light. Frames: frequency by frequency, four taps each.
+    The four taps of a pixel share the light of one exposure: the mean of tap theta is (A + contrast * B cos(phi -
+    theta)) / 4 with phi = 2 pi f l / c over the path length l (there and back); A holds white and ambient light. So the
+    taps add up to A. A pixel of two taps that takes two exposures has as much in each as this one with twice the
+    `exposure_s`. Frames: frequency by frequency, four taps each.
 
     Parameters
     ----------
@@ -90,7 +94,7 @@ class AmcwToF(Sensor):
         taps = ((phasor, tap) for phasor in channels for tap in TAPS_DEG)
         for frame, (phasor, tap) in zip(result, taps, strict=True):
             axis, sign = tap // 90 % 2, 1 - tap // 180 * 2  # cos or sin of the phase, and its sign
-            np.multiply(0.5, offset + sign * self.contrast * phasor[axis], out=frame, casting="same_kind")
+            np.multiply(SHARE, offset + sign * self.contrast * phasor[axis], out=frame, casting="same_kind")
         return result
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:
@@ -188,14 +192,14 @@ class AmcwDecoder(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        visibility = of_type(sensor, AmcwToF).contrast / 2
+        visibility = of_type(sensor, AmcwToF).contrast * SHARE
         least = self.phase.least_signal(len(TAPS_DEG), visibility, self.content(sensor), background)
         if background.noise_variance is None:
             least = np.maximum(least, background.floor(RELATIVE_SIGNAL))
         return least
 
     def content(self, sensor: Sensor) -> FrameContent:
-        return FrameContent(signal=0.5, ambient=0.5)
+        return FrameContent(signal=SHARE, ambient=SHARE)
 
 
 def _weight(capture: Capture, phase: Phase, modulation_hz: float) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from rangesim import limits
 from rangesim.capture import Capture, bright_level
 from rangesim.decoding.gray import Threshold
-from rangesim.decoding.histogram import coates, find_peak, window_reach
+from rangesim.decoding.histogram import coates, find_peak, runs_out, window_reach
 from rangesim.decoding.path_length import range_image_from_path_length
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
@@ -159,7 +159,8 @@ class DirectToFDecoder(Decoder):
 
     Pile-up is undone if the detector has it (Coates 1968, see `coates`). A filter matched to the instrument response
     finds the peak; the centroid of the counts above the background around it, re-centred once, gives the place within
-    a bin.
+    a bin. Where the pulses run out within the window of the peak, the reading is saturated (see `runs_out`); less light
+    helps.
 
     Parameters
     ----------
@@ -184,12 +185,16 @@ class DirectToFDecoder(Decoder):
         sensor = of_type(capture.sensor, DirectToF)
         height, width = capture.frames.shape[1:]
         position, peak, background, intensity = np.empty((4, height, width))
+        spent, pulses = np.zeros((height, width), dtype=bool), _pulses(capture)
 
         def measure(start: int, stop: int) -> None:
             for row in range(start, stop):
                 frames = capture.frames[:, row]
-                found = find_peak(_histogram(capture, frames), sensor.sigma_bins, sensor.is_cyclic)
+                histogram = frames.astype(np.float64) if pulses is None else coates(frames, pulses)
+                found = find_peak(histogram, sensor.sigma_bins, sensor.is_cyclic)
                 position[row], peak[row], background[row] = found
+                if pulses is not None:
+                    spent[row] = runs_out(frames, found[0], pulses, sensor.sigma_bins, sensor.is_cyclic)
                 intensity[row] = frames.sum(axis=0, dtype=np.float64)
 
         in_blocks(measure, height, smallest=MIN_ROWS)
@@ -197,7 +202,7 @@ class DirectToFDecoder(Decoder):
         bright = bright_level(peak)
         is_strong = peak >= self._least_counts(background) if capture.is_digital else peak > self.relative_peak * bright
         status = np.where(is_strong, Status.OK, Status.LOW_SIGNAL)
-        status[capture.saturated(capture.frames)] = Status.SATURATED
+        status[spent | capture.saturated(capture.frames)] = Status.SATURATED
         return range_image_from_path_length(
             capture, length, status=status, confidence=peak / (bright or 1.0), intensity=intensity
         )
@@ -223,7 +228,8 @@ def _window_bins(sensor: DirectToF) -> int:
     return 2 * window_reach(sensor.bins, sensor.sigma_bins, sensor.is_cyclic) + 1
 
 
-def _histogram(capture: Capture, frames: np.ndarray) -> np.ndarray:
+def _pulses(capture: Capture) -> int | None:
+    """How many pulses the exposure holds, if only the first photon of each was counted; None without pile-up."""
     if isinstance(capture.detector, SpadDetector) and capture.detector.pile_up:
-        return coates(frames, capture.detector.pulses(capture.sensor.gate, capture.exposure_s))
-    return frames.astype(np.float64)
+        return capture.detector.pulses(capture.sensor.gate, capture.exposure_s)
+    return None

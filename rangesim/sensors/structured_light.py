@@ -12,11 +12,13 @@ import numpy as np
 
 from rangesim import limits
 from rangesim.capture import Capture
+from rangesim.decoding.contradictions import binary_contradiction, fringe_contradiction, level_contradiction
 from rangesim.decoding.gray import GrayCode, GrayThresholds, decode_gray, direct_contrast
 from rangesim.decoding.phase_shift import PhaseThresholds, refine_by_phase
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.decoding.triangulate import TriangulationLimits, range_image_from_coordinates
+from rangesim.errors import warn
 from rangesim.response import DenseResponse, Fringes, GrayBits, LightPath, NumpyMath
 from rangesim.sensor import Background, Decoder, Emitter, FrameContent, Sensor, least_signal_for, of_type
 from rangesim.settings.bounds import Bounds, check_fields, whole
@@ -198,20 +200,33 @@ class StructuredLightDecoder(Decoder):
         check_fields(self)
 
     def decode(self, capture: Capture) -> RangeImage:
-        """Range image of a `StructuredLight` capture; ValueError also if the rig's projector is not of its size."""
+        """Range image of a `StructuredLight` capture; ValueError also if the rig's projector is not of its size.
+
+        `RangesimWarning` if frames and code contradict each other as a whole.
+        """
         sensor = of_type(capture.sensor, StructuredLight)
         if capture.rig is not None:
             sensor.check(capture.rig.projector.width, capture.rig.projector.height)
         contrast = direct_contrast(capture, capture.frames[WHITE], capture.frames[BLACK], self.gray)
         codes: dict[str, GrayCode] = {}
+        contradictions: dict[str, str | None] = {}
         for axis, response, frames in sensor.layout():
             if isinstance(response, GrayBits):
                 shift, size = response.shift, sensor.size(axis)
                 codes[axis] = decode_gray(capture, capture.frames[frames], shift, size, contrast, self.gray)
+                contradictions[axis] = binary_contradiction(codes[axis], axis)
             else:
                 fringes, least_swing = capture.frames[frames], self.gray.relative_bit * contrast.values
                 period_px = response.period_px
-                codes[axis] = refine_by_phase(capture, codes[axis], fringes, period_px, least_swing, self.phase)
+                gray = codes[axis]
+                codes[axis] = refine_by_phase(capture, gray, fringes, period_px, least_swing, self.phase)
+                contradictions[axis] = (
+                    contradictions[axis]
+                    or level_contradiction(capture, gray, codes[axis], frames, sensor.frame_names(), axis)
+                    or fringe_contradiction(gray, codes[axis], fringes, period_px, axis)
+                )
+        for contradiction in filter(None, contradictions.values()):
+            warn(contradiction)
         for axis, code in codes.items():
             outside = (code.coordinate < -0.5) | (code.coordinate > sensor.size(axis) + 0.5)
             code.status[outside & (code.status == Status.OK)] = Status.CODE_ERROR
@@ -224,6 +239,7 @@ class StructuredLightDecoder(Decoder):
             confidence=contrast.values / np.float32(capture.full_scale),
             intensity=capture.frames[WHITE].astype(np.float32) - np.float32(capture.black_level),
             limits=self.triangulation,
+            code_is_doubted=any(contradictions.values()),
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import subprocess
 import sys
@@ -56,6 +57,19 @@ def test_number_of_objects_and_one_file(scene, tmp_path):
     done = run(scene, "--out", tmp_path / "a.ply", "--objects", 7, "--no-color", *VIEW)
     assert done.exit_code == 0, done.output
     assert len(np.unique(pcgraph.read_cloud(tmp_path / "a.ply").labels)) == 7
+
+
+def test_colours_that_are_not_used_are_kept(tmp_path):
+    points, _, _ = two_boxes_on_a_plane()
+    shades = np.random.default_rng(2).integers(0, 256, (len(points), 3), np.uint8)
+    columns = {name: points[:, i] for i, name in enumerate("xyz")}
+    columns |= {name: shades[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    (tmp_path / "a.ply").write_bytes(encode_ply(columns))
+    done = run(tmp_path / "a.ply", "--out", tmp_path / "b.ply", "--no-color", *VIEW)
+    assert done.exit_code == 0, done.output
+    read = pcgraph.read_cloud(tmp_path / "b.ply")
+    assert np.array_equal(read.colors, shades)
+    assert np.array_equal(read.labels, pcgraph.segment(points, viewpoint=(0.8, -1, 3)).labels)
 
 
 @pytest.mark.parametrize("points", [[[1, 2, 3]], [[1, 2, 3], [4, 5, 6]], np.ones((9, 3))])
@@ -130,6 +144,73 @@ def test_missing_file_in_a_process_of_its_own(tmp_path):
     assert_refused_process = (done.returncode, done.stdout, list(tmp_path.iterdir()))
     assert assert_refused_process == (1, "", [])
     assert done.stderr == f"pcgraph: cannot read {tmp_path / 'none.pcd'}: No such file or directory.\n"
+
+
+@pytest.mark.parametrize("letters", [256, 300, 5000])
+def test_names_too_long_are_one_sentence(scene, tmp_path, letters):
+    name = "n" * letters
+    for arguments in (
+        (f"{name}.ply",),
+        (tmp_path / f"{name}.pcd", "--out", tmp_path / "out.npz"),
+        (scene, "--out", tmp_path / f"{name}.npz"),
+        (scene, "--out", tmp_path / name),
+        (scene, "--linkage", f"{name}.json", "--out", tmp_path / "out.npz"),
+    ):
+        assert_refused(run(*arguments), "File name too long", tmp_path, [scene.name])
+
+
+def test_a_link_to_itself_is_one_sentence(scene, tmp_path):
+    loop = tmp_path / "loop.ply"
+    loop.symlink_to(loop)
+    names = [scene.name, loop.name]
+    for arguments in ((loop,), (loop, "--out", tmp_path / "out.npz")):
+        assert_refused(run(*arguments), f"cannot read {loop}", tmp_path, names)
+    assert_refused(run(scene, "--out", loop), "is a link to a file that does not exist", tmp_path, names)
+    assert_refused(run(scene, "--out", loop / "a.ply"), "there is no folder", tmp_path, names)
+
+
+def test_an_older_output_that_cannot_be_read_is_one_sentence(scene, tmp_path, monkeypatch):
+    place = tmp_path / "out.npz"
+    place.write_bytes(b"older")
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr("pcgraph.io.segmentation_files.is_segmentation", refuse)
+    assert_refused(
+        run(scene, "--out", place), f"cannot use {place}: Permission denied", tmp_path, [scene.name, place.name]
+    )
+    assert place.read_bytes() == b"older"
+
+
+def test_a_working_directory_that_is_gone_is_one_sentence(scene, tmp_path):
+    code = """if True:
+        import os, sys
+        from pcgraph.__main__ import main
+        os.mkdir(sys.argv[1]); os.chdir(sys.argv[1]); os.rmdir(sys.argv[1])
+        sys.argv = ["pcgraph", "segment", sys.argv[2], *sys.argv[3:]]
+        main()
+    """
+    for more in ((), ("--out", "a.ply"), ("--out", "folder")):
+        command = [sys.executable, "-c", code, str(tmp_path / "gone"), str(scene), *more]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr == "pcgraph: expected a working directory, but this one is gone: change to another.\n"
+
+
+@pytest.mark.parametrize("order", ["\x1b[2J", "\u202e", "\x9b31m", "\n", "\r", "\u2028", "\u200f", "\udcff"])
+def test_names_give_no_orders_to_a_terminal(scene, tmp_path, order):
+    code = {"\n": "\\n"}.get(order[0], f"\\u{ord(order[0]):04x}") + order[1:]
+    hostile = tmp_path / f"red{order}evil.ply"
+    scene.rename(hostile)
+    done = run(hostile, "--out", tmp_path / "out", *VIEW)
+    assert done.exit_code == 0, done.output
+    places = [line.split(maxsplit=1)[1] for line in done.stdout.splitlines() if line.startswith("written")]
+    assert places == [f"{tmp_path}/out/red{code}evil.segments{suffix}" for suffix in (".ply", ".npz")]
+    missing = run(tmp_path / f"{order}no.ply")
+    assert (missing.exit_code, missing.stdout) == (1, "")
+    assert missing.stderr.count("\n") == 1
+    assert not any(order[0] in text for text in (done.stdout.replace("\n", "") + missing.stderr[:-1],))
 
 
 def test_a_directory_is_no_cloud(tmp_path):

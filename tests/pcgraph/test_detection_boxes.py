@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
@@ -114,6 +116,17 @@ def test_outline_of_a_square_and_what_lies_inside():
     assert segment.tolist() in ([[0, 0], [1, 0]], [[1, 0], [0, 0]])
     assert inside_outline(probe, segment, 0.6).tolist() == [True, True, True]
     assert inside_outline(probe, segment, 0.1).tolist() == [False, False, False]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_boxes_go_through_json_and_back(seed):
+    points = np.random.default_rng(seed).normal(size=(60, 3)) @ TURN.T + AWAY
+    for box in (tight_box(points), standing_box(points, UP), tight_box(points[:1])):
+        text = json.dumps(box.to_dict(), allow_nan=False)
+        back = OrientedBox(**{name: np.array(value) for name, value in json.loads(text).items()})
+        for name in ("center", "axes", "size"):
+            assert np.array_equal(getattr(back, name), getattr(box, name))
+        assert np.array_equal(back.corners(), box.corners())
 
 
 def test_plane_basis_is_right_handed():

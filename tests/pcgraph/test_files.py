@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import re
 import struct
 
 import numpy as np
 import pytest
+from fuzz.cloud_files import pcd, ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -115,6 +117,126 @@ def test_ply_colours_of_any_type(kind, stored, expected):
     values = " ".join(map(str, stored))
     text = f"ply\nformat ascii 1.0\nelement vertex 1\n{names}end_header\n0 0 1 {values}\n"
     assert read_ply(text.encode()).colors.tolist() == [expected]
+
+
+def text_files(rows: list[str]) -> dict:
+    """Readers and files of x, y, z, w for each row given, as PCD and as PLY; their first row is in line 12 and 13."""
+    names = ["x", "y", "z", "w"]
+    pcd = f"# by hand\nVERSION 0.7\nFIELDS {' '.join(names)}\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    pcd += "WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA ascii\n"
+    ply = "ply\nformat ascii 1.0\ncomment by hand\nelement camera 1\nproperty int id\nelement vertex 3\n"
+    ply += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    body = "\n".join(rows) + "\n"
+    return {"pcd": (read_pcd, (pcd + body).encode()), "ply": (read_ply, (ply + "7\n" + body).encode())}
+
+
+@pytest.mark.parametrize("kind", ["pcd", "ply"])
+@pytest.mark.parametrize(
+    ("rows", "row", "got"),
+    [
+        (["1 2 3 4", "5 6 7", "9 9 9 9 9"], 1, "3"),  # as many numbers in all as the header promises
+        (["1 2 3 4", "5 6 7 8 0", "9 9 9"], 1, "more than 4"),
+        (["1 2 3 4 0 \r", "5 6 7 8", "9 9 9 9"], 0, "more than 4"),
+        (["", "1 2 3 4", " \t\r", "5 6 7 8", "9"], 4, "1"),
+    ],
+)
+def test_rows_of_text_are_as_long_as_the_header_says(kind, rows, row, got):
+    """They were read as one stream of numbers, so that a number too many moved all that follow."""
+    reader, content = text_files(rows)[kind]
+    line = row + (12 if kind == "pcd" else 13)
+    with pytest.raises(CloudReadError, match=f"expected 4 numbers in each line.*line {line} has {got}: correct"):
+        reader(content)
+
+
+@pytest.mark.parametrize("kind", ["pcd", "ply"])
+def test_empty_lines_and_blanks_are_no_rows(kind):
+    reader, content = text_files(["", "1 2 3 4 \r", " \t", "\t5 6  7 8\r", "9 9 9 9"])[kind]
+    for text in (content, content + b"3 0 1 2\n", content.replace(b"7\n\n", b"\n7\n"), content.rstrip(b"\n")):
+        cloud = reader(text)
+        assert cloud.points.tolist() == [[1, 2, 3], [5, 6, 7], [9, 9, 9]]
+        assert cloud.columns["w"].tolist() == [4, 8, 9]
+    with pytest.raises(CloudReadError, match="promises 3 points, but 2 rows of numbers follow"):
+        reader(content.replace(b"9 9 9 9\n", b""))
+    with pytest.raises(CloudReadError, match=r"numbers only in the ascii data, got in line 1[67]: .*'nine'"):
+        reader(content.replace(b"9 9 9 9", b"9 9 9 nine"))
+
+
+@pytest.mark.parametrize("code", ["ascii", "binary_little_endian", "binary_big_endian", "pcd ascii", "pcd binary"])
+@pytest.mark.parametrize(
+    ("kind", "x", "dtype"),
+    [
+        ("i4", [2**24, -(2**24), 0], "f4"),
+        ("i4", [2**24 + 1, 0, 0], "f8"),
+        ("i4", [0, -(2**24) - 1, 5], "f8"),
+        ("i4", [-(2**31), 2**31 - 1, 1], "f8"),
+        ("u4", [2**32 - 1, 0, 2**31 + 1], "f8"),
+        ("u4", [7, 0, 2**24], "f4"),
+        ("i2", [-(2**15), 2**15 - 1, 0], "f4"),
+    ],
+)
+def test_whole_coordinates_stay_exact(code, kind, x, dtype):
+    """Beyond 2**24 they were rounded to float32: map coordinates in millimetres, by up to 128 mm."""
+    fields = [("x", kind, np.array(x)[:, None])] + [(name, "f4", np.full((3, 1), 0.1)) for name in "yz"]
+    cloud = read_pcd(pcd(code[4:], fields, 3, 1)) if code.startswith("pcd") else read_ply(ply(code, fields, 3))
+    assert cloud.points.dtype == dtype
+    assert cloud.points[:, 0].tolist() == x
+    assert cloud.points[:, 1:].tolist() == np.full((3, 2), 0.1, np.float32).tolist()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "cp1252", "cp1251", "cp850"])
+@pytest.mark.parametrize("by", ["Åsa", "Хорхе", "x\x85y", "a\x1cb\x1d\x1e\x0b\x0c", "à\xa0"])
+def test_headers_with_words_of_any_language(encoding, by):
+    """Letters of UTF-8 hold bytes that end lines or words in other codes: a comment broke the header."""
+    name = by.encode(encoding, "replace").replace(b"\n", b"")
+    rows = [f"comment by {i}".encode() + name for i in range(2)] + [b"obj_info " + name]
+    content = PLY.replace(b"element vertex", b"\n".join(rows) + b"\nelement vertex")
+    for text in (content, content.replace(b"comment by", b"comment")):
+        assert np.array_equal(read_ply(text).points, XYZ, equal_nan=True)
+    content = pcd_header("binary").replace(b"WIDTH", b"# by " + name + b"\n#" + name + b"\nWIDTH") + pcd_body()
+    assert np.array_equal(read_pcd(content).points, XYZ.reshape(2, 2, 3), equal_nan=True)
+
+
+def test_names_of_fields_of_any_language():
+    """`Å` was split within the letter, `à` at its second byte, which is a blank in Latin-1."""
+    for word in ("Å", "nà", "Хорхе"):
+        name = word.encode()
+        read = read_ply(PLY.replace(b"float z\n", b"float z\nproperty uchar " + name + b"\n") + bytes(4))
+        assert list(read.columns) == [name.decode("latin-1")]
+        columns = {"x": np.zeros(4), "y": np.ones(4), "z": np.ones(4), name.decode("latin-1"): np.arange(4.0)}
+        assert_same_columns(read_ply(encode_ply(columns)).columns, dict(list(columns.items())[3:]))
+        content = pcd_header("binary", fields="x y z rgb label w").replace(b" w\n", b" " + name + b"\n")
+        assert list(read_pcd(content + bytes(6 * 4 * 4)).columns) == [name.decode("latin-1")]
+
+
+def colored_texts(words: list[str], kind: str, name: str) -> list:
+    """Clouds of x, y, z and a packed colour for each word given, as PCD and as PLY of text."""
+    fields = [(axis, "f4", np.ones((len(words), 1))) for axis in "xyz"]
+    fields.append((name, kind, np.full((len(words), 1), 7777)))
+    files = [pcd("ascii", fields, len(words), 1), ply("ascii", fields, len(words))]
+    for word in words:
+        files = [re.sub(rb"7777(\.0)?", word.encode(), content, count=1) for content in files]
+    return [read_pcd(files[0]), read_ply(files[1])]
+
+
+@pytest.mark.parametrize("name", ["rgb", "rgba", "RGB"])
+@pytest.mark.parametrize(("kind", "red"), [("f4", "2.3418052e-38"), ("u4", "16711680"), ("i4", "16711680")])
+def test_packed_colours_of_text_that_are_nan_are_none(kind, red, name):
+    """They were the bits of that number: a dark red, (192, 0, 0)."""
+    for cloud in colored_texts(["nan", red, "NaN", "-nan"], kind, name):
+        assert cloud.colors.tolist() == [[0, 0, 0], [255, 0, 0], [0, 0, 0], [0, 0, 0]]
+    for cloud in colored_texts(["nan", "nan"], kind, name):
+        assert cloud.colors is None
+        assert cloud.columns == {}
+    for cloud in colored_texts([], kind, name):
+        assert cloud.colors.shape == (0, 3)
+
+
+def test_packed_colours_of_bytes_may_be_nan():
+    """Opaque colours with much red are the bits of a nan: PCL keeps them in float32."""
+    packed = np.array([0xFFFF0000, 0xFF800001, 0x7FC00000, 0xFFC01020], np.uint32)
+    assert np.isnan(packed.view(np.float32)).all()
+    cloud = read_pcd(pcd_of({"rgb": packed.view(np.float32)}, "binary"))
+    assert cloud.colors.reshape(-1, 3).tolist() == [[255, 0, 0], [128, 0, 1], [192, 0, 0], [192, 16, 32]]
 
 
 def test_open3d_files_are_read_and_ours_read_back(tmp_path):
@@ -386,7 +508,8 @@ def test_columns_are_written_back(scene, tmp_path):
     assert np.array_equal(read.columns["seen"], cloud.columns["seen"][finite])
     assert np.array_equal(read.columns["spectrum_2"], cloud.columns["spectrum"][finite, 2])
     assert np.array_equal(read.columns["stamp"], cloud.columns["stamp"][finite].astype(float))
-    assert np.array_equal(read.labels, result.labels[finite])  # the result's own, not the column of that name
+    assert np.array_equal(read.labels, cloud.columns["labels"][finite])  # the column of that name, not the result's own
+    assert np.array_equal(read.columns["segment_labels"], result.labels[finite])
     pcgraph.write_segmentation(tmp_path / "a.npz", cloud, result)
     with np.load(tmp_path / "a.npz") as arrays:
         assert_same_columns({name: arrays[f"column_{name}"] for name in cloud.columns}, cloud.columns)
@@ -401,11 +524,144 @@ def test_a_result_is_read_and_written_again(scene, tmp_path):
     pcgraph.write_segmentation(tmp_path / "b.ply", again, pcgraph.segment(again, voxel_size=0.35))
     twice = pcgraph.read_cloud(tmp_path / "b.ply")
     assert_same_columns({n: twice.columns[n] for n in COLUMNS}, {n: again.columns[n] for n in COLUMNS})
+    second = pcgraph.segment(again, voxel_size=0.5)
+    pcgraph.write_segmentation(tmp_path / "c.ply", twice, second)
+    last = pcgraph.read_cloud(tmp_path / "c.ply")
+    for cloud in (twice, last):  # what the first result said, under its names
+        assert np.array_equal(cloud.colors, again.colors)
+        assert np.array_equal(cloud.labels, again.labels)
+        assert np.array_equal(cloud.columns["supervoxels"], again.columns["supervoxels"])
+    assert np.array_equal(last.columns["segment_labels"], twice.columns["segment_labels"])
+    assert np.array_equal(last.columns["segment2_labels"], second.labels)
+    assert np.array_equal(last.columns["segment2_supervoxels"], second.supervoxels)
+
+
+@pytest.fixture(scope="module")
+def own(scene):
+    """The scene with colours, normals and labels of its own, and where they are finite."""
+    rng, n = np.random.default_rng(5), len(scene[0].points)
+    colors, labels = rng.integers(0, 256, (n, 3), np.uint8), rng.integers(-2, 2**31 - 1, n, np.int32)
+    normals = rng.standard_normal((n, 3)).astype(np.float32)
+    return pcgraph.Cloud(scene[0].points, colors, normals, labels), np.isfinite(scene[0].points[:, 0])
+
+
+def assert_kept(read, cloud, finite):
+    assert np.array_equal(read.colors, cloud.colors[finite])
+    assert np.array_equal(read.normals, cloud.normals[finite])
+    assert read.normals.dtype == cloud.normals.dtype
+    assert np.array_equal(read.labels, cloud.labels[finite])
+
+
+def test_colours_normals_and_labels_of_the_file_are_kept(scene, own, tmp_path):
+    """They were dropped, and the result's labels stood in the place of the file's."""
+    (cloud, finite), result = own, scene[1]
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert_kept(read, cloud, finite)
+    names = ["segment_red", "segment_green", "segment_blue", "segment_labels", "supervoxels"]
+    assert list(read.columns) == names
+    pcgraph.write_segmentation(tmp_path / "plain.ply", cloud.points, result)
+    plain = pcgraph.read_cloud(tmp_path / "plain.ply")  # of points alone: under the short names
+    assert np.array_equal(plain.colors, np.stack([read.columns[name] for name in names[:3]], axis=1))
+    assert np.array_equal(plain.labels, result.labels[finite])
+    assert np.array_equal(read.columns["segment_labels"], plain.labels)
+    pcgraph.write_segmentation(tmp_path / "a.npz", cloud, result)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.array_equal(arrays["cloud_colors"], cloud.colors)
+        assert np.array_equal(arrays["cloud_normals"], cloud.normals)
+        assert np.array_equal(arrays["cloud_labels"], cloud.labels)
+        assert np.array_equal(arrays["labels"], result.labels)
+    pcgraph.write_segmentation(tmp_path / "plain.npz", cloud.points, result)
+    with np.load(tmp_path / "plain.npz") as arrays:
+        assert not [name for name in arrays if name.startswith("cloud_")]
+
+
+@pytest.mark.parametrize("kept", ["colors", "normals", "labels"])
+def test_only_what_the_file_has_changes_the_names(kept, scene, own, tmp_path):
+    (cloud, finite), result = own, scene[1]
+    pcgraph.write_segmentation(tmp_path / "a.ply", pcgraph.Cloud(cloud.points, **{kept: getattr(cloud, kept)}), result)
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert np.array_equal(getattr(read, kept), getattr(cloud, kept)[finite])
+    assert ("segment_red" in read.columns) == (kept == "colors")
+    assert ("segment_labels" in read.columns) == (kept == "labels")
+    assert np.array_equal(read.columns["segment_labels"] if kept == "labels" else read.labels, result.labels[finite])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("red", "Green", "blue"),  # beside packed colours
+        ("red",),
+        ("rgba",),
+        ("nx", "ny", "nz"),  # beside normal_x and so on
+        ("normal_x", "normal_z"),
+        ("labels",),
+        ("supervoxels",),
+        ("segment_red", "segment_labels", "segment_supervoxels"),
+    ],
+)
+def test_columns_of_the_names_that_a_result_has_are_kept(names, scene, own, tmp_path):
+    (cloud, finite), result = own, scene[1]
+    columns = {name: np.arange(len(finite), dtype=np.int32) + i for i, name in enumerate(names)}
+    cloud = pcgraph.Cloud(cloud.points, cloud.colors, cloud.normals, cloud.labels, columns=columns)
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, result)
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert_kept(read, cloud, finite)
+    assert_same_columns({name: read.columns[name] for name in names}, {n: v[finite] for n, v in columns.items()})
+    ours = "segment2_labels" if "segment_labels" in names else "segment_labels"
+    assert np.array_equal(read.columns[ours], result.labels[finite])
+    ours = {"supervoxels": "segment_supervoxels"}.get(names[0], "supervoxels")
+    assert np.array_equal(read.columns[ours], result.supervoxels[finite])
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "f16"])
+def test_colours_and_normals_of_any_float_and_labels_of_any_integer(dtype, scene, own, tmp_path):
+    (cloud, finite), result = own, scene[1]
+    shades, labels = (cloud.colors / 255).astype(dtype), np.arange(len(finite))
+    pcgraph.write_segmentation(
+        tmp_path / "a.ply", pcgraph.Cloud(cloud.points, shades, cloud.normals.astype(dtype), labels), result
+    )
+    read = pcgraph.read_cloud(tmp_path / "a.ply")
+    assert np.array_equal(read.colors, cloud.colors[finite])
+    assert np.array_equal(read.normals, cloud.normals[finite].astype(dtype))
+    assert read.labels.dtype == np.int32
+    assert np.array_equal(read.labels, labels[finite])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"colors": np.zeros((2799, 3), np.uint8)}, r"cloud's colors in the shape \(2800, 3\), got \(2799, 3\)"),
+        ({"normals": np.zeros((2800, 4))}, r"cloud's normals in the shape \(2800, 3\), got \(2800, 4\)"),
+        ({"labels": np.zeros((2800, 1), int)}, r"cloud's labels in the shape \(2800,\), got \(2800, 1\)"),
+        ({"colors": np.full((2800, 3), 1.5)}, "colors as uint8 or as floats within 0..1, got float64"),
+        ({"colors": np.zeros((2800, 3), int)}, "colors as uint8 or as floats within 0..1, got int64"),
+        ({"normals": np.zeros((2800, 3), int)}, "normals as floats, got int64"),
+        ({"labels": np.full(2800, 1 << 40)}, "cloud's own labels: expected labels of 32 bits"),
+        ({"labels": np.full(2800, np.nan)}, "cloud's own labels: expected labels as whole numbers"),
+    ],
+)
+@pytest.mark.parametrize("file", ["a.ply", "a.npz"])
+def test_colours_normals_and_labels_that_cannot_be_written(arrays, message, file, scene, tmp_path):
+    with pytest.raises(pcgraph.CloudWriteError, match=message):
+        pcgraph.write_segmentation(tmp_path / file, pcgraph.Cloud(scene[0].points, **arrays), scene[1])
+    assert not list(tmp_path.iterdir())
+
+
+def test_columns_of_any_language_are_written_back(scene, tmp_path):
+    points, column = scene[0].points, np.arange(2800, dtype=np.int32)
+    names = [word.encode().decode("latin-1") for word in ("Å", "nà", "Хорхе")]
+    cloud = pcgraph.Cloud(points, columns=dict.fromkeys(names, column))
+    pcgraph.write_segmentation(tmp_path / "a.ply", cloud, scene[1])
+    read = pcgraph.read_cloud(tmp_path / "a.ply").columns
+    assert list(read) == ["supervoxels", *names]
+    assert all(np.array_equal(read[name], np.delete(column, 7)) for name in names)
 
 
 @pytest.mark.parametrize(
     ("name", "column", "message"),
     [
+        ("two\x0bwords", np.zeros(2800), "one word of Latin letters"),
         ("two words", np.zeros(2800), "one word of Latin letters, got 'two words'"),
         ("", np.zeros(2800), "one word of Latin letters"),
         ("∂", np.zeros(2800), "one word of Latin letters"),

@@ -85,7 +85,7 @@ def test_networkx_holds_plain_numbers_that_json_and_gexf_take(coloured, boxes, p
     for network in (coloured.to_networkx(), plate[0].to_networkx(plate[1]), lone.to_networkx(), *trees):
         rows = [row for _, row in network.nodes(data=True)] + [row for *_, row in network.edges(data=True)]
         assert {type(value) for row in rows for value in row.values()} <= {int, float, str}
-        text = json.dumps(nx.node_link_data(network, edges="edges"))
+        text = json.dumps(nx.node_link_data(network, edges="edges"), allow_nan=False)
         back = nx.node_link_graph(json.loads(text), edges="edges")
         assert nx.utils.graphs_equal(back, network)
         nx.write_gexf(network, tmp_path / "a.gexf")
@@ -94,6 +94,9 @@ def test_networkx_holds_plain_numbers_that_json_and_gexf_take(coloured, boxes, p
         assert read.number_of_edges() == network.number_of_edges()
         for node, row in network.nodes(data=True):
             assert {name: read.nodes[node][name] for name in row} == row
+    for tree, network in ((boxes[2].tree, trees[0]), (gap, trees[1])):
+        finite = {k: a for k, a in enumerate(tree.altitudes.tolist()) if np.isfinite(a)}
+        assert dict(network.nodes(data="altitude")) == dict.fromkeys(range(len(tree.parents))) | finite
     assert coloured.to_networkx().nodes[0]["normal_z"] == coloured.node_features.normal[0, 2]
 
 

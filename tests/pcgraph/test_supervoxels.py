@@ -41,11 +41,9 @@ def test_there_is_a_supervoxel_for_each_piece_and_at_most_one_for_each_voxel():
     assert finest.tree.n_leaves == finest.surface.grid.n_voxels
 
 
-@pytest.mark.parametrize(
-    "edge", [3.4, pytest.param(3.7, marks=pytest.mark.xfail(reason="where cells start now, a row of points is wrong"))]
-)
-def test_supervoxels_keep_to_the_edges_of_a_step(edge):
-    """A floor and a block's front and top: every point on the right side, to within a point, though voxels straddle."""
+def errors_on_a_step(edge):
+    """Undersegmentation error of `SurfaceGrowth` and of `Vccs` on a floor and a block's front and top, for voxels of so
+    many spacings; points on the edges themselves may be on either side."""
     faces = [
         patch((0, 0, 0), (0.6, 0, 0), (0, 0.3, 0)),
         patch((0, 0.3, 0.0), (0.6, 0, 0), (0, 0, 0.2)),
@@ -54,11 +52,29 @@ def test_supervoxels_keep_to_the_edges_of_a_step(edge):
     points, truth = np.vstack(faces), np.repeat([0, 1, 2], [len(face) for face in faces])
     on_an_edge = (abs(points[:, 1] - 0.3) < 1e-9) & ((abs(points[:, 2]) < 1e-9) | (abs(points[:, 2] - 0.2) < 1e-9))
     settings = {"voxel_size": edge * SPACING, "seed_size": 0.15, "viewpoint": (0.3, -3, 2)}
-    surface = pcgraph.segment(points, **settings).supervoxels
-    vccs = pcgraph.segment(points, **settings, method=pcgraph.Vccs()).supervoxels
-    error = undersegmentation_error(surface[~on_an_edge], truth[~on_an_edge])
-    assert error < 0.003
-    assert undersegmentation_error(vccs[~on_an_edge], truth[~on_an_edge]) > 3 * error + 0.01
+    return [
+        undersegmentation_error(
+            pcgraph.segment(points, **settings, method=method).supervoxels[~on_an_edge], truth[~on_an_edge]
+        )
+        for method in (pcgraph.SurfaceGrowth(), pcgraph.Vccs())
+    ]
+
+
+@pytest.mark.parametrize("edge", [3.2, 3.4])
+def test_supervoxels_keep_to_the_edges_of_a_step(edge):
+    """Every point on the right side, to within a point, though voxels straddle."""
+    surface, vccs = errors_on_a_step(edge)
+    assert surface < 0.003
+    assert vccs > 3 * surface + 0.01
+
+
+@pytest.mark.validation
+def test_supervoxels_keep_to_the_edges_of_a_step_better_than_vccs_at_most_sizes():
+    """Where the cells happen to start, a row or two of points is wrong (5 of 11 sizes have none)."""
+    surface, vccs = np.transpose([errors_on_a_step(edge) for edge in np.linspace(3.0, 4.0, 11)])
+    assert (surface == 0.0).sum() >= 4
+    assert surface.max() < 0.06
+    assert surface.mean() < 0.6 * vccs.mean()
 
 
 def test_both_faces_of_a_thin_plate_are_one_to_vccs_and_two_to_surface_growth():

@@ -277,8 +277,8 @@ def test_ground_seen_edge_on_from_viewpoints_of_its_points_faces_up(seed):
     assert np.mean(pcgraph.segment(ground, viewpoint=places).surface.normals[:, 2] > 0.0) > 0.95
 
 
-@pytest.mark.parametrize("seed", [0, 5, pytest.param(6, marks=pytest.mark.xfail(reason="half of 24 draws are right"))])
-def test_crevices_seen_better_from_behind_do_not_turn_a_heap_inside_out(seed):
+def facing_of_a_heap(seed):
+    """Fraction of the voxels of a heap of balls, seen from above, however turned, whose normals face up."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[-4:5, -4:5].reshape(2, -1)
     balls = np.stack((1.7 * (row + 0.5 * (column % 2)), 1.5 * column), axis=1)
@@ -288,7 +288,18 @@ def test_crevices_seen_better_from_behind_do_not_turn_a_heap_inside_out(seed):
     heap = np.column_stack((places, np.sqrt(1.0 - squared) - 0.02 * np.square(places).sum(axis=1)))
     turn = Rotation.random(random_state=seed).as_matrix()
     found = pcgraph.segment((heap + rng.normal(0.0, 0.01, heap.shape)) @ turn.T)
-    assert np.mean(found.surface.normals @ turn[:, 2] > 0.0) > 0.99
+    return np.mean(found.surface.normals @ turn[:, 2] > 0.0)
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_crevices_seen_better_from_behind_do_not_turn_a_heap_inside_out(seed):
+    assert facing_of_a_heap(seed) > 0.99
+
+
+@pytest.mark.validation
+def test_crevices_seen_better_from_behind_turn_half_of_the_heaps_inside_out_at_most():
+    """12 of 24 draws are right."""
+    assert sum(facing_of_a_heap(seed) > 0.99 for seed in range(24)) >= 8
 
 
 def ranges_with_ball(ranges, rays, middle, radius):
@@ -385,9 +396,7 @@ def test_a_thinned_image_of_a_table_is_seen_from_above_it_however_turned(seed):
     assert fraction_facing(points, pcgraph.segment(points), 100.0) > 0.97
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(0, marks=pytest.mark.xfail(reason="12 of 16 draws are right")), 1, *to_validate(5, 10)]
-)
+@pytest.mark.parametrize("seed", [0, 1, *to_validate(5, 10)])  # 15 of 16 draws are right
 def test_late_echoes_behind_a_thinned_image_of_a_table_do_not_turn_it_inside_out(seed):
     """Each in a cube of its own, so that thinning leaves nearly all: they are no surface, and stretch no box."""
     rng, image = np.random.default_rng(seed), image_of_a_table(seed)
@@ -485,22 +494,26 @@ def test_an_underside_faces_the_ground_and_goes_with_its_body(height):
         assert (result.labels == largest).sum() < 1.1 * len(body)
 
 
-POLE = pytest.mark.xfail(reason="in three of ten draws too little of the room tells")
-
-
-@pytest.mark.parametrize(
-    "seed",
-    [0, pytest.param(1, marks=POLE), *to_validate(2, 5, 6), pytest.param(3, marks=[POLE, pytest.mark.validation])],
-)
-def test_a_scanners_pole_says_nothing_against_its_own_place(seed):
-    """Told where the scanner stood, spacing below it grows with range by no power; elsewhere it does."""
+def pole_says_nothing(seed):
+    """Whether a room of boxes is segmented alike with the scanner's place given and found. Near its pole, spacing grows
+    with range by no power; elsewhere it does."""
     points, place = scanned_furniture(seed, (4.2, 0.8, 1.5), (5.0, 4.0, 2.6), highest=80, n_boxes=3)
-    assert spacing_law(points).holds
-    assert spacing_law(points, place).holds
+    if not (spacing_law(points).holds and spacing_law(points, place).holds):
+        return False
     told, found = pcgraph.segment(points, viewpoint=place), pcgraph.segment(points)
-    assert told.surface.grid.warp.of_one_scan
-    assert found.surface.grid.warp.of_one_scan
-    assert told.labels.max() <= found.labels.max() + 2
+    is_one_scan = told.surface.grid.warp.of_one_scan and found.surface.grid.warp.of_one_scan
+    return is_one_scan and told.labels.max() <= found.labels.max() + 2
+
+
+@pytest.mark.parametrize("seed", [0, *to_validate(2, 5, 6)])
+def test_a_scanners_pole_says_nothing_against_its_own_place(seed):
+    assert pole_says_nothing(seed)
+
+
+@pytest.mark.validation
+def test_a_scanners_pole_says_nothing_in_most_rooms():
+    """7 of 10 draws are right; in the others too little of the room tells."""
+    assert sum(pole_says_nothing(seed) for seed in range(10)) >= 5
 
 
 def rings_ahead(seed):
@@ -519,18 +532,26 @@ def rings_ahead(seed):
     return (rays * ranges[:, None])[ranges < 60]
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [0, 1, pytest.param(2, marks=pytest.mark.xfail(reason="21 of 24 draws are right")), *to_validate(3, 4, 5, 6, 7)],
-)
-def test_points_on_one_ring_tell_no_slant(seed):
-    """They lie on the cone of its beam, edge-on to the rays: taken for the surface, the scanner was underground."""
+def finds_the_lidar(seed):
+    """Whether a LiDAR is found from its points, however turned, and the surfaces face it."""
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     points = rings_ahead(seed)
     moved = points @ turn.T + 100.0
     off = turn.T @ (spacing_law(moved).viewpoint - 100.0)
-    assert np.linalg.norm(off) < 0.4 * np.median(np.linalg.norm(points, axis=1))
-    assert fraction_facing(moved, pcgraph.segment(moved), 100.0) > 0.85
+    is_near = np.linalg.norm(off) < 0.4 * np.median(np.linalg.norm(points, axis=1))
+    return is_near and fraction_facing(moved, pcgraph.segment(moved), 100.0) > 0.85
+
+
+@pytest.mark.parametrize("seed", [0, 1, *to_validate(3, 4, 5, 6, 7)])
+def test_points_on_one_ring_tell_no_slant(seed):
+    """They lie on the cone of its beam, edge-on to the rays: taken for the surface, the scanner was underground."""
+    assert finds_the_lidar(seed)
+
+
+@pytest.mark.validation
+def test_points_on_one_ring_tell_no_slant_in_most_draws():
+    """21 of 24 draws are right."""
+    assert sum(finds_the_lidar(seed) for seed in range(24)) >= 17
 
 
 def test_slant_alone_is_no_place():

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What came out of `rangesim decode`, in fractions, and why it is little if it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rangesim.capture import Capture
+from rangesim.decoding.range_image import RangeImage
+from rangesim.decoding.status import Status
+from rangesim.errors import one_line
+from rangesim.report.palette import STATUS_NAMES
+from rangesim.sensors import StructuredLight
+
+FEW = 0.5
+"""Fraction of measured pixels below which a cause is looked for."""
+CLEAR = 0.02
+"""Of full scale, by which black is clearly brighter than white."""
+DARK = 1 / 8
+"""Of full scale: no frame of an unknown detector reaches more."""
+LONGEST_BASELINE_M = 10.0
+
+
+def status_fractions(image: RangeImage) -> dict[str, float]:
+    """Fractions of the pixels, 0 to 1, by the name of their status; all statuses, also those of no pixel."""
+    counts = np.bincount(image.status.ravel(), minlength=len(Status))
+    return {STATUS_NAMES[status]: float(counts[status] / image.status.size) for status in Status}
+
+
+def likely_cause(image: RangeImage, capture: Capture) -> str | None:
+    """Why little was measured, or what is wrong with what was, in a clause; None if nothing points anywhere."""
+    if capture.rig is not None and capture.rig.baseline_m > LONGEST_BASELINE_M:
+        return (
+            f"camera and emitter are {capture.rig.baseline_m:g} m apart: if the calibration is in millimetres, "
+            "give --unit 0.001"
+        )
+    if isinstance(capture.sensor, StructuredLight) and _rows_come_first(image):
+        return "columns change along the image's height and rows along its width: rows may have been shown first"
+    if float((image.status == Status.OK).mean()) >= FEW:
+        return None
+    if isinstance(capture.sensor, StructuredLight):
+        contrast = capture.frames[-2].astype(np.float32) - capture.frames[-1].astype(np.float32)
+        clear = CLEAR * capture.full_scale
+        inverted = float((contrast < -clear).mean())
+        if inverted > float((contrast > clear).mean()):
+            return (
+                f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the last two images are white, "
+                "then black"
+            )
+    if capture.is_digital and capture.detector is None:
+        brightest = int(capture.frames.max())
+        if brightest < DARK * capture.full_scale:
+            return (
+                f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
+                f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
+            )
+    if float((image.status == Status.CODE_ERROR).mean()) > float((image.status == Status.OK).mean()):
+        return "codes miss their epipolar line or each other: check --calibration, --code-step and the patterns' order"
+    return None
+
+
+def _rows_come_first(image: RangeImage) -> bool:
+    """Whether columns change down the image and rows across it, each twice as much as the other way."""
+    if image.projector_column is None or image.projector_row is None:
+        return False
+    column, row = (_changes(c) for c in (image.projector_column, image.projector_row))
+    return column[1] > 2 * column[0] and row[0] > 2 * row[1]
+
+
+def _changes(coordinate: np.ndarray) -> tuple[float, float]:
+    """Mean size of the change to the next pixel across and down; 0 where no neighbours were decoded."""
+    steps = (np.abs(np.diff(coordinate, axis=axis)) for axis in (1, 0))
+    known = (s[np.isfinite(s)] for s in steps)
+    across, down = (float(k.mean()) if k.size else 0.0 for k in known)
+    return across, down
+
+
+def summary(image: RangeImage, capture: Capture, out: Path) -> str:
+    """What came out, in a line: fractions of all statuses that pixels have, depths, and the likely cause."""
+    fractions = status_fractions(image)
+    measured = fractions.pop(STATUS_NAMES[Status.OK])
+    parts = [f"{100 * measured:.1f} % of the pixels {'decoded' if image.camera is None else 'measured'}"]
+    if image.camera is not None and image.valid.any():
+        z = image.z[image.valid]
+        parts[0] += f", z from {z.min():.3f} to {z.max():.3f} m"
+    if others := ", ".join(f"{100 * fraction:.1f} % {name}" for name, fraction in fractions.items() if fraction):
+        parts.append(others)
+    if image.camera is None:
+        parts.append("without --calibration there is no depth")
+    if cause := likely_cause(image, capture):
+        parts.append(cause)
+    return f"{one_line(out)}: {'; '.join(parts)}."

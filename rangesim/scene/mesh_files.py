@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PLY files that a scene names, checked before Mitsuba reads them.
+
+Mitsuba 3.9 computes normals before anybody can look at the mesh: a face of a vertex that is not there reads, and
+writes, outside the arrays. Of a negative index it makes vertex 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from pcgraph.plain_files import read_file
+from rangesim import limits
+from rangesim.errors import FileFormatError
+from rangesim.settings.config import brief, shown
+
+_TYPES = (
+    {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "long": "i8", "ulong": "u8"}
+    | {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+    | {"half": "f2", "float": "f4", "double": "f8", "float16": "f2", "float32": "f4", "float64": "f8"}
+)
+"""Types of a property, in Mitsuba's words, as of NumPy."""
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_LONGEST_HEADER = 1 << 20
+_CORNERS = 3
+"""Mitsuba reads each list as a count, which has to be 3, and three entries."""
+
+
+@dataclass
+class _Element:
+    """An element of a PLY file: how many records it has, and the type of each field of a record."""
+
+    name: str
+    count: int
+    types: list[str] = field(default_factory=list)
+    corners: list[int] = field(default_factory=list)
+    """Fields that are entries of a list."""
+
+    def add(self, words: list[str]) -> None:
+        """A property, as a line of the header states it."""
+        if words[1] == "list":
+            start = len(self.types) + 1
+            self.types += [_TYPES[words[2]]] + [_TYPES[words[3]]] * _CORNERS
+            self.corners += range(start, start + _CORNERS)
+        else:
+            self.types.append(_TYPES[words[1]])
+            if self.name == "face" and words[2] in ("i0", "i1", "i2"):  # so Mitsuba calls the entries of a list
+                raise ValueError(f"a property named {words[2]}")
+
+
+def check_ply(path: Path) -> None:
+    """Raise FileFormatError if a triangle of a PLY file has a vertex that the file lacks, or the file is no PLY."""
+    content = read_file(path, FileFormatError)
+    try:
+        order, elements, start = _header(content)
+        indices = _indices(content, order, elements, start)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    except (ValueError, IndexError, KeyError, OverflowError) as error:
+        raise FileFormatError(f"{path} cannot be read as a PLY file of triangles: {brief(error)}.") from error
+    count = sum(element.count for element in elements if element.name == "vertex")
+    wrong = indices[~((indices >= 0) & (indices < count))]
+    if wrong.size:
+        raise FileFormatError(
+            f"{path}: expected faces of its {count} vertices, 0 to {count - 1}, got vertex {wrong[0]:.15g}; "
+            "repair the mesh first."
+        )
+
+
+def _header(content: bytes) -> tuple[str, list[_Element], int]:
+    """NumPy's letter of the byte order (empty for ASCII), the elements, and where they start."""
+    order, elements, start = None, list[_Element](), 0
+    while True:
+        end = content.find(b"\n", start, _LONGEST_HEADER)
+        if end < 0:
+            raise ValueError("its header has no end_header")
+        words = content[start:end].decode("latin-1").split()
+        start = end + 1
+        kind = words[0] if words else ""
+        if kind == "end_header":
+            break
+        if kind == "format":
+            order = _FORMATS[words[1]]
+        elif kind == "element":
+            if not (words[2].isascii() and words[2].isdigit()):
+                raise ValueError(f"expected a count of {words[1][:100]}, got {shown(words[2])}")
+            elements.append(_Element(words[1], int(words[2])))
+            limits.check("points", elements[-1].count, f"records of {words[1][:100]!r}", FileFormatError)
+        elif kind == "property":
+            elements[-1].add(words)
+    names = [element.name for element in elements]
+    for name in ("vertex", "face"):
+        if names.count(name) > 1:
+            raise ValueError(f"it has {names.count(name)} elements {name!r}")
+    if order is None:
+        raise ValueError("its header states no format")
+    return order, elements, start
+
+
+def _indices(content: bytes, order: str, elements: list[_Element], start: int) -> np.ndarray:
+    """(k,) array of all entries of the lists of the faces, in the type of the file."""
+    found = np.zeros(0, np.int64)
+    words = iter(content[start:].split() if order == "" else ())
+    for element in elements:
+        if order == "":
+            columns = _of_text(element, list(islice(words, element.count * len(element.types))))
+        else:
+            record = np.dtype([(f"p{i}", order + kind) for i, kind in enumerate(element.types)])
+            size = element.count * record.itemsize
+            if start + size > len(content):
+                raise ValueError("it ends early")
+            table = np.frombuffer(content, record, element.count if size else 0, start)
+            columns = [table[f"p{i}"] for i in element.corners]
+            start += size
+        if element.name == "face" and columns:
+            found = np.concatenate(columns)
+    return found
+
+
+def _of_text(element: _Element, words: list[bytes]) -> list[np.ndarray]:
+    """The fields of the lists of an element; ValueError if a word is no number of the type of its field."""
+    width = len(element.types)
+    if len(words) < element.count * width:
+        raise ValueError("it ends early")
+    columns = {}
+    for i, kind in enumerate(element.types):
+        read = float if kind.startswith("f") else int
+        columns[i] = np.array([read(word) for word in words[i::width]], np.float64)
+    return [columns[i] for i in element.corners]

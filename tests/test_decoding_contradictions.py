@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures read as what they are not say so, with the likely cause; sound ones, clean or noisy, are silent."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import plane_signals, signals_of_depth, stereo_rig
+
+from rangesim.capture import Capture
+from rangesim.capture.exposure import expose
+from rangesim.decoding import decode
+from rangesim.electronics.detector import Detector
+from rangesim.errors import RangesimWarning
+from rangesim.response import GrayBits
+from rangesim.rig import translation
+from rangesim.sensors import StructuredLight
+
+SENSORS = [
+    StructuredLight(),
+    StructuredLight(steps=3),
+    StructuredLight(axes=("columns", "rows"), period_px=20.0),
+    StructuredLight(period_px=37.0, steps=6),
+]
+
+
+def fringes(sensor: StructuredLight) -> list[slice]:
+    """Where the frames of the fringes stand, per axis."""
+    return [run.frames for run in sensor.layout()][1::2]
+
+
+def capture_of(sensor: StructuredLight, detector: Detector | None = None, exposure_s: float = 1e-3) -> Capture:
+    signals = plane_signals(stereo_rig(), sensor, ambient=0.01)
+    return expose(signals, sensor, detector, exposure_s=exposure_s) if detector else expose(signals, sensor)
+
+
+def with_fringes(capture: Capture, change: str, amount: float = 0.0) -> Capture:
+    """The capture with other fringes: `reversed`, or the whole signal `later` by projector pixels."""
+    sensor = capture.sensor
+    assert isinstance(sensor, StructuredLight)
+    frames = capture.frames.copy()
+    steps = 2 * np.pi * np.arange(sensor.steps) / sensor.steps
+    for run in fringes(sensor):
+        shown = frames[run].astype(np.float64)
+        mean = shown.mean(axis=0)
+        vector = 2 / sensor.steps * np.tensordot(np.exp(1j * steps), shown, axes=1)
+        if change == "reversed":
+            vector = vector.conj()
+        vector = vector * np.exp(-2j * np.pi * amount / sensor.period_px)
+        frames[run] = [mean + (vector * np.exp(-1j * s)).real for s in steps]
+    return replace(capture, frames=frames)
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=str)
+@pytest.mark.parametrize("exposure_s", [None, 1e-3, 4e-4, 1e-4, 3e-5])
+def test_sound_captures_are_silent(sensor: StructuredLight, exposure_s: float | None) -> None:
+    """Warnings are errors in these tests."""
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    decode(capture)
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=str)
+def test_fringes_in_the_other_direction_are_named(sensor: StructuredLight) -> None:
+    with pytest.warns(RangesimWarning, match="along columns contradict the Gray code.*other direction"):
+        decode(with_fringes(capture_of(replace(sensor, axes=("columns",))), "reversed"))
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=str)
+@pytest.mark.parametrize("quarters", [-1, 1])
+def test_a_start_at_sine_is_named_with_its_pixels(sensor: StructuredLight, quarters: int) -> None:
+    sensor = replace(sensor, axes=("columns",))
+    later = quarters * sensor.period_px / 4
+    with pytest.warns(RangesimWarning, match="contradict the Gray code") as caught:
+        decode(with_fringes(capture_of(sensor), "later", later))
+    found = re.search(r"start ([0-9.]+) projector pixels too (early|late)", str(caught[0].message))
+    assert found is not None
+    assert float(found[1]) == pytest.approx(abs(later), abs=0.25)
+    assert found[2] == ("late" if later > 0 else "early")
+
+
+@pytest.mark.parametrize("later", [-0.5, 0.5])
+@pytest.mark.parametrize("steps", [3, 4, 5])
+@pytest.mark.parametrize("exposure_s", [None, 4e-4])
+def test_a_start_half_a_pixel_off_is_named(later: float, steps: int, exposure_s: float | None) -> None:
+    sensor = StructuredLight(steps=steps)
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    with pytest.warns(
+        RangesimWarning, match=rf"start 0\.[456] projector pixels too {'late' if later > 0 else 'early'}"
+    ):
+        decode(with_fringes(capture, "later", later))
+
+
+@pytest.mark.parametrize("frame", [0, 2])
+@pytest.mark.parametrize("steps", [3, 4, 6])
+@pytest.mark.parametrize("exposure_s", [None, 4e-4, 1e-4])
+def test_a_black_frame_and_a_repeated_one_are_named(frame: int, steps: int, exposure_s: float | None) -> None:
+    sensor = StructuredLight(steps=steps)
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    run, (black, repeated) = fringes(sensor)[0], capture.frames[None].repeat(2, axis=0)
+    black[run.start + frame] = black[-1]
+    repeated[run.start + frame] = repeated[run.start + 1]
+    with pytest.warns(RangesimWarning, match=f"frame columns_phase{frame} is black everywhere"):
+        decode(replace(capture, frames=black))
+    first, second = sorted((frame, 1))
+    with pytest.warns(RangesimWarning, match=f"frame columns_phase{second} repeats columns_phase{first}"):
+        decode(replace(capture, frames=repeated))
+
+
+@pytest.mark.parametrize("gamma", [1.5, 2.2])
+@pytest.mark.parametrize("steps", [3, 4, 7])
+@pytest.mark.parametrize("exposure_s", [None, 4e-4])
+def test_a_gamma_is_named_with_the_mean_it_makes(gamma: float, steps: int, exposure_s: float | None) -> None:
+    """The mean of ((1 + cos x) / 2)^gamma is G(gamma + 1/2) / (sqrt(pi) G(gamma + 1))."""
+    sensor = StructuredLight(steps=steps)
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    frames, run = capture.frames.copy(), fringes(sensor)[0]
+    black = frames[-1].astype(np.float64)
+    contrast = frames[-2] - black
+    share = np.clip((frames[run] - black) / np.where(contrast > 0, contrast, np.inf), 0, 1)
+    frames[run] = (black + contrast * share**gamma).astype(frames.dtype)
+    with pytest.warns(RangesimWarning, match="check that projector and camera are linear") as caught:
+        decode(replace(capture, frames=frames))
+    found = re.search(r"mean lies at (\d+) % of the way", str(caught[0].message))
+    assert found is not None
+    expected = math.gamma(gamma + 0.5) / (math.sqrt(math.pi) * math.gamma(gamma + 1))
+    assert int(found[1]) == pytest.approx(100 * expected, abs=2)
+
+
+def as_plain_binary(capture: Capture) -> Capture:
+    """The capture with its Gray bits replaced by plain binary: each bit the exclusive or of those above."""
+    sensor = capture.sensor
+    assert isinstance(sensor, StructuredLight)
+    frames = capture.frames.copy()
+    runs = [run.frames for run in sensor.layout() if isinstance(run.response, GrayBits)]
+    for run in runs:
+        pairs = frames[run].reshape(-1, 2, *frames.shape[1:])
+        shown = np.logical_xor.accumulate(pairs[:, 0] > pairs[:, 1], axis=0)
+        pairs[:, 0], pairs[:, 1] = (np.where(s, pairs.max(axis=1), pairs.min(axis=1)) for s in (shown, ~shown))
+        frames[run] = pairs.reshape(-1, *frames.shape[1:])
+    return replace(capture, frames=frames)
+
+
+@pytest.mark.parametrize("exposure_s", [None, 4e-4, 1e-4])
+@pytest.mark.parametrize("axes", [("columns",), ("rows",)])
+@pytest.mark.parametrize("code", ["gray", "gray-phase"])
+def test_plain_binary_is_named(code: str, axes: tuple[str, ...], exposure_s: float | None) -> None:
+    sensor = StructuredLight(code=code, axes=axes)  # type: ignore[arg-type]
+    capture = capture_of(sensor) if exposure_s is None else capture_of(sensor, Detector(), exposure_s)
+    decode(capture)
+    with pytest.warns(RangesimWarning) as caught:
+        decode(as_plain_binary(capture))
+    assert len(caught) == 1
+    found = re.search(
+        rf"bits along {axes[0]} .* binary numbers .* lie ([0-9.]+) cells apart, as Gray code ([0-9.]+)",
+        str(caught[0].message),
+    )
+    assert found is not None
+    cells_per_pixel = 1280 * 45 / 60 / 160 / (1 if code == "gray" else 8)
+    assert float(found[1]) == pytest.approx(max(1, cells_per_pixel), rel=0.5)
+    assert float(found[2]) > 1.25 * float(found[1])
+
+
+@pytest.mark.parametrize("axes", [("columns",), ("rows",), ("columns", "rows")])
+def test_gray_code_of_any_fineness_is_silent(axes: tuple[str, ...]) -> None:
+    for width in (16, 100, 320):
+        for distance_m in (0.5, 1.0, 2.5):
+            sensor = StructuredLight(code="gray", axes=axes)  # type: ignore[arg-type]
+            decode(expose(plane_signals(stereo_rig(width, width), sensor, distance_m=distance_m), sensor))
+
+
+def share_behind(capture: Capture) -> float:
+    """Percent of decoded pixels that decode's warning says meet behind."""
+    with pytest.warns(RangesimWarning, match="meet behind camera or projector") as caught:
+        image = decode(capture)
+    found = re.search(r"^(\d+) % of the decoded rays", str(caught[0].message))
+    assert found is not None
+    assert image.projector_column is not None
+    decoded = np.isfinite(image.projector_column)
+    assert int(found[1]) <= 100 * (decoded & ~image.valid).sum() / decoded.sum() + 0.5
+    return float(found[1])
+
+
+@pytest.mark.parametrize("distance_m", [0.6, 1.0, 3.0])
+@pytest.mark.parametrize("axes", [("columns",), ("columns", "rows")])
+@pytest.mark.parametrize("code", ["gray", "gray-phase"])
+def test_a_mirrored_camera_is_told_by_rays_that_meet_behind(
+    code: str, axes: tuple[str, ...], distance_m: float
+) -> None:
+    sensor = StructuredLight(code=code, axes=axes)  # type: ignore[arg-type]
+    capture = expose(plane_signals(stereo_rig(), sensor, distance_m=distance_m), sensor)
+    decode(capture)
+    assert 25 < share_behind(replace(capture, frames=capture.frames[:, :, ::-1].copy())) < 50
+
+
+def test_an_inverted_calibration_is_told_by_rays_that_meet_behind() -> None:
+    """Parallel axes: every ray meets behind, with the baseline to the other side."""
+    rig, sensor = stereo_rig(T_camera_projector=translation(0.2, 0, 0)), StructuredLight()
+    capture = expose(plane_signals(rig, sensor, distance_m=1.5), sensor)
+    inverted = replace(rig, T_camera_projector=np.linalg.inv(rig.T_camera_projector))
+    assert share_behind(replace(capture, rig=inverted)) == 100
+
+
+def test_noise_on_what_is_far_away_is_silent() -> None:
+    """At 500 m rays are parallel within 0.5 pixels, and half of them meet behind."""
+    rig, sensor = stereo_rig(T_camera_projector=translation(0.2, 0, 0)), StructuredLight(code="gray")
+    image = decode(expose(signals_of_depth(rig, np.full((120, 160), 500.0), [sensor]), sensor))
+    assert not image.valid.any()
