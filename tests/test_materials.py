@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from tiers import to_validate
 
 import rangesim
 from rangesim.environment.backend import select_variant
+from rangesim.light_transport.narrow_lobes import thrown_light
+from rangesim.light_transport.photons import trace_photons
+from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.scene import retroreflector
 from rangesim.scene.materials import material_class
 
@@ -367,3 +371,87 @@ def test_a_texture_says_how_metallic_a_surface_is() -> None:
     for low, high, expected in ((0.9, 1.0, "mirror"), (0.0, 0.2, "glossy")):
         bsdf = {"type": "principled", "roughness": 0.1, "metallic": checks(low, high)}
         assert material_class(mi.load_dict(bsdf)) == expected
+
+
+# ---- Narrow lobes ------------------------------------------------------------------------------------
+
+
+def corner(paint: dict[str, object], turn_deg: float = 0.0, slab: bool = False) -> rangesim.Scene:
+    """A matte wall behind a plate, which lies before it, or stands as a slab of 6 mm."""
+    import mitsuba as mi
+
+    select_variant()
+    T = mi.ScalarTransform4d()
+    shape, size = ("cube", [0.3, 0.003, 0.3]) if slab else ("rectangle", [0.4, 0.5, 1.0])
+    matte = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    return rangesim.load_scene(
+        {
+            "type": "scene",
+            "camera": {
+                "type": "perspective",
+                "fov": 40.0,
+                "to_world": T.look_at(origin=[0, -1.2, 0.3], target=[0, 0, 0.2], up=[0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 16, "height": 12},
+            },
+            "wall": {"type": "rectangle", "to_world": T.translate([0, 0.5, 0]).rotate([1, 0, 0], 90), "bsdf": matte},
+            "plate": {"type": shape, "to_world": T.rotate([1, 0, 0], turn_deg).scale(size), "bsdf": paint},
+        }
+    )
+
+
+def said_of(scene: rangesim.Scene) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rangesim.transport(scene, scene.rig(), [], spp=1, photons=0, glint=False)
+    return [str(warning.message) for warning in caught if "narrow lobes" in str(warning.message)]
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 10.0])
+@pytest.mark.parametrize("alpha", [0.001, 0.003])
+def test_narrow_lobes_throw_as_much_light_as_the_mirror_they_nearly_are(alpha: float, turn_deg: float) -> None:
+    mirror, rough = (
+        corner(paint, turn_deg) for paint in ({"type": "conductor"}, {"type": "roughconductor", "alpha": alpha})
+    )
+    rig = mirror.rig()
+    budget = trace_photons(TracedScene.of(mirror.mitsuba, mirror.in_renderer(rig)), 1.0, 1 << 15, 1, 0, 1 << 28).energy
+    thrown = thrown_light(TracedScene.of(rough.mitsuba, rough.in_renderer(rig)))
+    assert thrown is not None
+    assert thrown.onto.sum() == pytest.approx(budget.stored, rel=0.02)
+    assert budget.stored > 0.05
+    wall, plate = (["wall", "plate"].index(instance.name) for instance in rough.instances)
+    assert thrown.onto[wall] == pytest.approx(thrown.by[plate]) == thrown.onto.sum()
+    assert thrown_light(TracedScene.of(mirror.mitsuba, mirror.in_renderer(rig))) is None
+
+
+@pytest.mark.parametrize(
+    ("paint", "slab"),
+    [
+        ({"type": "roughconductor", "alpha": 0.003}, False),
+        ({"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.02}}, False),
+        ({"type": "principled", "metallic": 1.0, "roughness": 0.05}, False),
+        ({"type": "principled", "spec_trans": 1.0, "roughness": 0.0}, True),
+        ({"type": "roughdielectric", "alpha": 0.01}, True),
+    ],
+)
+def test_light_that_narrow_lobes_throw_is_told(paint: dict[str, object], slab: bool) -> None:
+    (said,) = said_of(corner(paint, slab=slab))
+    assert "light reaches 'wall' over narrow lobes of 'plate'" in said
+
+
+@pytest.mark.parametrize(
+    ("paint", "slab"),
+    [
+        ({"type": "conductor"}, False),
+        ({"type": "roughconductor", "alpha": 0.1}, False),
+        ({"type": "principled", "metallic": 1.0, "roughness": 0.5}, False),
+        ({"type": "principled", "spec_trans": 1.0, "roughness": 0.5}, True),
+        ({"type": "dielectric"}, True),
+        ({"type": "plastic"}, False),
+    ],
+)
+def test_light_that_is_carried_is_not_told(paint: dict[str, object], slab: bool) -> None:
+    assert said_of(corner(paint, slab=slab)) == []
+
+
+def test_a_narrow_lobe_that_lights_nothing_is_not_told() -> None:
+    assert said_of(corner({"type": "roughconductor", "alpha": 0.003}, turn_deg=-60.0)) == []

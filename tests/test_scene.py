@@ -416,3 +416,24 @@ def test_an_aperture_that_is_left_out_is_told(tmp_path: Path, radius: float, foc
     with pytest.warns(RangesimWarning, match=rf"aperture of {radius:g} m is left out.*focus_m={focus:g}\)"):
         wide, _ = rendered(tmp_path / "b.xml", lens(radius))
     assert wide.camera == sharp.camera
+
+
+@pytest.mark.parametrize(("name", "advice"), [("part.obj", "needs --unit-m 0.001"), ("part.xml", "scale the scene's")])
+def test_a_run_that_measures_nothing_advises_what_the_scene_allows(
+    tmp_path: Path, name: str, advice: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rangesim.cli import main
+
+    write(tmp_path / "part.obj", re.sub(r"^(v.*)1", r"\g<1>5000", TETRAHEDRON, flags=re.MULTILINE))  # too far: dark
+    behind = SENSOR.replace('target="0,0,0"', 'target="0,-9,0"')
+    write(tmp_path / "part.xml", f'<scene version="3.0.0">{behind}{BALL}</scene>')
+    size = ("--width", "8", "--height", "6", "--spp", "1", "--sensor", "gray")
+    out = ("--out", str(tmp_path / "out"))
+    monkeypatch.setattr("sys.argv", ["rangesim", "run", str(tmp_path / name), *size, *out])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err
+    assert end.value.code == 0, said
+    assert "measured no pixel at all" in said
+    assert advice in said
+    assert ("--unit-m" in said) == name.endswith(".obj")

@@ -123,7 +123,7 @@ def run_command(
     say_where(out, target)
     with light_left_out_in_a_line(), progress_bar() as progress:
         pipeline.run(experiment, out, progress, announce=_announce)
-    _say_what_measured_nothing(target)
+    _say_what_measured_nothing(target, experiment.scene)
     typer.echo(one_line(out / "report.html"))
 
 
@@ -133,20 +133,27 @@ def _announce(cost: Cost) -> None:
         typer.echo(f"rangesim: this takes {cost}.", err=True)
 
 
-def _say_what_measured_nothing(out: Path) -> None:
-    """A line on stderr if some instrument has not a single point: most often the scene is not in metres."""
+def _say_what_measured_nothing(out: Path, scene: str) -> None:
+    """A line on stderr if some instrument has not a single point: most often the scene is not in metres.
+
+    scene : file or name of the scene, whose suffix tells how to bring it to metres.
+    """
     from rangesim.experiment.result_files import MeasurementRecord, read_settings
     from rangesim.files.schema import read_record
+    from rangesim.scene.mesh import MESH_SUFFIXES
 
     settings = read_settings(out)
     names = [entry.name for entry in settings.instruments]
     blind = [name for name in names if not read_record(out / name / "measurement.json", MeasurementRecord).points]
     if blind:
+        is_mesh = Path(scene).suffix.lower() in MESH_SUFFIXES
+        advice = (
+            "a mesh in millimetres needs --unit-m 0.001" if is_mesh else "scale the scene's shapes and camera to them"
+        )
         distance = settings.scene.working_distance_m
         typer.echo(
             f"rangesim: {one_line(', '.join(blind))} measured no pixel at all, at a working distance of "
-            f"{distance:g} m; "
-            "coordinates are metres (a mesh in millimetres needs --unit-m 0.001); in the dark, --spp or power helps.",
+            f"{distance:g} m; coordinates are metres ({advice}); in the dark, --spp or power helps.",
             err=True,
         )
 

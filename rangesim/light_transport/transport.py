@@ -18,6 +18,7 @@ from rangesim.light_transport.ground_truth import ground_truth, mean_reflectance
 from rangesim.light_transport.indirect_filter import LightFilter
 from rangesim.light_transport.kernel_launches import Launches, Progress, Report, raised_as_it_is, report_part
 from rangesim.light_transport.loop import PathSettings, Radiance, View
+from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
 from rangesim.light_transport.photons import Photons
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
@@ -111,6 +112,7 @@ def transport(
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
     adaptive = _adaptive(settings, sensors, responses)
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
+    warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
     views = [_CameraPass(scene, traced, one, settings, adaptive, number) for number, one in enumerate(rigs)]
     fewest = min(int(view.samples.min()) for view in views)
     at_work = partial(report, 0.0)

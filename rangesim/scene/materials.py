@@ -16,6 +16,10 @@ transparent: (nearly) specular refraction. translucent: scattered transmission. 
 SMOOTH = 0.05
 """Microfacet roughness alpha up to which a surface looks polished to a range sensor."""
 
+NARROW = 0.03
+"""Microfacet roughness alpha up to which light paths that start elsewhere hardly meet the lobe: its solid angle,
+about pi (2 alpha)^2, is a five-hundredth of a hemisphere there."""
+
 ALL_COMPONENTS = 0xFFFFFFFF
 
 _TEXTURE_PARTS = re.compile(r"(\.color[01])*(\.value|\.data)?$")
@@ -29,8 +33,7 @@ def material_class(bsdf: Any) -> str:
     Wrappers (`twosided`, `mask`, `bumpmap`) count as what they wrap; a blend has the lobes of all its parts.
     """
     parameters = _numbers(bsdf)
-    alphas = [parameters[key] for key in _ALPHAS if key in parameters]
-    alphas += [parameters["roughness"] ** 2] if "roughness" in parameters else []  # principled (Burley 2012)
+    alphas = _alphas(parameters)
     polished = all(alpha <= SMOOTH for alpha in alphas)
     delta = _has(bsdf, "DeltaReflection") or (polished and _has(bsdf, "GlossyReflection"))
     if _has(bsdf, "DeltaTransmission", "GlossyTransmission") or _has_thin_glass(bsdf):
@@ -49,6 +52,12 @@ def material_class(bsdf: Any) -> str:
 def is_cutout(bsdf: Any) -> bool:
     """Whether the surface has holes (`mask`, `null`); thin glass, which light passes unchanged as well, is none."""
     return holes(bsdf) != 0
+
+
+def has_narrow_lobe(bsdf: Any) -> bool:
+    """Whether a mitsuba.BSDF has a lobe that is as narrow as a mirror's nearly, but no delta interaction."""
+    alphas = _alphas(_numbers(bsdf))
+    return _has(bsdf, "GlossyReflection", "GlossyTransmission") and bool(alphas) and max(alphas) <= NARROW
 
 
 def is_closed_mask(bsdf: Any) -> bool:
@@ -89,6 +98,12 @@ def _has_thin_glass(bsdf: Any) -> bool:
 
 def _has(bsdf: Any, *lobes: str) -> bool:
     return any(bool(mi.has_flag(bsdf.flags(), getattr(mi.BSDFFlags, lobe))) for lobe in lobes)
+
+
+def _alphas(parameters: dict[str, float]) -> list[float]:
+    """The microfacet roughnesses among the parameters of a BSDF."""
+    alphas = [parameters[key] for key in _ALPHAS if key in parameters]
+    return alphas + ([parameters["roughness"] ** 2] if "roughness" in parameters else [])  # principled (Burley 2012)
 
 
 def _numbers(bsdf: Any) -> dict[str, float]:

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Light that narrow lobes throw onto other surfaces, which light paths hardly find: how much, and onto what.
+
+A mirror is a delta interaction, and photons carry its light. A rough metal with an alpha of 0.01, or a polished
+`principled`, which has no delta interaction at any roughness, is none; and a path from the lit wall meets its lobe by
+chance once in ten thousand times. What no sample found, the sampling error does not know of. So rays of the projector
+are followed here, through lobes and delta interactions, to the surfaces that scatter them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rangesim.errors import warn
+from rangesim.light_transport.spectrum import mono
+from rangesim.light_transport.surfaces import number_of, table_of
+from rangesim.light_transport.traced_scene import TracedScene
+from rangesim.scene.materials import NARROW, has_narrow_lobe
+
+RAYS = (128, 128)
+"""Columns and rows of rays over the projector's image."""
+MAX_SURFACES = 8
+"""Surfaces that a ray is followed over. A hollow glass has four."""
+WORTH_A_WARNING = 0.005
+"""Fraction of the projector's light."""
+WORTH_A_NAME = 0.1
+"""Fraction of the thrown light that a shape throws or receives."""
+MAX_NAMED = 3
+
+
+class ThrownLight(NamedTuple):
+    """Light that reached a surface over a narrow lobe, over all light of the projector, by shape.
+
+    by, onto : (shapes,) float64, in the order of the scene's shapes.
+    """
+
+    by: np.ndarray
+    onto: np.ndarray
+
+
+def thrown_light(traced: TracedScene) -> ThrownLight | None:
+    """What narrow lobes throw; None where no surface has one."""
+    scene, projector = traced.scene, traced.projector
+    shapes = scene.shapes()
+    is_narrow = [has_narrow_lobe(shape.bsdf()) for shape in shapes]
+    if not any(is_narrow):
+        return None
+    narrow_table = mi.Bool(table_of(scene, is_narrow))
+    columns, rows = RAYS
+    lanes = columns * rows
+    index = dr.arange(mi.UInt32, lanes)
+    rng = mi.PCG32(lanes)
+    place = mi.Vector2f(index % columns + rng.next_float32(), index // columns + rng.next_float32())
+    first = projector.centre_ray(mi.Point2f(place * projector.size / mi.Vector2f(columns, rows)))
+    ray = mi.Ray3f(first.origin, first.direction)
+    active = mi.Bool(True) if first.exists is None else mi.Bool(first.exists)
+    throughput, thrower, is_thrown = dr.full(mi.Float, 1.0, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Bool, lanes)
+    by, onto = (dr.zeros(mi.Float, int(dr.max(number_of(scene.shapes_dr()))[0]) + 1) for _ in range(2))
+    for _ in range(MAX_SURFACES):
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        active &= si.is_valid()
+        shape = number_of(si.shape)
+        xi = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        bs, weight = si.bsdf(ray).sample(mi.BSDFContext(), si, *xi, active)
+        meets_lobe = active & dr.gather(mi.Bool, narrow_table, shape, active)
+        meets_lobe &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Glossy)
+        goes_on = meets_lobe | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        goes_on |= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        lands = active & is_thrown & ~goes_on
+        dr.scatter_reduce(dr.ReduceOp.Add, onto, throughput, shape, lands)
+        dr.scatter_reduce(dr.ReduceOp.Add, by, throughput, thrower, lands)
+        thrower = dr.select(meets_lobe & ~is_thrown, shape, thrower)
+        is_thrown |= meets_lobe
+        active &= goes_on
+        throughput *= dr.select(active, mono(weight), 0)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        dr.eval(ray, active, throughput, thrower, is_thrown, rng, by, onto)
+    numbers = number_of(scene.shapes_dr()).numpy()
+    return ThrownLight(*(x.numpy()[numbers].astype(np.float64) / lanes for x in (by, onto)))
+
+
+def warn_of_narrow_lobes(traced: TracedScene, names: list[str]) -> None:
+    """Warn if narrow lobes throw noticeable light onto other surfaces; `names` of all shapes."""
+    thrown = thrown_light(traced)
+    if thrown is None or thrown.onto.sum() <= WORTH_A_WARNING:
+        return
+    lit, lobes = _named(names, thrown.onto), _named(names, thrown.by)
+    warn(
+        f"about {thrown.onto.sum():.1%} of the projector's light reaches {lit} over narrow lobes of {lobes}, where "
+        f"light paths find little of it: readings there are more wrong than their noise says; make {lobes} smooth "
+        f"(conductor, dielectric) or rougher than alpha {NARROW:g}."
+    )
+
+
+def _named(names: list[str], light: np.ndarray) -> str:
+    """The shapes with the most light, in words."""
+    order: Any = [int(i) for i in np.argsort(-light, kind="stable") if light[i] > WORTH_A_NAME * light.sum()]
+    listed = ", ".join(repr(names[i]) for i in order[:MAX_NAMED])
+    return listed + (" and others" if len(order) > MAX_NAMED else "")
