@@ -331,3 +331,12 @@ def test_an_experiment_names_files_from_its_own_folder(tmp_path: Path) -> None:
     assert one.name == "my-gates"
     assert one.detector == one.sensor.default_detector
     assert Instrument("x", one.sensor) == replace(one, name="x")
+
+
+def test_a_file_imports_its_neighbours(tmp_path: Path) -> None:
+    (tmp_path / "beside_the_sensor.py").write_text("CONTRAST = 0.25\n")
+    (tmp_path / "with_a_neighbour.py").write_text(
+        f"from beside_the_sensor import CONTRAST\n{TWIN}\nfrom dataclasses import dataclass\n@dataclass(frozen=True)\n"
+        "class Beside(AmcwToF):\n    contrast: float = CONTRAST\n    type_name = 'beside'\n"
+    )
+    assert sensor_of("with_a_neighbour.py:Beside", tmp_path).contrast == 0.25  # type: ignore[attr-defined]
