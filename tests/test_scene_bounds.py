@@ -506,3 +506,93 @@ main()
     assert "['ball'] 2\n['ball']\n" in done.stdout
     assert "light paths" in done.stdout  # of the estimate
     assert not mark.exists()
+
+
+# ---- Pipes and devices ---------------------------------------------------------------------------------------------
+
+
+def filename(name: str) -> str:
+    return f'<string name="filename" value="{name}"/>'
+
+
+def medium(kind: str) -> str:
+    volume = f'<volume name="albedo" type="gridvolume">{filename(kind)}</volume>'
+    return f'<bsdf type="null"/><medium name="interior" type="heterogeneous">{volume}</medium>'
+
+
+NAMING = {
+    "mesh.ply": f'<shape type="ply">{filename("mesh.ply")}</shape>',
+    "mesh.obj": f'<shape type="obj">{filename("mesh.obj")}</shape>',
+    "a.serialized": f'<shape type="serialized">{filename("a.serialized")}</shape>',
+    "sdf.vol": f'<shape type="sdfgrid">{filename("sdf.vol")}</shape>',
+    "hair.txt": f'<shape type="bsplinecurve">{filename("hair.txt")}</shape>',
+    "blobs.ply": f'<shape type="ellipsoids">{filename("blobs.ply")}</shape>',
+    "fog.vol": f'<shape type="sphere">{medium("fog.vol")}</shape>',
+    "sky.exr": f'<emitter type="envmap">{filename("sky.exr")}</emitter>',
+    "paint.png": f'<texture type="bitmap">{filename("paint.png")}</texture>',
+    "a.bsdf": f'<bsdf type="measured">{filename("a.bsdf")}</bsdf>',
+    "a.spd": '<bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>',
+    "b.spd": '<default name="n" value="b"/><bsdf type="diffuse"><spectrum name="x" filename="$n.spd"/></bsdf>',
+    "part.xml": '<include filename="part.xml"/>',
+    "sub/part.xml": '<path value="sub"/><include filename="part.xml"/>',
+    "sub/a.spd": '<path value="sub"/><bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>',
+    "sub/other.xml": '<include filename="sub/include_other.xml"/>',  # which lies beside the file that includes it
+}
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+@pytest.mark.parametrize("name", NAMING)
+def test_scenes_name_plain_files(tmp_path: Path, name: str, kind: str) -> None:
+    """Mitsuba 3.9 waits for ever for most of these pipes, and reads a device until there is no memory."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "include_other.xml").write_text(
+        '<scene version="3.0.0"><include filename="other.xml"/></scene>'
+    )
+    if kind == "pipe":
+        os.mkfifo(tmp_path / name)
+    elif kind == "device":
+        (tmp_path / name).symlink_to("/dev/zero")
+    else:
+        (tmp_path / name).mkdir()
+    body = f'{NAMING[name]}<shape type="sphere"/>'
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}{body}</scene>')
+    with pytest.raises(FileFormatError, match=rf"cannot read .*{name.split('/')[-1]}: it is no plain file"):
+        load_scene(tmp_path / "a.xml")
+
+
+@pytest.mark.parametrize("kind", ["ply", "serialized", "bitmap", "envmap", "spectrum", "irregular"])
+def test_dictionaries_name_plain_files(tmp_path: Path, kind: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    thing = {"type": kind, "filename": str(tmp_path / "pipe")}
+    holder = {"type": "diffuse", "reflectance": thing} if kind in ("bitmap", "spectrum", "irregular") else thing
+    with pytest.raises(FileFormatError, match=r"cannot read .*pipe: it is no plain file"):
+        load_scene(ball() | {"thing": holder})
+
+
+def test_files_of_scenes_have_a_size(tmp_path: Path) -> None:
+    path = mesh(tmp_path, "a.ply", binary_ply(2))
+    assert load_scene(path).instances[0].name == "part"
+    with limits.raised(bytes=100), pytest.raises(FileFormatError, match=r"at most 100 bytes in .*a\.ply"):
+        load_scene(path)
+
+
+def test_an_include_searches_its_own_paths(tmp_path: Path) -> None:
+    """The folder of the file that includes first, then the path that was added last, and only in that file."""
+    for folder in ("p", "q"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "part.xml").write_text(
+            f'<scene version="3.0.0"><shape type="sphere" id="{folder}"/></scene>'
+        )
+    (tmp_path / "a.xml").write_text(
+        f'<scene version="3.0.0">{XML_CAMERA}<path value="p"/><path value="q"/><include filename="part.xml"/></scene>'
+    )
+    assert [i.name for i in load_scene(tmp_path / "a.xml").instances] == ["q"]
+    (tmp_path / "q" / "part.xml").unlink()
+    os.mkfifo(tmp_path / "q" / "part.xml")
+    with pytest.raises(FileFormatError, match=r"q/part\.xml: it is no plain file"):
+        load_scene(tmp_path / "a.xml")
+    (tmp_path / "p" / "outer.xml").write_text(
+        '<scene version="3.0.0"><path value="../q"/><include filename="part.xml"/></scene>'
+    )
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}<include filename="p/outer.xml"/></scene>')
+    assert [i.name for i in load_scene(tmp_path / "a.xml").instances] == ["p"]

@@ -10,9 +10,9 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from xml.parsers import expat
 
 from pcgraph.plain_files import check_file
@@ -83,28 +83,38 @@ def _is_container(value: Any) -> bool:
     return isinstance(value, (Mapping, list, tuple))
 
 
-def check_xml(path: str | Path, resolve: Callable[[str], Path] | None = None) -> None:
+class SearchPaths(Protocol):
+    """Where the files lie that an XML file names."""
+
+    def resolve(self, name: str) -> Path:
+        """Path of the file of a name, which may be missing."""
+
+    def within(self, folder: str, beside: Path) -> SearchPaths:
+        """These with a folder before them, as `<path value="folder"/>` in the file `beside` asks for."""
+
+
+def check_xml(path: str | Path, search: SearchPaths | None = None) -> None:
     """Raise FileFormatError if an XML file is missing, too large, nested too deep, no XML, or declares entities.
 
-    resolve : finds the file that an `<include filename="..."/>` names; each is checked in its place. None: includes
-        mean nothing.
+    search : finds the files that `filename="..."` of an element names. Those that are there have to be plain files
+        within the limits; one that an `<include>` names is checked in its place. None: names of files mean nothing.
     """
-    _Xml(resolve).read(Path(path), 0, ())
+    _Xml().read(Path(path), 0, (), search)
 
 
 class _Xml:
     """Depth and size of an XML file with what it includes."""
 
-    def __init__(self, resolve: Callable[[str], Path] | None) -> None:
-        self.resolve = resolve
+    def __init__(self) -> None:
         self.size = 0
         self.defaults: dict[str, str] = {}
 
-    def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
-        """Check a file that stands `depth` levels deep inside the files `within`."""
-        if path in within:
-            raise FileFormatError(f"{path} includes itself.")
+    def read(self, path: Path, depth: int, within: tuple[Path, ...], search: SearchPaths | None) -> None:
+        """Check a file that stands `depth` levels deep inside the files `within`; paths that it adds are its own."""
         check_file(path, FileFormatError)
+        real = path.resolve()  # what it includes lies beside it by its name, though
+        if real in within:
+            raise FileFormatError(f"{path} includes itself.")
         try:
             self.size += path.stat().st_size
             limits.check("text", self.size, f"bytes in {path} and what it includes", FileFormatError)
@@ -115,17 +125,26 @@ class _Xml:
         level = depth
 
         def start(name: str, attributes: dict[str, str]) -> None:
-            nonlocal level
+            nonlocal level, search
             level += 1
             if level > deepest:
                 raise _too_deep(path)
             if name == "default" and "name" in attributes:
                 self.defaults.setdefault(attributes["name"], attributes.get("value", ""))
-            if name == "include" and self.resolve is not None:
-                place = _PARAMETER.sub(lambda m: self.defaults.get(m[1], m[0]), attributes.get("filename", ""))
-                found = self.resolve(place)
-                if os.path.isfile(found):  # also of names that cannot be; if not, whoever includes it says so
-                    self.read(found.resolve(), level, (*within, path))
+            if search is None:
+                return
+            if name == "path" and "value" in attributes:
+                search = search.within(self.filled(attributes["value"]), path)
+            if "filename" in attributes:
+                named = self.filled(attributes["filename"])
+                beside = path.parent / named
+                found = beside if name == "include" and os.path.exists(beside) else search.resolve(named)
+                if not os.path.exists(found):  # also of names that cannot be; whoever reads it says so
+                    return
+                check_file(found, FileFormatError)
+                limits.check("text", found.stat().st_size, f"bytes in {found}", FileFormatError)
+                if name == "include":
+                    self.read(found, level, (*within, real), search)
 
         def end(_: str) -> None:
             nonlocal level
@@ -140,6 +159,10 @@ class _Xml:
             parser.Parse(data, True)
         except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: of an unknown encoding
             raise FileFormatError(f"{path} is no valid XML: {brief(error)}.") from error
+
+    def filled(self, text: str) -> str:
+        """An attribute with the parameters put in that `<default>` has named before."""
+        return _PARAMETER.sub(lambda m: self.defaults.get(m[1], m[0]), text)
 
 
 def _too_deep(path: str | Path) -> FileFormatError:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -178,10 +179,27 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
     resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
     try:
-        check_xml(path, resolve=lambda name: Path(str(mi.file_resolver().resolve(name))))
+        check_xml(path, _SearchPaths(resolver))
     except FileFormatError as error:
         raise FileFormatError(f"{path} is no scene Mitsuba can load: {error}") from error
     return mi.parser.parse_file(config, str(path))
+
+
+class _SearchPaths:
+    """Mitsuba's search paths while a file is checked, with those that the file itself adds."""
+
+    def __init__(self, paths: Any) -> None:
+        self.paths = paths
+
+    def resolve(self, name: str) -> Path:
+        """Path of the file of a name, which may be missing."""
+        return Path(str(self.paths.resolve(name)))
+
+    def within(self, folder: str, beside: Path) -> _SearchPaths:
+        """These with a folder before them: one beside the file, else one in the paths so far."""
+        near, paths = beside.parent / folder, mi.FileResolver(self.paths)
+        paths.prepend(str(near if os.path.exists(near) else self.resolve(folder)))
+        return _SearchPaths(paths)
 
 
 @contextmanager
