@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -264,6 +265,50 @@ def test_faces_of_ply_are_those_of_the_file(tmp_path: Path, order: str, kind: st
     mesh(tmp_path, "a.ply", binary_ply(73, order, kind, extra=70))
     with pytest.raises(FileFormatError, match="0 to 72, got vertex 73"):
         load_scene(path)
+
+
+def serialized(*indices: int, version: int = 4, flags: int = 0x1000) -> bytes:
+    """A file of Mitsuba's own format: for each index a mesh of three vertices, and a face of two and of that one."""
+    content, places = b"", []
+    for index in indices:
+        numbers = 3 + 3 * bool(flags & 1) + 2 * bool(flags & 2) + 3 * bool(flags & 8)
+        values = [0, 0, 3, 1, 0, 3, 0, 1, 3] + [0.5] * 3 * (numbers - 3)
+        body = struct.pack("<I", flags) + (b"name\0" if version == 4 else b"") + struct.pack("<QQ", 3, 1)
+        body += struct.pack(f"<{len(values)}{'d' if flags & 0x2000 else 'f'}", *values) + struct.pack(
+            "<3I", 0, 1, index
+        )
+        places.append(len(content))
+        content += struct.pack("<HH", 0x041C, version) + zlib.compress(body)
+    return content + struct.pack(f"<{len(places)}{'Q' if version == 4 else 'I'}I", *places, len(places))
+
+
+@pytest.mark.parametrize("flags", [0x1000, 0x1001, 0x1002, 0x100B, 0x2000, 0x200B])
+@pytest.mark.parametrize("version", [3, 4])
+def test_faces_of_serialized_meshes_are_checked_too(tmp_path: Path, version: int, flags: int) -> None:
+    def shape(number: int, *indices: int) -> dict[str, Any]:
+        (tmp_path / "a.serialized").write_bytes(serialized(*indices, version=version, flags=flags))
+        return {"type": "serialized", "filename": str(tmp_path / "a.serialized"), "shape_index": number}
+
+    for number, indices in enumerate([(2, 9, 9), (9, 2, 9), (9, 9, 2)]):
+        (loaded,) = load_scene(scene(part=shape(number, *indices))).mitsuba.shapes()
+        np.testing.assert_array_equal(np.array(mi.traverse(loaded)["faces"]), [0, 1, 2])
+    for index in (3, 100_000, 2_000_000_000, 2**32 - 1):
+        with pytest.raises(FileFormatError, match=f"faces of its 3 vertices, 0 to 2, got vertex {index}; repair"):
+            load_scene(scene(part=shape(1, 2, index, 2)))
+    with pytest.raises(FileFormatError, match="it has 2 meshes, but number 2 was asked for"):
+        load_scene(scene(part=shape(2, 2, 2)))
+
+
+def test_serialized_meshes_cut_short_or_large_are_refused(tmp_path: Path) -> None:
+    path = mesh(tmp_path, "a.serialized", serialized(2))
+    assert load_scene(path).instances[0].name == "part"
+    for content in (serialized(2)[:30], serialized(2)[:3], b"", b"\x1c\x04\x05\x00" + serialized(2)[4:]):
+        with pytest.raises(FileFormatError, match=r"a\.serialized cannot be read as a serialized mesh|is empty"):
+            load_scene(mesh(tmp_path, "a.serialized", content))
+    body = struct.pack("<I", 0x1000) + b"name\0" + struct.pack("<QQ", 4 * 10**9, 1)
+    content = struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1)
+    with pytest.raises(FileFormatError, match=r"a\.serialized: expected at most 100000000 vertices or faces"):
+        load_scene(mesh(tmp_path, "a.serialized", content))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
-from rangesim.scene.mesh_files import check_ply
+from rangesim.scene.mesh_files import check_ply, check_serialized
 from rangesim.scene.nodes import check_type, named_file
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
@@ -133,11 +133,18 @@ def check_properties(state: Any, label: str) -> None:
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
         if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
-        if node.props.plugin_name() == "ply" and isinstance(name := node.props.get("filename"), str):
-            check_ply(named_file(name))
+        _check_mesh(node.props)
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
+
+
+def _check_mesh(props: Any) -> None:
+    name = props.get("filename")
+    if props.plugin_name() == "ply" and isinstance(name, str):
+        check_ply(named_file(name))
+    if props.plugin_name() == "serialized" and isinstance(name, str):
+        check_serialized(named_file(name), int(props.get("shape_index", 0)))
 
 
 def check_vertices(scene: Any, label: str) -> None:
