@@ -154,6 +154,8 @@ def _instantiate(
                 move_to_origin(state, origin_m, label)
                 loaded = made_of(state)
             mesh = coarsest_mesh(state, loaded) if advises else None
+    except MemoryError:
+        raise FileFormatError(f"{label} does not fit into memory; use smaller meshes and images.") from None
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
         reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)  # of a BSDF in Python
