@@ -82,6 +82,46 @@ def test_image_bombs_are_refused_by_their_header(tmp_path: Path, suffix: str) ->
             read(path)
 
 
+def radiance(width: int, height: int) -> bytes:
+    return b"#?RADIANCE\n# made by hand\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (height, width)
+
+
+def targa(width: int, height: int) -> bytes:
+    head = bytes([0, 0, 2]) + bytes(9) + struct.pack("<HHBB", width, height, 32, 0)
+    return head + bytes(4 * 30) + bytes(8) + b"TRUEVISION-XFILE.\0"
+
+
+OTHER_IMAGES = {
+    "hdr": radiance,
+    "pfm": lambda width, height: b"PF\n%d %d\n-1.0\n" % (width, height),
+    "grey.pfm": lambda width, height: b"Pf\n%d %d\n-1.0\n" % (width, height),
+    "tga": targa,
+    "exr": exr_of,
+}
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.dat", "a.hdr"])
+@pytest.mark.parametrize("kind", OTHER_IMAGES)
+def test_images_that_mitsuba_reads_by_their_contents_have_a_size(tmp_path: Path, kind: str, name: str) -> None:
+    """Mitsuba makes room for what the header states, whatever the name of the file says."""
+    path = tmp_path / name
+    for width, height in ((10_001, 10_000), (65_535, 65_535)):
+        path.write_bytes(OTHER_IMAGES[kind](width, height))
+        with pytest.raises(FileFormatError, match=rf"at most 100000000 pixels in .*{name}, got {width * height}"):
+            check_pixels(path)
+    path.write_bytes(OTHER_IMAGES[kind](6, 5) + bytes(6 * 5 * 12) * (kind in ("hdr", "pfm", "grey.pfm")))
+    check_pixels(path)
+
+
+@pytest.mark.parametrize(
+    "start", [b"#?RADIANCE\n", b"#?\n-Y 9x +X 9\n", b"PF\n", b"PF\n-1 5\n1.0\n", b"PF 9" + b"9" * 30]
+)
+def test_headers_without_a_size_are_refused(tmp_path: Path, start: bytes) -> None:
+    (tmp_path / "a.hdr").write_bytes(start)
+    with pytest.raises(FileFormatError, match="its header states no size"):
+        check_pixels(tmp_path / "a.hdr")
+
+
 def test_images_larger_than_pillows_own_limit_are_read_if_ours_is_raised(tmp_path: Path) -> None:
     path = tmp_path / "large.png"
     path.write_bytes(png_of(20_000, 20_000))

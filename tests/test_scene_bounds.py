@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -265,6 +266,50 @@ def test_faces_of_ply_are_those_of_the_file(tmp_path: Path, order: str, kind: st
     mesh(tmp_path, "a.ply", binary_ply(73, order, kind, extra=70))
     with pytest.raises(FileFormatError, match="0 to 72, got vertex 73"):
         load_scene(path)
+
+
+def serialized(*indices: int, version: int = 4, flags: int = 0x1000) -> bytes:
+    """A file of Mitsuba's own format: for each index a mesh of three vertices, and a face of two and of that one."""
+    content, places = b"", []
+    for index in indices:
+        numbers = 3 + 3 * bool(flags & 1) + 2 * bool(flags & 2) + 3 * bool(flags & 8)
+        values = [0, 0, 3, 1, 0, 3, 0, 1, 3] + [0.5] * 3 * (numbers - 3)
+        body = struct.pack("<I", flags) + (b"name\0" if version == 4 else b"") + struct.pack("<QQ", 3, 1)
+        body += struct.pack(f"<{len(values)}{'d' if flags & 0x2000 else 'f'}", *values) + struct.pack(
+            "<3I", 0, 1, index
+        )
+        places.append(len(content))
+        content += struct.pack("<HH", 0x041C, version) + zlib.compress(body)
+    return content + struct.pack(f"<{len(places)}{'Q' if version == 4 else 'I'}I", *places, len(places))
+
+
+@pytest.mark.parametrize("flags", [0x1000, 0x1001, 0x1002, 0x100B, 0x2000, 0x200B])
+@pytest.mark.parametrize("version", [3, 4])
+def test_faces_of_serialized_meshes_are_checked_too(tmp_path: Path, version: int, flags: int) -> None:
+    def shape(number: int, *indices: int) -> dict[str, Any]:
+        (tmp_path / "a.serialized").write_bytes(serialized(*indices, version=version, flags=flags))
+        return {"type": "serialized", "filename": str(tmp_path / "a.serialized"), "shape_index": number}
+
+    for number, indices in enumerate([(2, 9, 9), (9, 2, 9), (9, 9, 2)]):
+        (loaded,) = load_scene(scene(part=shape(number, *indices))).mitsuba.shapes()
+        np.testing.assert_array_equal(np.array(mi.traverse(loaded)["faces"]), [0, 1, 2])
+    for index in (3, 100_000, 2_000_000_000, 2**32 - 1):
+        with pytest.raises(FileFormatError, match=f"faces of its 3 vertices, 0 to 2, got vertex {index}; repair"):
+            load_scene(scene(part=shape(1, 2, index, 2)))
+    with pytest.raises(FileFormatError, match="it has 2 meshes, but number 2 was asked for"):
+        load_scene(scene(part=shape(2, 2, 2)))
+
+
+def test_serialized_meshes_cut_short_or_large_are_refused(tmp_path: Path) -> None:
+    path = mesh(tmp_path, "a.serialized", serialized(2))
+    assert load_scene(path).instances[0].name == "part"
+    for content in (serialized(2)[:30], serialized(2)[:3], b"", b"\x1c\x04\x05\x00" + serialized(2)[4:]):
+        with pytest.raises(FileFormatError, match=r"a\.serialized cannot be read as a serialized mesh|is empty"):
+            load_scene(mesh(tmp_path, "a.serialized", content))
+    body = struct.pack("<I", 0x1000) + b"name\0" + struct.pack("<QQ", 4 * 10**9, 1)
+    content = struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1)
+    with pytest.raises(FileFormatError, match=r"a\.serialized: expected at most 100000000 vertices or faces"):
+        load_scene(mesh(tmp_path, "a.serialized", content))
 
 
 @pytest.mark.parametrize(
@@ -620,3 +665,93 @@ def test_a_camera_inside_absorbing_glass_is_refused() -> None:
     loaded = load_scene(wall_behind(water=water))
     with pytest.raises(ValueError, match=r"expected the camera to stand in air, .* medium of shape 'water'"):
         rangesim.transport(loaded, loaded.rig(width=8), [], spp=1)
+
+
+# ---- Pipes and devices ---------------------------------------------------------------------------------------------
+
+
+def filename(name: str) -> str:
+    return f'<string name="filename" value="{name}"/>'
+
+
+def medium(kind: str) -> str:
+    volume = f'<volume name="albedo" type="gridvolume">{filename(kind)}</volume>'
+    return f'<bsdf type="null"/><medium name="interior" type="heterogeneous">{volume}</medium>'
+
+
+NAMING = {
+    "mesh.ply": f'<shape type="ply">{filename("mesh.ply")}</shape>',
+    "mesh.obj": f'<shape type="obj">{filename("mesh.obj")}</shape>',
+    "a.serialized": f'<shape type="serialized">{filename("a.serialized")}</shape>',
+    "sdf.vol": f'<shape type="sdfgrid">{filename("sdf.vol")}</shape>',
+    "hair.txt": f'<shape type="bsplinecurve">{filename("hair.txt")}</shape>',
+    "blobs.ply": f'<shape type="ellipsoids">{filename("blobs.ply")}</shape>',
+    "fog.vol": f'<shape type="sphere">{medium("fog.vol")}</shape>',
+    "sky.exr": f'<emitter type="envmap">{filename("sky.exr")}</emitter>',
+    "paint.png": f'<texture type="bitmap">{filename("paint.png")}</texture>',
+    "a.bsdf": f'<bsdf type="measured">{filename("a.bsdf")}</bsdf>',
+    "a.spd": '<bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>',
+    "b.spd": '<default name="n" value="b"/><bsdf type="diffuse"><spectrum name="x" filename="$n.spd"/></bsdf>',
+    "part.xml": '<include filename="part.xml"/>',
+    "sub/part.xml": '<path value="sub"/><include filename="part.xml"/>',
+    "sub/a.spd": '<path value="sub"/><bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>',
+    "sub/other.xml": '<include filename="sub/include_other.xml"/>',  # which lies beside the file that includes it
+}
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+@pytest.mark.parametrize("name", NAMING)
+def test_scenes_name_plain_files(tmp_path: Path, name: str, kind: str) -> None:
+    """Mitsuba 3.9 waits for ever for most of these pipes, and reads a device until there is no memory."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "include_other.xml").write_text(
+        '<scene version="3.0.0"><include filename="other.xml"/></scene>'
+    )
+    if kind == "pipe":
+        os.mkfifo(tmp_path / name)
+    elif kind == "device":
+        (tmp_path / name).symlink_to("/dev/zero")
+    else:
+        (tmp_path / name).mkdir()
+    body = f'{NAMING[name]}<shape type="sphere"/>'
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}{body}</scene>')
+    with pytest.raises(FileFormatError, match=rf"cannot read .*{name.split('/')[-1]}: it is no plain file"):
+        load_scene(tmp_path / "a.xml")
+
+
+@pytest.mark.parametrize("kind", ["ply", "serialized", "bitmap", "envmap", "spectrum", "irregular"])
+def test_dictionaries_name_plain_files(tmp_path: Path, kind: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    thing = {"type": kind, "filename": str(tmp_path / "pipe")}
+    holder = {"type": "diffuse", "reflectance": thing} if kind in ("bitmap", "spectrum", "irregular") else thing
+    with pytest.raises(FileFormatError, match=r"cannot read .*pipe: it is no plain file"):
+        load_scene(ball() | {"thing": holder})
+
+
+def test_files_of_scenes_have_a_size(tmp_path: Path) -> None:
+    path = mesh(tmp_path, "a.ply", binary_ply(2))
+    assert load_scene(path).instances[0].name == "part"
+    with limits.raised(bytes=100), pytest.raises(FileFormatError, match=r"at most 100 bytes in .*a\.ply"):
+        load_scene(path)
+
+
+def test_an_include_searches_its_own_paths(tmp_path: Path) -> None:
+    """The folder of the file that includes first, then the path that was added last, and only in that file."""
+    for folder in ("p", "q"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "part.xml").write_text(
+            f'<scene version="3.0.0"><shape type="sphere" id="{folder}"/></scene>'
+        )
+    (tmp_path / "a.xml").write_text(
+        f'<scene version="3.0.0">{XML_CAMERA}<path value="p"/><path value="q"/><include filename="part.xml"/></scene>'
+    )
+    assert [i.name for i in load_scene(tmp_path / "a.xml").instances] == ["q"]
+    (tmp_path / "q" / "part.xml").unlink()
+    os.mkfifo(tmp_path / "q" / "part.xml")
+    with pytest.raises(FileFormatError, match=r"q/part\.xml: it is no plain file"):
+        load_scene(tmp_path / "a.xml")
+    (tmp_path / "p" / "outer.xml").write_text(
+        '<scene version="3.0.0"><path value="../q"/><include filename="part.xml"/></scene>'
+    )
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{XML_CAMERA}<include filename="p/outer.xml"/></scene>')
+    assert [i.name for i in load_scene(tmp_path / "a.xml").instances] == ["p"]

@@ -37,6 +37,11 @@ GREY_LEVELS = 5
 """Of 255, difference at most between the channels of a pixel that counts as grey."""
 
 
+_EXR = b"\x76\x2f\x31\x01"
+_TARGA = b"TRUEVISION-XFILE.\0"
+_LONGEST_HEADER = 1 << 16
+
+
 class _OtherFormatError(OSError):
     """A file begins like none of the formats that are read here."""
 
@@ -95,19 +100,20 @@ def is_coloured(path: Path) -> bool:
 def check_pixels(path: Path) -> None:
     """Raise FileFormatError if an image file states more pixels, or bytes, than the limits allow, or is damaged.
 
-    For files that others will decode: Mitsuba's libpng crashed on some. A file of another format than those of
-    `read_grey` passes.
+    For files that others will decode: Mitsuba's libpng crashed on some. Of Radiance files, float maps and Targa only
+    the stated size is checked; a file of yet another format than those of `read_grey` passes.
     """
     check_file(path, FileFormatError)
     try:
         with _quiet():
-            if path.suffix.lower() == ".exr":
+            if path.suffix.lower() == ".exr" or _start_of(path).startswith(_EXR):  # Mitsuba goes by the contents
                 _open_exr(path)
-            else:
+                return
+            try:
                 with _open_raster(path) as image:
                     image.load()
-    except _OtherFormatError:
-        return
+            except _OtherFormatError:
+                _check_stated_size(path)
     except FileFormatError:
         raise
     except _BROKEN as error:
@@ -167,6 +173,35 @@ def _quiet() -> Iterator[None]:
                 kept.callback(os.dup2, before, stream)
                 os.dup2(nowhere, stream)
         yield
+
+
+def _start_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(16)
+
+
+def _check_stated_size(path: Path) -> None:
+    """Check the size that a Radiance file (RGBE), float map (PFM) or Targa states; none of them is decoded here.
+
+    Mitsuba reads them, and makes room for as much as they state.
+    """
+    content = path.read_bytes()
+    words: list[bytes] = []
+    if content.startswith(b"#?"):
+        for line in content.split(b"\n"):
+            words = line.replace(b",", b" ").split()
+            if len(words) == 4 and words[0] == b"-Y" and words[2] == b"+X":
+                words = words[1::2]
+                break
+    elif content.startswith((b"PF", b"Pf")):
+        words = content[2:_LONGEST_HEADER].split(None, 2)[:2]
+    elif content.endswith(_TARGA) and len(content) >= 18:
+        words = [b"%d" % size for size in struct.unpack_from("<HH", content, 12)]
+    else:
+        return
+    if len(words) != 2 or not all(word.isdigit() and len(word) < 20 for word in words):
+        raise ValueError("its header states no size")
+    limits.check("pixels", math.prod(map(int, words)), f"pixels in {path}", FileFormatError)
 
 
 def _open_exr(path: Path) -> None:

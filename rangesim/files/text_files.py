@@ -10,9 +10,9 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from xml.parsers import expat
 
 from pcgraph.plain_files import check_file
@@ -83,13 +83,21 @@ def _is_container(value: Any) -> bool:
     return isinstance(value, (Mapping, list, tuple))
 
 
-def check_xml(
-    path: str | Path, resolve: Callable[[str], Path] | None = None, ignored: tuple[str, ...] = ()
-) -> dict[str, str]:
+class SearchPaths(Protocol):
+    """Where the files lie that an XML file names."""
+
+    def resolve(self, name: str) -> Path:
+        """Path of the file of a name, which may be missing."""
+
+    def within(self, folder: str, beside: Path) -> SearchPaths:
+        """These with a folder before them, as `<path value="folder"/>` in the file `beside` asks for."""
+
+
+def check_xml(path: str | Path, search: SearchPaths | None = None, ignored: tuple[str, ...] = ()) -> dict[str, str]:
     """Values for the parameters (`$name`) without a default that stand inside elements which are ignored alone.
 
-    resolve : finds the file that an `<include filename="..."/>` names; each is checked in its place. None: includes
-        mean nothing.
+    search : finds the files that `filename="..."` of an element names. Those that are there have to be plain files
+        within the limits; one that an `<include>` names is checked in its place. None: names of files mean nothing.
     ignored : names of elements whose contents do not matter.
 
     Raises
@@ -97,27 +105,28 @@ def check_xml(
     FileFormatError
         The file is missing, too large, nested too deep, no XML, or declares entities.
     """
-    xml = _Xml(resolve, ignored)
-    xml.read(Path(path), 0, ())
+    xml = _Xml(ignored)
+    xml.read(Path(path), 0, (), search)
     return {name: value for name, value in xml.fillers.items() if name not in xml.needed | set(xml.defaults)}
 
 
 class _Xml:
     """Depth and size of an XML file with what it includes."""
 
-    def __init__(self, resolve: Callable[[str], Path] | None, ignored: tuple[str, ...]) -> None:
-        self.resolve, self.ignored = resolve, ignored
+    def __init__(self, ignored: tuple[str, ...]) -> None:
+        self.ignored = ignored
         self.size = 0
         self.defaults: dict[str, str] = {}
         self.open: list[str] = []  # elements around the present place
         self.fillers: dict[str, str] = {}  # for parameters without a default inside ignored elements
         self.needed: set[str] = set()  # parameters without a default elsewhere
 
-    def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
-        """Check a file that stands `depth` levels deep inside the files `within`."""
-        if path in within:
-            raise FileFormatError(f"{path} includes itself.")
+    def read(self, path: Path, depth: int, within: tuple[Path, ...], search: SearchPaths | None) -> None:
+        """Check a file that stands `depth` levels deep inside the files `within`; paths that it adds are its own."""
         check_file(path, FileFormatError)
+        real = path.resolve()  # what it includes lies beside it by its name, though
+        if real in within:
+            raise FileFormatError(f"{path} includes itself.")
         try:
             self.size += path.stat().st_size
             limits.check("text", self.size, f"bytes in {path} and what it includes", FileFormatError)
@@ -128,7 +137,7 @@ class _Xml:
         level = depth
 
         def start(name: str, attributes: dict[str, str]) -> None:
-            nonlocal level
+            nonlocal level, search
             level += 1
             if level > deepest:
                 raise _too_deep(path)
@@ -136,11 +145,20 @@ class _Xml:
             self.note_parameters(name, attributes)
             if name == "default" and "name" in attributes:
                 self.defaults.setdefault(attributes["name"], attributes.get("value", ""))
-            if name == "include" and self.resolve is not None:
-                place = _PARAMETER.sub(lambda m: self.defaults.get(m[1], m[0]), attributes.get("filename", ""))
-                found = self.resolve(place)
-                if os.path.isfile(found):  # also of names that cannot be; if not, whoever includes it says so
-                    self.read(found.resolve(), level, (*within, path))
+            if search is None:
+                return
+            if name == "path" and "value" in attributes:
+                search = search.within(self.filled(attributes["value"]), path)
+            if "filename" in attributes:
+                named = self.filled(attributes["filename"])
+                beside = path.parent / named
+                found = beside if name == "include" and os.path.exists(beside) else search.resolve(named)
+                if not os.path.exists(found):  # also of names that cannot be; whoever reads it says so
+                    return
+                check_file(found, FileFormatError)
+                limits.check("text", found.stat().st_size, f"bytes in {found}", FileFormatError)
+                if name == "include":
+                    self.read(found, level, (*within, real), search)
 
         def end(_: str) -> None:
             nonlocal level
@@ -164,6 +182,10 @@ class _Xml:
             self.fillers |= dict.fromkeys(missing, "false" if name == "boolean" else "1")
         else:
             self.needed |= missing
+
+    def filled(self, text: str) -> str:
+        """An attribute with the parameters put in that `<default>` has named before."""
+        return _PARAMETER.sub(lambda m: self.defaults.get(m[1], m[0]), text)
 
 
 def _too_deep(path: str | Path) -> FileFormatError:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -175,6 +176,8 @@ def _instantiate(
                 move_to_origin(state, origin_m, label)
                 loaded = made_of(state)
             mesh = coarsest_mesh(state, loaded) if advises else None
+    except MemoryError:
+        raise FileFormatError(f"{label} does not fit into memory; use smaller meshes and images.") from None
     except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
         reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
         reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)  # of a BSDF in Python
@@ -200,7 +203,7 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
     resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
     resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
     try:
-        fillers = check_xml(path, lambda name: Path(str(mi.file_resolver().resolve(name))), IGNORED_ELEMENTS)
+        fillers = check_xml(path, _SearchPaths(resolver), IGNORED_ELEMENTS)
     except FileFormatError as error:
         raise FileFormatError(f"{path} is no scene Mitsuba can load: {error}") from error
     try:
@@ -212,6 +215,23 @@ def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Pa
             f"{path}: the parameter ${missing[1]} has no value; put "
             f'<default name="{missing[1]}" value="..."/> before it in the scene.'
         ) from error
+
+
+class _SearchPaths:
+    """Mitsuba's search paths while a file is checked, with those that the file itself adds."""
+
+    def __init__(self, paths: Any) -> None:
+        self.paths = paths
+
+    def resolve(self, name: str) -> Path:
+        """Path of the file of a name, which may be missing."""
+        return Path(str(self.paths.resolve(name)))
+
+    def within(self, folder: str, beside: Path) -> _SearchPaths:
+        """These with a folder before them: one beside the file, else one in the paths so far."""
+        near, paths = beside.parent / folder, mi.FileResolver(self.paths)
+        paths.prepend(str(near if os.path.exists(near) else self.resolve(folder)))
+        return _SearchPaths(paths)
 
 
 @contextmanager

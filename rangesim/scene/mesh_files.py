@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PLY files that a scene names, checked before Mitsuba reads them.
+"""PLY and serialized files that a scene names, checked before Mitsuba reads them.
 
 Mitsuba 3.9 computes normals before anybody can look at the mesh: a face of a vertex that is not there reads, and
 writes, outside the arrays. Of a negative index it makes vertex 0.
@@ -7,6 +7,8 @@ writes, outside the arrays. Of a negative index it makes vertex 0.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -26,6 +28,10 @@ _TYPES = (
 """Types of a property, in Mitsuba's words, as of NumPy."""
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
+_MAGIC = 0x041C
+_DOUBLE = 0x2000
+_NUMBERS_PER_VERTEX = {0x1: 3, 0x2: 2, 0x8: 3}
+"""Of normals, texture coordinates and colours, by their flag in a serialized file; the place has three."""
 _CORNERS = 3
 """Mitsuba reads each list as a count, which has to be 3, and three entries."""
 
@@ -62,13 +68,55 @@ def check_ply(path: Path) -> None:
         raise FileFormatError(f"{path}: {error}") from error
     except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise FileFormatError(f"{path} cannot be read as a PLY file of triangles: {brief(error)}.") from error
-    count = sum(element.count for element in elements if element.name == "vertex")
+    _check_indices(indices, sum(element.count for element in elements if element.name == "vertex"), path)
+
+
+def check_serialized(path: Path, index: int) -> None:
+    """As `check_ply`, of mesh number `index` of a file in Mitsuba's own format, version 3 or 4."""
+    content = read_file(path, FileFormatError)
+    try:
+        count, indices = _unpacked(content, index)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    except (ValueError, IndexError, OverflowError, struct.error, zlib.error) as error:
+        raise FileFormatError(f"{path} cannot be read as a serialized mesh: {brief(error)}.") from error
+    _check_indices(indices, count, path)
+
+
+def _check_indices(indices: np.ndarray, count: int, path: Path) -> None:
     wrong = indices[~((indices >= 0) & (indices < count))]
     if wrong.size:
         raise FileFormatError(
             f"{path}: expected faces of its {count} vertices, 0 to {count - 1}, got vertex {wrong[0]:.15g}; "
             "repair the mesh first."
         )
+
+
+def _unpacked(content: bytes, index: int) -> tuple[int, np.ndarray]:
+    """Number of vertices, and (3 faces,) uint32 indices, of a mesh of a serialized file."""
+    magic, version = struct.unpack_from("<HH", content)
+    if magic != _MAGIC or version not in (3, 4):
+        raise ValueError("expected version 3 or 4 of the format")
+    start = 0
+    if index:
+        (meshes,) = struct.unpack_from("<I", content, len(content) - 4)
+        if not 0 < index < meshes:
+            raise ValueError(f"it has {meshes} meshes, but number {index} was asked for, from 0")
+        place = 4 + 8 * (meshes - index) if version == 4 else 4 * (meshes - index + 1)
+        if place > len(content):
+            raise ValueError("it ends early")
+        (start,) = struct.unpack_from("<Q" if version == 4 else "<I", content, len(content) - place)
+    stream = zlib.decompressobj()
+    head = stream.decompress(content[start + 4 :], _LONGEST_HEADER)
+    (flags,) = struct.unpack_from("<I", head)
+    place = head.index(b"\0", 4) + 1 if version == 4 else 4  # after the name of the mesh
+    vertices, faces = struct.unpack_from("<QQ", head, place)
+    limits.check("points", max(vertices, faces), "vertices or faces", FileFormatError)
+    numbers = 3 + sum(size for flag, size in _NUMBERS_PER_VERTEX.items() if flags & flag)
+    place += 16 + vertices * numbers * (8 if flags & _DOUBLE else 4)
+    missing = place + 12 * faces - len(head)
+    body = head + stream.decompress(stream.unconsumed_tail, missing) if missing > 0 else head
+    return vertices, np.frombuffer(body, "<u4", 3 * faces, place) if faces else np.zeros(0, np.uint32)
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], int]:

@@ -12,6 +12,8 @@ from typing import Any
 
 import mitsuba as mi
 
+from pcgraph.plain_files import check_file
+from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.scene.materials import MATERIAL_CLASSES
 from rangesim.settings.config import nearest, shown
@@ -53,6 +55,21 @@ def check_type(name: str, label: str) -> None:
         f"{label}: expected types of plugins that come with Mitsuba or are registered in Python, got "
         f"{shown(name)}{nearest(name, shipped_types())}; a scene may bring no library of its own."
     )
+
+
+def named_file(name: str) -> Path:
+    """Path of a file that a scene names; it may be missing, which Mitsuba says.
+
+    Raises
+    ------
+    FileFormatError
+        It is a pipe, a device or a directory, or larger than the limit `bytes`.
+    """
+    path = Path(str(mi.file_resolver().resolve(name)))
+    if os.path.exists(path):  # False also of names that cannot be
+        check_file(path, FileFormatError)
+        limits.check("bytes", path.stat().st_size, f"bytes in {path}", FileFormatError)
+    return path
 
 
 def check_types(state: Any, label: str) -> None:

@@ -20,8 +20,8 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
-from rangesim.scene.mesh_files import check_ply
-from rangesim.scene.nodes import check_type
+from rangesim.scene.mesh_files import check_ply, check_serialized
+from rangesim.scene.nodes import check_type, named_file
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
 from rangesim.settings.config import shown
 
@@ -134,6 +134,8 @@ def check_dictionary(scene: Any, label: str) -> None:
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
             if key == "type" and isinstance(value, str):
                 check_type(value, label)
+            elif key == "filename" and isinstance(value, str):  # of a spectrum, which Mitsuba reads as it parses
+                named_file(value)
 
 
 def check_evaluable(state: Any, label: str) -> None:
@@ -174,15 +176,24 @@ def check_properties(state: Any, label: str) -> None:
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
         if node.props.plugin_name() == "bitmap" and not any(name in node.props for name in BITMAP_SOURCES):
             raise FileFormatError(f"{label}: {_place(state, parents, index)}: expected a filename, found none.")
-        if node.props.plugin_name() == "ply" and isinstance(name := node.props.get("filename"), str):
-            path = Path(str(mi.file_resolver().resolve(name)))
-            try:
-                check_ply(path)
-            except FileFormatError as error:
-                raise FileFormatError(f"{label}: {error}") from error
+        _check_mesh(node.props, label)
         if node.type == mi.ObjectType.Film:
             width, height = (int(node.props.get(name, default)) for name, default in (("width", 768), ("height", 576)))
             limits.check("pixels", width * height, f"pixels of the film of {label}", FileFormatError)
+
+
+def _check_mesh(props: Any, label: str) -> None:
+    """Raise FileFormatError, which names the scene too, if the file of a mesh would make Mitsuba crash."""
+    name = props.get("filename")
+    if not isinstance(name, str):
+        return
+    try:
+        if props.plugin_name() == "ply":
+            check_ply(named_file(name))
+        if props.plugin_name() == "serialized":
+            check_serialized(named_file(name), int(props.get("shape_index", 0)))
+    except FileFormatError as error:
+        raise FileFormatError(f"{label}: {error}") from error
 
 
 def check_vertices(scene: Any, label: str) -> None:
@@ -225,7 +236,7 @@ class _Property:
         if _is_transform(value):
             return _problem_of_transform(value, key)
         if key.endswith("filename") and isinstance(value, str):
-            return self._problem_of_image(Path(str(mi.file_resolver().resolve(value))), key)
+            return self._problem_of_image(named_file(value), key)
         if key in ("width", "height") and isinstance(value, float):
             return f"expected {key} to be {self.bounds}, got {shown(value)}"
         for number in getattr(value, "wavelengths", ()):
