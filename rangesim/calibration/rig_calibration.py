@@ -134,7 +134,7 @@ def calibrate_rig(
 
     Parameters
     ----------
-    captures : three or more, of `StructuredLight` with columns and rows.
+    captures : two or more, of `StructuredLight` with columns and rows.
     coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for pinholes.
     names : of the captures, for messages; None: their numbers.
 

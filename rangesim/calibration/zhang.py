@@ -2,9 +2,9 @@
 """A camera calibrated by views of a plane: homographies, the image of the absolute conic, then everything at once.
 
 Z. Zhang: "A flexible new technique for camera calibration", PAMI 2000. Each view of a plane maps the plane's circular
-points to two points of the image of the absolute conic, omega = K^-T K^-1: two linear equations for its 5 degrees of
-freedom, so three views determine it. Where they do not (boards that are parallel to each other, or all straight in
-front), that is an error.
+points to two points of the image of the absolute conic, omega = K^-T K^-1: two linear equations for its 4 degrees of
+freedom without skew, so two views determine it; 5 with skew, so three do. Where they do not (boards that are parallel
+to each other, or all straight in front), that is an error.
 """
 
 from __future__ import annotations
@@ -26,10 +26,18 @@ from rangesim.geometry.least_squares import Minimum
 from rangesim.geometry.reprojection import LENS, POSE, by_lens
 from rangesim.rig import Intrinsics
 
-MIN_VIEWS = 3
+MIN_VIEWS = 2
+"""Of a camera without skew."""
 DETERMINED = 1e-4
 """The second smallest singular value of the equations of the conic, relative to the largest, below which their views
 are parallel to each other, to what noise allows to tell."""
+MIN_APART_DEG = 1.0
+"""Largest angle between two boards below which all count as parallel. Parallel ones are found within 0.1 degrees, ones
+turned at random by up to 5 degrees 4.8 degrees apart or more (measured, noise of 0.05 px)."""
+FEW_VIEWS = 5
+"""Up to which more than one start is tried: of 3 views by 10 degrees, 1 of 40 had ended in a side minimum."""
+SAME_MINIMUM = 0.999
+"""Ratio of sums of squares of two minima from which on they are one."""
 MAX_DEVIATION = 0.1
 """Standard deviation of a focal length, relative, above which the views do not determine it."""
 MAX_CORNER_PX = 5.0
@@ -60,24 +68,30 @@ class CameraCalibration:
     suspects: tuple[Suspect, ...] = ()
 
 
-def intrinsics_from_homographies(homographies: ArrayLike) -> Array:
+def intrinsics_from_homographies(homographies: ArrayLike, *, has_skew: bool = False) -> Array:
     """(3, 3) K of a camera from homographies (k, 3, 3) that map a plane's coordinates to pixels (Zhang 2000, 3.1).
 
     With columns h1, h2 of each: h1^T omega h2 = 0 and h1^T omega h1 = h2^T omega h2, linear in the six entries of the
-    symmetric omega, up to scale; then omega = K^-T K^-1 by Cholesky. K33 = 1, skew included.
+    symmetric omega, up to scale; then omega = K^-T K^-1 by Cholesky. K33 = 1.
+
+    Parameters
+    ----------
+    has_skew : whether K12 is free, which takes a third view. False: it is 0, and so is omega12; of a camera that has
+        skew all the rest is then wrong.
 
     Raises
     ------
     ValueError
-        Fewer than three homographies; views that are parallel to each other; or homographies of no camera (omega is not
-        positive definite).
+        Fewer than two homographies, three with skew; views that are parallel to each other; or homographies
+        of no camera (omega is not positive definite).
     """
     H = checked_array("homographies", homographies, 3, 3)
-    if H.ndim != 3 or len(H) < MIN_VIEWS:
+    freedom, least = (5, MIN_VIEWS + 1) if has_skew else (4, MIN_VIEWS)
+    if H.ndim != 3 or len(H) < least:
         n = len(H) if H.ndim == 3 else 1
         raise ValueError(
-            f"expected at least {MIN_VIEWS} views of the plane, got {n}: each gives two equations for the 5 degrees of "
-            "freedom of the absolute conic's image."
+            f"expected at least {least} views of the plane, got {n}: each gives two equations for the {freedom} "
+            "degrees of freedom of the absolute conic's image."
         )
     # pixels about their middle and of size 1, planes of size 1: the equations are then of one size
     corners = H[:, :2, 2] / H[:, 2:, 2]
@@ -88,23 +102,55 @@ def intrinsics_from_homographies(homographies: ArrayLike) -> Array:
     scale = np.linalg.norm(unit[:, :, :2], axis=(1, 2), keepdims=True)
     first, second = ((unit[:, :, :2] / scale)[:, :, k] for k in (0, 1))
     rows = np.concatenate([_conic_row(first, second), _conic_row(first, first) - _conic_row(second, second)])
+    if not has_skew:
+        rows = np.delete(rows, 1, axis=1)
     _, values, axes = np.linalg.svd(rows)
-    if not values[4] > DETERMINED * values[0]:
+    if not values[freedom - 1] > DETERMINED * values[0]:
         raise ValueError(
             f"expected views of the plane under different tilts, got {len(H)} that are nearly parallel to each other: "
             "they do not determine the camera; tilt the board."
         )
-    a, b, c, d, e, f = axes[5]
+    a, b, c, d, e, f = axes[5] if has_skew else np.insert(axes[4], 1, 0.0)
     omega = np.array([[a, b, d], [b, c, e], [d, e, f]])
     omega = omega if omega[0, 0] > 0 else -omega
     if np.linalg.eigvalsh(omega)[0] <= 0:
-        raise ValueError(
+        raise _NoCamera(
             "expected homographies of one camera, got some whose absolute conic is not one (not positive definite): "
             "wrong points, much distortion, or views that differ too little."
         )
     K = np.linalg.inv(np.linalg.cholesky(omega).T)
     K = np.linalg.inv(to_unit) @ (K / K[2, 2])
     return np.asarray(K / K[2, 2])
+
+
+class _NoCamera(ValueError):
+    """The equations of the conic have a solution, which no camera has."""
+
+
+def _starting_intrinsics(homographies: ArrayLike, width: int, height: int) -> list[Intrinsics]:
+    """What bundles start from: the camera of the homographies, unless noise or distortion leaves none; of few views
+    also the one with the principal point in the middle of the image, as noise moves that of the homographies far away.
+    """
+    H = np.asarray(homographies, dtype=np.float64)
+    matrices, none = [], None
+    try:
+        matrices.append(intrinsics_from_homographies(H))
+    except _NoCamera as error:
+        none = error
+    if none is not None or len(H) <= FEW_VIEWS:
+        to_middle = np.array([[1.0, 0, -width / 2], [0, 1.0, -height / 2], [0, 0, 1.0]])
+        centred = to_middle @ H
+        centred = centred / np.linalg.norm(centred[:, :, :2], axis=(1, 2), keepdims=True)
+        first, second = centred[:, :, 0], centred[:, :, 1]
+        rows = np.concatenate([_conic_row(first, second), _conic_row(first, first) - _conic_row(second, second)])
+        # omega = diag(1 / fx^2, 1 / fy^2, 1)
+        inverse_squares = np.linalg.lstsq(rows[:, [0, 2]], -rows[:, 5], rcond=None)[0]
+        if (inverse_squares > 0).all():
+            fx, fy = 1 / np.sqrt(inverse_squares)
+            matrices.append(np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1.0]]))
+    if none is not None and not matrices:
+        raise none
+    return [Intrinsics(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])) for K in matrices]
 
 
 def calibrate_camera(
@@ -120,7 +166,7 @@ def calibrate_camera(
 
     Parameters
     ----------
-    views : of `board.find`, three or more, under different tilts, ten to twenty all over the image for a good one.
+    views : of `board.find`, two or more, under different tilts, ten to twenty all over the image for a good one.
     width, height : of the images, pixels.
     coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for a pinhole.
     names : of the views, for messages; None: their numbers.
@@ -131,7 +177,7 @@ def calibrate_camera(
     Raises
     ------
     ValueError
-        Fewer than three views, one view twice, points outside the image, or views that do not determine the camera.
+        Fewer than two views, one view twice, points outside the image, or views that do not determine the camera.
     """
     names = [f"view {k}" for k in range(len(views))] if names is None else [str(name) for name in names]
     if len(names) != len(views):
@@ -185,13 +231,30 @@ def _calibrated(
                 "another size?"
             )
         homographies.append(plane.matrix)
-    K = intrinsics_from_homographies(homographies)
-    start = Intrinsics(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    starts = _starting_intrinsics(homographies, width, height)
     observations = [Observation(0, k, board.points[view.indices], view.pixels) for k, view in enumerate(views)]
-    bundle = Bundle((start,), np.eye(4), board_poses(start, observations))
-    found, observations = adjust_as_seen(board, bundle, observations, views, coefficients)
+    adjusted = []
+    for start in starts:
+        bundle = Bundle((start,), np.eye(4), board_poses(start, observations))
+        adjusted.append(adjust_as_seen(board, bundle, observations, views, coefficients))
+    found, observations = adjusted[0]
+    for other in adjusted[1:]:
+        if other[0].cost < SAME_MINIMUM * found.cost:
+            found, observations = other
+    _refuse_parallel(found.state.T_first_board)
     noise, deviations = judged(found, observations, says)
     return found, observations, noise, deviations
+
+
+def _refuse_parallel(T_camera_board: Array) -> None:
+    """Raise ValueError if all boards are parallel, whose views give the same two equations, up to distortion."""
+    normals = T_camera_board[:, :3, 2]
+    apart = np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
+    if apart < MIN_APART_DEG:
+        raise ValueError(
+            f"expected views of the plane under different tilts, got {len(normals)} whose boards are within "
+            f"{apart:.2g} degrees of parallel: they do not determine the camera; tilt the board."
+        )
 
 
 def adjust_as_seen(
@@ -224,7 +287,7 @@ def check_views(board: Board, views: Sequence[BoardView], coefficients: int, nam
     """Raise ValueError unless there are enough views of this board, and a number of coefficients from 0 to 5."""
     if len(views) < MIN_VIEWS:
         raise ValueError(
-            f"expected at least {MIN_VIEWS} views of the board, got {len(views)}: each gives two equations for the 5 "
+            f"expected at least {MIN_VIEWS} views of the board, got {len(views)}: each gives two equations for the 4 "
             "degrees of freedom of the absolute conic's image."
         )
     n_points = board.columns * board.rows

@@ -28,7 +28,7 @@ def calibrate_command(
     captures: Annotated[
         list[Path],
         typer.Argument(
-            help="Three or more, each a capture that rangesim wrote or a folder of images; images, for a camera alone.",
+            help="Two or more, each a capture that rangesim wrote or a folder of images; images, for a camera alone.",
             show_default=False,
         ),
     ],
@@ -56,7 +56,7 @@ def calibrate_command(
         int | None, typer.Option(help="Of bare images: depth, if less than the file's, such as 12.")
     ] = None,
 ) -> None:
-    """Calibrate camera and projector from structured light, columns and rows, on a board in three or more poses.
+    """Calibrate camera and projector from structured light, columns and rows, on a board in two or more poses.
 
     Ten to twenty poses all over the image, tilted by 20 to 40 degrees in different directions, make a good one.
 
