@@ -20,6 +20,7 @@ import numpy as np
 from pcgraph.plain_files import DISK, check_file
 from rangesim import limits
 from rangesim.errors import FileFormatError
+from rangesim.files.utf8_names import utf8_name
 from rangesim.settings.config import brief
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".exr")
@@ -59,7 +60,8 @@ def write_grey(path: Path, image: np.ndarray) -> None:
 
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         try:
-            OpenEXR.File(header, {"Y": np.ascontiguousarray(image, dtype=np.float32)}).write(str(path))
+            with utf8_name(path) as name:
+                OpenEXR.File(header, {"Y": np.ascontiguousarray(image, dtype=np.float32)}).write(name)
         except RuntimeError as error:  # OpenEXR's for whatever the system says
             said = next((number for number in DISK if os.strerror(number) in str(error)), errno.EIO)
             raise OSError(said, os.strerror(said), str(path)) from error
@@ -209,7 +211,9 @@ def _open_exr(path: Path) -> None:
     import OpenEXR
 
     pixels = size = 0
-    for part in OpenEXR.File(str(path), header_only=True).parts:
+    with utf8_name(path) as name:
+        parts = OpenEXR.File(name, header_only=True).parts
+    for part in parts:
         low, high = part.header["dataWindow"]
         area = math.prod(max(0, int(b) - int(a) + 1) for a, b in zip(low, high, strict=True))
         pixels, size = max(pixels, area), size + 4 * area * len(part.header["channels"])
@@ -221,7 +225,8 @@ def _read_exr(path: Path) -> np.ndarray:
     import OpenEXR
 
     _open_exr(path)
-    file = OpenEXR.File(str(path), separate_channels=True)
+    with utf8_name(path) as name:
+        file = OpenEXR.File(name, separate_channels=True)
     if not file.parts:
         raise FileFormatError(f"{path} cannot be read as an image: its pixels are damaged or missing.")
     channels = {name: c.pixels for name, c in file.channels().items()}

@@ -70,7 +70,12 @@ def read_record(path: Path, kind: type[R]) -> R:
 
 def write_record(path: Path, record: Record) -> None:
     """Write a record as JSON, indented; `read_record` reads it back equal."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(record), indent=1) + b"\n")
+    try:
+        content = msgspec.json.encode(record)
+    except UnicodeEncodeError:  # a file's name that is no UTF-8: json spells half surrogate pairs out
+        write_json(path, msgspec.to_builtins(record))
+    else:
+        path.write_bytes(msgspec.json.format(content, indent=1) + b"\n")
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

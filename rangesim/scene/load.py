@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -20,6 +19,7 @@ from rangesim.environment.backend import images_can_be_read, select_variant
 from rangesim.errors import FileFormatError
 from rangesim.files.bundled_scenes import CATALOGUE, scene_file
 from rangesim.files.text_files import check_xml
+from rangesim.files.utf8_names import Utf8Names, is_utf8, utf8_names
 from rangesim.rig import Intrinsics, translation
 from rangesim.scene import retroreflector
 from rangesim.scene.camera import camera_of, warn_of_aperture
@@ -146,8 +146,8 @@ def _instantiate(
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = config.merge_equivalent = False  # merged shapes would lose their instance ids
 
-    def parsed(folder: str, advises: bool) -> tuple[Any, set[str], dict[str, str]]:
-        state = _parse(config, source, material, unit_m, Path(folder), advises)
+    def parsed(names: Utf8Names, advises: bool) -> tuple[Any, set[str], dict[str, str]]:
+        state = _parse(config, source, material, unit_m, names, advises)
         mi.file_resolver().prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]  # again: a scene adds paths
         check_types(state, label)
         check_depth(state, label)
@@ -165,23 +165,25 @@ def _instantiate(
         loaded = mi.parser.instantiate(config, state)
         return loaded[0] if isinstance(loaded, list) else loaded
 
-    try:
-        with tempfile.TemporaryDirectory() as folder, _own_file_resolver():
-            state, ids, classes = parsed(folder, advises)
-            place, transform = camera_place(state, sensor), coarsest_transform(state) if advises else None
-            coloured = coloured_materials(state) if advises else []
-            loaded, origin_m = made_of(state), np.zeros(3)
-            if is_far(place) and isinstance(loaded, mi.Scene) and _looks_elsewhere(loaded, sensor, place, label):
-                state, origin_m = parsed(folder, False)[0], place
-                move_to_origin(state, origin_m, label)
-                loaded = made_of(state)
-            mesh = coarsest_mesh(state, loaded) if advises else None
-    except MemoryError:
-        raise FileFormatError(f"{label} does not fit into memory; use smaller meshes and images.") from None
-    except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
-        reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
-        reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)  # of a BSDF in Python
-        raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
+    with utf8_names() as names:
+        try:
+            with _own_file_resolver(names):
+                state, ids, classes = parsed(names, advises)
+                place, transform = camera_place(state, sensor), coarsest_transform(state) if advises else None
+                coloured = coloured_materials(state) if advises else []
+                loaded, origin_m = made_of(state), np.zeros(3)
+                if is_far(place) and isinstance(loaded, mi.Scene) and _looks_elsewhere(loaded, sensor, place, label):
+                    state, origin_m = parsed(names, False)[0], place
+                    move_to_origin(state, origin_m, label)
+                    loaded = made_of(state)
+                mesh = coarsest_mesh(state, loaded) if advises else None
+        except MemoryError:
+            raise FileFormatError(f"{label} does not fit into memory; use smaller meshes and images.") from None
+        except (RuntimeError, TypeError, OverflowError, UnicodeDecodeError) as error:
+            reason = re.sub(r"\[\w+\.cpp:\d+\] ", "", " ".join(str(error).split()))
+            # a traceback is of a BSDF in Python
+            reason = re.sub(r"Traceback \(most recent call last\): .* (?=\w+Error: )", "", reason)
+            raise FileFormatError(f"{label} is no scene Mitsuba can load: {reason}") from error
     warn_of_colours(coloured, label)
     warn_of_coarse_transform(transform, label)
     warn_of_coarse_mesh(mesh, label)
@@ -190,24 +192,24 @@ def _instantiate(
     return loaded, ids, classes, origin_m
 
 
-def _parse(config: Any, source: Source, material: str, unit_m: float, folder: Path, advises: bool) -> Any:
+def _parse(config: Any, source: Source, material: str, unit_m: float, names: Utf8Names, advises: bool) -> Any:
     if isinstance(source, Mapping):
         check_dictionary(source, "the scene dictionary")
         return mi.parser.parse_dict(config, dict(source))
     path = scene_file(source)
     if _is_mesh(path):
-        return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, folder, advises))
+        return mi.parser.parse_dict(config, scene_around_mesh(path, material, unit_m, names.folder, advises))
     if path.suffix.lower() != ".xml":
         raise FileFormatError(f"expected a scene (.xml) or a mesh ({', '.join(MESH_SUFFIXES)}), got {path}.")
     resolver = mi.file_resolver()
-    resolver.prepend(str(path.resolve().parent))  # type: ignore[attr-defined]
-    resolver.append(str(CATALOGUE))  # type: ignore[attr-defined]
+    resolver.prepend(str(names.of(path.resolve().parent)))  # type: ignore[attr-defined]
+    resolver.append(str(names.of(CATALOGUE)))  # type: ignore[attr-defined]
     try:
         fillers = check_xml(path, _SearchPaths(resolver), IGNORED_ELEMENTS)
     except FileFormatError as error:
         raise FileFormatError(f"{path} is no scene Mitsuba can load: {error}") from error
     try:
-        return mi.parser.parse_file(config, str(path), **fillers)
+        return mi.parser.parse_file(config, str(names.of(path)), **fillers)
     except RuntimeError as error:
         if (missing := re.search(r"undefined parameter: \$(\w+)", str(error))) is None:
             raise
@@ -235,11 +237,15 @@ class _SearchPaths:
 
 
 @contextmanager
-def _own_file_resolver() -> Iterator[None]:
+def _own_file_resolver(names: Utf8Names) -> Iterator[None]:
     """Search paths of this scene, forgotten afterwards, so that no scene finds another's files."""
     before = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(before))
-    mi.file_resolver().prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]
+    resolver = mi.file_resolver()
+    here = os.path.realpath(os.curdir)
+    if not is_utf8(here):  # Mitsuba has it among its paths, and can find files there, but not say where they are
+        resolver.prepend(str(names.of(Path(here))))  # type: ignore[attr-defined]
+    resolver.prepend(str(OF_MITSUBA))  # type: ignore[attr-defined]
     try:
         yield
     finally:

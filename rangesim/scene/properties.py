@@ -20,6 +20,7 @@ from rangesim import limits
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import check_pixels
 from rangesim.files.text_files import is_nested_deeper
+from rangesim.files.utf8_names import is_utf8
 from rangesim.scene.mesh_files import check_ply, check_serialized
 from rangesim.scene.nodes import check_type, named_file
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds
@@ -130,6 +131,11 @@ def check_dictionary(scene: Any, label: str) -> None:
             elif value is None or (isinstance(value, int) and abs(value) >= 1 << 63):
                 name = f"{place}{key}"[-200:]
                 raise FileFormatError(f"{label}: expected {name} to be a value of 64 bits, got {shown(value)}.")
+            elif isinstance(value, str) and not is_utf8(value):
+                name = f"{place}{key}"[-200:]
+                raise FileFormatError(
+                    f"{label}: expected {name} in UTF-8, got {shown(value)}; name a link to that file instead."
+                )
             if not isinstance(key, str):
                 raise FileFormatError(f"{label}: expected names as keys, got {shown(key)}.")
             if key == "type" and isinstance(value, str):
