@@ -156,6 +156,37 @@ def test_the_verdict_says_what_the_rows_say() -> None:
     assert "Smallest median error" not in verdict([good, poor])[-1].text  # on the few pixels that are left
 
 
+def _side_by_side(*measurements: Any) -> str:
+    return verdict(list(measurements))[-1].text
+
+
+def test_side_by_side_ranks_by_right_readings() -> None:
+    """The one that measures everywhere, but wrong, was "most complete" at 97.0 %; it reads half of the pixels right."""
+    wrong = _measured("amcw", 0.97, 5e-3, 0.4, acquisition_s=0.1, failed=0.5)
+    right = _measured("lines", 0.9, 1e-3, 0.01, acquisition_s=0.2, failed=0.12)
+    fair = _measured("histogram", 0.95, 2e-3, 0.1, acquisition_s=0.3, failed=0.15)
+    best, against = (
+        "Most right readings, to 10\xa0mm: Structured light, 88.0\xa0% of the pixels",
+        "50.0\xa0% of the pixels",
+    )
+    for two in ([wrong, right], [right, wrong]):
+        assert f"{best} (against {against})." in _side_by_side(*two)
+    assert f"{best} (next: Time of flight (direct), 85.0\xa0% of the pixels)." in _side_by_side(wrong, fair, right)
+    assert "97.0" not in _side_by_side(wrong, right)
+    assert "right readings" not in _side_by_side(right, _measured("amcw", 0.97, 5e-3, 0.4, 0.1, failed=0.12))
+    assert "right readings" not in _side_by_side(right, _measured("amcw", 0.97, 5e-3, 0.4, 0.1, failed=None))
+
+
+def test_no_measurement_is_bold_for_being_there() -> None:
+    wrong = _measured("amcw", 0.97, 5e-3, 0.4, acquisition_s=0.1)
+    right = _measured("lines", 0.9, 1e-3, 0.01, acquisition_s=0.2)
+    (_, lines), *_ = tables.comparison_table([wrong, right])
+    bold = {
+        name: [c.title for c, cell in zip(tables.COLUMNS, cells, strict=True) if cell.best] for name, cells in lines
+    }
+    assert bold == {"amcw": [], "lines": ["median error", "95\xa0% within", "outliers"]}
+
+
 def test_no_bold_where_a_sensor_is_unreliable() -> None:
     good = _measured("lines", 0.99, 5e-3, 0.01, acquisition_s=0.2)
     fair = _measured("histogram", 0.9, 6e-3, 0.02, acquisition_s=0.2)
@@ -169,7 +200,9 @@ def test_no_bold_where_a_sensor_is_unreliable() -> None:
     assert bold(good, few) == []
 
 
-def _measured(sensor: str, complete: float, median: float, outliers: float, acquisition_s: float) -> Any:
+def _measured(
+    sensor: str, complete: float, median: float, outliers: float, acquisition_s: float, failed: float | None = 0.05
+) -> Any:
     row: dict[str, Any] = {
         "completeness": complete,
         "median_abs_m": median,
@@ -177,7 +210,7 @@ def _measured(sensor: str, complete: float, median: float, outliers: float, acqu
         "outlier_rate": outliers,
     }
     row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
-    row |= {"failed": 0.05, "causes": {"multipath": 0.04, "low_signal": 0.01}}
+    row |= {"failed": failed, "causes": {"multipath": 0.8 * failed, "low_signal": 0.2 * failed} if failed else {}}
     rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
     metadata = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
     return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, metadata=metadata)
