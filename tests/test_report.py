@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from browser import browser
+from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
 from small_result import SENSORS, small_result
 
@@ -273,6 +273,53 @@ def test_slider_mouse_and_wheel_work(tmp_path: Path) -> None:
         page.mouse("mouseWheel", page.place("canvas.cloud"), deltaX=0, deltaY=-300)
         page.wait_for("page.view.zoom > 1")
         assert page.evaluate("page.view.zoom") == pytest.approx(np.exp(0.45))
+
+
+CLOUD = """(() => { const one = document.querySelectorAll("canvas.cloud")[%d], copy = document.createElement("canvas");
+    copy.width = one.width; copy.height = one.height;
+    const context = copy.getContext("2d"); context.drawImage(one, 0, 0);
+    return [one.height, one.width, ...context.getImageData(0, 0, one.width, one.height).data]; })()"""
+
+
+def _clouds(folder: Path, options: tuple[str, ...], state: str) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """(h, w, 3) colours of each cloud, and what the page says."""
+    folder.mkdir()
+    with browser(folder, options) as page:
+        page.open(small_result() / "report.html", state)
+        clouds = []
+        for i in range(len(SENSORS)):
+            height, width, *pixels = page.evaluate(CLOUD % i)
+            clouds.append(np.array(pixels, float).reshape(height, width, 4)[..., :3])
+        page.drag("canvas.cloud", 50)
+        notes = "[...document.querySelectorAll('canvas.%s + .note')].map((n) => n.textContent)"
+        return clouds, {
+            "errors": page.said,
+            "turning": page.evaluate("document.querySelector('#turning').textContent"),
+            "yaw": page.evaluate("page.view.yaw"),
+            "points": page.evaluate(notes % "cloud"),
+            "segments": page.evaluate(notes % "labels"),
+        }
+
+
+@needs_browser
+@pytest.mark.parametrize("mode", ["intensity", "error", "segments"])
+def test_without_webgl_the_clouds_are_still_pictures(tmp_path: Path, mode: str) -> None:
+    """The same pictures as WebGL draws, with all captions, a sentence and no uncaught error."""
+    still, said = _clouds(tmp_path / "without", WITHOUT_WEBGL, f"color={mode}")
+    drawn, usual = _clouds(tmp_path / "with", OPTIONS, f"color={mode}")
+    assert said["errors"] == usual["errors"] == []
+    assert said["turning"].startswith("This browser has no WebGL")
+    assert usual["turning"].startswith("Drag to turn")
+    assert said["yaw"] == -0.45 < usual["yaw"]
+    assert [said["points"], said["segments"]] == [usual["points"], usual["segments"]]
+    assert all(re.match(r"[\d,]+ points", note) for note in said["points"])
+    for one, other in zip(still, drawn, strict=True):
+        assert one.shape == other.shape
+        ground = [(np.abs(picture - CANVAS) <= 2).all(axis=2) for picture in (one, other)]
+        assert (ground[0] == ground[1]).mean() > 0.97
+        np.testing.assert_allclose(one.mean(axis=(0, 1)), other.mean(axis=(0, 1)), atol=3)
+        if mode != "error":  # of neighbours whose errors differ, chance says which is in front
+            assert (np.abs(one - other).max(axis=2) < 24).mean() > 0.9
 
 
 def _browse(folder: Path, state: str, *options: str, console: bool = True, path: Path | None = None) -> str:
