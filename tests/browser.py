@@ -20,6 +20,7 @@ from rangesim.environment.doctor import find_browser
 BROWSER = find_browser()
 QUIET = ("disable-background-networking", "disable-component-update", "disable-sync", "no-first-run", "no-sandbox")
 OPTIONS = (*QUIET, "disable-gpu", "use-angle=swiftshader", "enable-unsafe-swiftshader", "hide-scrollbars")
+WITHOUT_WEBGL = (*QUIET, "disable-gpu", "disable-3d-apis", "hide-scrollbars")
 WATCH = """
 window.violations = [];
 addEventListener("securitypolicyviolation", (e) => violations.push(`${e.effectiveDirective} ${e.blockedURI}`));
@@ -132,14 +133,14 @@ class Page:
 
 
 @contextmanager
-def browser(folder: Path) -> Iterator[Page]:
+def browser(folder: Path, options: tuple[str, ...] = OPTIONS) -> Iterator[Page]:
     """A page in a browser of its own, whose profile is in `folder`; it ends with the block."""
     assert BROWSER is not None
     theirs_in, commands = os.pipe()
     answers, theirs_out = os.pipe()
     command = [sys.executable, "-c", LAUNCHER, str(theirs_in), str(theirs_out), BROWSER]
     command += ["--headless", "--remote-debugging-pipe"]
-    command += [*(f"--{o}" for o in OPTIONS), f"--user-data-dir={folder / 'profile'}", "--window-size=1280,1000"]
+    command += [*(f"--{o}" for o in options), f"--user-data-dir={folder / 'profile'}", "--window-size=1280,1000"]
     with (folder / "browser.log").open("w") as log:
         process = subprocess.Popen(command, pass_fds=(theirs_in, theirs_out), stdout=log, stderr=log)
         os.close(theirs_in)

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from browser import browser
+from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
 from small_result import SENSORS, small_result
 
@@ -156,6 +156,37 @@ def test_the_verdict_says_what_the_rows_say() -> None:
     assert "Smallest median error" not in verdict([good, poor])[-1].text  # on the few pixels that are left
 
 
+def _side_by_side(*measurements: Any) -> str:
+    return verdict(list(measurements))[-1].text
+
+
+def test_side_by_side_ranks_by_right_readings() -> None:
+    """The one that measures everywhere, but wrong, was "most complete" at 97.0 %; it reads half of the pixels right."""
+    wrong = _measured("amcw", 0.97, 5e-3, 0.4, acquisition_s=0.1, failed=0.5)
+    right = _measured("lines", 0.9, 1e-3, 0.01, acquisition_s=0.2, failed=0.12)
+    fair = _measured("histogram", 0.95, 2e-3, 0.1, acquisition_s=0.3, failed=0.15)
+    best, against = (
+        "Most right readings, to 10\xa0mm: Structured light, 88.0\xa0% of the pixels",
+        "50.0\xa0% of the pixels",
+    )
+    for two in ([wrong, right], [right, wrong]):
+        assert f"{best} (against {against})." in _side_by_side(*two)
+    assert f"{best} (next: Time of flight (direct), 85.0\xa0% of the pixels)." in _side_by_side(wrong, fair, right)
+    assert "97.0" not in _side_by_side(wrong, right)
+    assert "right readings" not in _side_by_side(right, _measured("amcw", 0.97, 5e-3, 0.4, 0.1, failed=0.12))
+    assert "right readings" not in _side_by_side(right, _measured("amcw", 0.97, 5e-3, 0.4, 0.1, failed=None))
+
+
+def test_no_measurement_is_bold_for_being_there() -> None:
+    wrong = _measured("amcw", 0.97, 5e-3, 0.4, acquisition_s=0.1)
+    right = _measured("lines", 0.9, 1e-3, 0.01, acquisition_s=0.2)
+    (_, lines), *_ = tables.comparison_table([wrong, right])
+    bold = {
+        name: [c.title for c, cell in zip(tables.COLUMNS, cells, strict=True) if cell.best] for name, cells in lines
+    }
+    assert bold == {"amcw": [], "lines": ["median error", "95\xa0% within", "outliers"]}
+
+
 def test_no_bold_where_a_sensor_is_unreliable() -> None:
     good = _measured("lines", 0.99, 5e-3, 0.01, acquisition_s=0.2)
     fair = _measured("histogram", 0.9, 6e-3, 0.02, acquisition_s=0.2)
@@ -169,7 +200,9 @@ def test_no_bold_where_a_sensor_is_unreliable() -> None:
     assert bold(good, few) == []
 
 
-def _measured(sensor: str, complete: float, median: float, outliers: float, acquisition_s: float) -> Any:
+def _measured(
+    sensor: str, complete: float, median: float, outliers: float, acquisition_s: float, failed: float | None = 0.05
+) -> Any:
     row: dict[str, Any] = {
         "completeness": complete,
         "median_abs_m": median,
@@ -177,7 +210,7 @@ def _measured(sensor: str, complete: float, median: float, outliers: float, acqu
         "outlier_rate": outliers,
     }
     row |= {column.key: None for column in tables.COLUMNS if column.key not in row}
-    row |= {"failed": 0.05, "causes": {"multipath": 0.04, "low_signal": 0.01}}
+    row |= {"failed": failed, "causes": {"multipath": 0.8 * failed, "low_signal": 0.2 * failed} if failed else {}}
     rows: list[dict[str, Any]] = [{"material": name, **row} for name in ("glossy", "all")]
     metadata = SimpleNamespace(acquisition_s=acquisition_s, frames=10)
     return SimpleNamespace(name=sensor, capture=SimpleNamespace(sensor=SENSORS[sensor]), rows=rows, metadata=metadata)
@@ -240,6 +273,53 @@ def test_slider_mouse_and_wheel_work(tmp_path: Path) -> None:
         page.mouse("mouseWheel", page.place("canvas.cloud"), deltaX=0, deltaY=-300)
         page.wait_for("page.view.zoom > 1")
         assert page.evaluate("page.view.zoom") == pytest.approx(np.exp(0.45))
+
+
+CLOUD = """(() => { const one = document.querySelectorAll("canvas.cloud")[%d], copy = document.createElement("canvas");
+    copy.width = one.width; copy.height = one.height;
+    const context = copy.getContext("2d"); context.drawImage(one, 0, 0);
+    return [one.height, one.width, ...context.getImageData(0, 0, one.width, one.height).data]; })()"""
+
+
+def _clouds(folder: Path, options: tuple[str, ...], state: str) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """(h, w, 3) colours of each cloud, and what the page says."""
+    folder.mkdir()
+    with browser(folder, options) as page:
+        page.open(small_result() / "report.html", state)
+        clouds = []
+        for i in range(len(SENSORS)):
+            height, width, *pixels = page.evaluate(CLOUD % i)
+            clouds.append(np.array(pixels, float).reshape(height, width, 4)[..., :3])
+        page.drag("canvas.cloud", 50)
+        notes = "[...document.querySelectorAll('canvas.%s + .note')].map((n) => n.textContent)"
+        return clouds, {
+            "errors": page.said,
+            "turning": page.evaluate("document.querySelector('#turning').textContent"),
+            "yaw": page.evaluate("page.view.yaw"),
+            "points": page.evaluate(notes % "cloud"),
+            "segments": page.evaluate(notes % "labels"),
+        }
+
+
+@needs_browser
+@pytest.mark.parametrize("mode", ["intensity", "error", "segments"])
+def test_without_webgl_the_clouds_are_still_pictures(tmp_path: Path, mode: str) -> None:
+    """The same pictures as WebGL draws, with all captions, a sentence and no uncaught error."""
+    still, said = _clouds(tmp_path / "without", WITHOUT_WEBGL, f"color={mode}")
+    drawn, usual = _clouds(tmp_path / "with", OPTIONS, f"color={mode}")
+    assert said["errors"] == usual["errors"] == []
+    assert said["turning"].startswith("This browser has no WebGL")
+    assert usual["turning"].startswith("Drag to turn")
+    assert said["yaw"] == -0.45 < usual["yaw"]
+    assert [said["points"], said["segments"]] == [usual["points"], usual["segments"]]
+    assert all(re.match(r"[\d,]+ points", note) for note in said["points"])
+    for one, other in zip(still, drawn, strict=True):
+        assert one.shape == other.shape
+        ground = [(np.abs(picture - CANVAS) <= 2).all(axis=2) for picture in (one, other)]
+        assert (ground[0] == ground[1]).mean() > 0.97
+        np.testing.assert_allclose(one.mean(axis=(0, 1)), other.mean(axis=(0, 1)), atol=3)
+        if mode != "error":  # of neighbours whose errors differ, chance says which is in front
+            assert (np.abs(one - other).max(axis=2) < 24).mean() > 0.9
 
 
 def _browse(folder: Path, state: str, *options: str, console: bool = True, path: Path | None = None) -> str:

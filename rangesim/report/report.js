@@ -125,7 +125,8 @@ class Page {
     this.mode = "intensity";
     this.levels = new Levels(DATA.instruments.map((one) => one.segmentation).filter(Boolean));
     this.view = { ...START, depth: this.middle(), changed: () => this.redraw() };
-    this.clouds = all("canvas.cloud").map((c) => new CloudView(c, this.of(c), this.of(c).z, this.view));
+    this.clouds = all("canvas.cloud").map((c) => cloudView(c, this.of(c), this.of(c).z, this.view));
+    if (this.clouds.some((cloud) => cloud instanceof StillView)) this.sayStill();
     $("level").addEventListener("input", () => { this.setMode("segments"); this.setAltitude(this.levels.altitude(+$("level").value)); });
     all("input[name=mode]").forEach((input) => input.addEventListener("change", () => { this.setMode(input.value); this.paint(); }));
     $("reset").addEventListener("click", () => { Object.assign(this.view, START); this.redraw(); });
@@ -134,6 +135,11 @@ class Page {
       map.addEventListener("pointermove", (e) => this.probe(map, e));
       map.addEventListener("pointerleave", () => all(".map i").forEach((dot) => { dot.style.display = "none"; }));
     });
+  }
+
+  sayStill() {
+    $("turning").textContent = "This browser has no WebGL, so the clouds are still pictures: their colours change, but they do not turn.";
+    $("reset").hidden = true;
   }
 
   of(element) { return DATA.instruments[+element.dataset.instrument]; }

@@ -25,7 +25,7 @@ UNRELIABLE = 0.5
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the comparison. better : "high", "low", "near zero" or "" if no value is better than another."""
+    """A column of the comparison. better : "low", "near zero" or "" if no value is better than another."""
 
     key: str
     title: str
@@ -40,7 +40,7 @@ COLUMNS = (
         "complete",
         "%",
         "fraction of the pixels that the emitter lights which have a measurement",
-        "high",
+        "",  # a wrong reading completes nothing
     ),
     Column("bias_m", "bias", "mm", "mean of measured minus true z; positive is too far", "near zero"),
     Column("median_abs_m", "median error", "mm", "median of |z − true z|"),
@@ -238,9 +238,9 @@ def settings_line(experiment: Experiment, width: int, height: int) -> str:
 
 def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
     values = [row[column.key] for row in rows if row[column.key] is not None]
-    if len(rows) < 2 or not values:
+    if len(rows) < 2 or not values or not column.better:
         return None
-    return float(max(values) if column.better == "high" else min(values, key=abs))
+    return float(min(values, key=abs))
 
 
 def _cell(column: Column, value: float | None, best: float | None, rival: bool) -> Cell:

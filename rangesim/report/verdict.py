@@ -38,7 +38,7 @@ def verdict(measurements: Sequence[Measurement]) -> list[Finding]:
     real = [m for m in measurements if not is_reference(m)] or list(measurements)
     findings = [Finding(names[m.name], f"{_accuracy(m.rows)}{_failures(m.rows)}{_reasons(m.rows)}") for m in real]
     if len(real) > 1:
-        parts = [_best_error(real, names), _most_complete(real, names), _shortest_exposure(real, names)]
+        parts = [_best_error(real, names), _most_right(real, names), _shortest_exposure(real, names)]
         findings.append(Finding("Side by side", " ".join(filter(None, parts))))
     return findings
 
@@ -92,9 +92,12 @@ def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
     return _ranked("Smallest median error", [(name, _mm(e)) for e, name in errors])
 
 
-def _most_complete(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    fractions = [(_total(m.rows)["completeness"], names[m.name]) for m in real if _total(m.rows)["completeness"]]
-    return _ranked("Most complete", [(name, _percent(s)) for s, name in sorted(fractions, reverse=True)])
+def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
+    """By the pixels with a right reading: who measures everywhere, but wrong, is not complete."""
+    failed = [(_total(m.rows)["failed"], names[m.name]) for m in real if _total(m.rows)["failed"] is not None]
+    limit = _glued(f"{1e3 * OUTLIER_M:g} mm")
+    entries = [(name, f"{_percent(1.0 - f)} of the pixels") for f, name in sorted(failed)]
+    return _ranked(f"Most right readings, to {limit}", entries)
 
 
 def _shortest_exposure(real: Sequence[Measurement], names: dict[str, str]) -> str:

@@ -1,5 +1,5 @@
 "use strict";
-// Point clouds in WebGL: one canvas per sensor, one view for all of them.
+// Point clouds: one canvas per sensor, one view for all of them; in WebGL, or as still pictures where there is none.
 
 const VERTEX = `
 attribute vec3 position; attribute vec3 color;
@@ -18,6 +18,7 @@ const FRAGMENT = `
 precision mediump float; varying vec3 tint;
 void main() { gl_FragColor = vec4(tint, 1.0); }`;
 
+const BACKGROUND = [16, 21, 29];
 const START = { yaw: -0.45, pitch: 0.22, zoom: 1, shift: [0, 0] };
 
 // Positions (3 per point; x right, y up, z towards the viewer, metres) and the pixel of each, of a depth image.
@@ -37,34 +38,107 @@ function unproject(instrument, z) {
   return { positions, pixels };
 }
 
-class CloudView {
+// Focal length over half the height, of the camera's own field of view.
+function focalOf(camera, height) { return 2 * camera[1] / height; }
+
+// Pixels that a point at its own distance covers, on a canvas of a height.
+function pointSize(camera, focal, height) { return 1.35 * focal * height / 2 / camera[1]; }
+
+// Turn about the centre at depth d, step back, project; column-major.
+function projection(view, focal, aspect) {
+  const { yaw, pitch, zoom, shift, depth } = view;
+  const [sy, cy, sp, cp] = [Math.sin(yaw), Math.cos(yaw), Math.sin(pitch), Math.cos(pitch)];
+  const r = [[cy, 0, sy], [sp * sy, cp, -sp * cy], [-cp * sy, sp, cp * cy]];
+  const back = depth * 1.12 / zoom, near = 0.02 * back, far = back + 20 * depth;
+  const t = [shift[0] * back + r[0][2] * depth, shift[1] * back + r[1][2] * depth, r[2][2] * depth - back];
+  const a = (far + near) / (near - far), b = 2 * far * near / (near - far);
+  const columns = [];
+  for (let j = 0; j < 4; j++) {
+    const [x, y, z] = j < 3 ? [r[0][j], r[1][j], r[2][j]] : t;
+    columns.push(focal / aspect * x, focal * y, a * z + (j === 3 ? b : 0), -z);
+  }
+  return new Float32Array(columns);
+}
+
+// The canvas as large as it is shown; its size in pixels.
+function fit(canvas) {
+  const ratio = Math.min(window.devicePixelRatio || 1, 2);
+  const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+  if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  return [width, height];
+}
+
+// WebGL of a canvas with the program of the clouds; null where the browser or its driver has none.
+function openWebGL(canvas) {
+  const gl = canvas.getContext("webgl", { antialias: true, preserveDrawingBuffer: true });
+  if (!gl) return null;
+  const program = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) return null;
+  gl.useProgram(program);
+  gl.enable(gl.DEPTH_TEST);
+  gl.clearColor(...BACKGROUND.map((c) => c / 255), 1);
+  return { gl, program };
+}
+
+// A cloud that turns, or a still picture of it.
+function cloudView(canvas, instrument, z, view) {
+  const opened = openWebGL(canvas);
+  if (opened) return new CloudView(canvas, instrument, z, view, opened);
+  const fresh = canvas.cloneNode();  // one that has tried WebGL may refuse to be drawn on otherwise
+  canvas.replaceWith(fresh);
+  return new StillView(fresh, instrument, z, view);
+}
+
+// A cloud from where the view starts, drawn without WebGL.
+class StillView {
   constructor(canvas, instrument, z, view) {
-    this.canvas = canvas;
-    this.view = view;
-    this.camera = instrument.camera;
-    this.height = instrument.height;
-    Object.assign(this, unproject(instrument, z));
-    const gl = this.gl = canvas.getContext("webgl", { antialias: true, preserveDrawingBuffer: true });
-    if (!gl) throw new Error("this browser has no WebGL, so there are no point clouds to turn");
-    this.program = this.link();
-    this.fill("position", this.positions, gl.FLOAT, false);
-    this.follow();
+    Object.assign(this, { canvas, view, camera: instrument.camera, height: instrument.height }, unproject(instrument, z));
+    canvas.classList.add("still");
   }
 
-  link() {
-    const gl = this.gl, program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source);
-      gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-      gl.attachShader(program, shader);
+  // colors: RGB bytes per pixel of the image
+  paint(colors) { this.colors = colors; }
+
+  draw() {
+    const [width, height] = fit(this.canvas);
+    if (!(width && height)) return;
+    const focal = focalOf(this.camera, this.height), size = pointSize(this.camera, focal, height);
+    const m = projection(this.view, focal, width / height), positions = this.positions;
+    const context = this.canvas.getContext("2d"), image = context.createImageData(width, height);
+    const nearest = new Float32Array(width * height).fill(Infinity), shown = new Uint32Array(image.data.buffer);
+    const color = (r, g, b) => new Uint32Array(new Uint8Array([r, g, b, 255]).buffer)[0];
+    shown.fill(color(...BACKGROUND));
+    for (let k = 0; k < this.pixels.length; k++) {
+      const [x, y, z] = positions.subarray(3 * k, 3 * k + 3), w = m[3] * x + m[7] * y + m[11] * z + m[15];
+      if (w <= 0) continue;
+      const side = Math.max(1, Math.min(24, size * -z / w)), depth = w * (0.995 + 0.01 * (k * 0.618033988749895 % 1));
+      const left = (0.5 + 0.5 * (m[0] * x + m[4] * y + m[8] * z + m[12]) / w) * width - side / 2;
+      const top = (0.5 - 0.5 * (m[1] * x + m[5] * y + m[9] * z + m[13]) / w) * height - side / 2;
+      const rgb = color(...this.colors.subarray(3 * this.pixels[k], 3 * this.pixels[k] + 3));
+      for (let j = Math.max(0, Math.round(top)); j < Math.min(height, Math.round(top + side)); j++) {
+        for (let i = Math.max(0, Math.round(left)); i < Math.min(width, Math.round(left + side)); i++) {
+          if (depth >= nearest[j * width + i]) continue;
+          nearest[j * width + i] = depth;
+          shown[j * width + i] = rgb;
+        }
+      }
     }
-    gl.linkProgram(program);
-    gl.useProgram(program);
-    gl.enable(gl.DEPTH_TEST);
-    gl.clearColor(0.063, 0.082, 0.114, 1);
-    return program;
+    context.putImageData(image, 0, 0);
+  }
+}
+
+class CloudView {
+  constructor(canvas, instrument, z, view, opened) {
+    Object.assign(this, { canvas, view, camera: instrument.camera, height: instrument.height }, opened, unproject(instrument, z));
+    this.fill("position", this.positions, this.gl.FLOAT, false);
+    this.follow();
   }
 
   fill(name, data, type, normalised) {
@@ -90,31 +164,13 @@ class CloudView {
   }
 
   draw() {
-    const gl = this.gl, ratio = Math.min(window.devicePixelRatio || 1, 2), canvas = this.canvas;
-    const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
-    if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+    const gl = this.gl, [width, height] = fit(this.canvas);
     gl.viewport(0, 0, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const focal = 2 * this.camera[1] / this.height;  // the camera's own field of view
-    gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "matrix"), false, this.matrix(focal, width / height));
-    gl.uniform1f(gl.getUniformLocation(this.program, "size"), 1.35 * focal * height / 2 / this.camera[1]);
+    const focal = focalOf(this.camera, this.height);
+    gl.uniformMatrix4fv(gl.getUniformLocation(this.program, "matrix"), false, projection(this.view, focal, width / height));
+    gl.uniform1f(gl.getUniformLocation(this.program, "size"), pointSize(this.camera, focal, height));
     gl.drawArrays(gl.POINTS, 0, this.pixels.length);
-  }
-
-  // Turn about the centre at depth d, step back, project; column-major.
-  matrix(focal, aspect) {
-    const { yaw, pitch, zoom, shift, depth } = this.view;
-    const [sy, cy, sp, cp] = [Math.sin(yaw), Math.cos(yaw), Math.sin(pitch), Math.cos(pitch)];
-    const r = [[cy, 0, sy], [sp * sy, cp, -sp * cy], [-cp * sy, sp, cp * cy]];
-    const back = depth * 1.12 / zoom, near = 0.02 * back, far = back + 20 * depth;
-    const t = [shift[0] * back + r[0][2] * depth, shift[1] * back + r[1][2] * depth, r[2][2] * depth - back];
-    const a = (far + near) / (near - far), b = 2 * far * near / (near - far);
-    const columns = [];
-    for (let j = 0; j < 4; j++) {
-      const [x, y, z] = j < 3 ? [r[0][j], r[1][j], r[2][j]] : t;
-      columns.push(focal / aspect * x, focal * y, a * z + (j === 3 ? b : 0), -z);
-    }
-    return new Float32Array(columns);
   }
 
   follow() {
