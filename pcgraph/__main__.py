@@ -6,12 +6,12 @@ from __future__ import annotations
 
 def main() -> None:
     """Run the command line."""
-    from pcgraph.interrupts import end_on_signals
+    from pcgraph.interrupts import end_on_signals, run
 
     end_on_signals("pcgraph", writes=True)
-    from pcgraph.cli import main as run
+    from pcgraph.cli import main as command
 
-    run()
+    run(command)
 
 
 if __name__ == "__main__":

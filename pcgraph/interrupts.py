@@ -6,6 +6,9 @@ import half done, by a compiler that calls back, by a destructor. So the handler
 waits for the signal's number on a pipe (`signal.set_wakeup_fd`) ends the process: also while the main thread is busy in
 compiled code that has let go of the interpreter.
 
+A process that has ended its work leaves at once: Python's own end, up to half a second for large libraries, gives the
+handlers up first, and a signal then would kill without a word.
+
 Only the standard library is imported, so that this can come before every other import.
 """
 
@@ -24,6 +27,8 @@ handled = False
 """Whether a thread of this module ends the process on a signal, whatever the others do."""
 removers: list[Callable[[], bool]] = []
 """Of work in progress, called before the process ends, the last one first: each says whether there was any."""
+LOST_OUTPUT = 120
+"""Status of a command whose last words nobody could read, as Python's own."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 
@@ -41,7 +46,7 @@ def end_on_signals(program: str, writes: bool) -> None:
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup and the like
             signal.signal(number, lambda *_: None)
-    atexit.register(_stay)
+    atexit.register(_leave)  # before anybody else, so that it comes last
     global handled
     handled = True
     threading.Thread(target=_wait, args=(reader, os.dup(2), program, writes), name="interrupts", daemon=True).start()
@@ -60,7 +65,23 @@ def _open_standard_streams() -> None:
         sys.stderr = os.fdopen(2, "w", closefd=False)
 
 
+def run(command: Callable[[], None]) -> None:
+    """Run a command, the last thing that a process does: how it ends is how the process ends."""
+    global _status
+    try:
+        command()
+        _status = 0
+    except SystemExit as end:
+        if end.code is None or isinstance(end.code, int):  # else Python prints it
+            _status = end.code or 0
+        raise
+
+
 _ending = threading.Event()
+_end_lock = threading.Lock()
+"""Held by whoever ends the process: the thread that waits for signals, or the main thread."""
+_status: int | None = None
+"""Of the process once its command has ended; None: not yet, or by an error that Python has to print."""
 _written = 0
 
 
@@ -81,8 +102,21 @@ def holding(lock: threading.RLock) -> Iterator[None]:
             lock.release()
 
 
-def _stay() -> None:
-    """Keep the main thread, whose work has just been taken away, from ending the process with an error of its own."""
+def _leave() -> None:
+    """End the process, if its command has ended and no signal has come; wait if one has.
+
+    What else was registered with `atexit` has run by now. The main thread of a command that is interrupted fails, as
+    its work is taken away: it must not end the process with an error of its own.
+    """
+    status = _status
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):  # nobody reads any more, or the disk is full
+            status = status or LOST_OUTPUT
+    with _end_lock:
+        if status is not None and not _ending.is_set():
+            os._exit(status & 0xFF)
     while _ending.is_set():
         time.sleep(1.0)
 
@@ -96,8 +130,9 @@ def _wait(reader: int, screen: int, program: str, writes: bool) -> None:
 
 def _end(number: int, screen: int, program: str, writes: bool) -> None:
     """End the process. `screen` is what stderr was at the start: another may stand there to keep libraries quiet."""
-    try:
+    with _end_lock:
         _ending.set()
+    try:
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
         clear = "\r\x1b[2K\x1b[?25h" if os.isatty(screen) else ""  # a progress bar hides the cursor

@@ -7,45 +7,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from numba import config, njit
-from numba.core.caching import FunctionCache
+from numba import config
 
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """Numba's cache of a compiled function; empty where it names classes that are no more, as after an update.
-
-    What was compiled is kept by function and line, and read before it is asked whether the file has changed since.
-    """
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        try:
-            return super().load_overload(sig, target_context)
-        except (AttributeError, ImportError):
-            self._forget()
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        try:
-            super().save_overload(sig, data)
-        except (AttributeError, ImportError):
-            self._forget()
-            super().save_overload(sig, data)
-
-    def _forget(self) -> None:
-        with self._guard_against_spurious_io_errors():
-            self.flush()
+from pcgraph.kernel_cache import cached_njit
 
 
 def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """A decorator of compiled functions that are kept on disk."""
-
-    def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)(function)
-        if not config.DISABLE_JIT:
-            dispatcher._cache = _Cache(function)
-        return dispatcher
-
-    return decorate
+    return cached_njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)
 
 
 kernel = _compiled()

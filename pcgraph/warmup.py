@@ -36,6 +36,7 @@ from pcgraph.graph.bridges import bridges
 from pcgraph.graph.continuations import continuations
 from pcgraph.graph.gaps import gaps
 from pcgraph.inputs import Pixels, clean_cloud
+from pcgraph.kernel_cache import is_sound
 from pcgraph.pixels import even_steps
 from pcgraph.supervoxels import clustering
 from pcgraph.supervoxels.surface_growth import SurfaceGrowth
@@ -230,12 +231,11 @@ def _is_cached(kernel: Any) -> bool:
     try:
         written = Path(source.co_filename).stat().st_mtime
         names = Path(kernel.stats.cache_path).glob(f"*.{source.co_name}-{source.co_firstlineno}.*.nbi")
-        return any(name.stat().st_mtime >= written and _version_of(name) == numba.__version__ for name in names)
-    except (
-        OSError,
-        EOFError,
-        pickle.UnpicklingError,
-    ):  # the source is no plain file, or another process clears the cache: nothing can be said
+        return any(
+            name.stat().st_mtime >= written and is_sound(name) and _version_of(name) == numba.__version__
+            for name in names
+        )
+    except OSError:  # the source is no plain file, or another process clears the cache: nothing can be said
         return True
 
 

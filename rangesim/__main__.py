@@ -8,12 +8,12 @@ import sys
 
 def main() -> None:
     """Run the command line."""
-    from pcgraph.interrupts import end_on_signals
+    from pcgraph.interrupts import end_on_signals, run
 
     end_on_signals("rangesim", writes=bool({"run", "scan", "decode", "report"} & set(sys.argv[1:3])))
-    from rangesim.cli import main as run
+    from rangesim.cli import main as command
 
-    run()
+    run(command)
 
 
 if __name__ == "__main__":

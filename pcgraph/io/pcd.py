@@ -216,9 +216,9 @@ def _check_length(available: int, needed: int, header: PcdHeader) -> None:
 @cache
 def lzf_decompressor() -> Callable[[NDArray[np.uint8], NDArray[np.uint8]], int]:
     """`decompress_lzf`, compiled; numba is imported only where a file is compressed."""
-    from numba import njit
+    from pcgraph.kernel_cache import cached_njit
 
-    return njit(cache=True)(decompress_lzf)
+    return cached_njit()(decompress_lzf)
 
 
 def decompress_lzf(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:

@@ -6,13 +6,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from pcgraph.kernel_cache import cached_njit
 
 MAX_FRACTION = 1 - 1e-6
 """Of pulses in which a photon was detected: more leave no estimate."""
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def detected_fraction(counts, pulses, fraction):  # type: ignore[no-untyped-def]
     """Write, of histograms (k, n) of first photons, the fraction of the pulses that were left before each bin."""
     left = np.full(counts.shape[1], float(pulses))
@@ -22,7 +23,7 @@ def detected_fraction(counts, pulses, fraction):  # type: ignore[no-untyped-def]
             left[column] -= counts[b, column]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def measure_peaks(histograms, filtered, reach, is_cyclic, place, height, background):  # type: ignore[no-untyped-def]
     """Of histograms (k, n), write what `rangesim.decoding.histogram.find_peak` returns, (n,) each.
 
@@ -51,7 +52,7 @@ def measure_peaks(histograms, filtered, reach, is_cyclic, place, height, backgro
         height[column] = _counts(histograms, column, recentred, reach, is_cyclic) - background[column]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _counts(histograms, column, centre, reach, is_cyclic):  # type: ignore[no-untyped-def]
     """Sum of the window around the bin `centre`."""
     total = 0.0
@@ -60,7 +61,7 @@ def _counts(histograms, column, centre, reach, is_cyclic):  # type: ignore[no-un
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _centroid(histograms, column, centre, reach, is_cyclic, level):  # type: ignore[no-untyped-def]
     """Mean place of what the window has above `level`, bins, beyond the ends if need be; without any its middle."""
     total = moment = 0.0
@@ -71,7 +72,7 @@ def _centroid(histograms, column, centre, reach, is_cyclic, level):  # type: ign
     return moment / total if total > 0 else centre + 0.5
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _count(histograms, column, b, is_cyclic):  # type: ignore[no-untyped-def]
     """Count of bin b; beyond the ends zero, or that of the other end."""
     if is_cyclic:

@@ -6,7 +6,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numba import njit
+
+from pcgraph.kernel_cache import cached_njit
 
 REACH_SIGMAS = 4.0
 """Standard deviations after which the filter is cut off, as in SciPy."""
@@ -35,7 +36,7 @@ def gaussian_filter(histograms: np.ndarray, sigma_bins: float, mode: Literal["wr
     return result
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _correlate(histograms, sources, weights, result):  # type: ignore[no-untyped-def]
     """Symmetric correlation along the bins; `weights` from the middle outwards.
 

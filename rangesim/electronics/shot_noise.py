@@ -17,7 +17,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from pcgraph.kernel_cache import cached_njit
 
 SMALL_MEAN = 4.0
 """From here on the expansion is used."""
@@ -33,7 +34,7 @@ SPARSE = 5.0
 share a pulse with an earlier one."""
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def read_frame(rng, radiance, pixel, dn):  # type: ignore[no-untyped-def]
     """Write digital numbers `dn` (h, w) of a frame of mean radiance (h, w) float32, W/m2/sr.
 
@@ -47,7 +48,7 @@ def read_frame(rng, radiance, pixel, dn):  # type: ignore[no-untyped-def]
             dn[row, column] = min(max(number, 0.0), pixel.max_dn)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def count_photons(rng, radiance, pixel, counts):  # type: ignore[no-untyped-def]
     """Write the counts (bins, w) of one image row of mean radiance (bins, w) float32, W/m2/sr: every photon.
 
@@ -59,7 +60,7 @@ def count_photons(rng, radiance, pixel, counts):  # type: ignore[no-untyped-def]
             counts[b, column] = min(poisson(rng, mean), pixel.max_dn)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[no-untyped-def]
     """As `count_photons`, but only the first photon of each of `pulses` pulses counts."""
     unused = np.full(radiance.shape[1], pulses)
@@ -72,7 +73,7 @@ def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[n
             counts[b, column] = min(hit, pixel.max_dn)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+@cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
     """How many of `pulses` bring a photon, or more, each `mean` photons on average: binomial, 1 - exp(-mean) each.
 
@@ -85,7 +86,7 @@ def pulses_hit(rng, mean, pulses):  # type: ignore[no-untyped-def]
     return photons if photons < 2 else photons - _shared(rng, photons, pulses)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
     """How many of `photons`, each in one of `pulses` by chance, fall into a pulse that has one before them.
 
@@ -103,7 +104,7 @@ def _shared(rng, photons, pulses):  # type: ignore[no-untyped-def]
         number += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+@cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def poisson(rng, mean):  # type: ignore[no-untyped-def]
     """A whole number (float64) of Poisson's distribution.
 
@@ -124,7 +125,7 @@ def poisson(rng, mean):  # type: ignore[no-untyped-def]
     return _search(w, mean, max(0.0, math.floor(x)))
 
 
-@njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+@cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def quantile(w, mean):  # type: ignore[no-untyped-def]
     """x, whose floor is the Poisson quantile at the normal deviate w, and a bound of its error for |w| < MAX_DEVIATE.
 
@@ -136,7 +137,7 @@ def quantile(w, mean):  # type: ignore[no-untyped-def]
     return x, (0.025 + 0.0012 * square * square * square) * inverse * inverse * inverse
 
 
-@njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
+@cached_njit(nogil=True, error_model="numpy", forceinline=True)
 def _count_at(u, mean):  # type: ignore[no-untyped-def]
     """The Poisson quantile at u in [0, 1), by adding up probabilities."""
     probability = math.exp(-mean)
@@ -152,7 +153,7 @@ def _count_at(u, mean):  # type: ignore[no-untyped-def]
     return float(count)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _search(w, mean, count):  # type: ignore[no-untyped-def]
     """The Poisson quantile at the normal deviate w, beginning at `count`."""
     while _is_below(count, w, mean):
@@ -162,7 +163,7 @@ def _search(w, mean, count):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _is_below(count, w, mean):  # type: ignore[no-untyped-def]
     """Whether P(N <= count) <= Phi(w); by the sums of the tail on w's side, which keep their precision."""
     tail, total = 0.5 * math.erfc(abs(w) * math.sqrt(0.5)), 0.0
@@ -181,12 +182,12 @@ def _is_below(count, w, mean):  # type: ignore[no-untyped-def]
     return total >= tail
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _probability(count, mean):  # type: ignore[no-untyped-def]
     return math.exp(count * math.log(mean) - mean - math.lgamma(count + 1))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _within(mean, most):  # type: ignore[no-untyped-def]
     """`mean` between 0 and `most`; NaN stays."""
     if mean < 0:

@@ -22,9 +22,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pcgraph.kernel_cache import cached_njit
 from pcgraph.parallel import MIN_ROWS, in_blocks
 
 LEVELS = 2
@@ -109,7 +109,7 @@ def level_weights(guides: Guides, mixed: NDArray[np.bool_], step: int) -> NDArra
     return weights
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _find_mixed(start, stop, instance, position, normal, mixed):  # type: ignore[no-untyped-def]
     h, w = instance.shape
     for y in range(start, stop):
@@ -128,7 +128,7 @@ def _find_mixed(start, stop, instance, position, normal, mixed):  # type: ignore
                     mixed[y, x] = True
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _weigh(start, stop, step, instance, position, normal, mixed, weights):  # type: ignore[no-untyped-def]
     h, w = instance.shape
     for y in range(start, stop):
@@ -186,7 +186,7 @@ def _of_radiance(first: NDArray[np.float32], last: NDArray[np.float32], reflecta
     last *= reflectance[:, None, :]
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _apply(start, stop, weights, step, image, out):  # type: ignore[no-untyped-def]
     channels, h, _ = image.shape
     for first in range(start, stop, ROWS_AT_ONCE):  # whose weights stay in the cache
@@ -197,7 +197,7 @@ def _apply(start, stop, weights, step, image, out):  # type: ignore[no-untyped-d
                 _apply_to_row(weights[y], step, above, image[c, y], below, out[c, y])
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def _apply_to_row(weights, step, above, row, below, out):  # type: ignore[no-untyped-def]
     w = len(row)
     for border in range(min(step, (w + 1) // 2)):

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from pcgraph.kernel_cache import cached_njit
 from pcgraph.parallel import MIN_ROWS, in_blocks
 from rangesim.decoding.range_image import RangeImage
 from rangesim.settings.config import ShortRepr
@@ -152,7 +152,7 @@ def lattice_normals(z: np.ndarray, rays: np.ndarray, radius: int = NORMAL_RADIUS
     return normals
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _fit_normals(start, stop, radius, limits, z, inverse, rays, normals):  # type: ignore[no-untyped-def]
     """Write the normals of the rows from `start` to `stop`."""
     h, w = z.shape

@@ -10,12 +10,14 @@ import subprocess
 import sys
 from ast import literal_eval
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import pcgraph
 from pcgraph import warmup
 from pcgraph.graph import contacts
+from pcgraph.kernel_cache import is_sound
 from pcgraph.supervoxels import clustering
 
 KERNELS = """
@@ -170,3 +172,96 @@ print(twice({name}(21)), sum(twice.stats.cache_hits.values()))
         said.append(run.stdout.split())
     assert [value for value, _ in said] == ["42"] * 4
     assert [hits for _, hits in said[2:]] == ["0", "1"]
+
+
+CACHED = """
+import sys
+import numpy as np
+from pcgraph.kernel_cache import cached_njit
+from pcgraph.parallel import kernel
+
+@kernel
+def total(values):
+    sum = 0.0
+    for value in values:
+        sum += value
+    return sum
+
+@cached_njit()
+def larger(n):
+    return n + 1
+
+print(total(np.arange(10.0)), total(np.arange(5)), larger(41))
+print(*(sum(function.stats.cache_hits.values()) for function in (total, larger)))
+"""
+
+
+def damage_of(kind, content):
+    """What became of a file."""
+    middle = len(content) // 2
+    if kind == "one bit":
+        return content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :]
+    if kind == "cut short":
+        return content[:middle]
+    if kind == "blocks of zeros":
+        return bytes(len(content))
+    if kind == "other machine code":
+        return content.replace(b"\x7fELF", b"\x7fELK")
+    if kind == "numba's own":
+        return content[: content.rindex(b"pcgraph kernel ")]
+    return {"empty": b"", "a pickle that ends the process": b"cos\n_exit\n(I7\ntR."}[kind]
+
+
+DAMAGES = ["one bit", "cut short", "blocks of zeros", "other machine code", "numba's own", "empty"]
+DAMAGES += ["a pickle that ends the process"]
+
+
+@pytest.fixture(scope="module")
+def cached(tmp_path_factory):
+    """A folder with a module whose kernels are in numba's cache there."""
+    folder = tmp_path_factory.mktemp("cached")
+    (folder / "kernels.py").write_text(CACHED)
+    assert hits_of(folder) == "0 0"
+    assert hits_of(folder) == "2 1"
+    return folder
+
+
+def hits_of(folder):
+    """How many signatures of either kernel a new process finds in the cache."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(pcgraph.__file__).parents[1])}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    line = [sys.executable, "-c", "import kernels"]
+    run = subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+    assert (run.returncode, run.stderr) == (0, "")
+    values, hits = run.stdout.splitlines()
+    assert values == "45.0 10.0 42"
+    return hits
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_a_damaged_cache_heals(cached, kind):
+    """Index and machine code alike: it is removed, compiled anew, and found sound by the process after that."""
+    before = sorted((cached / "__pycache__").iterdir())
+    for suffix in ("nbc",) if kind == "other machine code" else ("nbi", "nbc"):
+        for path in (path for path in before if path.name.endswith(suffix)):
+            assert is_sound(path)
+            path.write_bytes(damage_of(kind, path.read_bytes()))
+            assert not is_sound(path)
+        assert hits_of(cached) == "0 0"
+    assert hits_of(cached) == "2 1"
+    assert sorted((cached / "__pycache__").iterdir()) == before
+
+
+def test_an_index_that_is_damaged_counts_as_missing(tmp_path):
+    """So `pcgraph segment` says beforehand that it compiles."""
+    warmup.compile_kernels()
+    kernel = clustering._expand
+    code = kernel.py_func.__code__
+    (index,) = Path(kernel.stats.cache_path).glob(f"*.{code.co_name}-{code.co_firstlineno}.*.nbi")
+    copy = Path(shutil.copy2(index, tmp_path))
+    here = SimpleNamespace(py_func=kernel.py_func, stats=SimpleNamespace(cache_path=tmp_path))
+    assert warmup._is_cached(here)
+    content = index.read_bytes()
+    for damaged in (content[:-1] + bytes([content[-1] ^ 1]), content[:9], b""):
+        copy.write_bytes(damaged)
+        assert not warmup._is_cached(here)

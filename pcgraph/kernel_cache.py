@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba's cache of compiled functions, with seals: what is damaged is removed and compiled anew.
+
+Numba unpickles whatever its files hold and hands machine code on to LLVM, which ends the process if it is none. Each
+file here ends with a checksum of the rest, which numba passes over, and is looked at before it is read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from numba import config, njit
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+_MARK = b"pcgraph kernel "
+_DIGEST_BYTES = 32
+
+
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """A decorator of compiled functions that are kept on disk, as `numba.njit(cache=True, **options)` is."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = njit(**options)(function)
+        if not config.DISABLE_JIT:
+            dispatcher._cache = _Cache(function)
+        return dispatcher
+
+    return decorate
+
+
+def is_sound(path: str | Path) -> bool:
+    """Whether a file of the cache is as it was written; OSError if it cannot be read."""
+    content = Path(path).read_bytes()
+    return content.endswith(_seal(content[: -len(_MARK) - _DIGEST_BYTES]))
+
+
+def _seal(content: bytes) -> bytes:
+    return _MARK + hashlib.sha256(content).digest()
+
+
+class _CacheFile(IndexDataCacheFile):  # type: ignore[misc]
+    """The files of one function: an index, and one with machine code for each signature."""
+
+    def _load_index(self) -> Any:
+        return super()._load_index() if self._keep_if_sound(self._index_path) else {}
+
+    def _load_data(self, name: str) -> Any:
+        path = self._data_path(name)
+        if not self._keep_if_sound(path):
+            raise FileNotFoundError(path)  # by which numba knows that it has to compile
+        return super()._load_data(name)
+
+    def _keep_if_sound(self, path: str) -> bool:
+        """Whether there is such a file, and sound; one that is not is removed."""
+        try:
+            if is_sound(path):
+                return True
+        except FileNotFoundError:
+            return False
+        with suppress(OSError):  # another process was faster; where it must not be removed, it is passed over
+            os.unlink(path)
+        return False
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
+        content = io.BytesIO()
+        yield content
+        with super()._open_for_write(filepath) as file:
+            file.write(content.getvalue() + _seal(content.getvalue()))
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """Numba's cache of one function; empty where it names classes that are no more, as after an update.
+
+    What was compiled is kept by function and line, and read before it is asked whether the file has changed since.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        of = self._impl
+        self._cache_file = _CacheFile(self.cache_path, of.filename_base, of.locator.get_source_stamp())
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except (AttributeError, ImportError):
+            self._forget()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except (AttributeError, ImportError):
+            self._forget()
+            super().save_overload(sig, data)
+
+    def _forget(self) -> None:
+        with self._guard_against_spurious_io_errors():
+            self.flush()
