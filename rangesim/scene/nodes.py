@@ -57,8 +57,8 @@ def check_type(name: str, label: str) -> None:
     )
 
 
-def named_file(name: str) -> Path:
-    """Path of a file that a scene names; it may be missing, which Mitsuba says.
+def named_file(name: str, label: str) -> Path:
+    """Path of a file that the scene `label` names; it may be missing, which Mitsuba says.
 
     Raises
     ------
@@ -67,8 +67,11 @@ def named_file(name: str) -> Path:
     """
     path = Path(str(mi.file_resolver().resolve(name)))
     if os.path.exists(path):  # False also of names that cannot be
-        check_file(path, FileFormatError)
-        limits.check("bytes", path.stat().st_size, f"bytes in {path}", FileFormatError)
+        try:
+            check_file(path, FileFormatError)
+        except FileFormatError as error:
+            raise FileFormatError(f"{label} names a file: {error}") from error
+        limits.check("bytes", path.stat().st_size, f"bytes in {path}, which {label} names", FileFormatError)
     return path
 
 

@@ -141,7 +141,7 @@ def check_dictionary(scene: Any, label: str) -> None:
             if key == "type" and isinstance(value, str):
                 check_type(value, label)
             elif key == "filename" and isinstance(value, str):  # of a spectrum, which Mitsuba reads as it parses
-                named_file(value)
+                named_file(value, label)
 
 
 def check_evaluable(state: Any, label: str) -> None:
@@ -174,7 +174,7 @@ def check_properties(state: Any, label: str) -> None:
     for index, node in enumerate(state.nodes):
         bounds = PROPERTIES.get(node.type.name, {})
         for key, value in node.props.items():
-            checked = _Property(state, key, bounds.get(key, ANY))
+            checked = _Property(state, key, bounds.get(key, ANY), label)
             problem = checked.problem(value)
             if problem:
                 raise FileFormatError(f"{label}: {_place(state, parents, index)}: {problem}.")
@@ -193,11 +193,12 @@ def _check_mesh(props: Any, label: str) -> None:
     name = props.get("filename")
     if not isinstance(name, str):
         return
+    path = named_file(name, label)
     try:
         if props.plugin_name() == "ply":
-            check_ply(named_file(name))
+            check_ply(path)
         if props.plugin_name() == "serialized":
-            check_serialized(named_file(name), int(props.get("shape_index", 0)))
+            check_serialized(path, int(props.get("shape_index", 0)))
     except FileFormatError as error:
         raise FileFormatError(f"{label}: {error}") from error
 
@@ -231,8 +232,8 @@ def check_vertices(scene: Any, label: str) -> None:
 class _Property:
     """A property of a node, and the bounds of all numbers in it."""
 
-    def __init__(self, state: Any, key: str, bounds: Bounds) -> None:
-        self.state, self.key, self.bounds = state, key, bounds
+    def __init__(self, state: Any, key: str, bounds: Bounds, label: str) -> None:
+        self.state, self.key, self.bounds, self.label = state, key, bounds, label
 
     def problem(self, value: Any, key: str = "") -> str:
         """What is wrong with the value of the property, or an empty text."""
@@ -242,7 +243,7 @@ class _Property:
         if _is_transform(value):
             return _problem_of_transform(value, key)
         if key.endswith("filename") and isinstance(value, str):
-            return self._problem_of_image(named_file(value), key)
+            return self._problem_of_image(named_file(value, self.label), key)
         if key in ("width", "height") and isinstance(value, float):
             return f"expected {key} to be {self.bounds}, got {shown(value)}"
         for number in getattr(value, "wavelengths", ()):
