@@ -27,7 +27,7 @@ from rangesim.geometry.reprojection import LENS, POSE, by_lens
 from rangesim.rig import Intrinsics
 
 MIN_VIEWS = 2
-"""Of a camera without skew."""
+"""Least number of views for a camera without skew; with skew it is one more (Zhang 2000, section 3.1)."""
 DETERMINED = 1e-4
 """The second smallest singular value of the equations of the conic, relative to the largest, below which their views
 are parallel to each other, to what noise allows to tell."""
@@ -35,7 +35,8 @@ MIN_APART_DEG = 1.0
 """Largest angle between two boards below which all count as parallel. Parallel ones are found within 0.1 degrees, ones
 turned at random by up to 5 degrees 4.8 degrees apart or more (measured, noise of 0.05 px)."""
 FEW_VIEWS = 5
-"""Up to which more than one start is tried: of 3 views by 10 degrees, 1 of 40 had ended in a side minimum."""
+"""Number of views up to which more than one start is tried: with 3 views at 10 degrees, 1 of 40
+ended in a side minimum."""
 SAME_MINIMUM = 0.999
 """Ratio of sums of squares of two minima from which on they are one."""
 MAX_DEVIATION = 0.1
@@ -128,8 +129,10 @@ class _NoCamera(ValueError):
 
 
 def _starting_intrinsics(homographies: ArrayLike, width: int, height: int) -> list[Intrinsics]:
-    """What bundles start from: the camera of the homographies, unless noise or distortion leaves none; of few views
-    also the one with the principal point in the middle of the image, as noise moves that of the homographies far away.
+    """Cameras that the bundle adjustment starts from: that of the homographies, unless noise or distortion leaves none.
+
+    With few views also the one with the principal point in the middle of the image, as noise moves that of the
+    homographies far away.
     """
     H = np.asarray(homographies, dtype=np.float64)
     matrices, none = [], None

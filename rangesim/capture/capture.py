@@ -31,9 +31,15 @@ def bright_level(values: np.ndarray) -> float:
     return float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 0.0
 
 
-CLIP_SHARE, CLIP_PEAK, CLIP_TAIL, CLIP_LEVELS = 0.005, 10.0, 0.05, 16
-"""Least share of the pixels at the level where they clip; how many times those of an average level below these are at
-least; least share of these that the levels just below hold together; how many levels, of 256 up to there, that is."""
+MIN_CLIPPED_FRACTION = 0.005
+"""Least fraction of the pixels at the level where a camera clips."""
+MIN_CLIP_PEAK = 10.0
+"""Least ratio of the pixels at that level to those at an average one of the `CLIP_LEVELS` below."""
+MIN_CLIP_TAIL = 0.05
+"""Least ratio of the pixels in the `CLIP_LEVELS` below together to those at that level; an image of few grey levels has
+none."""
+CLIP_LEVELS = 16
+"""Number of levels looked at below, each 1/256 of the level where the camera clips."""
 
 
 def clip_level(brightest: np.ndarray, max_dn: int) -> int:
@@ -53,8 +59,8 @@ def clip_level(brightest: np.ndarray, max_dn: int) -> int:
     at_top = int((brightest == top).sum())
     width = max(1.0, top / 256)
     below = int(((brightest < top) & (brightest >= top - CLIP_LEVELS * width)).sum())
-    piled = at_top > CLIP_PEAK * below / CLIP_LEVELS and below > CLIP_TAIL * at_top
-    return top if piled and at_top > CLIP_SHARE * brightest.size else max_dn
+    piled = at_top > MIN_CLIP_PEAK * below / CLIP_LEVELS and below > MIN_CLIP_TAIL * at_top
+    return top if piled and at_top > MIN_CLIPPED_FRACTION * brightest.size else max_dn
 
 
 @dataclass(frozen=True, eq=False, repr=False)

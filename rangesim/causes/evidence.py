@@ -32,7 +32,7 @@ DIM = 0.1
 """Less than this fraction of what white paper would return here is little light."""
 DISTURBING = 0.005
 """Fraction of the projector's light, other than direct, from which it can shift a reading by the tolerance."""
-MOST_PULSES = 0.9
+MAX_PULSES_HIT = 0.9
 """Fraction of the pulses with a photon from which less light makes less noise: 2.3 photons a pulse, where Coates'
 estimate is best at 1 to 2."""
 MOTION_FRACTION = 0.1
@@ -88,14 +88,14 @@ class Evidence:
 
     @cached_property
     def piled_up(self) -> np.ndarray:
-        """Of the pulses of which the first photon is counted, more brought one than `MOST_PULSES`, or the decoder says
+        """Whether more than `MAX_PULSES_HIT` of the pulses brought a photon, or the decoder says
         that they ran out though no counter is full."""
         detector, capture = self.capture.detector, self.capture
         if not isinstance(detector, SpadDetector) or not detector.pile_up:
             return np.zeros(self.truth.z.shape, dtype=bool)
         pulses = detector.pulses(capture.sensor.gate, capture.exposure_s)
         ran_out = (self.image.status == Status.SATURATED) & ~capture.saturated(capture.frames)
-        return np.asarray(ran_out | (capture.frames.sum(axis=0, dtype=np.float64) > MOST_PULSES * pulses))
+        return np.asarray(ran_out | (capture.frames.sum(axis=0, dtype=np.float64) > MAX_PULSES_HIT * pulses))
 
     # ---- The surface ---------------------------------------------------------------------------------
 

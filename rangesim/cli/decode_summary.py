@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What came out of `rangesim decode`, in fractions, and why it is little if it is."""
+"""The summary of `rangesim decode`: fractions of pixels by status, and the likely cause where few are measured."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from rangesim.errors import one_line
 from rangesim.report.palette import STATUS_NAMES
 from rangesim.sensors import StructuredLight
 
-FEW = 0.5
+MIN_MEASURED = 0.5
 """Fraction of measured pixels below which a cause is looked for."""
-CLEAR = 0.02
-"""Of full scale, by which black is clearly brighter than white."""
-DARK = 1 / 8
-"""Of full scale: no frame of an unknown detector reaches more."""
-LONGEST_BASELINE_M = 10.0
+MIN_CONTRAST = 0.02
+"""Fraction of full scale by which black is brighter than white where the two are exchanged."""
+MIN_BRIGHTEST = 1 / 8
+"""Fraction of full scale below which the brightest value of all frames is told, as the detector's
+full scale may be less."""
+MAX_BASELINE_M = 10.0
+"""Baseline beyond which the calibration is probably in millimetres."""
 
 
 def status_fractions(image: RangeImage) -> dict[str, float]:
@@ -31,18 +33,18 @@ def status_fractions(image: RangeImage) -> dict[str, float]:
 
 def likely_cause(image: RangeImage, capture: Capture) -> str | None:
     """Why little was measured, or what is wrong with what was, in a clause; None if nothing points anywhere."""
-    if capture.rig is not None and capture.rig.baseline_m > LONGEST_BASELINE_M:
+    if capture.rig is not None and capture.rig.baseline_m > MAX_BASELINE_M:
         return (
             f"camera and emitter are {capture.rig.baseline_m:g} m apart: if the calibration is in millimetres, "
             "give --unit 0.001"
         )
     if isinstance(capture.sensor, StructuredLight) and _rows_come_first(image):
         return "columns change along the image's height and rows along its width: rows may have been shown first"
-    if float((image.status == Status.OK).mean()) >= FEW:
+    if float((image.status == Status.OK).mean()) >= MIN_MEASURED:
         return None
     if isinstance(capture.sensor, StructuredLight):
         contrast = capture.frames[-2].astype(np.float32) - capture.frames[-1].astype(np.float32)
-        clear = CLEAR * capture.full_scale
+        clear = MIN_CONTRAST * capture.full_scale
         inverted = float((contrast < -clear).mean())
         if inverted > float((contrast > clear).mean()):
             return (
@@ -51,7 +53,7 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
             )
     if capture.is_digital and capture.detector is None:
         brightest = int(capture.frames.max())
-        if brightest < DARK * capture.full_scale:
+        if brightest < MIN_BRIGHTEST * capture.full_scale:
             return (
                 f"the brightest value is {brightest} of {capture.full_scale:.0f}: give --bits "
                 f"{max(brightest.bit_length(), 1)} if the camera has no more, or expose longer"
@@ -78,7 +80,7 @@ def _changes(coordinate: np.ndarray) -> tuple[float, float]:
 
 
 def summary(image: RangeImage, capture: Capture, out: Path) -> str:
-    """What came out, in a line: fractions of all statuses that pixels have, depths, and the likely cause."""
+    """One line on the result: fractions of all statuses that pixels have, depths, and the likely cause."""
     fractions = status_fractions(image)
     measured = fractions.pop(STATUS_NAMES[Status.OK])
     parts = [f"{100 * measured:.1f} % of the pixels {'decoded' if image.camera is None else 'measured'}"]

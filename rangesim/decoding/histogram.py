@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-LEAST_PULSES = 10
-"""Pulses without a photon that the end of a peak's window must leave: with fewer, Coates' estimate of a bin is off."""
+MIN_PULSES_LEFT = 10
+"""Least number of pulses that have met no photon by the end of a peak's window; with fewer, Coates' estimate is off."""
 
 
 def find_peak(
@@ -60,7 +60,7 @@ def runs_out(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: flo
     place : (n,) float, bins, of the peaks that `find_peak` found in `coates` of them with the same `sigma_bins` and
         `is_cyclic`.
 
-    Fewer than `LEAST_PULSES` are left, or than half of all where there are fewer than twice as many. With as many
+    Fewer than `MIN_PULSES_LEFT` are left, or than half of all where there are fewer than twice as many. With as many
     left, a bin of the window is 5 % too large at most, on average.
     """
     bins = len(counts)
@@ -70,4 +70,4 @@ def runs_out(counts: np.ndarray, place: np.ndarray, pulses: int, sigma_bins: flo
     if is_cyclic:
         last[first < reach] = bins - 1  # the window begins at the other end, where fewest are left
     used = np.cumsum(counts, axis=0, dtype=np.int64)[last, np.arange(counts.shape[1])]
-    return np.asarray(pulses - used < min(LEAST_PULSES, pulses / 2))
+    return np.asarray(pulses - used < min(MIN_PULSES_LEFT, pulses / 2))

@@ -40,7 +40,8 @@ GREY_LEVELS = 5
 
 _EXR = b"\x76\x2f\x31\x01"
 _TARGA = b"TRUEVISION-XFILE.\0"
-_LONGEST_HEADER = 1 << 16
+_MAX_HEADER = 1 << 16
+"""Bytes of a text header that are searched for the size of the image."""
 
 
 class _OtherFormatError(OSError):
@@ -196,7 +197,7 @@ def _check_stated_size(path: Path) -> None:
                 words = words[1::2]
                 break
     elif content.startswith((b"PF", b"Pf")):
-        words = content[2:_LONGEST_HEADER].split(None, 2)[:2]
+        words = content[2:_MAX_HEADER].split(None, 2)[:2]
     elif content.endswith(_TARGA) and len(content) >= 18:
         words = [b"%d" % size for size in struct.unpack_from("<HH", content, 12)]
     else:

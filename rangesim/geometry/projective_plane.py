@@ -23,8 +23,8 @@ LINE_AT_INFINITY: tuple[float, float, float] = (0.0, 0.0, 1.0)
 """Meets every line in its point at infinity; fixed by a map if and only if that is an affinity."""
 
 LAST_DIGITS = 1e-15
-"""Relative; a few roundings of double precision: of a homogeneous coordinate that is 0, of parallel directions, in rad.
-"""
+"""Relative error of a few operations in double precision: below it a homogeneous coordinate is 0, and lines at that
+angle, in radians, are parallel."""
 
 
 def homogeneous(points: ArrayLike) -> Array:

@@ -40,14 +40,16 @@ COMPARED_POINTS = 3000
 """Of the source, by which poses are compared."""
 MIN_AGREEMENT = 0.45
 """Least mean of 1 - (d / s)^2 over the points with a partner, s the spacing, or the roughness of a cloud if larger.
-Of right poses 0.47 to 0.96, but 0.37 of a scan ten times as dense as the target with noise above the target's spacing;
--0.1 to 0.44 of corrugated plates that lie askew and of parts 5 or 10 % off in scale (measured)."""
+Measured: 0.47 to 0.96 for right poses, but 0.37 for a scan ten times as dense as the target with noise above the
+target's spacing; -0.1 to 0.44 for corrugated plates that lie askew and for parts 5 or 10 % off in scale."""
 FAR_EXTENTS = 5.0
 """Clouds further than this from the origin, in units of their extent, are moved there before they are solved."""
-SLIDE_SPACINGS, MAX_SLIDES = 6.0, 6
-"""Steps, and how many to either side, by which a result of `icp` is slid along the surface to look for others."""
+SLIDE_SPACINGS = 6.0
+"""Step, in spacings of the target, by which a result of `icp` is slid along the surface to look for other poses."""
+MAX_SLIDES = 6
+"""Largest number of such steps to either side."""
 SLID_POINTS = 800
-"""Of the source, that are slid: a pose that fits as well does so by few points, too."""
+"""Number of points of the source that are slid: a pose that fits as well does so by few points, too."""
 AS_GOOD = 0.95
 """Fraction of the best agreement at which another pose fits alike."""
 

@@ -51,13 +51,13 @@ OF_ROTATION = 3
 MAX_PIXELS = 1e5
 """Coordinates of images, about."""
 MAX_LINES = 5
-"""Of pairs off a plane, with the largest parallax, along which other epipoles are looked for."""
-POSITIONS = 90
-"""Of an epipole along such a line, of its directions in normalised coordinates: every 2 degrees."""
+"""Number of pairs off a plane, those of the largest parallax, along whose lines other epipoles are looked for."""
+EPIPOLES_PER_LINE = 90
+"""Number of epipoles tried along such a line, one every 2 degrees of its directions in normalised coordinates."""
 MIN_EXTENT = 0.05
-"""Coordinates of the smallest images, about: those of a lens of 6 degrees in units of its focal length."""
+"""Coordinates of the smallest images, roughly: a lens of 6 degrees in units of its focal length."""
 SINGLE_ROUNDING = 1e-6
-"""Relative; a few roundings of single precision, in which matrices of other programs come."""
+"""Relative error of a few operations in single precision, in which matrices of other programs come."""
 ANOTHER = 0.02
 """Difference of an entry of F, at unit norm in normalised coordinates, from which on it is another one."""
 MAX_STANDARD_DEVIATION = 0.3
@@ -104,7 +104,7 @@ def centred_cameras(p: Array, q: Array) -> tuple[Array, Array, Array]:
 
 
 SHIFT_ROUNDING = 64 * float(np.finfo(np.float64).eps)
-"""Of the last column, relative to the distance it was moved by: that of the given one, and of the move."""
+"""Error of the last column, of the given one and of the move, relative to the distance it was moved by."""
 
 
 def essential_from_pose(T_second_first: ArrayLike) -> Array:
@@ -534,7 +534,7 @@ def _refuse_open_epipole(
     # the noise of the plane's points alone sets the sums of two members apart by 2 sqrt(n), as two chi^2 of n
     rise = consensus.chi2_limit(PARAMETERS) + 2 * np.sqrt(len(a))
     allowed = found.cost + rise * (noise_px * scale) ** 2
-    angles = np.linspace(0, np.pi, POSITIONS, endpoint=False)
+    angles = np.linspace(0, np.pi, EPIPOLES_PER_LINE, endpoint=False)
     for line in np.cross(mapped, unit_b[off])[farthest]:
         axes = np.linalg.svd(line[None])[2][1:]
         for epipole in np.outer(np.cos(angles), axes[0]) + np.outer(np.sin(angles), axes[1]):

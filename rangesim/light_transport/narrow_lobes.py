@@ -19,17 +19,18 @@ from rangesim.errors import warn
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.surfaces import number_of, table_of
 from rangesim.light_transport.traced_scene import TracedScene
-from rangesim.scene.materials import NARROW, has_narrow_lobe
+from rangesim.scene.materials import MAX_NARROW_ALPHA, has_narrow_lobe
 
 RAYS = (128, 128)
-"""Columns and rows of rays over the projector's image."""
+"""Columns and rows of the grid of rays over the projector's image."""
 MAX_SURFACES = 8
-"""Surfaces that a ray is followed over. A hollow glass has four."""
-WORTH_A_WARNING = 0.005
-"""Fraction of the projector's light."""
-WORTH_A_NAME = 0.1
-"""Fraction of the thrown light that a shape throws or receives."""
+"""Number of surfaces that a ray is followed over; a hollow glass has four."""
+MIN_THROWN = 0.005
+"""Fraction of the projector's light that narrow lobes throw onto other surfaces, from which on it is warned of."""
+MIN_NAMED = 0.1
+"""Fraction of the thrown light that a shape throws or receives, from which on the warning names it."""
 MAX_NAMED = 3
+"""Number of shapes that the warning names."""
 
 
 class ThrownLight(NamedTuple):
@@ -43,7 +44,7 @@ class ThrownLight(NamedTuple):
 
 
 def thrown_light(traced: TracedScene) -> ThrownLight | None:
-    """What narrow lobes throw; None where no surface has one."""
+    """Light that narrow lobes throw onto other surfaces; None where no surface has such a lobe."""
     scene, projector = traced.scene, traced.projector
     shapes = scene.shapes()
     is_narrow = [has_narrow_lobe(shape.bsdf()) for shape in shapes]
@@ -86,18 +87,18 @@ def thrown_light(traced: TracedScene) -> ThrownLight | None:
 def warn_of_narrow_lobes(traced: TracedScene, names: list[str]) -> None:
     """Warn if narrow lobes throw noticeable light onto other surfaces; `names` of all shapes."""
     thrown = thrown_light(traced)
-    if thrown is None or thrown.onto.sum() <= WORTH_A_WARNING:
+    if thrown is None or thrown.onto.sum() <= MIN_THROWN:
         return
     lit, lobes = _named(names, thrown.onto), _named(names, thrown.by)
     warn(
         f"about {thrown.onto.sum():.1%} of the projector's light reaches {lit} over narrow lobes of {lobes}, where "
         f"light paths find little of it: readings there are more wrong than their noise says; make {lobes} smooth "
-        f"(conductor, dielectric) or rougher than alpha {NARROW:g}."
+        f"(conductor, dielectric) or rougher than alpha {MAX_NARROW_ALPHA:g}."
     )
 
 
 def _named(names: list[str], light: np.ndarray) -> str:
     """The shapes with the most light, in words."""
-    order: Any = [int(i) for i in np.argsort(-light, kind="stable") if light[i] > WORTH_A_NAME * light.sum()]
+    order: Any = [int(i) for i in np.argsort(-light, kind="stable") if light[i] > MIN_NAMED * light.sum()]
     listed = ", ".join(repr(names[i]) for i in order[:MAX_NAMED])
     return listed + (" and others" if len(order) > MAX_NAMED else "")

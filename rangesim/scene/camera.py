@@ -14,8 +14,8 @@ from rangesim.rig import Intrinsics
 # Mitsuba's camera looks along +z with x to the left and y up; ours has x to the right and y down.
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
-VISIBLE_BLUR = 0.1
-"""Diameter of a lens' blur, in pixels, that is worth a warning."""
+MAX_BLUR_PX = 0.1
+"""Diameter of a lens' blur beyond which leaving it out is warned of."""
 
 
 def camera_of(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
@@ -45,7 +45,7 @@ def camera_of(sensor: Any, label: str) -> tuple[Intrinsics, np.ndarray]:
 
 
 def warn_of_aperture(sensor: Any, camera: Intrinsics, distance_m: float, label: str) -> None:
-    """Warn if a `thinlens` sensor would blur what is out of focus by more than `VISIBLE_BLUR`: here it is a pinhole.
+    """Warn if a `thinlens` sensor would blur what is out of focus by more than `MAX_BLUR_PX`: here it is a pinhole.
 
     distance_m : metres, depth of what the camera sees.
     """
@@ -54,7 +54,7 @@ def warn_of_aperture(sensor: Any, camera: Intrinsics, distance_m: float, label: 
         return
     radius, focus = (_number(params[name]) for name in ("aperture_radius", "focus_distance"))
     blur = 2 * radius * camera.fx / min(focus, distance_m)  # pixels, of what is far off
-    if blur > VISIBLE_BLUR:
+    if blur > MAX_BLUR_PX:
         warn(
             f"{label}: the camera's aperture of {radius:g} m is left out, so the image is sharp everywhere; state it "
             f"in the rig: camera_lens=Lens(aperture_radius_m={radius:g}, focus_m={focus:g})."

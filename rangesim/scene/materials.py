@@ -16,7 +16,7 @@ transparent: (nearly) specular refraction. translucent: scattered transmission. 
 SMOOTH = 0.05
 """Microfacet roughness alpha up to which a surface looks polished to a range sensor."""
 
-NARROW = 0.03
+MAX_NARROW_ALPHA = 0.03
 """Microfacet roughness alpha up to which light paths that start elsewhere hardly meet the lobe: its solid angle,
 about pi (2 alpha)^2, is a five-hundredth of a hemisphere there."""
 
@@ -57,7 +57,7 @@ def is_cutout(bsdf: Any) -> bool:
 def has_narrow_lobe(bsdf: Any) -> bool:
     """Whether a mitsuba.BSDF has a lobe that is as narrow as a mirror's nearly, but no delta interaction."""
     alphas = _alphas(_numbers(bsdf))
-    return _has(bsdf, "GlossyReflection", "GlossyTransmission") and bool(alphas) and max(alphas) <= NARROW
+    return _has(bsdf, "GlossyReflection", "GlossyTransmission") and bool(alphas) and max(alphas) <= MAX_NARROW_ALPHA
 
 
 def is_closed_mask(bsdf: Any) -> bool:

@@ -18,7 +18,7 @@ _OBLIQUE = np.array(
 DIRECTIONS = _OBLIQUE / np.linalg.norm(_OBLIQUE, axis=1, keepdims=True)
 """(7, 3) float64, unit vectors to all sides, oblique to the axes, along which edges of shapes like to lie."""
 MAX_SURFACES = 64
-"""Surfaces, one behind another, that are looked through for the bodies a place is in."""
+"""Number of surfaces, one behind another, that are looked through for the bodies a place is in."""
 
 
 def is_boundary(shape: Any) -> bool:

@@ -27,13 +27,16 @@ _TYPES = (
 )
 """Types of a property, in Mitsuba's words, as of NumPy."""
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LONGEST_HEADER = 1 << 20
+_MAX_HEADER = 1 << 20
+"""Bytes of a header, a longer one is refused."""
 _MAGIC = 0x041C
+"""First two bytes of a serialized file, as Mitsuba writes them."""
 _DOUBLE = 0x2000
+"""Flag of a serialized file whose numbers are of double precision."""
 _NUMBERS_PER_VERTEX = {0x1: 3, 0x2: 2, 0x8: 3}
-"""Of normals, texture coordinates and colours, by their flag in a serialized file; the place has three."""
+"""Numbers of a vertex beside its place, by flag of a serialized file: normals, texture coordinates, colours."""
 _CORNERS = 3
-"""Mitsuba reads each list as a count, which has to be 3, and three entries."""
+"""Entries of each list of a PLY face: Mitsuba takes every face for a triangle."""
 
 
 @dataclass
@@ -72,7 +75,7 @@ def check_ply(path: Path) -> None:
 
 
 def check_serialized(path: Path, index: int) -> None:
-    """As `check_ply`, of mesh number `index` of a file in Mitsuba's own format, version 3 or 4."""
+    """Raise FileFormatError as `check_ply` does, for mesh `index` of a file in Mitsuba's own format, version 3, 4."""
     content = read_file(path, FileFormatError)
     try:
         count, indices = _unpacked(content, index)
@@ -107,7 +110,7 @@ def _unpacked(content: bytes, index: int) -> tuple[int, np.ndarray]:
             raise ValueError("it ends early")
         (start,) = struct.unpack_from("<Q" if version == 4 else "<I", content, len(content) - place)
     stream = zlib.decompressobj()
-    head = stream.decompress(content[start + 4 :], _LONGEST_HEADER)
+    head = stream.decompress(content[start + 4 :], _MAX_HEADER)
     (flags,) = struct.unpack_from("<I", head)
     place = head.index(b"\0", 4) + 1 if version == 4 else 4  # after the name of the mesh
     vertices, faces = struct.unpack_from("<QQ", head, place)
@@ -123,7 +126,7 @@ def _header(content: bytes) -> tuple[str, list[_Element], int]:
     """NumPy's letter of the byte order (empty for ASCII), the elements, and where they start."""
     order, elements, start = None, list[_Element](), 0
     while True:
-        end = content.find(b"\n", start, _LONGEST_HEADER)
+        end = content.find(b"\n", start, _MAX_HEADER)
         if end < 0:
             raise ValueError("its header has no end_header")
         words = content[start:end].decode("latin-1").split()

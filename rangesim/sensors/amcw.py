@@ -26,8 +26,8 @@ MAX_RANGE_M = 100.0
 """Ranges beyond are not searched by phase unwrapping, even if the frequencies were unambiguous farther out."""
 TAPS_DEG = (0, 90, 180, 270)
 """Delays of the taps of each frequency, in degrees of its phase; `frames` and `tap_phase` are for quarter turns."""
-SHARE = 1 / len(TAPS_DEG)
-"""Of the light of an exposure that each tap collects on average: its taps share it, and none is lost."""
+TAP_FRACTION = 1 / len(TAPS_DEG)
+"""Fraction of an exposure's light that each tap collects on average: the taps divide it, and none is lost."""
 RELATIVE_SIGNAL = 1e-4
 """Light of noise-free captures that counts as none, as a fraction of that of the bright pixels."""
 
@@ -94,7 +94,7 @@ class AmcwToF(Sensor):
         taps = ((phasor, tap) for phasor in channels for tap in TAPS_DEG)
         for frame, (phasor, tap) in zip(result, taps, strict=True):
             axis, sign = tap // 90 % 2, 1 - tap // 180 * 2  # cos or sin of the phase, and its sign
-            np.multiply(SHARE, offset + sign * self.contrast * phasor[axis], out=frame, casting="same_kind")
+            np.multiply(TAP_FRACTION, offset + sign * self.contrast * phasor[axis], out=frame, casting="same_kind")
         return result
 
     def frames_per_exposure(self, single_tap: bool = False) -> int:
@@ -192,14 +192,14 @@ class AmcwDecoder(Decoder):
         )
 
     def least_signal(self, sensor: Sensor, background: Background) -> np.ndarray:
-        visibility = of_type(sensor, AmcwToF).contrast * SHARE
+        visibility = of_type(sensor, AmcwToF).contrast * TAP_FRACTION
         least = self.phase.least_signal(len(TAPS_DEG), visibility, self.content(sensor), background)
         if background.noise_variance is None:
             least = np.maximum(least, background.floor(RELATIVE_SIGNAL))
         return least
 
     def content(self, sensor: Sensor) -> FrameContent:
-        return FrameContent(signal=SHARE, ambient=SHARE)
+        return FrameContent(signal=TAP_FRACTION, ambient=TAP_FRACTION)
 
 
 def _weight(capture: Capture, phase: Phase, modulation_hz: float) -> np.ndarray:
