@@ -127,9 +127,16 @@ def centres(T: np.ndarray) -> np.ndarray:
     return -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
 
 
-def position_error(T: np.ndarray, true: np.ndarray) -> float:
-    """Root mean square distance of cameras from the true ones, after a similarity, metres."""
-    return float(np.sqrt(((aligned(centres(T), centres(true)) - centres(true)) ** 2).sum(axis=1).mean()))
+def position_error(T: np.ndarray, true: np.ndarray, *, is_scaled: bool = True) -> float:
+    """Root mean square distance of cameras from the true ones, metres, after a similarity; not `is_scaled`: after a
+    rotation and a translation, so that a wrong scale counts."""
+    found, places = centres(T), centres(true)
+    if is_scaled:
+        return float(np.sqrt(((aligned(found, places) - places) ** 2).sum(axis=1).mean()))
+    turn = nearest_similarity(found, places)[:3, :3]
+    turn = turn / np.cbrt(np.linalg.det(turn))
+    off = (found - found.mean(axis=0)) @ turn.T - (places - places.mean(axis=0))
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
 class Deforming(NamedTuple):
@@ -216,13 +223,20 @@ def online(options: argparse.Namespace) -> Part:
             T_start, _ = perturbed(scene, 0.002, 0.002, 0.0)
             found = adjust_online(scene.tracks, scene.camera, T_start[:8], window=10, noise_px=NOISE)
             offline = bundle_adjust(scene.tracks, scene.camera, found.T_camera_world, found.points)
-            errors.append([position_error(T, scene.T) for T in (found.T_camera_world, offline.T_camera_world)])
-        of_online, of_offline = np.sqrt(np.mean(np.square(errors), axis=0))
+            errors.append(
+                [
+                    position_error(T, scene.T, is_scaled=is_scaled)
+                    for is_scaled in (True, False)
+                    for T in (found.T_camera_world, offline.T_camera_world)
+                ]
+            )
+        of_online, of_offline, online_unscaled, offline_unscaled = np.sqrt(np.mean(np.square(errors), axis=0))
         ratios.append(of_online / of_offline)
         rows.append(
             (
                 f"positions of 60 frames, tracks of {life}: window of 10 against all at once",
-                f"{1e3 * of_online:.2f} mm / {1e3 * of_offline:.2f} mm = {ratios[-1]:.2f}",
+                f"{1e3 * of_online:.2f} mm / {1e3 * of_offline:.2f} mm = {ratios[-1]:.2f}; with the error of the scale "
+                f"{1e3 * online_unscaled:.1f} mm / {1e3 * offline_unscaled:.1f} mm",
             )
         )
     return Part(rows, {"online_ratio": round(float(np.max(ratios)), 3)})

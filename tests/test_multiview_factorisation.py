@@ -60,6 +60,47 @@ def test_orthographic_factorisation_reaches_the_bound(scale: bool, missing: floa
     assert 0.8 < np.mean(ratios) < 1.2
 
 
+@pytest.mark.parametrize(("scale", "missing"), [(False, 0.2), (True, 0.0)])
+def test_the_deviation_of_an_orthographic_shape_is_that_of_its_errors(scale: bool, missing: float) -> None:
+    off, stated = [], []
+    for seed in range(20):
+        true = rigid(seed, 0.5, missing, scale)
+        found = factorise_orthographic(true.tracks, has_scale=scale)
+        first = true.seen[0] - true.seen[0].mean(axis=0)
+        off.append(min(((answer.points - first) ** 2).mean() for answer in (found, found.reversed)))
+        stated.append((found.shape_deviation_px**2).mean())
+    assert 0.7 < np.mean(off) / np.mean(stated) < 1.4
+
+
+def turned_little(seed: int, turn: float, noise: float) -> tuple[np.ndarray, Tracks]:
+    """The points in the frame of the first camera, about their mean, 58 px in each coordinate, and tracks of 8 images
+    that turn by `turn` rad in each direction."""
+    random = np.random.default_rng(seed)
+    X = random.uniform(-100, 100, (40, 3))
+    R = Rotation.from_rotvec(random.normal(0, turn, (8, 3))).as_matrix()
+    return (X - X.mean(axis=0)) @ R[0].T, tracks_of(R, X, noise)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5])
+def test_turns_too_small_to_tell_depths_are_refused(noise: float) -> None:
+    """Depths of a third or a thousand times the true ones came from these, and no deviation."""
+    for seed in range(8):
+        _, tracks = turned_little(seed, 0.005, noise)
+        with pytest.raises(ValueError, match=r"depths|turn"):
+            factorise_orthographic(tracks)
+
+
+@pytest.mark.parametrize(("turn", "noise"), [(0.005, 1e-4), (0.03, 0.1), (0.05, 0.1), (0.1, 0.5)])
+def test_small_turns_tell_depths_within_the_deviation(turn: float, noise: float) -> None:
+    for seed in range(8):
+        X, tracks = turned_little(seed, turn, noise)
+        found = factorise_orthographic(tracks)
+        off = min(np.sqrt(((answer.points - X) ** 2).mean()) for answer in (found, found.reversed))
+        stated = np.sqrt((found.shape_deviation_px**2).mean())
+        assert off < 3 * stated
+        assert stated < 0.1 * np.sqrt((X**2).mean())
+
+
 def projective(seed: int, noise: float, missing: float):  # type: ignore[no-untyped-def]
     scene = around(8, 40, fraction=1 - missing, noise=0.0, seed=seed)
     exact = observed(PINHOLE, scene.T, scene.X)

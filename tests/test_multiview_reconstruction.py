@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from many_views import aligned, around, perturbed, position_error, walk
+from many_views import aligned, around, centres, perturbed, position_error, walk
 from scipy.spatial.transform import Rotation
 from tiers import to_validate
 
@@ -109,6 +109,33 @@ def test_a_window_over_everything_is_offline() -> None:
     found = adjust_online(scene.tracks, scene.camera, start, window=8, noise_px=0.5)
     offline = bundle_adjust(scene.tracks, scene.camera, found.T_camera_world, found.points)
     np.testing.assert_allclose(found.T_camera_world, offline.T_camera_world, atol=1e-4)
+
+
+@pytest.mark.parametrize(("points", "life", "first"), [(150, 25, 2), (300, 10, 3)])
+@pytest.mark.parametrize("seed", [0, 2])
+def test_online_keeps_the_scale_of_its_start(points: int, life: int, first: int, seed: int) -> None:
+    """Metres of the start are metres of the path; each new image had moved the scale, to paths 4 to 9 % shorter."""
+    scene = walk(20, points, life, seed=seed)
+    found = adjust_online(scene.tracks, scene.camera, scene.T[:first], window=10, noise_px=0.5)
+    offline = bundle_adjust(scene.tracks, scene.camera, scene.T, scene.X)
+    assert np.abs(found.T_camera_world[0] - scene.T[0]).max() < 1e-9
+    (of_start, online), (offline_start, at_once), (true, _) = (
+        np.linalg.norm(centres(T)[[first - 1, -1]] - centres(T)[0], axis=1)
+        for T in (found.T_camera_world, offline.T_camera_world, scene.T)
+    )
+    assert of_start == pytest.approx(true, rel=5e-3)
+    assert online == pytest.approx(at_once * true / offline_start, rel=0.02)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1000.0])
+def test_online_follows_the_unit_of_its_start(scale: float) -> None:
+    scene = walk(14, 120, 8)
+    start = scene.T[:3].copy()
+    start[:, :3, 3] *= scale
+    metres = adjust_online(scene.tracks, scene.camera, scene.T[:3], window=5, noise_px=0.5)
+    other = adjust_online(scene.tracks, scene.camera, start, window=5, noise_px=0.5)
+    np.testing.assert_allclose(centres(other.T_camera_world) / scale, centres(metres.T_camera_world), atol=1e-5)
+    np.testing.assert_allclose(other.points / scale, metres.points, rtol=1e-4)
 
 
 def test_online_takes_nothing_from_the_future() -> None:

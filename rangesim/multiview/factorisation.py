@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rangesim.geometry.consensus import SIGNIFICANCE, refuse_misfit, rounding_of, simpler_model_suffices
 from rangesim.geometry.correspondences import (
@@ -32,7 +33,7 @@ from rangesim.geometry.correspondences import (
     normalising_transform,
     right_singular_vectors,
 )
-from rangesim.geometry.least_squares import descend
+from rangesim.geometry.least_squares import Descended, descend
 from rangesim.multiview import orthographic
 from rangesim.multiview.bundle_adjustment import check_connected
 from rangesim.multiview.orthographic import Shapes
@@ -49,6 +50,9 @@ SAME_COST = 1e-6
 LEAST_DAMPING = 1e-12
 MAX_ROTATION_DEVIATION = 0.3
 """Radians; rotations known worse than this are none."""
+MAX_DEPTH_DEVIATION = 0.15
+"""Relative standard deviation of the depths of a rigid shape together, beyond which they are open. Noise is Gaussian in
+1 / depth^2: at 0.15, two standard deviations are depths 1.6 times as large; at 0.2, noise alone finds 1000 times."""
 
 
 class AffineCameras(NamedTuple):
@@ -87,8 +91,10 @@ class OrthographicFactorisation:
 
     R_camera_world : (n_images, 3, 3), the first of which is the identity. t : (n_images, 2) pixels. scale :
     (n_images,), 1 under orthography, and 1 in the first image under weak perspective. points : (n_points, 3) in units
-    of the pixels, of the first image, their mean at 0; NaN of points seen in too few images. residuals_px : (m, 2)
-    predicted less seen; NaN of what was left out. noise_px : standard deviation of a coordinate.
+    of the pixels, of the first image, their mean at 0; NaN of points seen in too few images. shape_deviation_px :
+    (n_points,) standard deviation of a coordinate of `points`, root mean square over the three; NaN as `points`, and
+    where nothing tells the noise. residuals_px : (m, 2) predicted less seen; NaN of what was left out. noise_px :
+    standard deviation of a pixel's coordinate.
 
     Without perspective a shape and its mirror image, deep for shallow, look alike (Necker reversal): `reversed` is as
     good an answer as this one. Here the first image that turns is taken to be turned by a positive angle about the
@@ -99,6 +105,7 @@ class OrthographicFactorisation:
     t: Array
     scale: Array
     points: Array
+    shape_deviation_px: Array
     residuals_px: Array
     noise_px: float
 
@@ -335,7 +342,8 @@ def factorise_orthographic(
     ------
     ValueError
         As `factorise_affine`; fewer than three images (two leave a family of shapes, Ullman 1979); or images that turn
-        too little, or about the viewing direction alone, so that the shape stays open.
+        too little, or about the viewing direction alone, so that the shape stays open: half the depth and twice the
+        turn look the same but for the square of the turn.
     """
     if tracks.n_images < 3:
         raise ValueError(
@@ -354,12 +362,15 @@ def factorise_orthographic(
     refuse_misfit(float((residuals**2).sum()), freedom, noise_px, "one rigid shape without perspective")
     noise = noise_of(residuals, freedom, noise_px)
     refuse_open_rotations(found.here, gauge, noise)
+    _refuse_open_depth(found, noise)
+    deviations = shape_deviations(found, gauge)[0] * noise
     shapes = first_upright(shapes)
     return OrthographicFactorisation(
         shapes.R,
         shapes.t,
         shapes.scale,
         scattered(tracks, points, shapes.basis[:, 0]),
+        scattered(tracks, points, deviations[:, None])[:, 0],
         everywhere(tracks, points, residuals),
         noise,
     )
@@ -417,6 +428,62 @@ def refuse_open_rotations(equations: NormalEquations, gauge: int, noise: float, 
         raise ValueError(
             f"expected images that determine the shape, got some that leave their rotations open at a noise of "
             f"{noise:.3g} px: they turn too little, the same view again, or too few points; add views from other sides."
+        )
+
+
+def shape_deviations(found: Descended[Shapes, NormalEquations], gauge: int) -> Array:
+    """(n, p) root mean square standard deviation of the coordinates of the shape as its camera sees it, for residuals
+    of unit variance: what the points leave open, and what the images do, whose errors the points follow."""
+    shapes, sizes = found.state, found.here.sizes
+    n, K = shapes.coefficients.shape
+    p, c = len(shapes.basis), sizes.of_image
+    of_points = found.here.covariance_of_points().reshape(p, K, 3, K, 3)
+    weights = shapes.coefficients
+    variance = np.einsum("nk,pkdld,nl->np", weights, of_points, weights)
+    values, axes = np.linalg.eigh(found.here.free_covariance(gauge))
+    half = axes * np.sqrt(np.maximum(values, 0))
+    response = found.here.response_of_points().reshape(p, K, 3, n * c) @ half
+    for i in range(n):
+        seen = shapes.basis @ shapes.R[i].T  # (p, K, 3)
+        moved = np.einsum("ad,pkdg,k->pag", shapes.R[i], response, weights[i])
+        y = np.einsum("k,pkd->pd", weights[i], seen)
+        mine = half[i * c : (i + 1) * c]
+        moved += np.cross(mine[:3].T[None], y[:, None]).transpose(0, 2, 1)
+        moved += np.einsum("pkd,kg->pdg", seen[:, 1:], mine[5 : 4 + K])
+        if c > 4 + K:  # the logarithm of a scale
+            moved += y[:, :, None] * mine[-1]
+        moved -= moved.mean(axis=0)  # where the whole shape stands is no part of it
+        variance[i] += (moved**2).sum(axis=(1, 2))
+    return np.asarray(shapes.scale[:, None] * np.sqrt(variance / 3))
+
+
+def _refuse_open_depth(found: Descended[Shapes, NormalEquations], noise: float) -> None:
+    """Raise ValueError where the depths of a rigid shape, all by one factor, are known worse than within
+    `MAX_DEPTH_DEVIATION`.
+
+    Tilts w_i against the mean direction grow as the depths shrink: d log depth = -sum w_i dw_i / sum w_i^2.
+    """
+    shapes, size = found.state, found.here.sizes.of_image
+    n = len(shapes.R)
+    # the first image stays, and so does the mean of the shape along its viewing direction
+    conditions = np.zeros((7 if size > 5 else 6, n, size))
+    conditions[:5, 0, :5] = np.eye(5)
+    along = shapes.R[:, :2] @ shapes.R[0, 2]
+    conditions[5, :, 3:5] = along / max(float(np.linalg.norm(along)), 1e-300)
+    conditions[6:, 0, 5:] = 1.0
+    covariance = found.here.covariance(conditions.reshape(len(conditions), -1))
+    mean = Rotation.from_matrix(shapes.R).mean().as_matrix()
+    tilts = Rotation.from_matrix(shapes.R @ mean.T).as_rotvec() * [1, 1, 0]
+    tilts -= tilts.mean(axis=0)
+    weights = np.zeros((n, size))
+    weights[:, :3] = tilts / max(float((tilts**2).sum()), 1e-300)
+    with np.errstate(invalid="ignore"):
+        open_by = float(np.sqrt(weights.ravel() @ covariance @ weights.ravel())) * (0.0 if np.isnan(noise) else noise)
+    if not open_by <= MAX_DEPTH_DEVIATION:
+        amount = f"by {100 * open_by:.0f} %" if open_by < 10 else "altogether"
+        raise ValueError(
+            f"expected images whose turns determine the depths, got some that leave these open {amount} at a noise of "
+            f"{noise:.3g} px: shallow points that turn more look nearly the same; add views from other sides."
         )
 
 

@@ -49,6 +49,7 @@ from rangesim.multiview.factorisation import (
     refuse_open_rotations,
     refuse_rank,
     renumbered,
+    shape_deviations,
     whitened,
 )
 from rangesim.multiview.orthographic import Shapes, TemporalPrior
@@ -208,7 +209,7 @@ def adjust_nonrigid(
         found, noise = _left_wrong_minimum(some, found, noise, noise_px is None)
         # of a shape that is open, there is nothing to estimate
         gauge = count_unknowns(1, 1, n_basis).gauge
-        _refuse_open_shape(_deviations(found, gauge) * noise, _principal(found.state), noise)
+        _refuse_open_shape(shape_deviations(found, gauge) * noise, _principal(found.state), noise)
     used = prior if isinstance(prior, TemporalPrior) else _estimated(found)
     start = found.state
     if used.shape_bend_px is not None:
@@ -321,37 +322,13 @@ def _estimated(found: Descended[Shapes, NormalEquations], *, has_repeats: bool =
     follow. The sum of squares of the prior is to be that of K - 1 numbers of unit variance, and not of n - 2, else it
     is too sure by the root of (n - 2) / (K - 1), and pulls the shape off what the tracks say.
     """
-    deviation = _deviations(found, count_unknowns(1, 1, found.state.basis.shape[1]).gauge).max(axis=0)
+    deviation = shape_deviations(found, count_unknowns(1, 1, found.state.basis.shape[1]).gauge).max(axis=0)
     best = np.argsort(deviation)[: -(-len(deviation) // 2)]
     bends = np.diff(found.state.shapes[:, best], n=2, axis=0)
     n, K = found.state.coefficients.shape
     repeated = max((n - 2) / max(K - 1, 1), 1.0) if has_repeats else 1.0
     size = float(np.sqrt(((bends - bends.mean(axis=1, keepdims=True)) ** 2).mean() * repeated))
     return TemporalPrior(shape_bend_px=size if size > 0 else None)
-
-
-def _deviations(found: Descended[Shapes, NormalEquations], gauge: int) -> Array:
-    """(n, p) root mean square standard deviation of the coordinates of the shape as its camera sees it, for residuals
-    of unit variance: what the points leave open, and what the images do, whose errors the points follow."""
-    shapes, sizes = found.state, found.here.sizes
-    n, K = shapes.coefficients.shape
-    p, c = len(shapes.basis), sizes.of_image
-    of_points = found.here.covariance_of_points().reshape(p, K, 3, K, 3)
-    weights = shapes.coefficients
-    variance = np.einsum("nk,pkdld,nl->np", weights, of_points, weights)
-    values, axes = np.linalg.eigh(found.here.free_covariance(gauge))
-    half = axes * np.sqrt(np.maximum(values, 0))
-    response = found.here.response_of_points().reshape(p, K, 3, n * c) @ half
-    for i in range(n):
-        seen = shapes.basis @ shapes.R[i].T  # (p, K, 3)
-        moved = np.einsum("ad,pkdg,k->pag", shapes.R[i], response, weights[i])
-        y = np.einsum("k,pkd->pd", weights[i], seen)
-        mine = half[i * c : (i + 1) * c]
-        moved += np.cross(mine[:3].T[None], y[:, None]).transpose(0, 2, 1)
-        moved += np.einsum("pkd,kg->pdg", seen[:, 1:], mine[5 : 4 + K])
-        moved -= moved.mean(axis=0)  # where the whole shape stands is no part of it
-        variance[i] += (moved**2).sum(axis=(1, 2))
-    return np.asarray(np.sqrt(variance / 3))
 
 
 def _judged(
@@ -368,7 +345,7 @@ def _judged(
     # a prior on bends of the shape fixes where the deformations have their middle
     gauge = 3 + 3 * (K if prior.shape_bend_px is None else 1) + K * (K - 1)
     refuse_open_rotations(found.here, gauge, noise, unit)
-    deviations = _deviations(found, gauge) * noise / unit
+    deviations = shape_deviations(found, gauge) * noise / unit
     shapes = _principal(found.state)
     _refuse_open_shape(deviations, shapes, noise)
     residuals = shapes.project()[some.image, some.point] - some.pixels

@@ -56,7 +56,9 @@ def adjust_online(
     ----------
     tracks : of images in the order of time; wrong observations taken out (`structure_from_motion` finds them).
     T_start : (k, 4, 4) poses of the first k >= 2 images, T_camera_world, such as of a relative pose: they are adjusted
-        together first, in the gauge of `bundle_adjust`.
+        together first, in the gauge of `bundle_adjust`. The pose of the first image stays. Until a second image has
+        left the window, its distance from the farthest one of the start stays too, then the poses that have left do:
+        so the path has the scale of the start. A longer start tells the scale of the rest better.
     window : images that are free, at least two.
     noise_px : standard deviation of a coordinate.
 
@@ -84,7 +86,7 @@ def adjust_online(
     for image in range(k, tracks.n_images):
         past = tracks.of_images(np.arange(image + 1))
         T[image] = _placed(past, camera, X, image)
-        T[: image + 1], X, used = _adjusted(past, camera, T[: image + 1], X, window, noise_px)
+        T[: image + 1], X, used = _adjusted(past, camera, T[: image + 1], X, window, noise_px, k)
         arrival[image] = T[image]
         largest = max(largest, used)
     X = triangulate_many(tracks, camera, T, noise_px=noise_px).points
@@ -102,9 +104,12 @@ def _placed(past: Tracks, camera: Intrinsics, X: Array, image: int) -> Array:
 
 
 def _adjusted(
-    past: Tracks, camera: Intrinsics, T: Array, X: Array, window: int, noise_px: float
+    past: Tracks, camera: Intrinsics, T: Array, X: Array, window: int, noise_px: float, starting: int
 ) -> tuple[Array, Array, int]:
-    """Poses and points after an adjustment of the window, and how many images took part."""
+    """Poses and points after an adjustment of the window, and how many images took part.
+
+    starting : number of images of the start, which set the scale.
+    """
     newest = max(past.n_images - window, 1)  # the first image is the gauge
     current = np.zeros(past.n_points, dtype=bool)
     current[past.point[past.image >= newest]] = True
@@ -119,7 +124,39 @@ def _adjusted(
     some = live.keep(sound[live.point]).of_images(used)
     held = [i for i, image in enumerate(used) if image < newest]
     found = adjusted_views(some, camera, T[used], known, held=held, noise_px=noise_px)
+    moved, points = found.T_camera_world, found.points
+    if len(held) < 2:  # two that are held fix the scale
+        moved, points = _with_scale(moved, points, T[used], _image_of_scale(used, T, starting))
     T, X = T.copy(), X.copy()
-    T[used] = found.T_camera_world
-    X[current] = found.points[current]
+    T[used] = moved
+    X[current] = points[current]
     return T, X, len(used)
+
+
+def _image_of_scale(used: np.ndarray, T: Array, starting: int) -> int:
+    """Place in `used` of the image whose distance from the first of `used` keeps the scale: the farthest of the start.
+
+    Where fewer than two of the start take part, the farthest of the others that were adjusted before: all but the
+    newest, whose place is estimated from its points alone.
+    """
+    of_start = int((used < starting).sum())
+    end = of_start if of_start > 1 else max(len(used) - 1, 2)
+    centres = _centres(T[used[:end]])
+    return int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
+
+
+def _with_scale(T: Array, X: Array, before: Array, other: int) -> tuple[Array, Array]:
+    """Poses and points scaled about the first image so that the image `other` is as far from it as before."""
+    was, now = (np.linalg.norm(np.subtract(*_centres(some[[other, 0]]))) for some in (before, T))
+    if not (was > 0 and now > 0):
+        return T, X
+    scale, centre = was / now, _centres(T[:1])[0]
+    moved = T.copy()
+    places = centre + scale * (_centres(T) - centre)
+    moved[:, :3, 3] = -np.einsum("nij,nj->ni", T[:, :3, :3], places)
+    return moved, centre + scale * (X - centre)
+
+
+def _centres(T: Array) -> Array:
+    """(n, 3) world, the places of cameras."""
+    return np.asarray(-np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]))
