@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
+from scroll_hints import check_scroll_hints
 from small_result import SENSORS, small_result
 
 from rangesim.causes import Cause
@@ -320,6 +321,12 @@ def test_without_webgl_the_clouds_are_still_pictures(tmp_path: Path, mode: str) 
         np.testing.assert_allclose(one.mean(axis=(0, 1)), other.mean(axis=(0, 1)), atol=3)
         if mode != "error":  # of neighbours whose errors differ, chance says which is in front
             assert (np.abs(one - other).max(axis=2) < 24).mean() > 0.9
+
+
+@needs_browser
+def test_tables_wider_than_the_page_say_that_they_scroll(tmp_path: Path) -> None:
+    with browser(tmp_path) as page:
+        check_scroll_hints(page, small_result() / "report.html")
 
 
 def _browse(folder: Path, state: str, *options: str, console: bool = True, path: Path | None = None) -> str:

@@ -17,7 +17,7 @@ from rangesim.report import cloud, figures, palette, tables
 from rangesim.report.policy import StyleRules, content_policy, visible_text
 from rangesim.report.verdict import verdict
 
-SCRIPTS = ("viewer.js", "report.js")
+SCRIPTS = ("scroll.js", "viewer.js", "report.js")
 
 
 def write_report(result: Result, path: Path) -> None:
