@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from browser import BROWSER, browser
 from scipy.spatial.transform import Rotation
+from scroll_hints import check_scroll_hints
 
 from rangesim.calibration import BoardView, Checkerboard, RigCalibration, Suspect, default_rig
 from rangesim.cli.calibrate import check_places
@@ -101,6 +102,13 @@ def test_a_name_is_shown_and_not_run_and_the_page_asks_for_nothing(tmp_path: Pat
         assert page.evaluate("window.attacked") is None
         assert page.evaluate("document.querySelectorAll('svg image').length") == 6
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium found; apt-get install chromium")
+def test_tables_wider_than_the_page_say_that_they_scroll(tmp_path: Path):
+    (tmp_path / "page.html").write_text(render_calibration(calibrated(), NAMES))
+    with browser(tmp_path) as page:
+        check_scroll_hints(page, tmp_path / "page.html")
 
 
 def test_names_and_images_of_each_capture_are_needed():

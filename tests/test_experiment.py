@@ -206,6 +206,35 @@ def test_a_scene_from_a_dictionary_runs_too(tmp_path: Path) -> None:
     assert measurement.rows[-1]["median_abs_m"] < 0.01
 
 
+@pytest.mark.parametrize(("width", "power_w", "photons"), [(32, 10.0, 11.0), (64, 10.0, 2.76), (32, 0.01, 0.011)])
+def test_a_result_says_how_many_photons_a_pulse_brings(
+    tmp_path: Path, width: int, power_w: float, photons: float
+) -> None:
+    """A wall at 2 m: as many as the pulse's energy, the patch that a pixel sees and the aperture say; kept in files."""
+    wall = (ROOT / "scenes" / "plane.xml").read_text().replace('y="1" z="0.5"', 'y="2" z="0.5"')
+    (tmp_path / "wall.xml").write_text(wall.replace('scale x="1.5" y="1.5"', 'scale x="6" y="6"'))
+    detector = SpadDetector(bits=16, dark_counts_hz=0.0)
+    direct = Instrument("direct", DirectToF(), detector, power_w=power_w, exposure_s=1e-3)
+    size = {"width": width, "height": width * 3 // 4, "spp": 4, "photons": 0, "max_depth": 2}
+    run(Experiment(str(tmp_path / "wall.xml"), instruments=(direct, instrument("gray")), **size), tmp_path / "out")
+    counting, integrating = load_result(tmp_path / "out").measurements
+    rig, found = counting.capture.rig, counting.metadata.photons_per_pulse
+    assert rig is not None
+    assert found is not None
+    camera, projector = rig.camera, rig.projector
+    pixel = projector.fx * projector.fy / (projector.width * projector.height) / (camera.fx * camera.fy)
+    energy_j = power_w * 256 * 100e-12 * pixel * 0.5 * (rig.camera_lens.aperture_radius_m / 2.0) ** 2
+    expected = energy_j * 0.15 * 905e-9 / (6.62607015e-34 * 299792458)
+    assert expected == pytest.approx(photons, rel=0.01)
+    assert found.median == pytest.approx(expected, rel=0.01)
+    assert found.median <= found.largest < 1.1 * expected
+    assert integrating.metadata.photons_per_pulse is None
+    page = (tmp_path / "out" / "report.html").read_text()
+    said = re.findall(r"100 ps · ([\d.]+) photons detected per pulse in the median pixel, ([\d.]+) in", page)
+    assert len(said) == page.count("detected per pulse") == 1
+    assert [float(value) for value in said[0]] == pytest.approx([found.median, found.largest], rel=0.05)
+
+
 def test_an_experiment_states_its_ambient_light() -> None:
     experiment = experiment_from_dict({"scene": "a.xml", "ambient": {"illuminant": "sun", "illuminance_lux": 5e4}})
     assert experiment.ambient is not None

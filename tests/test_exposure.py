@@ -10,7 +10,7 @@ import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import BRIGHT_PERCENTILE
-from rangesim.capture.exposure import TARGET_FRACTION, expose
+from rangesim.capture.exposure import TARGET_FRACTION, expose, photons_per_pulse
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.response import SPEED_OF_LIGHT
@@ -134,6 +134,61 @@ def test_the_laser_fires_again_only_when_the_histogram_is_full(start_s: float) -
     signal = signals.channels[sensor.responses()[0]].sum(axis=0).mean() * per_second * exposure
     expected = signal + (0.5 * 2.0 * per_second + 2e5) * open_s
     assert abs(counts / expected - 1) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("width", "wall_m", "power_w", "albedo", "laser"),
+    [
+        (32, 2.0, 10.0, 0.5, "periodic"),
+        (64, 2.0, 10.0, 0.5, "periodic"),
+        (32, 0.2, 1.0, 0.9, "single-shot"),
+        (160, 3.0, 0.1, 0.1, "periodic"),
+    ],
+)
+@pytest.mark.parametrize("pile_up", [True, False])
+def test_photons_per_pulse_of_a_plain_wall_are_those_by_hand(
+    width: int, wall_m: float, power_w: float, albedo: float, laser: str, pile_up: bool
+) -> None:
+    """A pulse's energy over the wall that the projector lights, and what the lens catches of a pixel's patch."""
+    rig = stereo_rig(width, width * 3 // 4, baseline_m=0.0, projector_power_w=power_w)
+    sensor = DirectToF(laser=laser)
+    detector = SpadDetector(pile_up=pile_up, dark_counts_hz=1e5, ambient_transmission=0.5)
+    depth = np.full((rig.camera.height, rig.camera.width), wall_m)
+    signals = signals_of_depth(rig, depth, [sensor], albedo=albedo, ambient=0.3)
+    capture = expose(signals, sensor, detector, 1e-4)
+    period_s = sensor.bins * sensor.bin_s
+    per_joule = detector.quantum_efficiency * detector.wavelength_m / (6.62607015e-34 * 299792458)
+    camera, projector = rig.camera, rig.projector
+    lit_m2 = (projector.width / projector.fx) * (projector.height / projector.fy) * wall_m**2
+    patch_m2 = wall_m**2 / (camera.fx * camera.fy)
+    caught = albedo * (rig.camera_lens.aperture_radius_m / wall_m) ** 2  # pi a^2 / z^2 of albedo / pi
+    laser_photons = power_w * period_s * patch_m2 / lit_m2 * caught * per_joule
+    lens_m2 = np.pi * rig.camera_lens.aperture_radius_m**2
+    ambient_photons = 0.5 * 0.3 * lens_m2 / (camera.fx * camera.fy) * period_s * per_joule
+    found = photons_per_pulse(signals, capture)
+    assert found is not None
+    assert found.shape == depth.shape
+    np.testing.assert_allclose(found, laser_photons + ambient_photons + 1e5 * period_s, rtol=1e-3)
+
+
+def test_photons_per_pulse_are_what_the_counts_say() -> None:
+    """A histogram of first photons has a count of 1 - exp(-photons) of the pulses, one of all photons their mean."""
+    rig, sensor = stereo_rig(60, 40, baseline_m=0.0, projector_power_w=0.5), DirectToF()
+    signals = plane_signals(rig, sensor, distance_m=1.5, ambient=0.2)
+    for detector in (SpadDetector(bits=16), SpadDetector(bits=16, pile_up=False)):
+        capture = expose(signals, sensor, detector, 1e-3)
+        photons, pulses = photons_per_pulse(signals, capture), detector.pulses(sensor.gate, 1e-3)
+        assert photons is not None
+        assert 0.1 < np.median(photons) < 3
+        counted = -np.expm1(-photons) if detector.pile_up else photons
+        assert abs(capture.frames.sum(axis=0).mean() / pulses / counted.mean() - 1) < 1e-3
+
+
+def test_detectors_that_integrate_know_no_photons_per_pulse() -> None:
+    rig, counting = stereo_rig(), DirectToF()
+    signals = plane_signals(rig, SENSOR, counting)
+    assert photons_per_pulse(signals, expose(signals, SENSOR, Detector())) is None
+    assert photons_per_pulse(signals, expose(signals, counting)) is None  # noise-free
 
 
 def test_without_a_detector_frames_are_the_radiance() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from browser import BROWSER, browser
+from scroll_hints import check_scroll_hints
 from typer.testing import CliRunner
 
 from rangesim import load_range_image
@@ -159,3 +160,9 @@ def test_the_page_shows_its_pictures_and_breaks_none_of_its_rules(scanned: Path,
         assert page.evaluate("violations.length") == 0
         assert "measured" in page.evaluate("document.querySelector('.verdict').textContent")
         assert page.said == []
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser")
+def test_tables_wider_than_the_page_say_that_they_scroll(scanned: Path, tmp_path: Path) -> None:
+    with browser(tmp_path) as page:
+        check_scroll_hints(page, scanned / "report.html")

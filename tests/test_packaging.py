@@ -50,7 +50,9 @@ def test_the_wheel_holds_scenes_templates_and_types(built: Path) -> None:
     assert len(scenes) > 60
     assert scenes <= names
     assert {"rangesim/py.typed", "pcgraph/py.typed"} <= names
-    assert {f"rangesim/report/{n}" for n in ("report.html.j2", "report.js", "viewer.js", "style.css")} <= names
+    assert {
+        f"rangesim/report/{n}" for n in ("report.html.j2", "report.js", "scroll.js", "viewer.js", "style.css")
+    } <= names
     assert {name.split("/")[0] for name in names} == {"rangesim", "pcgraph", f"rangesim-{PROJECT['version']}.dist-info"}
 
 

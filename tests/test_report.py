@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from browser import OPTIONS, WITHOUT_WEBGL, browser
 from PIL import Image
+from scroll_hints import check_scroll_hints
 from small_result import SENSORS, small_result
 
 from rangesim.causes import Cause
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
-from rangesim.experiment.result_files import load_result
+from rangesim.experiment.result_files import PhotonsRecord, load_result
 from rangesim.report import cloud, palette, tables
 from rangesim.report.verdict import verdict
 
@@ -320,6 +321,19 @@ def test_without_webgl_the_clouds_are_still_pictures(tmp_path: Path, mode: str) 
         np.testing.assert_allclose(one.mean(axis=(0, 1)), other.mean(axis=(0, 1)), atol=3)
         if mode != "error":  # of neighbours whose errors differ, chance says which is in front
             assert (np.abs(one - other).max(axis=2) < 24).mean() > 0.9
+
+
+def test_photons_per_pulse_have_two_digits() -> None:
+    shown = {0.0: "0", 2e-4: "< 0.001", 0.0213: "0.021", 0.213: "0.21", 2.13: "2.1", 21.3: "21", 21300.0: "21 300"}
+    for value, text in shown.items():
+        said = tables.photons(PhotonsRecord(median=value, largest=3e4))
+        assert said == f"{text} photons detected per pulse in the median pixel, 30 000 in the brightest"
+
+
+@needs_browser
+def test_tables_wider_than_the_page_say_that_they_scroll(tmp_path: Path) -> None:
+    with browser(tmp_path) as page:
+        check_scroll_hints(page, small_result() / "report.html")
 
 
 def _browse(folder: Path, state: str, *options: str, console: bool = True, path: Path | None = None) -> str:

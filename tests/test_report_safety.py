@@ -123,7 +123,7 @@ def test_a_hash_in_the_address_chooses_colours_and_nothing_else(page: Page) -> N
         assert "NaN" not in page.evaluate("document.body.innerText")
 
 
-@pytest.mark.parametrize("name", ["report.html.j2", "report.js", "viewer.js"])
+@pytest.mark.parametrize("name", ["report.html.j2", "report.js", "scroll.js", "viewer.js"])
 def test_no_door_for_markup_or_code_in_the_sources(name: str) -> None:
     source = (Path(write_report.__code__.co_filename).parent / name).read_text(encoding="utf-8")
     doors = (

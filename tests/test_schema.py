@@ -79,6 +79,8 @@ JSON_DAMAGES: list[tuple[str, Edit, str]] = [
     ("lines/comparison.json", lambda d: d["rows"].append(d["rows"][0]), r"one row per material"),
     ("lines/measurement.json", put("pixels", 0), r"expected sensor, frames and pixels of the capture"),
     ("lines/measurement.json", put("exposure_s", 0.0), r"expected float > 0"),
+    ("histogram/measurement.json", put("photons_per_pulse", {"median": 1.0, "largest": -1.0}), r"expected float >= 0"),
+    ("histogram/measurement.json", put("photons_per_pulse", {"median": 1.0}), r"missing required field"),
     ("lines/capture/capture.json", put("rig.camera.fx", 1e308), r"fx"),
     ("lines/capture/capture.json", put("rig", None), r"expected a rig"),
 ]

@@ -61,11 +61,24 @@ def expose(
         ambient.check_emitters(bool(signals.energy.ambient.any()))
     if detector is None or sensor.is_ideal:
         return noise_free_capture(signals, sensor, ambient)
-    radiance = _through_lens(signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient)), signals.rig)
+    radiance = _mean_radiance(signals, sensor, detector, ambient)
     if exposure_s is None:
         exposure_s = auto_exposure_s(radiance, sensor, detector, signals.rig)
     frames = detector.read_out(radiance, sensor.gate, signals.rig, exposure_s, seed)
     return Capture(frames, sensor, signals.rig, detector, exposure_s, ambient)
+
+
+def photons_per_pulse(signals: Signals, capture: Capture) -> np.ndarray | None:
+    """(h, w) float64, photons that each pixel of the capture detected per laser pulse, on average, whether or not the
+    detector could count them; None if it integrates, or the capture is noise-free.
+
+    signals : those that the capture was exposed from.
+    """
+    sensor, detector = capture.sensor, capture.detector
+    if detector is None or sensor.gate is None:
+        return None
+    radiance = _mean_radiance(signals, sensor, detector, capture.ambient)
+    return detector.photons_per_pulse(radiance, sensor.gate, signals.rig)
 
 
 def noise_free_capture(
@@ -75,6 +88,11 @@ def noise_free_capture(
     unfiltered = 1.0 if ambient is None else ambient.scale
     frames = signals.frames(sensor, unfiltered, sampling_errors)
     return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
+
+
+def _mean_radiance(signals: Signals, sensor: Sensor, detector: PhotoDetector, ambient: Ambient | None) -> np.ndarray:
+    """(k, h, w) W/m2/sr, of the frames that a detector takes, on average."""
+    return _through_lens(signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient)), signals.rig)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:

@@ -96,6 +96,11 @@ class PhotoDetector(Named, ABC):
         photon counts, whose decoders know their own statistics."""
         return None
 
+    def photons_per_pulse(self, radiance: np.ndarray, gate: Gate | None, rig: Rig) -> np.ndarray | None:
+        """(h, w) float64, photons that a pixel detects per laser pulse, on average, of frames (k, h, w) of mean
+        radiance, W/m2/sr; None of a detector that integrates."""
+        return None
+
     def ambient_fraction(self, gate: Gate | None, ambient: Ambient | None = None) -> float:
         """Factor on the scene's ambient light for the part that counts: what passes the filter.
 

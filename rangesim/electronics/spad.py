@@ -86,6 +86,14 @@ class SpadDetector(PhotoDetector):
         pixel = self._pixel(_counting(gate), rig, exposure_s)
         return np.asarray(pixel.photons * np.asarray(radiance, dtype=np.float64) + pixel.dark)
 
+    def photons_per_pulse(self, radiance: np.ndarray, gate: Gate | None, rig: Rig) -> np.ndarray:
+        """(h, w) float64, photons that a pixel detects per laser pulse, on average, ambient light and dark counts
+        included, as if each were counted: with `pile_up`, the histogram has a count of 1 - exp(-photons) of the pulses.
+        """
+        gate = _counting(gate)
+        pixel = self._pixel(gate, rig, gate.period_s)  # an exposure of one pulse
+        return np.asarray(pixel.photons * radiance.sum(axis=0, dtype=np.float64) + len(radiance) * pixel.dark)
+
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         from pcgraph.parallel import MIN_ROWS, in_blocks
         from rangesim.electronics.shot_noise import count_first_photons, count_photons

@@ -17,6 +17,7 @@ import rangesim
 from pcgraph.output import new_directory
 from rangesim.capture import Capture
 from rangesim.capture.capture_files import write_capture
+from rangesim.capture.exposure import photons_per_pulse
 from rangesim.causes import explain
 from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
@@ -28,6 +29,7 @@ from rangesim.experiment.result_files import (
     RESULT,
     SETTINGS,
     MeasurementRecord,
+    PhotonsRecord,
     load_result,
     save_causes,
     save_rows,
@@ -182,7 +184,7 @@ def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, a
     if enough:
         with timed(times, "segmentation"):
             segment(cloud, folder / "segmentation.npz")
-    metadata = acquisition(capture, instrument.timing, moves, int(cloud.valid.sum()), times)
+    metadata = acquisition(capture, signals, instrument.timing, int(cloud.valid.sum()), times)
     write_record(folder / "measurement.json", metadata)
 
 
@@ -225,13 +227,15 @@ def noise_seed(experiment: Experiment, instrument: Instrument) -> int:
 
 
 def acquisition(
-    capture: Capture, timing: Timing, moves: bool, points: int, times_s: dict[str, float]
+    capture: Capture, signals: Signals, timing: Timing, points: int, times_s: dict[str, float]
 ) -> MeasurementRecord:
-    """Frames and time of a capture; exposure None for a noise-free one, which takes no time.
+    """Frames, time and photons of a capture of signals; exposure None for a noise-free one, which takes no time.
 
     Exposures follow each other at once, or, where something moves, as the timing says.
     """
     exposure = capture.exposure_s if np.isfinite(capture.exposure_s) else None
+    moves = signals.motion_m is not None
+    photons = photons_per_pulse(signals, capture)
     camera = capture.frames.shape[1:]
     shots = len(timing.exposure_times_s(capture.sensor))
     taken = None
@@ -246,8 +250,13 @@ def acquisition(
         acquisition_s=taken,
         pixels=int(capture.frames[0].size),
         points=points,
+        photons_per_pulse=_photons_record(photons) if photons is not None else None,
         times_s=times_s,
     )
+
+
+def _photons_record(photons: np.ndarray) -> PhotonsRecord:
+    return PhotonsRecord(median=float(np.median(photons)), largest=float(photons.max()))
 
 
 def _unwatched(stage: str, fraction: float) -> None:

@@ -38,6 +38,7 @@ from rangesim.files.schema import (
     Fraction,
     Metres,
     Name,
+    Photons,
     Positive,
     Record,
     Seconds,
@@ -97,8 +98,19 @@ class ResultRecord(Record, frozen=True, kw_only=True):
     times_s: dict[str, Seconds]
 
 
+class PhotonsRecord(Record, frozen=True, kw_only=True):
+    """Photons that a pixel detects per laser pulse, on average: median and largest of the pixels. From about one on,
+    pile-up hides later ones."""
+
+    median: Photons
+    largest: Photons
+
+
 class MeasurementRecord(Record, frozen=True, kw_only=True):
-    """`measurement.json`: frames, exposure and time per stage; exposure None for a noise-free capture."""
+    """`measurement.json`: frames, exposure and time per stage; exposure None for a noise-free capture.
+
+    photons_per_pulse : None where no photons are counted.
+    """
 
     format: Literal["rangesim-measurement"] = "rangesim-measurement"
     format_version: Literal[1] = 1
@@ -108,6 +120,7 @@ class MeasurementRecord(Record, frozen=True, kw_only=True):
     acquisition_s: Seconds | None
     pixels: Count
     points: Count
+    photons_per_pulse: PhotonsRecord | None = None
     times_s: dict[str, Seconds]
 
 
@@ -175,7 +188,7 @@ class Measurement(ShortRepr):
     rows : statistics per material class, "all" last; see `rangesim.evaluation.comparison.ErrorStatistics` and
         `rangesim.causes.CauseMap.fractions`.
     segmentation : Segmentation, or None if there were no points to group.
-    metadata : MeasurementRecord, frames, exposure and time per stage.
+    metadata : MeasurementRecord, frames, exposure, photons per pulse and time per stage.
     light_pass : int from 1, the transport pass the instrument took part in.
     """
 

@@ -25,6 +25,8 @@ from rangesim.files.text_files import read_json
 from rangesim.settings.config import shown
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
+Photons = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
+"""A mean number of photons."""
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]

@@ -17,7 +17,7 @@ from rangesim.report import cloud, figures, palette, tables
 from rangesim.report.policy import StyleRules, content_policy, visible_text
 from rangesim.report.verdict import verdict
 
-SCRIPTS = ("viewer.js", "report.js")
+SCRIPTS = ("scroll.js", "viewer.js", "report.js")
 
 
 def write_report(result: Result, path: Path) -> None:
@@ -98,10 +98,13 @@ def _frames(m: Measurement) -> dict[str, Any]:
         taken += f", {tables.seconds(f.exposure_s)} each" if f.frames != 1 else f", {tables.seconds(f.exposure_s)}"
     else:
         taken += ", noise-free"
+    details = [m.capture.sensor.details]
+    if f.photons_per_pulse is not None:
+        details.append(tables.photons(f.photons_per_pulse))
     return {
         "name": m.name,
         "taken": taken,
-        "details": m.capture.sensor.details,
+        "details": " · ".join(details),
         "frames": figures.captured_frames(m.capture),
     }
 

@@ -63,6 +63,7 @@ def context(found: RigCalibration, names: list[str], images: Sequence[np.ndarray
     T = found.rig.T_camera_projector
     return {
         "css": Markup(_asset("style.css")),  # our own files
+        "script": Markup(_asset("scroll.js")),
         "rules": StyleRules(),
         "content_policy": content_policy,
         "verdict": _verdict(found, names, devices, boards),

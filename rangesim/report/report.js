@@ -224,7 +224,7 @@ async function start() {
   if (Object.hasOwn(PAINT, wanted.get("color"))) page.setMode(wanted.get("color"));
   all("canvas.cloud").forEach((canvas) => {
     const one = page.of(canvas), drawn = one.z.reduce((n, v) => n + (v > 0), 0);
-    canvas.nextElementSibling.textContent = `${drawn.toLocaleString("en")} points` + (one.hidden ? `; ${one.hidden} farther ones not drawn` : "");
+    canvas.nextElementSibling.textContent = `${drawn.toLocaleString("en")} points` + (one.hidden ? `; ${one.hidden} farther ${one.hidden === 1 ? "one" : "ones"} not drawn` : "");
   });
   page.paint();
   page.clouds.forEach((cloud) => cloud.draw());

@@ -57,7 +57,8 @@ def context(result: ScanResult) -> dict[str, Any]:
     places = _places(result)
     fused = result.fused
     return {
-        "css": Markup(_asset("style.css")),  # our own file
+        "css": Markup(_asset("style.css")),  # our own files
+        "script": Markup(_asset("scroll.js")),
         "rules": StyleRules(),
         "content_policy": content_policy,
         "scene": result.settings.scene,

@@ -11,7 +11,7 @@ from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.evaluation.comparison import OUTLIER_M
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
-from rangesim.experiment.result_files import Measurement
+from rangesim.experiment.result_files import Measurement, PhotonsRecord
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import markdown_table
@@ -214,6 +214,20 @@ def seconds(value: float | None) -> str:
         if value * factor >= 0.9995:
             return f"{value * factor:.3g} {unit}"
     return f"{value * 1e6:.2g} µs"
+
+
+def photons(per_pulse: PhotonsRecord) -> str:
+    """What a laser pulse brings, in the median pixel and in the brightest."""
+    median, largest = (_amount(value) for value in (per_pulse.median, per_pulse.largest))
+    return f"{median} photons detected per pulse in the median pixel, {largest} in the brightest"
+
+
+def _amount(value: float) -> str:
+    """A number that is not negative, with about two significant digits, down to a thousandth."""
+    if value < 0.001:
+        return "< 0.001" if value else "0"
+    digits = 3 if value < 0.0995 else 2 if value < 0.995 else 1 if value < 9.95 else 0
+    return f"{value:,.{digits}f}".replace(",", " ") if value < 1e9 else f"{value:.2g}"
 
 
 def cost_table(measurements: Sequence[Measurement]) -> list[tuple[str, list[str]]]:
