@@ -175,7 +175,8 @@ def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -
     """One array per field of the numbers of a text, in the types that the header names.
 
     A packed colour that is nan says that there is none, as a text does not keep the bits of a nan: it becomes 0, black,
-    and the field is left out where it holds no other.
+    and the field is left out where it holds no other. One in whole numbers of 32 bits may be written with a sign or
+    without, whatever the header says.
 
     Parameters
     ----------
@@ -186,19 +187,44 @@ def columns_from_text(table: NDArray[np.float64], fields: Iterable[TextField]) -
     Returns
     -------
     dict of field name to (n,) array, (n, c) where the count is above 1
+
+    Raises
+    ------
+    CloudReadError
+        A field of integers has a number that is not whole, or that its type does not hold.
     """
     columns: dict[str, NDArray[np.generic]] = {}
     end = 0
     for name, dtype, count in fields:
         first, end = end, end + count
         numbers = table[:, first] if count == 1 else table[:, first:end]
-        if name.lower() in PACKED_NAMES and np.dtype(dtype).itemsize == 4 and (none := np.isnan(numbers)).any():
+        kind = np.dtype(dtype)
+        is_packed = name.lower() in PACKED_NAMES and kind.itemsize == 4
+        if is_packed and (none := np.isnan(numbers)).any():
             if none.all():
                 continue
             numbers = np.where(none, 0.0, numbers)
+        if kind.kind in "iu":
+            limits = np.iinfo(kind)
+            least, most = (-(1 << 31), (1 << 32) - 1) if is_packed else (int(limits.min), int(limits.max))
+            _check_whole(name, numbers, least, most)
+        if is_packed and kind.kind in "iu":
+            numbers = numbers.astype(np.int64)
         with np.errstate(over="ignore", invalid="ignore"):
-            columns[name] = numbers.astype(dtype)
+            columns[name] = numbers.astype(kind)
     return columns
+
+
+def _check_whole(name: str, numbers: NDArray[np.float64], least: int, most: int) -> None:
+    """Refuse numbers, (n,) or (n, c), that a field of integers cannot hold."""
+    wrong = ~((numbers >= float(least)) & (numbers <= float(most)) & (numbers == np.rint(numbers)))
+    if wrong.any():
+        row = int(np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))[0])
+        got = f"{numbers[wrong][0]:.12g}"
+        raise CloudReadError(
+            f"the header says that {name!r} holds whole numbers from {least} to {most}, "
+            f"but row {row + 1} of numbers has {got}: correct the type in the header, or the number"
+        )
 
 
 def numbers_from_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> NDArray[np.float64]:
@@ -241,6 +267,9 @@ def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> 
         words = line.split(None, n_columns)
         if not words:
             continue
+        if b"_" in line:  # Python reads 1_000 as a number, nobody else does
+            word = next((word for word in words if b"_" in word), line).decode("latin-1")
+            raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {word[:80]!r}")
         if len(words) != n_columns:
             got = f"more than {n_columns}" if len(words) > n_columns else f"{len(words)}"
             raise CloudReadError(

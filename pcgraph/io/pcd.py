@@ -198,9 +198,17 @@ def _exact(values: NDArray[np.generic], body: bytes, place: tuple[int, int, int]
     words = body.split(None, len(values) * width)[: len(values) * width]
     rows = [words[row + first : row + end] for row in range(0, len(words), width)]
     try:
-        return np.array([[int(word) for word in row] for row in rows], values.dtype).reshape(values.shape)
-    except (ValueError, OverflowError):
-        return values  # nan, or a decimal point
+        return np.array([[_whole(word) for word in row] for row in rows], values.dtype).reshape(values.shape)
+    except OverflowError:  # by less than a double tells
+        limits = np.iinfo(values.dtype.name)
+        raise CloudReadError(f"expected whole numbers from {limits.min} to {limits.max}, as the header says") from None
+
+
+def _whole(word: bytes) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        return int(float(word))  # with a decimal point or an exponent
 
 
 def _check_length(available: int, needed: int, header: PcdHeader) -> None:

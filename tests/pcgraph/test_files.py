@@ -161,6 +161,77 @@ def test_empty_lines_and_blanks_are_no_rows(kind):
         reader(content.replace(b"9 9 9 9", b"9 9 9 nine"))
 
 
+@pytest.mark.parametrize("file", ["pcd", "ply"])
+@pytest.mark.parametrize(
+    ("kind", "words", "wrong"),
+    [
+        ("u1", ["0", "255", "300"], "300"),
+        ("u1", ["255", "-1", "0"], "-1"),
+        ("u1", ["0.25", "1", "0"], "0.25"),
+        ("i1", ["127", "-128", "-129"], "-129"),
+        ("u2", ["65536", "1", "2"], "65536"),
+        ("i4", ["1", "nan", "3"], "nan"),
+        ("i4", ["1", "2", "3000000000"], "3000000000"),
+        ("u4", ["4294967295", "4294967296", "0"], "4294967296"),
+        ("i4", ["1", "inf", "3"], "inf"),
+    ],
+)
+def test_whole_numbers_of_text_are_as_the_header_says(file, kind, words, wrong):
+    """They wrapped: a red of 300 became 44, a label of nan -2147483648."""
+    rows = [f"1 2 3 {word}" for word in words]
+    size, letter = kind[1], kind[0].upper()
+    name = {"i1": "char", "u1": "uchar", "u2": "ushort", "i4": "int", "u4": "uint"}[kind]
+
+    def content(rows):
+        reader, text = text_files(rows)[file]
+        text = text.replace(b"SIZE 4 4 4 4\nTYPE F F F F", f"SIZE 4 4 4 {size}\nTYPE F F F {letter}".encode())
+        return reader, text.replace(b"float w", f"{name} w".encode())
+
+    row = words.index(wrong) + 1
+    reader, text = content(rows)
+    with pytest.raises(CloudReadError, match=f"'w' holds whole numbers from .*row {row} of numbers has {wrong}: "):
+        reader(text)
+    rows[row - 1] = "1 2 3 1.0e1"
+    reader, text = content(rows)
+    column = reader(text).columns["w"]
+    assert column.dtype == kind
+    assert column.tolist() == [10 if word == wrong else int(word) for word in words]
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [("I", "9223372036854775808"), ("U", "18446744073709551616"), ("U", "-1"), ("I", "0.5"), ("I", "nan")],
+)
+def test_whole_numbers_of_64_bits_of_text(kind, wrong):
+    """One that is written with an exponent made all others of its column round; one too large was rounded."""
+    most = {"I": 2**63 - 1, "U": 2**64 - 1}[kind]
+    content = text_files([f"1 2 3 {most}", f"1 2 3 {most - 10}", "1 2 3 1e1"])["pcd"][1]
+    content = content.replace(b"SIZE 4 4 4 4\nTYPE F F F F", b"SIZE 4 4 4 8\nTYPE F F F " + kind.encode())
+    assert read_pcd(content).columns["w"].tolist() == [most, most - 10, 10]
+    with pytest.raises(CloudReadError, match="whole numbers from"):
+        read_pcd(content.replace(b"1e1", wrong.encode()))
+
+
+@pytest.mark.parametrize("kind", ["i4", "u4"])
+@pytest.mark.parametrize("name", ["rgb", "rgba"])
+def test_packed_colours_of_text_with_a_sign_or_without(kind, name):
+    """The bits are the same; those of more than 31 became black where the header says int."""
+    for word in ("4294901760", "-65536", "16711680"):  # red, opaque or not
+        for cloud in colored_texts([word, "255"], kind, name):
+            assert cloud.colors.tolist() == [[255, 0, 0], [0, 0, 255]]
+    with pytest.raises(CloudReadError, match="whole numbers from -2147483648 to 4294967295"):
+        colored_texts(["4294967296"], kind, name)
+
+
+@pytest.mark.parametrize("kind", ["pcd", "ply"])
+def test_numbers_as_python_alone_writes_them_are_none(kind):
+    reader, content = text_files(["1 2 3 4", "1_0 2 3 4", "5 6 7 8"])[kind]
+    with pytest.raises(
+        CloudReadError, match=f"numbers only in the ascii data, got in line {13 + (kind == 'ply')}: '1_0'"
+    ):
+        reader(content)
+
+
 @pytest.mark.parametrize("code", ["ascii", "binary_little_endian", "binary_big_endian", "pcd ascii", "pcd binary"])
 @pytest.mark.parametrize(
     ("kind", "x", "dtype"),
