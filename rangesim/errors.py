@@ -8,6 +8,8 @@ command line prints it as it stands.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from pcgraph.errors import one_line, visible
 
@@ -23,6 +25,7 @@ __all__ = [
     "sentence",
     "visible",
     "warn",
+    "without_warnings",
 ]
 
 MAX_SENTENCE = 480
@@ -67,6 +70,14 @@ class SamplingWarning(RangesimWarning):
 def warn(message: str) -> None:
     """Warn with one sentence; the command line prints it on a line of its own."""
     warnings.warn(sentence(message), RangesimWarning, stacklevel=3)
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """Suppress `RangesimWarning`: what is decoded again for comparison has warned already."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RangesimWarning)
+        yield
 
 
 def sentence(message: str) -> str:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rangesim import AmcwToF, IdealToF, Scene, StructuredLight, decode, expose, load_scene, transport
-from rangesim.errors import SamplingWarning
+from rangesim.causes import explain
+from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import range_noise, robust_sigma, warn_of_sampling
 from rangesim.experiment.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
 from rangesim.experiment.instrument import Instrument
@@ -53,6 +54,30 @@ def test_the_drawn_error_of_halves_of_unequal_size_has_the_variance_of_the_mean(
     assert mean.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
     assert error.std() == pytest.approx(1 / np.sqrt(p + q), rel=0.02)
     assert abs(error.mean()) < 0.01
+
+
+def test_what_is_decoded_again_for_comparison_does_not_warn_again(matte: Scene, monkeypatch: Any) -> None:
+    """A decoder that warns of every capture does so once, for the reading itself; the masks are as without."""
+    sensor, rig = AmcwToF(), matte.rig(0.03, **SMALL_IMAGE)
+    signals = transport(matte, rig, [sensor], spp=4)
+    capture = expose(signals, sensor)
+    image = decode(capture)
+    noise, causes = range_noise(image, capture, signals), explain(image, capture, signals)
+    assert causes.failed.any()
+    decoder, quiet = type(sensor.default_decoder), type(sensor.default_decoder).decode
+
+    def loud(self: Any, capture: Any) -> Any:
+        warn("frames and code contradict each other.")
+        return quiet(self, capture)
+
+    monkeypatch.setattr(decoder, "decode", loud)
+    with pytest.warns(RangesimWarning, match="contradict"):
+        image = decode(capture)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again, anew = range_noise(image, capture, signals), explain(image, capture, signals)
+    np.testing.assert_array_equal(again.sampling, noise.sampling)
+    np.testing.assert_array_equal(anew.cause, causes.cause)
 
 
 @pytest.mark.validation

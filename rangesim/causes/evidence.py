@@ -17,6 +17,7 @@ from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.electronics.spad import SpadDetector
+from rangesim.errors import without_warnings
 from rangesim.evaluation.comparison import neighbours
 from rangesim.evaluation.depth_edges import across, depth_edges
 from rangesim.response import DIRECT, KINDS, MULTIPATH
@@ -229,7 +230,8 @@ class Evidence:
     def _read(self, frames: np.ndarray) -> np.ndarray:
         """(n,) depths that the decoder reads of noise-free frames (k, h, w) in the failed pixels, metres."""
         clean = Capture(frames, self.capture.sensor, self.signals.rig)
-        return decode(clean, self.decoder).z[self.failed].astype(np.float64)
+        with without_warnings():
+            return decode(clean, self.decoder).z[self.failed].astype(np.float64)
 
     def _wrong(self, z: np.ndarray) -> np.ndarray:
         """Where depths z (n,) of the failed pixels are off by half of their error or more."""

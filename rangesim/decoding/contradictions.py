@@ -69,7 +69,8 @@ def fringe_contradiction(
     if resultant > 0.8 * np.sinc(2 * half):
         return (
             f"{text}: they seem to start {abs(offset_px):.1f} projector pixels too {'early' if mean > 0 else 'late'}, "
-            "so check where their cosine starts (half a pixel: at the first pixel's centre, not its edge)."
+            "so check where their cosine starts (half a pixel: at the first pixel's centre, not its edge), "
+            "and whether something moved between the frames."
         )
     return f"{text}, as if by chance: check the period, the steps, the order of the frames and the code."
 

@@ -19,7 +19,7 @@ import numpy as np
 from rangesim.capture import Capture
 from rangesim.capture.exposure import noise_free_capture
 from rangesim.decoding.range_image import RangeImage
-from rangesim.errors import SamplingWarning, sentence
+from rangesim.errors import SamplingWarning, sentence, without_warnings
 from rangesim.signals import ALL
 
 if TYPE_CHECKING:
@@ -70,10 +70,11 @@ def range_noise(image: RangeImage, capture: Capture, signals: Signals) -> RangeN
     """
     from rangesim.decoding import decode
 
-    above, below = (
-        decode(noise_free_capture(signals, capture.sensor, capture.ambient, error), image.decoder).z.astype(np.float64)
-        for error in (1.0, -1.0)
-    )
+    with without_warnings():
+        above, below = (
+            decode(noise_free_capture(signals, capture.sensor, capture.ambient, error), image.decoder).z.astype(float)
+            for error in (1.0, -1.0)
+        )
     detector = image.z - (above + below) / 2 if capture.is_digital else np.full(image.z.shape, np.nan)
     sampling = np.where(np.isnan(above) | np.isnan(below), np.inf, (above - below) / 2)
     sampling[~image.valid] = np.nan
