@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -279,6 +280,59 @@ def moved(view, point, off):
     pixels = view.pixels.copy()
     pixels[point] += off
     return BoardView(view.indices, pixels)
+
+
+@pytest.mark.filterwarnings("ignore:.*in a corner of its image")
+@pytest.mark.parametrize(
+    ("distortion", "count", "coefficients"),
+    [
+        (CAMERA.distortion, 10, 0),
+        (CAMERA.distortion, 4, 0),
+        ((-0.3, 0.1), 10, 0),
+        ((-0.05,), 10, 0),
+        ((-0.3, 0.4), 10, 1),
+    ],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_distortion_that_is_left_out_is_told(distortion, count, coefficients, seed):
+    """The camera was off by up to 29 px at a stated 2.8, without a word or with 'leave that view out'."""
+    rng = np.random.default_rng(seed)
+    camera = replace(CAMERA, distortion=distortion)
+    seen = views(poses(count, rng, camera), camera, 0.1, rng)
+    with pytest.warns(rangesim.errors.RangesimWarning, match=rf"distortion that {coefficients} free") as told:
+        found = calibrate_camera(BOARD, seen, 640, 480, coefficients=coefficients)
+    full = calibrate_camera(BOARD, seen, 640, 480, coefficients=5)
+    assert not any("than noise can explain" in str(warning.message) for warning in told)
+    assert found.suspects == full.suspects == ()
+    text = next(str(w.message) for w in told if "distortion that" in str(w.message))
+    name, shift = re.search(r"move (\w+) of the camera by ([-+.\d]+) px", text).groups()
+    k = ["fx", "fy", "cx", "cy"].index(name)
+    assert float(shift) == pytest.approx((lens(full.camera) - lens(found.camera))[k], abs=0.06)
+    assert abs(float(shift)) > 2 * found.deviations[k]
+
+
+@pytest.mark.filterwarnings("ignore:.*in a corner of its image")
+@pytest.mark.parametrize(("distortion", "coefficients"), [((), 0), ((-0.1,), 1), ((-0.12, 0.05), 2)])
+def test_coefficients_that_suffice_are_not_said_to_be_too_few(distortion, coefficients):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        camera = replace(CAMERA, distortion=distortion)
+        found = calibrate_camera(
+            BOARD, views(poses(8, rng, camera), camera, 0.1, rng), 640, 480, coefficients=coefficients
+        )
+        assert found.suspects == ()
+
+
+@pytest.mark.filterwarnings("ignore:.*in a corner of its image")
+def test_a_view_that_does_not_fit_is_no_distortion():
+    rng = np.random.default_rng(4)
+    pinhole = replace(CAMERA, distortion=())
+    seen = views(poses(10, rng, pinhole), pinhole, 0.1, rng)
+    seen[3] = moved(seen[3], 0, (4.0, 3.0))
+    with pytest.warns(rangesim.errors.RangesimWarning, match="point 0 of view 3 is off by"):
+        found = calibrate_camera(BOARD, seen, 640, 480, coefficients=0)
+    assert (found.suspects[0].view, found.suspects[0].point) == (3, 0)
+    assert {s.view for s in found.suspects} == {3}
 
 
 @pytest.mark.filterwarnings("ignore:.*in a corner of its image")

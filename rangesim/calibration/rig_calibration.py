@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.calibration.boards import Board, BoardView
 from rangesim.calibration.bundle import Bundle, Observation
-from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
+from rangesim.calibration.suspects import Suspect, suspects_told
 from rangesim.calibration.zhang import adjust_as_seen, check_views, first_camera, judged
 from rangesim.capture import Capture
 from rangesim.decoding.range_image import RangeImage
@@ -193,8 +193,7 @@ def calibrate_rig(
     of_camera, of_projector = tuple(residuals[: len(views)]), tuple(residuals[len(views) :])
     by_device = np.zeros((2, LENS))
     by_device[:, :lens] = deviations[: 2 * lens].reshape(2, lens)
-    suspects = find_suspects(bundle, observations, every, found.noise(found.jacobian.shape[1]), coefficients)
-    warn_of_suspects(suspects, names)
+    suspects = suspects_told(found, observations, every, coefficients, names)
     return RigCalibration(
         Rig(camera_found, projector_found, T_camera_projector=np.linalg.inv(bundle.T_second_first)),
         by_device[0],

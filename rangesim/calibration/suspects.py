@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of views that do not fit a calibration, by more than noise can explain."""
+"""Points of views that do not fit a calibration, and distortion that it leaves out, by more than noise can explain."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rangesim.calibration.boards import BoardView
-from rangesim.calibration.bundle import Bundle, Observation, reweighted
+from rangesim.calibration.bundle import Bundle, Observation, adjust, reweighted
 from rangesim.errors import warn
+from rangesim.geometry.consensus import simpler_model_suffices
 from rangesim.geometry.correspondences import Array
+from rangesim.geometry.least_squares import Minimum
+from rangesim.rig import Intrinsics
 
 LIMIT = 6.0
 """Robust standard deviations of a coordinate: noise goes beyond once in 10^8 points."""
@@ -20,6 +23,13 @@ LEAST_PX = 0.1
 MAX_NOISE = 1.5
 """Noise of a bundle over that of its devices by themselves, above which views contradict each other."""
 DEVICES = ("camera", "projector")
+
+COEFFICIENTS = 5
+"""Of distortion, that a lens has at most."""
+MAX_SHIFT = 2.0
+"""Standard deviations by which the distortion that is left out may move a focal length or a principal point."""
+ROUNDING_PX = 1e-6
+"""Residuals below are none."""
 
 
 class Suspect(NamedTuple):
@@ -70,7 +80,68 @@ def _beyond(
     return tuple(sorted(found, key=lambda suspect: -suspect.error_px))
 
 
-def warn_of_suspects(suspects: Sequence[Suspect], names: Sequence[str]) -> None:
+def suspects_told(
+    found: Minimum[Bundle],
+    observations: Sequence[Observation],
+    views: Sequence[BoardView],
+    coefficients: int,
+    names: Sequence[str],
+) -> tuple[Suspect, ...]:
+    """`find_suspects`, with a warning that names the view of the worst one.
+
+    Where all points fit a lens with all coefficients of distortion, there are none, and the warning is of these.
+
+    Parameters
+    ----------
+    found : of `adjust` with so many `coefficients`. views : the points of each observation. names : of the views.
+    """
+
+    def suspects_of(minimum: Minimum[Bundle], free: int) -> tuple[Suspect, ...]:
+        is_rig = len(minimum.state.devices) > 1
+        noise = minimum.noise(minimum.jacobian.shape[1]) if is_rig else 1.0
+        return find_suspects(minimum.state, observations, views, noise, free)
+
+    if coefficients < COEFFICIENTS:
+        full = adjust(found.state, observations, COEFFICIENTS)
+        says = _missing_distortion(found, full, coefficients)
+        if says is not None and not suspects_of(full, COEFFICIENTS):
+            warn(says)
+            return ()
+    suspects = suspects_of(found, coefficients)
+    _warn_of_suspects(suspects, names)
+    return suspects
+
+
+def _missing_distortion(found: Minimum[Bundle], full: Minimum[Bundle], coefficients: int) -> str | None:
+    """A sentence if all coefficients of distortion explain residuals that `found` leaves, and move its cameras by more
+    than it states, None if not."""
+    n = len(found.residuals)
+    (simple, k), (fuller, more) = ((minimum.cost, minimum.jacobian.shape[1]) for minimum in (found, full))
+    if n <= more or simpler_model_suffices((simple, n - k), (fuller, n - more), None, ROUNDING_PX):
+        return None
+    deviations = np.sqrt(np.diag(found.covariance(max(found.noise(k), ROUNDING_PX))))
+    shifts = []
+    for device, (was, now) in enumerate(zip(found.state.devices, full.state.devices, strict=True)):
+        moved = _pinhole(now) - _pinhole(was)
+        first = device * (4 + coefficients)
+        relative = np.abs(moved) / deviations[first : first + 4]
+        worst = int(np.argmax(relative))
+        shifts.append((float(relative[worst]), float(moved[worst]), ("fx", "fy", "cx", "cy")[worst], DEVICES[device]))
+    relative_shift, shift, parameter, name = max(shifts)
+    if not relative_shift > MAX_SHIFT:
+        return None
+    return (
+        f"the residuals show distortion that {coefficients} free coefficients leave out: all {COEFFICIENTS} lower the "
+        f"squared errors by {100 * (1 - fuller / simple):.0f} % and move {parameter} of the {name} by {shift:+.1f} px, "
+        f"{relative_shift:.0f} times the standard deviation stated; free more coefficients."
+    )
+
+
+def _pinhole(device: Intrinsics) -> Array:
+    return np.array([device.fx, device.fy, device.cx, device.cy])
+
+
+def _warn_of_suspects(suspects: Sequence[Suspect], names: Sequence[str]) -> None:
     """A warning that names the view of the worst of them, if there are any."""
     if suspects:
         worst = suspects[0]

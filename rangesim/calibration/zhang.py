@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from rangesim.calibration.boards import Board, BoardView
 from rangesim.calibration.bundle import Bundle, Observation, adjust
-from rangesim.calibration.suspects import Suspect, find_suspects, warn_of_suspects
+from rangesim.calibration.suspects import Suspect, suspects_told
 from rangesim.errors import warn
 from rangesim.geometry.camera_pose import fit_camera_pose
 from rangesim.geometry.correspondences import Array, checked_array, unit_norm
@@ -174,8 +174,8 @@ def calibrate_camera(
     coefficients : of distortion that are free, of k1, k2, p1, p2, k3 in this order; 0 for a pinhole.
     names : of the views, for messages; None: their numbers.
 
-    Warns of points that do not fit (`suspects`), and of a lens that is unknown in a corner of the image, or folds
-    there.
+    Warns of points that do not fit (`suspects`), of distortion that too few coefficients leave out, and of a lens that
+    is unknown in a corner of the image, or folds there.
 
     Raises
     ------
@@ -186,8 +186,7 @@ def calibrate_camera(
     if len(names) != len(views):
         raise ValueError(f"expected a name for each of the {len(views)} views, got {len(names)}.")
     found, observations, noise, deviations = _calibrated(board, views, width, height, coefficients, names)
-    suspects = find_suspects(found.state, observations, views, 1.0, coefficients)
-    warn_of_suspects(suspects, names)
+    suspects = suspects_told(found, observations, views, coefficients, names)
     residuals = tuple(found.state.project(seen) - seen.pixels for seen in observations)
     everywhere = np.concatenate(residuals)
     lens = np.zeros(LENS)

@@ -14,26 +14,30 @@ from rangesim.decoding.gray import GrayCode
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.status import Status
 
-LEAST_PIXELS = 200
-"""Fewer say nothing."""
-MOST_PIXELS = 200_000
-"""More say no more; evenly spread over the image."""
-MOST_FAR = 0.2
-"""Share of pixels whose phase lies more than an eighth of a period outside their Gray cell; a quarter if by chance."""
-LEAST_ONE_SIDED = 0.02
-LEAST_OFFSET_PX = 0.25
-LEVEL_ERROR = 0.03
-"""Of white - black, by which the mean of the fringes may miss the middle between black and white."""
+MIN_PIXELS = 200
+"""Pixels; fewer say nothing."""
+MAX_PIXELS = 200_000
+"""Pixels that are looked at, evenly spread over the image; more say no more."""
+MAX_FAR_FRACTION = 0.2
+"""Fraction of pixels whose phase may lie more than an eighth of a period outside their Gray cell; a quarter do by
+chance."""
+MIN_ONE_SIDED_FRACTION = 0.02
+"""Fraction of pixels outside their Gray cell, on one side more than on the other, from which on fringes are shifted."""
+MIN_OFFSET_PX = 0.25
+"""Projector pixels by which fringes must be shifted to be told."""
+MAX_LEVEL_ERROR = 0.03
+"""Fraction of white - black by which the mean of the fringes may miss the middle between black and white."""
 PHASE_BINS = 8
-LEAST_STEPS = 100
+"""Into which a period is divided, to see at which phases the mean of the fringes is off."""
+MIN_STEPS = 100
 """Pairs of neighbouring pixels in different cells; fewer do not tell plain binary from Gray code."""
-FARTHER = 0.3
-"""In powers of two, by which neighbours lie farther apart if read as Gray code, of plain binary; about 1 expected."""
-MOST_BEHIND = 0.2
-"""Share of pixels whose rays meet behind a device, and clearly so; a few do by interreflection."""
-CLEARLY_BEHIND_PX = 10.0
-"""Projector pixels from parallel; less may be noise on what is far away."""
-LEAST_CELLS = 8
+MAX_FARTHER = 0.3
+"""Powers of two by which neighbours may lie farther apart if read as Gray code; about 1 is expected of plain binary."""
+MAX_BEHIND_FRACTION = 0.2
+"""Fraction of pixels whose rays may meet clearly behind a device; a few do by interreflection."""
+MIN_BEHIND_PX = 10.0
+"""Projector pixels from parallel, from which on rays meet clearly behind; less may be noise on what is far away."""
+MIN_CELLS = 8
 """Gray cells that must be in view to say that a frame is black or white everywhere."""
 
 
@@ -50,7 +54,7 @@ def fringe_contradiction(
     period_px : float, projector pixels.
     """
     used = _comparable(gray, refined)
-    if len(used) < LEAST_PIXELS:
+    if len(used) < MIN_PIXELS:
         return None
     phase = phase_of(frames.reshape(len(frames), -1)[:, used]).normalised
     off = _wrapped(phase - gray.coordinate.ravel()[used] / np.float32(period_px))
@@ -59,12 +63,12 @@ def fringe_contradiction(
     above, below = float((off > half + 0.005).mean()), float((off < -half - 0.005).mean())
     mean, resultant = _circular_mean(off)
     offset_px = mean * period_px
-    one_sided = max(above, below) > LEAST_ONE_SIDED + 3 * min(above, below) and abs(offset_px) > LEAST_OFFSET_PX
-    if far <= MOST_FAR and not one_sided:
+    one_sided = max(above, below) > MIN_ONE_SIDED_FRACTION + 3 * min(above, below) and abs(offset_px) > MIN_OFFSET_PX
+    if far <= MAX_FAR_FRACTION and not one_sided:
         return None
     outside = 100 * float((np.abs(off) > half + 0.005).mean())
     text = f"the fringes along {axis} contradict the Gray code at {outside:.0f} % of the pixels"
-    if far > MOST_FAR and _direction(gray, refined, frames) < 0:
+    if far > MAX_FAR_FRACTION and _direction(gray, refined, frames) < 0:
         return f"{text}: they seem to be shifted in the other direction, so check the order of their frames."
     if resultant > 0.8 * np.sinc(2 * half):
         return (
@@ -90,19 +94,19 @@ def level_contradiction(
     """
     white, black = capture.frames[-2], capture.frames[-1]
     used = _spread(np.flatnonzero(_inside_cell(gray, refined) & ~capture.saturated(white[None])))
-    if len(used) < LEAST_PIXELS:
+    if len(used) < MIN_PIXELS:
         return None
     dark = black.ravel()[used].astype(np.float64)
     values = (capture.frames[run].reshape(run.stop - run.start, -1)[:, used] - dark) / (white.ravel()[used] - dark)
     phase = phase_of(values)
     bins = np.minimum((phase.normalised * PHASE_BINS).astype(int), PHASE_BINS - 1)
-    members = [m for m in (np.flatnonzero(bins == b) for b in range(PHASE_BINS)) if len(m) >= LEAST_PIXELS / 10]
+    members = [m for m in (np.flatnonzero(bins == b) for b in range(PHASE_BINS)) if len(m) >= MIN_PIXELS / 10]
     if not members:
         return None
     off, noise = _medians(values.mean(axis=0) - 0.5, members)
-    if np.sqrt((off**2).mean()) < LEVEL_ERROR + 3 * np.sqrt((noise**2).mean()):
+    if np.sqrt((off**2).mean()) < MAX_LEVEL_ERROR + 3 * np.sqrt((noise**2).mean()):
         return None
-    if len(np.unique(gray.coordinate.ravel()[used])) >= LEAST_CELLS and (
+    if len(np.unique(gray.coordinate.ravel()[used])) >= MIN_CELLS and (
         fault := _odd_frame(values, members, names[run])
     ):
         return f"the fringes along {axis} contradict white and black: {fault}."
@@ -149,7 +153,7 @@ def binary_contradiction(gray: GrayCode, axis: str) -> str | None:
         both = usable[here] & usable[there] & (number[here] != number[there])
         apart.append([np.abs(n[there][both] - n[here][both]) for n in (number, plain)])
     as_gray, as_binary = (np.log2(np.concatenate(steps)) for steps in zip(*apart, strict=True))
-    if len(as_gray) < LEAST_STEPS or as_gray.mean() < as_binary.mean() + FARTHER:
+    if len(as_gray) < MIN_STEPS or as_gray.mean() < as_binary.mean() + MAX_FARTHER:
         return None
     return (
         f"the bits along {axis} contradict Gray code: read as plain binary numbers neighbouring pixels lie "
@@ -164,13 +168,13 @@ def behind_contradiction(behind_px: np.ndarray) -> str | None:
     ----------
     behind_px : (n,) float, as `ProjectorTriangulation` has it.
     """
-    share = float((behind_px > CLEARLY_BEHIND_PX).mean()) if len(behind_px) >= LEAST_PIXELS else 0.0
-    if share <= MOST_BEHIND:
+    fraction = float((behind_px > MIN_BEHIND_PX).mean()) if len(behind_px) >= MIN_PIXELS else 0.0
+    if fraction <= MAX_BEHIND_FRACTION:
         return None
     return (
-        f"{100 * share:.0f} % of the decoded rays meet behind camera or projector, where nothing is, so the depth of "
-        "the others is doubtful: check that no image is mirrored, that T_camera_projector is not its inverse, and that "
-        "the axes and their order are those shown."
+        f"{100 * fraction:.0f} % of the decoded rays meet behind camera or projector, where nothing is, so the depth "
+        "of the others is doubtful: check that no image is mirrored, that T_camera_projector is not its inverse, and "
+        "that the axes and their order are those shown."
     )
 
 
@@ -187,7 +191,7 @@ def _inside_cell(gray: GrayCode, refined: GrayCode) -> np.ndarray:
 
 
 def _spread(indices: np.ndarray) -> np.ndarray:
-    return indices[:: 1 + len(indices) // MOST_PIXELS]
+    return indices[:: 1 + len(indices) // MAX_PIXELS]
 
 
 def _direction(gray: GrayCode, refined: GrayCode, frames: np.ndarray) -> float:
