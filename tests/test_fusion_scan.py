@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from fusion_scenes import ball, block, mesh_depth, part, range_image
 
 import rangesim
 from rangesim import IdealToF, StructuredLight, load_scene
-from rangesim.errors import AlignmentWarning
+from rangesim.errors import AlignmentWarning, sentence
 from rangesim.fusion import (
     Dome,
     HandHeld,
@@ -23,11 +24,15 @@ from rangesim.fusion import (
     Viewpoint,
     align,
     fuse,
+    multiway_registration,
     pose_errors,
     scan,
     surface_error,
 )
-from rangesim.fusion.multiway_registration import _unchecked, _without_planes
+from rangesim.fusion.multiway_registration import _unchecked, _without_planes, check_first_pair
+from rangesim.fusion.scan_run import run_scan
+from rangesim.fusion.scan_settings import ScanSettings
+from rangesim.geometry import Registration
 from rangesim.rig import Intrinsics, look_at, translation
 from rangesim.scene.triangles import true_surfaces
 from rangesim.triangle_mesh import TriangleMesh
@@ -263,6 +268,74 @@ def test_views_without_overlap_are_told_what_order_is_expected() -> None:
         ValueError, match=r"view 1 cannot be aligned; on view 0: expected (.|\n)*in the order of a walk"
     ):
         align(shuffled)
+
+
+REASONS = [
+    "expected 30% of the source on the target, got 0.0% within 3 spacings; scan with more overlap, or a first guess.",
+    "expected surfaces that hold each other, got ones that slide (constraint 1.0e-03): a plane, a sphere, a cylinder; "
+    "add points of another shape to the clouds, such as what they stand on.",
+    "expected clouds that fit in one way, got two poses 180 degrees and 0.00123 m apart that both fit (agreement 0.912 "
+    "and 0.898): what both clouds show is symmetric, or too little; scan with more overlap.",
+    "expected surfaces that lie on each other, got partners 0.00123 m apart along the normals, an agreement of -0.12, "
+    "below 0.45: a wrong pose, another shape or scale, or noise far above the spacing; start nearer.",
+]
+
+
+@pytest.mark.parametrize("reason", REASONS)
+@pytest.mark.parametrize(("n", "told"), [(1, ""), (2, ", nor on 0"), (3, ", nor on 1, nor on 0")])
+def test_a_view_that_fits_on_none_before_is_told_in_a_sentence_that_is_never_cut(
+    reason: str, n: int, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds = [np.full((1, 3), float(k)) for k in range(n + 1)]
+
+    def fails_on_the_last(source: np.ndarray, target: np.ndarray, **_: object) -> Registration:
+        if source[0, 0] == n:
+            raise ValueError(reason)
+        return Registration(np.eye(4), 1.0, 1.0, 0.0, 1.0, 1.0)
+
+    monkeypatch.setattr(multiway_registration, "register", fails_on_the_last)
+    with pytest.raises(ValueError, match=f"view {n} cannot be aligned; on view {n - 1}: expected ") as refused:
+        multiway_registration._chain(clouds, 0)
+    message = str(refused.value)
+    assert len(message) <= 350
+    assert sentence(message) == message
+    assert reason.partition("; ")[0] + f"{told}. Views are expected in the order of a walk" in message
+
+
+@pytest.mark.parametrize(("failures", "is_refused"), [(0, False), (1, False), (2, False), (3, True)])
+def test_the_first_two_views_are_refused_early_only_if_they_fit_at_no_spacing(
+    failures: int, is_refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second has to fit on the first, as there is no other before it; but the spacing may turn out another."""
+    sizes: list[int] = []
+
+    def fails_at_first(source: np.ndarray, target: np.ndarray, **_: object) -> Registration:
+        sizes.append(len(source))
+        if len(sizes) <= failures:
+            raise ValueError("expected more, got less; do it.")
+        return Registration(np.eye(4), 1.0, 1.0, 0.0, 1.0, 1.0)
+
+    monkeypatch.setattr(multiway_registration, "register", fails_at_first)
+    views = made(part(), 2, 20.0)
+    if is_refused:
+        with pytest.raises(ValueError, match="view 1 cannot be aligned; on view 0: expected more, got less\\. Views"):
+            check_first_pair(views)
+        assert sizes[2] < sizes[0] < sizes[1]  # points of 1.25 times, once and 0.8 times the spacing
+    else:
+        check_first_pair(views)
+    assert len(sizes) == min(failures + 1, 3)
+
+
+@pytest.mark.parametrize(("views", "rendered"), [(7, 2), (2, 2)])
+def test_poses_that_cannot_be_found_are_refused_before_all_views_are_rendered(
+    views: int, rendered: int, tmp_path: Path
+) -> None:
+    stages: list[str] = []
+    settings = ScanSettings("plane", width=48, spp=2, path=Turntable(views), registration="unknown")
+    with pytest.raises(ValueError, match="view 1 cannot be aligned"):
+        run_scan(settings, tmp_path / "out", lambda stage, _: stages.append(stage))
+    assert [s for s in stages if s.startswith("View")] == [f"View {k + 1} of {views}" for k in range(rendered)]
+    assert not list(tmp_path.iterdir())
 
 
 def test_refuses_what_cannot_be_aligned() -> None:

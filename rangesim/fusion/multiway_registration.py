@@ -62,6 +62,8 @@ THROUGH = 4.0
 """Spacings in front of another view's surface from which a point contradicts it, besides 1 % of the depth."""
 MAX_CONTRADICTION = 0.15
 """Fraction of the points of a view that another may see through: edges and ghosts, not a wrong pose."""
+EARLY_SPACINGS = (1.0, 0.8, 1.25)
+"""Spacings at which the first two views of a scan are tried, over their own: those of a whole scan differ by less."""
 
 ORDER = "Views are expected in the order of a walk, each overlapping the one before by a third or more."
 REMEDY = f"add views between, or scan something that looks different from all sides. {ORDER}"
@@ -153,6 +155,22 @@ def align(scan: Scan, spacing_m: float | None = None, *, seed: int = 0) -> Align
         views = ", ".join(map(str, unchecked))
         warnings.warn(AlignmentWarning(f"no loop confirms the pose of view {views}; add views between."), stacklevel=2)
     return Alignment(aligned, pairs, spacing, unchecked)
+
+
+def check_first_pair(first_two: Scan, *, seed: int = 0) -> None:
+    """Raise ValueError if the second view of a scan fits nowhere on the first, as `align` of the whole scan would.
+
+    The spacing of the whole scan is not known yet, so that of two views is tried, then others near it.
+    """
+    clouds, spacing = _thinned(first_two, None, seed)
+    problems = []
+    for scale in EARLY_SPACINGS:
+        try:
+            _chain(clouds if scale == 1 else _thinned(first_two, scale * spacing, seed)[0], seed)
+            return
+        except ValueError as error:
+            problems.append(error)
+    raise problems[0]
 
 
 class PoseErrors(NamedTuple):
@@ -254,18 +272,28 @@ def _chain(clouds: list[Array], seed: int) -> list[PairFit]:
     """Each view registered to one before."""
     found = []
     for source in range(1, len(clouds)):
-        reasons = []
+        reasons: dict[int, str] = {}
         for target in range(source - 1, max(-1, source - 1 - BACK), -1):
             try:
                 fit = register(clouds[source], clouds[target], min_fitness=MIN_OVERLAP, seed=seed)
             except ValueError as error:
-                reasons.append(f"on view {target}: {error}")
+                reasons[target] = str(error)
                 continue
             found.append(PairFit(source, target, np.asarray(fit.T_target_source), fit.fitness, np.nan, False))
             break
         else:
-            raise ValueError(f"view {source} cannot be aligned; {' '.join(reasons)} {ORDER}")
+            raise ValueError(f"view {source} cannot be aligned; {_why(reasons)} {ORDER}")
     return found
+
+
+def _why(reasons: dict[int, str]) -> str:
+    """Why a view fits none of those before, by the nearest one: reasons of all, the nearest one's first.
+
+    What a reason advises, after its semicolon, is for two clouds alone; of three, a message would be too long to read.
+    """
+    (nearest, reason), *others = reasons.items()
+    what = reason.partition("; ")[0].rstrip(".")
+    return f"on view {nearest}: {what}" + "".join(f", nor on {target}" for target, _ in others) + "."
 
 
 def _placed(chain: list[PairFit], n: int) -> list[Array]:

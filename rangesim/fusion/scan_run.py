@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,16 +26,17 @@ from pcgraph.output import DirectoryKind, new_directory
 from rangesim.errors import FileFormatError
 from rangesim.files.schema import write_json
 from rangesim.fusion.mesh_error import SurfaceError, distances_to, surface_error
-from rangesim.fusion.multiway_registration import PoseErrors, align, pose_errors
+from rangesim.fusion.multiway_registration import PoseErrors, align, check_first_pair, pose_errors
 from rangesim.fusion.paths import Viewpoint
 from rangesim.fusion.scan_settings import ScanSettings, scan_settings_to_dict
 from rangesim.fusion.seen_volume import Occupancy, occupancy
 from rangesim.fusion.truncated_average import FusedSurface, fuse
-from rangesim.fusion.views import Scan, poses_of, scan
+from rangesim.fusion.views import Scan, poses_of, taken
 from rangesim.fusion.voxel_grid import VoxelGrid
 from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
+    from rangesim.decoding.range_image import RangeImage
     from rangesim.scene import Scene
 
 SIDECAR = "scan.json"
@@ -136,19 +137,28 @@ def carry_out(settings: ScanSettings, progress: Progress | None = None, scene: S
         rig = settings.instrument.rig(scene, settings.width, settings.height)
         surfaces = true_surfaces(scene)
     poses = poses_of(settings.path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
+    registration_seed = settings.seed & 0x7FFFFFFF
     with _timed(times, "views"):
-        views = scan(
-            scene, rig, settings.instrument, poses, settings.transport_settings(), ambient=settings.ambient,
-            seed=settings.seed,
-            progress=lambda done: tell(f"View {done} of {len(poses)}", 0.05 + 0.6 * done / len(poses)),
-        )  # fmt: skip
-    _check_readings(views)
-    found = None
+        images, truths = [], []
+        for number, (image, truth) in enumerate(
+            taken(
+                scene, rig, settings.instrument, poses, settings.transport_settings(), settings.ambient, settings.seed
+            ),
+            1,
+        ):
+            images.append(image)
+            truths.append(truth)
+            tell(f"View {number} of {len(poses)}", 0.05 + 0.6 * number / len(poses))
+            if number == 2 < len(poses) and settings.registration == "unknown":  # before the others take their time
+                _check_readings(images)
+                check_first_pair(Scan(tuple(images)), seed=registration_seed)
+    _check_readings(images)
+    views, found = Scan(tuple(images), tuple(truths), poses), None
     if settings.registration == "unknown":
         tell("Finding poses", 0.66)
         with _timed(times, "registration"):
             first = np.stack([poses[0]] * len(poses))
-            views = align(views.with_poses(first), seed=settings.seed & 0x7FFFFFFF).scan
+            views = align(views.with_poses(first), seed=registration_seed).scan
         found = pose_errors(views.poses, poses)
     tell("Fusing", 0.8)
     with _timed(times, "fusion"):
@@ -221,10 +231,10 @@ def _voxel_m(views: Scan) -> float:
     return float(f"{VOXEL_SPACINGS * np.median(spacings):.2g}")
 
 
-def _check_readings(views: Scan) -> None:
-    if not any(image.valid.any() for image in views.images):
+def _check_readings(images: Sequence[RangeImage]) -> None:
+    if not any(image.valid.any() for image in images):
         raise ValueError(
-            f"expected readings in some of {len(views)} views, got none: the path may look past the scene, its poses "
+            f"expected readings in some of {len(images)} views, got none: the path may look past the scene, its poses "
             "not be T_world_camera in metres, or the scene not be in metres (a mesh in millimetres needs unit_m = "
             "0.001)."
         )

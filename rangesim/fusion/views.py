@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -93,7 +93,6 @@ def scan(
     ValueError
         Poses that are not rigid, or as `transport`, `expose` and `decode`.
     """
-    import rangesim
     from rangesim.light_transport.transport_settings import chosen
 
     if not isinstance(sensor, (Sensor, Instrument)):
@@ -103,19 +102,38 @@ def scan(
     poses = poses_of(path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
     chosen_settings = chosen(settings, cast("TransportOptions", options))
     images, truths = [], []
+    for number, (image, truth) in enumerate(taken(scene, rig, instrument, poses, chosen_settings, ambient, seed), 1):
+        images.append(image)
+        truths.append(truth)
+        if progress is not None:
+            progress(number)
+    return Scan(tuple(images), tuple(truths), poses)
+
+
+def taken(
+    scene: Scene,
+    rig: Rig,
+    instrument: Instrument,
+    poses: Array,
+    settings: TransportSettings,
+    ambient: Ambient | None,
+    seed: int,
+) -> Iterator[tuple[RangeImage, GroundTruth]]:
+    """The views of `scan` one after the other, each rendered when it is asked for: its readings, and the truth.
+
+    poses : (n, 4, 4) T_world_camera. The rest as of `scan`.
+    """
+    import rangesim
+
     for number, T in enumerate(poses):
         placed = replace(rig, T_world_camera=T)
-        here = replace(chosen_settings, seed=derived_seed(seed, number, 0))
+        here = replace(settings, seed=derived_seed(seed, number, 0))
         signals = rangesim.transport(scene, placed, [instrument.sensor], here)
         noise_seed = derived_seed(seed, number, 1)
         capture = rangesim.expose(
             signals, instrument.sensor, instrument.detector, instrument.exposure_s, noise_seed, ambient
         )
-        images.append(rangesim.decode(capture, instrument.decoder))
-        truths.append(signals.truth)
-        if progress is not None:
-            progress(number + 1)
-    return Scan(tuple(images), tuple(truths), poses)
+        yield rangesim.decode(capture, instrument.decoder), signals.truth
 
 
 def poses_of(path: Path | ArrayLike | Sequence[ArrayLike], viewpoint: Viewpoint | None = None) -> Array:

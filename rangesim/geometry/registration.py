@@ -291,9 +291,8 @@ def _refuse_disagreement(found: Registration, source: Array, surface: _Surface) 
     if agreement < MIN_AGREEMENT:
         raise ValueError(
             f"expected surfaces that lie on each other, got partners {found.rms_m:.3g} m apart along the normals, an "
-            f"agreement of {agreement:.2f} (at least {MIN_AGREEMENT:g} is needed): the pose is wrong, or the clouds "
-            "differ in shape or scale, or their noise is far above their spacing; start nearer, check the scale, or "
-            "thin the clouds."
+            f"agreement of {agreement:.2f}, below {MIN_AGREEMENT:g}: a wrong pose, another shape or scale, or noise "
+            "far above the spacing; start nearer, check the scale, or thin the clouds."
         )
 
 
