@@ -63,6 +63,16 @@ def clip_level(brightest: np.ndarray, max_dn: int) -> int:
     return top if piled and at_top > MIN_CLIPPED_FRACTION * brightest.size else max_dn
 
 
+def _masked_in_all(frames: np.ndarray) -> np.ndarray:
+    """Frames (k, h, w), those of float32 with NaN in all where one of them is not finite."""
+    if np.issubdtype(frames.dtype, np.integer):
+        return frames
+    masked = np.zeros(frames.shape[1:], dtype=bool)
+    for frame in frames:
+        masked |= ~np.isfinite(frame)
+    return np.where(masked, np.float32(np.nan), frames) if masked.any() else frames
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Capture(ShortRepr):
     """A stack of frames of one sensor.
@@ -70,7 +80,7 @@ class Capture(ShortRepr):
     Parameters
     ----------
     frames : (k, h, w) uint8, uint16 or uint32 digital numbers; or float32 radiance (W/m2/sr) of a noise-free
-        capture.
+        capture. A pixel that is not finite in one frame is kept as NaN in all: it is masked, and measures nothing.
     sensor : Sensor, the measuring principle the frames were taken with.
     rig : Rig, or None for an uncalibrated capture.
     detector : PhotoDetector, or None if unknown (a real capture) or noise-free.
@@ -98,6 +108,7 @@ class Capture(ShortRepr):
                 f"expected frames of {self.rig.camera.width} x {self.rig.camera.height} pixels as the rig's camera, "
                 f"got {self.frames.shape[2]} x {self.frames.shape[1]}."
             )
+        object.__setattr__(self, "frames", _masked_in_all(self.frames))
 
     @property
     def is_digital(self) -> bool:

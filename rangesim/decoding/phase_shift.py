@@ -117,7 +117,7 @@ def modulation_is_weak(capture: Capture, phase: Phase, steps: int, thresholds: P
         return np.asarray(sigma > thresholds.max_sigma_rad)
     if capture.is_digital:
         return np.asarray(phase.modulation < thresholds.modulation_of_scale * capture.full_scale)
-    return np.asarray(phase.modulation <= thresholds.relative_modulation * np.maximum(phase.mean, 0))
+    return np.asarray(~(phase.modulation > thresholds.relative_modulation * np.maximum(phase.mean, 0)))  # NaN is weak
 
 
 def refine_by_phase(
