@@ -418,6 +418,25 @@ def test_an_aperture_that_is_left_out_is_told(tmp_path: Path, radius: float, foc
     assert wide.camera == sharp.camera
 
 
+@pytest.mark.parametrize(
+    ("name", "at_m", "is_told"),
+    [
+        *(("near_clip", 1.01, True), ("near_clip", 7.0, True), ("near_clip", 0.99, False)),
+        *(("far_clip", 0.99, True), ("far_clip", 1.01, False)),
+    ],
+)
+def test_surfaces_that_the_clipping_planes_of_mitsuba_hide_are_told(
+    tmp_path: Path, name: str, at_m: float, is_told: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    """The wall of `plane` stands 1 m before the camera; here it is seen, wherever the planes are."""
+    plane = (Path(__file__).parent.parent / "scenes" / "plane.xml").read_text()
+    clip = f'<sensor type="perspective"><float name="{name}" value="{at_m}"/>'
+    scene = rangesim.load_scene(write(tmp_path / "plane.xml", plane.replace('<sensor type="perspective">', clip)))
+    assert scene.working_distance_m == pytest.approx(1.0)
+    told = f"the camera's {name} of {at_m:g} m is left out, so it sees what that hides in Mitsuba, on 100 %"
+    assert [told in str(w.message) for w in recwarn] == [True] * is_told
+
+
 @pytest.mark.parametrize(("name", "advice"), [("part.obj", "needs --unit-m 0.001"), ("part.xml", "scale the scene's")])
 def test_a_run_that_measures_nothing_advises_what_the_scene_allows(
     tmp_path: Path, name: str, advice: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
