@@ -11,7 +11,9 @@ import pytest
 from small_result import SCENES
 from synthetic import signals_of_depth, stereo_rig
 
+from rangesim.capture.exposure import expose
 from rangesim.causes.range_limits import fraction_beyond_range
+from rangesim.decoding import decode
 from rangesim.errors import RangesimWarning
 from rangesim.experiment import Experiment
 from rangesim.experiment.instrument import Instrument
@@ -47,6 +49,24 @@ def test_the_fraction_outside_the_range_is_that_of_its_limits(
         assert middle_m == pytest.approx(np.median(range_m[outside]), abs=0.01)
     else:
         assert np.isnan(middle_m)
+
+
+@pytest.mark.parametrize(
+    ("modulation_hz", "farthest_m"),
+    [((1e6,), 149.9), ((1e6, 2e6), 149.9), ((0.7e6,), 214.1), ((1e5,), 1499.0), ((15e6, 37e6), 100.0)],
+)
+def test_what_a_low_frequency_reads_right_is_within_its_range(
+    modulation_hz: tuple[float, ...], farthest_m: float
+) -> None:
+    """A whole period of the highest frequency is told apart, even where it is longer than the search."""
+    sensor, rig = AmcwToF(modulation_hz), stereo_rig(baseline_m=0.0)
+    signals = signals_of_depth(rig, np.linspace(0.5, 0.7 * farthest_m, 160 * 120).reshape(120, 160), [sensor])
+    image = decode(expose(signals, sensor))
+    within = signals.truth.range_m < farthest_m
+    assert within.any()
+    np.testing.assert_allclose(image.range_m[within], signals.truth.range_m[within], rtol=1e-3, atol=1e-3)
+    assert not sensor.is_beyond_range(2 * signals.truth.range_m[within]).any()
+    assert sensor.is_beyond_range(np.array([2.05 * farthest_m])).all()
 
 
 def test_a_scene_without_a_surface_is_not_outside() -> None:

@@ -418,6 +418,25 @@ def test_an_aperture_that_is_left_out_is_told(tmp_path: Path, radius: float, foc
     assert wide.camera == sharp.camera
 
 
+@pytest.mark.parametrize(
+    ("name", "at_m", "is_told"),
+    [
+        *(("near_clip", 1.01, True), ("near_clip", 7.0, True), ("near_clip", 0.99, False)),
+        *(("far_clip", 0.99, True), ("far_clip", 1.01, False)),
+    ],
+)
+def test_surfaces_that_the_clipping_planes_of_mitsuba_hide_are_told(
+    tmp_path: Path, name: str, at_m: float, is_told: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    """The wall of `plane` stands 1 m before the camera; here it is seen, wherever the planes are."""
+    plane = (Path(__file__).parent.parent / "scenes" / "plane.xml").read_text()
+    clip = f'<sensor type="perspective"><float name="{name}" value="{at_m}"/>'
+    scene = rangesim.load_scene(write(tmp_path / "plane.xml", plane.replace('<sensor type="perspective">', clip)))
+    assert scene.working_distance_m == pytest.approx(1.0)
+    told = f"the camera's {name} of {at_m:g} m is left out, so it sees what that hides in Mitsuba, on 100 %"
+    assert [told in str(w.message) for w in recwarn] == [True] * is_told
+
+
 @pytest.mark.parametrize(("name", "advice"), [("part.obj", "needs --unit-m 0.001"), ("part.xml", "scale the scene's")])
 def test_a_run_that_measures_nothing_advises_what_the_scene_allows(
     tmp_path: Path, name: str, advice: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -437,3 +456,37 @@ def test_a_run_that_measures_nothing_advises_what_the_scene_allows(
     assert "measured no pixel at all" in said
     assert advice in said
     assert ("--unit-m" in said) == name.endswith(".obj")
+
+
+@pytest.mark.parametrize(
+    ("sensor", "change", "told"),
+    [
+        ("amcw", "", "ambient-swamped: Enough projector light"),
+        ("gray-phase", "power_w = 1000.0\n", "glint or saturated: The detector saturated"),
+        ("direct-tof", "", "ambient-swamped: Enough projector light"),
+    ],
+)
+def test_a_run_that_measures_nothing_for_another_reason_than_distance_says_which(
+    tmp_path: Path,
+    sensor: str,
+    change: str,
+    told: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A wall 1 m away under a bright lamp, exposed for a tenth of a second: more power or other units do not help."""
+    from rangesim.cli import main
+
+    lamp = '<emitter type="constant"><spectrum name="radiance" value="500"/></emitter></scene>'
+    plane = (Path(__file__).parent.parent / "scenes" / "plane.xml").read_text()
+    write(tmp_path / "plane.xml", plane.replace("</scene>", lamp))
+    run = f'scene = "plane.xml"\nwidth = 8\nheight = 6\nspp = 1\n[[instrument]]\nsensor = "{sensor}"\n'
+    write(tmp_path / "run.toml", f"{run}exposure_s = 0.1\n{change}")
+    arguments = ("run", "--config", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out"))
+    monkeypatch.setattr("sys.argv", ["rangesim", *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err
+    assert end.value.code == 0, said
+    assert f"measured no pixel at all, most of all by {told}" in said
+    assert "metres" not in said

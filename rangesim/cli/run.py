@@ -134,26 +134,38 @@ def _announce(cost: Cost) -> None:
 
 
 def _say_what_measured_nothing(out: Path, scene: str) -> None:
-    """A line on stderr if some instrument has not a single point: most often the scene is not in metres.
+    """A line on stderr for the instruments that have not a single point, of each cause that most of their pixels have.
+
+    Where that is too little light or a distance that cannot be read, the scene most often is not in metres.
 
     scene : file or name of the scene, whose suffix tells how to bring it to metres.
     """
-    from rangesim.experiment.result_files import MeasurementRecord, read_settings
+    from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
+    from rangesim.experiment.result_files import MeasurementRecord, read_rows, read_settings
     from rangesim.files.schema import read_record
     from rangesim.scene.mesh import MESH_SUFFIXES
+    from rangesim.signals import ALL
 
+    of_distance = (Cause.LOW_SIGNAL, Cause.RANGE_AMBIGUITY, Cause.RESOLUTION)
     settings = read_settings(out)
-    names = [entry.name for entry in settings.instruments]
-    blind = [name for name in names if not read_record(out / name / "measurement.json", MeasurementRecord).points]
-    if blind:
+    blind: dict[Cause, list[str]] = {}
+    for name in (entry.name for entry in settings.instruments):
+        if not read_record(out / name / "measurement.json", MeasurementRecord).points:
+            shares = next(row["causes"] for row in read_rows(out / name) if row["material"] == ALL)
+            cause = Cause[max(shares, key=shares.get).upper()] if shares else Cause.NONE
+            blind.setdefault(Cause.NONE if cause in of_distance else cause, []).append(name)
+    for cause, names in blind.items():
+        start = f"rangesim: {one_line(', '.join(names))} measured no pixel at all"
+        if cause:
+            typer.echo(f"{start}, most of all by {TITLES[cause]}: {DEFINITIONS[cause]}", err=True)
+            continue
         is_mesh = Path(scene).suffix.lower() in MESH_SUFFIXES
         advice = (
             "a mesh in millimetres needs --unit-m 0.001" if is_mesh else "scale the scene's shapes and camera to them"
         )
-        distance = settings.scene.working_distance_m
         typer.echo(
-            f"rangesim: {one_line(', '.join(blind))} measured no pixel at all, at a working distance of "
-            f"{distance:g} m; coordinates are metres ({advice}); in the dark, --spp or power helps.",
+            f"{start}, at a working distance of {settings.scene.working_distance_m:g} m; coordinates are metres "
+            f"({advice}); in the dark, --spp or power helps.",
             err=True,
         )
 

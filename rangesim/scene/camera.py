@@ -14,6 +14,8 @@ from rangesim.rig import Intrinsics
 # Mitsuba's camera looks along +z with x to the left and y up; ours has x to the right and y down.
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
+UNSTATED_CLIP = {"near_clip": 0.01, "far_clip": 1e4}
+"""Metres, of a sensor that states none: it asks for nothing to be hidden."""
 MAX_BLUR_PX = 0.1
 """Diameter of a lens' blur beyond which leaving it out is warned of."""
 
@@ -59,6 +61,20 @@ def warn_of_aperture(sensor: Any, camera: Intrinsics, distance_m: float, label: 
             f"{label}: the camera's aperture of {radius:g} m is left out, so the image is sharp everywhere; state it "
             f"in the rig: camera_lens=Lens(aperture_radius_m={radius:g}, focus_m={focus:g})."
         )
+
+
+def warn_of_clipping(sensor: Any, z: np.ndarray, label: str) -> None:
+    """Warn if the sensor's near_clip or far_clip would hide surfaces from the camera: here it sees them.
+
+    z : (n,) metres, depth of what some of its rays meet first; NaN where they meet nothing.
+    """
+    near, far = float(sensor.near_clip()), float(sensor.far_clip())
+    for name, at, hidden in (("near_clip", near, z < near), ("far_clip", far, z > far)):
+        if hidden.any() and not np.isclose(at, UNSTATED_CLIP[name]):
+            warn(
+                f"{label}: the camera's {name} of {at:g} m is left out, so it sees what that hides in Mitsuba, on "
+                f"{100 * hidden.mean():.0f} % of its image; take these surfaces out of the scene."
+            )
 
 
 def _number(value: Any) -> float:

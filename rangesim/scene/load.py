@@ -22,7 +22,7 @@ from rangesim.files.text_files import check_xml
 from rangesim.files.utf8_names import Utf8Names, is_utf8, utf8_names
 from rangesim.rig import Intrinsics, translation
 from rangesim.scene import retroreflector
-from rangesim.scene.camera import camera_of, warn_of_aperture
+from rangesim.scene.camera import camera_of, warn_of_aperture, warn_of_clipping
 from rangesim.scene.materials import has_texture, is_cutout, is_matte, material_class
 from rangesim.scene.media import is_boundary, why_not_traced
 from rangesim.scene.mesh import MESH_SUFFIXES, scene_around_mesh
@@ -123,6 +123,7 @@ def load_scene(
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)
     working_distance_m = _median_depth(loaded, camera, T_camera)
     warn_of_aperture(loaded.sensors()[sensor], camera, working_distance_m, label)
+    warn_of_clipping(loaded.sensors()[sensor], _depths(loaded, camera, T_camera), label)
     return Scene(
         name="scene" if isinstance(source, Mapping) else Path(source).stem,
         mitsuba=loaded,
@@ -288,11 +289,16 @@ def _looks_elsewhere(scene: Any, sensor: int, place: np.ndarray, label: str) -> 
     return bool(np.linalg.norm(place) > AS_FAR * _median_depth(scene, camera, T_camera))
 
 
-def _median_depth(scene: Any, camera: Intrinsics, T_camera: np.ndarray, columns: int = 64) -> float:
+def _median_depth(scene: Any, camera: Intrinsics, T_camera: np.ndarray) -> float:
     """Median z over a coarse grid of camera rays; 1 where the camera sees nothing. `T_camera` is to the renderer."""
+    z = _depths(scene, camera, T_camera)
+    return float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0
+
+
+def _depths(scene: Any, camera: Intrinsics, T_camera: np.ndarray, columns: int = 64) -> np.ndarray:
+    """(n,) float32, z in metres over a coarse grid of camera rays, NaN where they meet nothing."""
     grid = camera.resized(columns, max(1, round(columns * camera.height / camera.width)))
     directions = grid.directions(grid.pixel_centres()).reshape(-1, 3) @ T_camera[:3, :3].T
     ray = mi.Ray3f(o=mi.Point3f(*map(float, T_camera[:3, 3])), d=mi.Vector3f(directions.T.astype(np.float32)))
     si = scene.ray_intersect_preliminary(ray, coherent=True)
-    z = np.array(dr.select(si.is_valid(), si.t, dr.nan))  # directions have z = 1, so t is depth
-    return float(np.nanmedian(z)) if np.isfinite(z).any() else 1.0
+    return np.array(dr.select(si.is_valid(), si.t, dr.nan))  # directions have z = 1, so t is depth
