@@ -151,7 +151,11 @@ def segment(
 
 def main() -> None:
     """Run the command line."""
-    app(prog_name="pcgraph")
+    try:
+        app(prog_name="pcgraph")
+    except OSError as error:  # those of files are told by the commands
+        typer.echo(f"pcgraph: cannot print: {one_line(said(error))}.", err=True)
+        raise SystemExit(1) from None
 
 
 def _targets(cloud: Path, out: Path | None) -> list[Path]:

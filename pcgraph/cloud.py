@@ -40,7 +40,8 @@ class Cloud(ShortRepr):
     normals : same leading shape + (3,), float32 or float64, or None
         As stored; not checked for unit length.
     labels : same leading shape, int32, or None
-        The file's own ``label`` or ``labels`` field, for example ground truth.
+        The file's own ``label`` or ``labels`` field, for example ground truth. Those of unsigned 32 bits keep their
+        bits: 4294967295, how PCL stores -1, is -1. A field of 64 bits that int32 does not hold stays in `columns`.
     viewpoint : (3,) float64, metres, or None
         Where the sensor stood, from the PCD header; None if the format does not say.
     columns : dict of name to array of the same leading shape, or that + (c,), of any dtype of numbers
@@ -69,8 +70,8 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     columns : mapping of field name to (n,) or (n, c) array
         Must hold ``x``, ``y``, ``z``; colours (``rgb``/``rgba`` packed, or ``red``/``green``/``blue``),
         normals and labels are picked up under the names that PCL, Open3D and MeshLab write, in upper or lower case.
-        Colours run to 65535 in unsigned 16 bits, to 1 in floats none of which is larger, else to 255. The others are
-        kept as they are, but for ``_``, the name of padding in PCD files.
+        Colours run to 65535 in unsigned 16 bits, to 1 in floats none of which is larger, else to 255. The others, and
+        fields of several numbers for each point, are kept as they are, but for ``_``, the name of padding in PCD files.
     shape : (n,) or (h, w)
         Leading shape of the result.
     viewpoint : (3,) float64, metres, optional
@@ -78,12 +79,16 @@ def cloud_from_columns(columns: Columns, shape: tuple[int, ...], viewpoint: NDAr
     Raises
     ------
     CloudReadError
-        A coordinate is missing or is not a floating-point or integer number.
+        A coordinate is missing or is not one number for each point.
     """
     stored, names = columns, _names_by_lower_case(columns)
-    columns = {lower: _first_numbers(stored[name]) for lower, name in names.items()}
+    columns = {lower: stored[name] for lower, name in names.items() if stored[name].ndim == 1}
     missing = [name for name in "xyz" if name not in columns]
     if missing:
+        vectors = [name for name in missing if name in names]
+        if vectors:
+            count = stored[names[vectors[0]]].shape[1]
+            raise CloudReadError(f"expected one number for each point in the field {vectors[0]!r}, got {count}")
         raise CloudReadError(
             f"expected the fields x, y and z, but {', '.join(missing)} is missing; found: {', '.join(columns)[:200]}"
         )
@@ -151,7 +156,15 @@ def _normal_names(columns: Columns) -> tuple[str, ...]:
 
 
 def _label_name(columns: Columns) -> tuple[str, ...]:
-    return tuple(name for name in LABEL_NAMES if name in columns and columns[name].dtype.kind in "iu")[:1]
+    return tuple(name for name in LABEL_NAMES if name in columns and _are_labels(columns[name]))[:1]
+
+
+def _are_labels(column: NDArray[np.generic]) -> bool:
+    """Whether a column holds whole numbers of which int32 makes no two the same."""
+    if column.dtype.kind not in "iu" or column.dtype.itemsize <= 4:
+        return column.dtype.kind in "iu"
+    limits = np.iinfo(np.int32)
+    return limits.min <= int(column.min(initial=0)) and int(column.max(initial=0)) <= limits.max
 
 
 def _names_by_lower_case(columns: Columns) -> dict[str, str]:
@@ -160,10 +173,6 @@ def _names_by_lower_case(columns: Columns) -> dict[str, str]:
     for name in sorted(columns, key=lambda name: name != name.lower()):
         found.setdefault(name.lower(), name)
     return found
-
-
-def _first_numbers(column: NDArray[np.generic]) -> NDArray[np.generic]:
-    return column if column.ndim == 1 else column[:, 0]
 
 
 def _kept(column: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:

@@ -103,6 +103,9 @@ def _checked_header(entries: dict[str, list[str]], n_lines: int) -> PcdHeader:
             f"expected as many SIZE, TYPE and COUNT entries as FIELDS ({len(names)}), "
             f"got {len(sizes)}, {len(kinds)} and {len(counts)}"
         )
+    fields = [name for name in names if name != "_"]  # padding may come several times
+    if len(set(fields)) != len(fields):
+        raise CloudReadError(f"expected distinct FIELDS in the PCD header, got {' '.join(names)[:80]}")
     dtypes = []
     for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True):
         if kind not in _KINDS or size not in _SIZES[kind] or not 1 <= count <= 4096:

@@ -356,3 +356,21 @@ def test_warnings_are_a_line_on_stderr(tmp_path):
     assert done.exit_code == 0
     assert "pcgraph: warning: expected far fewer objects than supervoxels" in done.stderr
     assert "cli.py" not in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["segment", "--help"], ["segment", "scene.ply"]])
+def test_a_full_disk_under_what_is_printed_is_one_sentence(arguments, scene):
+    """It was a traceback, although the files were written."""
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "pcgraph", *arguments],
+            cwd=scene.parent,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert done.stderr == "pcgraph: cannot print: no space left on the device.\n"
+    assert done.returncode == 1
+    written = sorted(path.name for path in scene.parent.iterdir() if path != scene)
+    assert written == (["scene.segments.npz", "scene.segments.ply"] if arguments[-1] == "scene.ply" else [])

@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 import pytest
-from fuzz.cloud_files import pcd, ply
+from fuzz.cloud_files import CODES, pcd, ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -539,6 +539,50 @@ def test_pcd_columns_come_as_they_are_stored(data):
 @pytest.mark.parametrize("code", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_ply_columns_come_as_they_are_stored(code):
     assert_same_columns(read_ply(ply_of(COLUMNS, code)).columns, COLUMNS)
+
+
+@pytest.mark.parametrize("code", CODES)
+@pytest.mark.parametrize(
+    ("kind", "stored", "expected"),
+    [
+        ("i8", [5_000_000_000, 705_032_704, -1], None),  # the first two became one label
+        ("u8", [2**33 + 7, 7, 0], None),
+        ("u8", [2**64 - 1, 7, 0], None),
+        ("i8", [2**31, 0, 0], None),
+        ("i8", [2**31 - 1, -(2**31), 0], [2**31 - 1, -(2**31), 0]),
+        ("u8", [3, 2, 1], [3, 2, 1]),
+        ("u4", [2**32 - 1, 2**31 - 1, 0], [-1, 2**31 - 1, 0]),
+    ],
+)
+def test_labels_that_32_bits_do_not_hold_stay_columns(code, kind, stored, expected):
+    fields = [(axis, "f4", np.ones((3, 1))) for axis in "xyz"] + [("label", kind, np.array(stored, kind)[:, None])]
+    cloud = read_pcd(pcd(code, fields, 3, 1))
+    if expected is None:
+        assert cloud.labels is None
+        assert cloud.columns["label"].dtype == kind
+        assert cloud.columns["label"].tolist() == stored
+    else:
+        assert cloud.labels.tolist() == expected
+        assert cloud.columns == {}
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_a_field_counts_once(code):
+    """Of two fields of one name the first was lost, and of two numbers for each x the second."""
+    rows = np.arange(6.0)[:, None]
+    fields = [(name, "f4", rows + i) for i, name in enumerate(["x", "_", "y", "i", "_", "z"])]
+    assert read_pcd(pcd(code, fields, 6, 1)).columns["i"].tolist() == (rows[:, 0] + 3).tolist()
+    for name in ("x", "i"):
+        with pytest.raises(CloudReadError, match="expected distinct FIELDS in the PCD header, got x _ y i"):
+            read_pcd(pcd(code, [*fields, (name, "f4", rows)], 6, 1))
+    with pytest.raises(CloudReadError, match="one number for each point in the field 'y', got 3"):
+        read_pcd(pcd(code, [*fields[:2], ("y", "f4", np.ones((6, 3))), *fields[3:]], 6, 1))
+    for name, kind in (("label", "i4"), ("rgb", "u4"), ("normal_x", "f4")):
+        vectors = rows.astype(kind) + np.arange(2).astype(kind)
+        others = [(name.replace("_x", axis), "f4", rows) for axis in ("_y", "_z") if name == "normal_x"]
+        cloud = read_pcd(pcd(code, [*fields, (name, kind, vectors), *others], 6, 1))
+        assert cloud.labels is cloud.colors is cloud.normals is None
+        assert cloud.columns[name].tolist() == vectors.tolist()
 
 
 def test_names_in_any_case_and_padding_as_pcl_writes_it():
