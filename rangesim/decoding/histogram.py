@@ -16,7 +16,8 @@ def find_peak(
 
     Place in bins from the start of the first bin (the centre of bin b is b + 0.5); height is the sum over the
     peak's window less the background, background the sum under that window. `is_cyclic`: a window goes on at the
-    other end.
+    other end. Of a peak that the first or the last bin cuts off, place is that of the whole Gaussian, which may lie
+    outside of the histogram.
     """
     from rangesim.decoding.histogram_kernels import measure_peaks
     from rangesim.decoding.matched_filter import gaussian_filter
@@ -24,7 +25,7 @@ def find_peak(
     filtered = gaussian_filter(histogram, sigma_bins, "wrap" if is_cyclic else "edge") if sigma_bins > 0 else histogram
     place, height, background = np.empty((3, histogram.shape[1]))
     reach = window_reach(len(histogram), sigma_bins, is_cyclic)
-    measure_peaks(histogram, filtered, reach, is_cyclic, place, height, background)
+    measure_peaks(histogram, filtered, reach, float(sigma_bins), is_cyclic, place, height, background)
     return place, height, background
 
 

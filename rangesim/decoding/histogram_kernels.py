@@ -11,6 +11,8 @@ from pcgraph.kernel_cache import cached_njit
 
 MAX_FRACTION = 1 - 1e-6
 """Of pulses in which a photon was detected: more leave no estimate."""
+MAX_OUTSIDE, MAX_STEPS, LEAST_RATE, CONVERGED = 3.0, 50, 1e-3, 1e-6
+"""Of `whole_peak`."""
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -24,11 +26,13 @@ def detected_fraction(counts, pulses, fraction):  # type: ignore[no-untyped-def]
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def measure_peaks(histograms, filtered, reach, is_cyclic, place, height, background):  # type: ignore[no-untyped-def]
+def measure_peaks(  # type: ignore[no-untyped-def]
+    histograms, filtered, reach, sigma, is_cyclic, place, height, background
+):
     """Of histograms (k, n), write what `rangesim.decoding.histogram.find_peak` returns, (n,) each.
 
     filtered : (k, n), the matched filter's output, whose largest value is the peak. reach : bins on either side of it
-    that belong to its window.
+    that belong to its window. sigma : of the pulse, bins.
     """
     bins, columns = histograms.shape
     everything, highest, largest = np.zeros(columns), np.zeros(columns, np.int64), filtered[0].copy()
@@ -47,9 +51,36 @@ def measure_peaks(histograms, filtered, reach, is_cyclic, place, height, backgro
         recentred = math.floor(_centroid(histograms, column, peak, reach, is_cyclic, level))
         recentred = recentred % bins if is_cyclic else min(max(recentred, 0), bins - 1)
         centroid = _centroid(histograms, column, recentred, reach, is_cyclic, level)
-        place[column] = centroid % bins if is_cyclic else centroid
+        if is_cyclic:
+            centroid %= bins
+        elif sigma > 0 and (recentred < reach or recentred + reach >= bins):
+            low, high = max(recentred - reach, 0), min(recentred + reach + 1, bins)
+            centroid = whole_peak(centroid, float(low), float(high), sigma)
+        place[column] = centroid
         background[column] = level * width
         height[column] = _counts(histograms, column, recentred, reach, is_cyclic) - background[column]
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def whole_peak(centroid, low, high, sigma):  # type: ignore[no-untyped-def]
+    """Place of a Gaussian pulse whose part between `low` and `high` has this centroid; all in bins, sigma > 0.
+
+    The mean of a normal distribution that is cut off grows with that of the whole one, at the rate variance of the part
+    over sigma^2: Newton's method. A pulse farther outside than `MAX_OUTSIDE` sigmas counts as that far off.
+    """
+    first, last = low - MAX_OUTSIDE * sigma, high + MAX_OUTSIDE * sigma
+    place = centroid
+    for _ in range(MAX_STEPS):
+        a, b = (low - place) / sigma, (high - place) / sigma
+        density_a, density_b = math.exp(-0.5 * a * a), math.exp(-0.5 * b * b)
+        mass = math.sqrt(0.5 * math.pi) * (math.erf(b * math.sqrt(0.5)) - math.erf(a * math.sqrt(0.5)))
+        shift = (density_a - density_b) / mass
+        rate = 1 + (a * density_a - b * density_b) / mass - shift * shift
+        before = place
+        place = min(max(place + (centroid - place - sigma * shift) / max(rate, LEAST_RATE), first), last)
+        if abs(place - before) < CONVERGED * sigma:
+            break
+    return place
 
 
 @cached_njit(nogil=True, error_model="numpy")

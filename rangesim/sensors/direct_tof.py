@@ -159,8 +159,9 @@ class DirectToFDecoder(Decoder):
 
     Pile-up is undone if the detector has it (Coates 1968, see `coates`). A filter matched to the instrument response
     finds the peak; the centroid of the counts above the background around it, re-centred once, gives the place within
-    a bin. Where the pulses run out within the window of the peak, the reading is saturated (see `runs_out`); less light
-    helps.
+    a bin. A peak that the end of the histogram cuts off is completed to a Gaussian; where that lies outside, the
+    reading is out of range. Where the pulses run out within the window of the peak, the reading is saturated (see
+    `runs_out`); less light helps.
 
     Parameters
     ----------
@@ -202,6 +203,7 @@ class DirectToFDecoder(Decoder):
         bright = bright_level(peak)
         is_strong = peak >= self._least_counts(background) if capture.is_digital else peak > self.relative_peak * bright
         status = np.where(is_strong, Status.OK, Status.LOW_SIGNAL)
+        status[is_strong & ((position < 0) | (position > sensor.bins))] = Status.OUT_OF_RANGE
         status[spent | capture.saturated(capture.frames)] = Status.SATURATED
         return range_image_from_path_length(
             capture, length, status=status, confidence=peak / (bright or 1.0), intensity=intensity
