@@ -81,6 +81,9 @@ def encode_segmentation(
     name: str, cloud: Cloud | ArrayLike, segmentation: Segmentation, labels: ArrayLike | None = None
 ) -> bytes:
     """What `write_segmentation` writes to a file of such a name."""
+    from pcgraph.segmentation import check_segmentation
+
+    check_segmentation(segmentation)
     cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(without_mask(cloud)))
     cloud = replace(cloud, points=np.asarray(without_mask(cloud.points)))
     labels = segmentation.labels if labels is None else _whole_labels(labels)
