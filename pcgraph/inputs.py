@@ -359,7 +359,17 @@ def _number(value: float) -> float:
         return float("nan")
 
 
+def without_mask(values: ArrayLike) -> ArrayLike:
+    """Numbers as they are; of a masked array floats, NaN where it is masked."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    if values.dtype.kind not in "fiu" or not np.ma.getmaskarray(values).any():
+        return values.data
+    return np.ma.filled(values.astype(np.result_type(values.dtype, np.float32)), np.nan)
+
+
 def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    values = without_mask(values)
     try:
         array = np.asarray(values)
     except ValueError:
@@ -384,7 +394,10 @@ def _rows(values: NDArray[np.generic], kept: NDArray[np.int64]) -> NDArray[np.ge
 def _colors(colors: ArrayLike | None, shape: tuple[int, ...], kept: NDArray[np.int64]) -> NDArray[np.float64] | None:
     if colors is None:
         return None
-    array = _rows(_same_shape("colors", colors, shape), kept)
+    masked = np.ma.getmaskarray(colors) if isinstance(colors, np.ma.MaskedArray) else np.zeros(0, bool)
+    array = _rows(_same_shape("colors", np.ma.getdata(colors) if masked.any() else colors, shape), kept)
+    if masked.any() and masked.reshape(-1, 3)[kept].any():
+        raise ValueError("expected colors of all finite points, but some are masked; fill them, or mask the points")
     if array.dtype == np.uint8:
         shades = array.astype(np.float64, order="C")
         shades *= 1.0 / 255.0

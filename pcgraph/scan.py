@@ -117,11 +117,11 @@ def segment(
     points : (n, 3) or (h, w, 3) float or integer, metres, any frame; or a Cloud, or the name of a file
         Of a `Cloud`, and of a file that `read_cloud` reads, colours, normals and viewpoint are used too where none
         are given (not a viewpoint of zeros, which PCD files hold where none is known).
-        NaN and infinite points are left out and labelled -1, and so are those that are exactly (0, 0, 0), as drivers
-        write holes, if there are several in an organised cloud (h, w, 3), or more than a thousand and one in a thousand
-        in a list; outliers, no denser around than noise would be, -2 (`pcgraph.voxels.outliers.outlier_voxels`). What
-        looks like a camera's image, organised or not, is taken for one, in whatever frame, unless `camera` says
-        otherwise.
+        NaN, infinite and masked points are left out and labelled -1, and so are those that are exactly (0, 0, 0), as
+        drivers write holes, if there are several in an organised cloud (h, w, 3), or more than a thousand and one in a
+        thousand in a list; outliers, no denser around than noise would be, -2
+        (`pcgraph.voxels.outliers.outlier_voxels`). What looks like a camera's image, organised or not, is taken for
+        one, in whatever frame, unless `camera` says otherwise.
     colors : same shape, uint8 0..255 or float 0..1, optional
     normals : same shape, float, optional
         Outward normals; kept in their direction. Where zero or NaN, and without them, they are estimated.

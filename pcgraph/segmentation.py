@@ -216,3 +216,9 @@ class Segmentation:
         full = np.full(self.supervoxels.shape, missing, values.dtype)
         full[self.supervoxels >= 0] = values
         return full
+
+
+def check_segmentation(given: object) -> None:
+    """Raise ValueError unless this is a `Segmentation`."""
+    if not isinstance(given, Segmentation):
+        raise ValueError(f"expected a Segmentation, as pcgraph.segment returns it, got {type(given).__name__}")

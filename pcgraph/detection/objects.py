@@ -19,7 +19,7 @@ from pcgraph.detection.plane_detection import Planes, find_planes, members
 from pcgraph.detection.shapes import Shape, fit_shape
 from pcgraph.disjoint_sets import connected_components
 from pcgraph.inputs import non_negative
-from pcgraph.segmentation import Segmentation
+from pcgraph.segmentation import Segmentation, check_segmentation
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
@@ -109,7 +109,10 @@ def objects_on(
     lies above it. A piece that lies mostly within the box of a larger one goes to it, and so does one that hangs
     beside another without reaching the support, such as the inside of a cup (`linked_pieces`).
     """
+    check_segmentation(segmentation)
     planes = find_planes(segmentation) if planes is None else planes
+    if not isinstance(planes, Planes):
+        raise ValueError(f"expected planes as find_planes returns them, got {type(planes).__name__}")
     if len(planes.plane_of_supervoxel) != segmentation.tree.n_leaves:
         raise ValueError(
             f"expected planes of this segmentation, of {segmentation.tree.n_leaves} supervoxels, got planes of "
@@ -145,6 +148,7 @@ def objects_on(
 
 def object_labels(segmentation: Segmentation, objects: list[DetectedObject]) -> NDArray[np.int32]:
     """Index of each point's object in the points' shape, int32; -1 where it belongs to none."""
+    check_segmentation(segmentation)
     of_leaf = np.full(segmentation.tree.n_leaves, -1, np.int32)
     for i, thing in enumerate(objects):
         of_leaf[thing.supervoxels] = i

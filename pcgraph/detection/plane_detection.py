@@ -19,7 +19,7 @@ from pcgraph.detection.region_growing import (
 )
 from pcgraph.features.nodes import node_features, unit_vector
 from pcgraph.inputs import positive
-from pcgraph.segmentation import Segmentation
+from pcgraph.segmentation import Segmentation, check_segmentation
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.directions import plane_basis
 
@@ -127,6 +127,7 @@ def find_planes(
     Regions grow over the graph as in Vo et al. 2015, here from supervoxel to supervoxel by exact moments
     (`pcgraph.detection.region_growing`).
     """
+    check_segmentation(segmentation)
     if not isinstance(angle, Real) or not 0.0 < angle <= np.pi / 2:
         raise ValueError(f"expected an angle above 0 and up to pi/2 radians, got {angle!r}")
     if min_area is not None and not (isinstance(min_area, Real) and 0.0 < min_area < np.inf):

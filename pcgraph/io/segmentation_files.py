@@ -7,6 +7,7 @@ import io
 import warnings
 import zipfile
 from collections.abc import Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pcgraph.cloud import COLOR_NAMES, LABEL_NAMES, NORMAL_NAMES, PACKED_NAMES, Cloud
 from pcgraph.errors import CloudWriteError
+from pcgraph.inputs import without_mask
 from pcgraph.io.ply import encode_ply
 from pcgraph.plain_files import is_sealed, sealed, unsealed, write_file
 
@@ -79,7 +81,11 @@ def encode_segmentation(
     name: str, cloud: Cloud | ArrayLike, segmentation: Segmentation, labels: ArrayLike | None = None
 ) -> bytes:
     """What `write_segmentation` writes to a file of such a name."""
-    cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(cloud))
+    from pcgraph.segmentation import check_segmentation
+
+    check_segmentation(segmentation)
+    cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(without_mask(cloud)))
+    cloud = replace(cloud, points=np.asarray(without_mask(cloud.points)))
     labels = segmentation.labels if labels is None else _whole_labels(labels)
     shape = segmentation.labels.shape
     if np.shape(cloud.points) != (*shape, 3):
@@ -239,7 +245,7 @@ def _further_columns(cloud: Cloud) -> dict[str, NDArray[np.generic]]:
             raise CloudWriteError(f"expected the column {name!r} as an array of numbers, got {kind}")
         if column.shape[: len(shape)] != shape or column.ndim > len(shape) + 1:
             raise CloudWriteError(f"expected the column {name!r} in the points' shape {shape}, got {column.shape}")
-    return cloud.columns
+    return {name: np.asarray(without_mask(column)) for name, column in cloud.columns.items()}
 
 
 def _is_word(name: str) -> bool:

@@ -41,18 +41,21 @@ def horizontal_cut(
         last = n_leaves + _merges(altitudes[n_leaves:], n, altitude, n_leaves)
         return propagation_sources(parents, parents < last)[:n_leaves].copy()
     cores = size_cores(parents, counts, min_size)
-    merges = _merges(altitudes[n_leaves:], n, altitude, len(cores.joins) + 1)
+    least = f" of {min_size} points or more"
+    merges = _merges(altitudes[n_leaves:], n, altitude, len(cores.joins) + 1, least)
     last = n_leaves + merges
     if n is not None:  # so many of the merges that join cores
         last = int(cores.joins[merges - 1]) + 1 if merges > 0 else 0
     return propagation_sources(parents, parents < last)[cores.of_leaf]
 
 
-def _merges(merge_altitudes: NDArray[np.float64], n: int | None, altitude: float | None, most: int) -> int:
-    """Number of merges that a cut does; of a tree with `most` segments at its finest."""
+def _merges(
+    merge_altitudes: NDArray[np.float64], n: int | None, altitude: float | None, most: int, least: str = ""
+) -> int:
+    """Number of merges that a cut does; of a tree with `most` segments at its finest, `least` says of which."""
     if n is not None and altitude is None:
         if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 1 <= n <= most:
-            raise ValueError(f"expected a whole number n of 1..{most} segments, got {n!r}")
+            raise ValueError(f"expected a whole number n of 1..{most} segments{least}, got {n!r}")
         return most - int(n)
     if altitude is None or n is not None:
         raise ValueError(f"expected either n or altitude, got n={n} and altitude={altitude}")

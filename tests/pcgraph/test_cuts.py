@@ -350,3 +350,11 @@ def test_one_leaf_is_a_tree():
         assert cut.tolist() == [0]
     assert tree.persistence.tolist() == [np.inf]
     assert tree.edge_saliency(graph.edges).tolist() == []
+
+
+@pytest.mark.parametrize(("min_size", "most"), [(1, 5), (10, 3), (31, 1), (1000, 1)])
+def test_too_many_segments_are_told_of_which_size(tree, min_size, most):
+    """With a least size the limit was said without it, so that nobody knew where it came from."""
+    of_size = "" if min_size == 1 else f" of {min_size} points or more"
+    with pytest.raises(ValueError, match=f"n of 1..{most} segments{of_size}, got 6$"):
+        tree.cut(n=6, min_size=min_size)

@@ -97,3 +97,20 @@ def test_wrong_arguments_are_refused(boxes):
         objects_on(result, planes, points=points[:-1])
     with pytest.raises(ValueError, match="margin"):
         objects_on(result, planes, margin=-1.0)
+
+
+@pytest.mark.parametrize("kind", ["points", "cloud", "labels", "nothing"])
+def test_what_is_no_segmentation_is_refused_in_a_sentence(boxes, kind, tmp_path):
+    """Points in place of their segmentation ended in an AttributeError."""
+    points, _, result = boxes
+    given = {"points": points, "cloud": pcgraph.Cloud(points), "labels": result.labels, "nothing": None}[kind]
+    calls = [lambda: find_planes(given), lambda: objects_on(given), lambda: object_labels(given, [])]
+    calls += [lambda: objects_on(given, find_planes(result), points=points)]
+    calls += [lambda: pcgraph.write_segmentation(tmp_path / "a.ply", points, given)]
+    calls += [lambda: pcgraph.write_segmentation(tmp_path / "a.npz", points, given)]
+    for call in calls:
+        with pytest.raises(ValueError, match=rf"expected a Segmentation, .* got {type(given).__name__}$"):
+            call()
+    with pytest.raises(ValueError, match=f"expected planes as find_planes returns them, got {type(points).__name__}"):
+        objects_on(result, points)
+    assert list(tmp_path.iterdir()) == []

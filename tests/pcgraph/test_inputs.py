@@ -147,3 +147,50 @@ def test_what_is_no_method_or_linkage_is_refused_whatever_it_is(argument):
     for wrong in (0, "", False, "lccp"):
         with pytest.raises(ValueError, match=f"expected a {argument} such as"):
             pcgraph.segment(POINTS, **{argument: wrong})
+
+
+def scene_with_holes(dtype, organised):
+    """Two planes as a camera sees them, in 1/1000 m of any type, and which points are none."""
+    y, x = np.mgrid[:40, :50]
+    points = np.stack((x * 20, y * 20, np.where(x < 20, 900, 1400)), axis=-1).astype(dtype)
+    holes = np.random.default_rng(4).random((40, 50)) < 0.2
+    return (points, holes) if organised else (points.reshape(-1, 3), holes.reshape(-1))
+
+
+@pytest.mark.parametrize("organised", [True, False])
+@pytest.mark.parametrize("dtype", ["f4", "f8", "i2", "i4", "u2"])
+def test_masked_points_are_none(dtype, organised, tmp_path):
+    """Masks were passed over: what lies beneath, often a fill value, was taken for measured."""
+    points, holes = scene_with_holes(dtype, organised)
+    colors = np.random.default_rng(5).integers(0, 256, points.shape).astype(np.uint8)
+    expected = pcgraph.segment(
+        np.where(holes[..., None], np.nan, points.astype(float)), colors, features=points[..., 0]
+    )
+    for mask in (holes[..., None] & np.ones(3, bool), holes[..., None] & np.array([False, True, False])):
+        beneath = points.copy()
+        beneath[mask] = 17
+        masked = np.ma.masked_array(beneath, mask)
+        for given in (masked, pcgraph.Cloud(masked)):
+            found = pcgraph.segment(given, np.ma.masked_array(colors, mask), features=points[..., 0])
+            assert same(found, expected)
+            assert (found.labels[holes] == -1).all()
+            pcgraph.write_segmentation(tmp_path / "a.ply", given, found)
+            written = pcgraph.read_cloud(tmp_path / "a.ply")
+            assert np.array_equal(written.points, points[~holes])
+            assert np.array_equal(written.labels, expected.labels[~holes])
+    unmasked = np.ma.masked_array(points, np.zeros(points.shape, bool))
+    assert same(pcgraph.segment(unmasked), pcgraph.segment(points))
+
+
+def test_masked_features_are_unknown_and_masked_colours_are_refused():
+    points, holes = scene_with_holes("f8", organised=True)
+    numbers = points[..., 0].copy()
+    expected = pcgraph.segment(points, features=np.where(holes, np.nan, numbers))
+    numbers[holes] = -1e9
+    masked = np.ma.masked_array(numbers, holes)
+    assert same(pcgraph.segment(points, features=masked), expected)
+    assert same(pcgraph.segment(pcgraph.Cloud(points, columns={"t": masked}), features="t"), expected)
+    for colors in (np.zeros(points.shape), np.zeros(points.shape, np.uint8)):
+        masked = np.ma.masked_array(colors, np.repeat(holes[..., None], 3, axis=-1))
+        with pytest.raises(ValueError, match="colors of all finite points, but some are masked"):
+            pcgraph.segment(points, masked)
