@@ -11,8 +11,14 @@ from pcgraph.kernel_cache import cached_njit
 
 MAX_FRACTION = 1 - 1e-6
 """Of pulses in which a photon was detected: more leave no estimate."""
-MAX_OUTSIDE, MAX_STEPS, LEAST_RATE, CONVERGED = 3.0, 50, 1e-3, 1e-6
-"""Of `whole_peak`."""
+MAX_OUTSIDE = 3.0
+"""Largest distance of a pulse's middle from the bins that show its flank, in standard deviations of the pulse."""
+MAX_STEPS = 50
+"""Largest number of Newton steps to the place of a pulse that is cut off."""
+MIN_RATE = 1e-3
+"""Least rate of a cut-off pulse's centroid over its place, as the steps would grow without bound."""
+CONVERGED = 1e-6
+"""Step at which the place of a pulse is found, in standard deviations of the pulse."""
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -77,7 +83,7 @@ def whole_peak(centroid, low, high, sigma):  # type: ignore[no-untyped-def]
         shift = (density_a - density_b) / mass
         rate = 1 + (a * density_a - b * density_b) / mass - shift * shift
         before = place
-        place = min(max(place + (centroid - place - sigma * shift) / max(rate, LEAST_RATE), first), last)
+        place = min(max(place + (centroid - place - sigma * shift) / max(rate, MIN_RATE), first), last)
         if abs(place - before) < CONVERGED * sigma:
             break
     return place
