@@ -7,10 +7,13 @@ not (another start or direction of the fringes, another order of frames) contrad
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
+
 import numpy as np
 
 from rangesim.capture import Capture
-from rangesim.decoding.gray import GrayCode
+from rangesim.decoding.gray import Contrast, GrayCode, binary_of_gray
 from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.status import Status
 
@@ -29,10 +32,25 @@ MAX_LEVEL_ERROR = 0.03
 """Fraction of white - black by which the mean of the fringes may miss the middle between black and white."""
 PHASE_BINS = 8
 """Into which a period is divided, to see at which phases the mean of the fringes is off."""
+MAX_PAIRS = 50_000
+"""Pairs of neighbouring pixels, across and down each, that are looked at in every order of the frames."""
 MIN_STEPS = 100
 """Pairs of neighbouring pixels in different cells; fewer do not tell plain binary from Gray code."""
 MAX_FARTHER = 0.3
 """Powers of two by which neighbours may lie farther apart if read as Gray code; about 1 is expected of plain binary."""
+MAX_UNPAIRED_FRACTION = 0.2
+"""Fraction of pixels at which a pattern and its inverse may miss white + black; half do of two patterns that are
+no pair."""
+MIN_UNPAIRED = 0.75
+"""Fraction of white - black from which on they miss it: 1 where both are lit or both are dark, to 0.56 by a gamma."""
+MAX_NEARER_FRACTION = 0.8
+"""Fraction of neighbours that another order of the frames may bring nearer to each other, of those that it brings to
+half or twice the distance; all, if that order is the right one."""
+MIN_REPEATED_FRACTION = 0.9
+"""Fraction of the changes of one bit, from pixel to pixel, that another bit has too, from which on it is the same
+frame; none in Gray code, seen sharply."""
+MIN_ALONE_FRACTION = 0.3
+"""Fraction of these changes at which no third bit changes; at a step of the scene other bits change, too."""
 MAX_BEHIND_FRACTION = 0.2
 """Fraction of pixels whose rays may meet clearly behind a device; a few do by interreflection."""
 MIN_BEHIND_PX = 10.0
@@ -159,6 +177,155 @@ def binary_contradiction(gray: GrayCode, axis: str) -> str | None:
         f"the bits along {axis} contradict Gray code: read as plain binary numbers neighbouring pixels lie "
         f"{2 ** as_binary.mean():.1f} cells apart, as Gray code {2 ** as_gray.mean():.1f}: check which code was shown."
     )
+
+
+def pair_contradiction(capture: Capture, contrast: Contrast, run: slice, names: list[str], axis: str) -> str | None:
+    """A sentence if patterns and inverses do not add up to white + black, None if they do.
+
+    They do at any blur and any interreflection, for light adds up. Two frames that are no pair do at half of the
+    pixels.
+
+    Parameters
+    ----------
+    run : where the Gray patterns of `axis` stand among the frames. names : of all frames.
+    """
+    white, black = capture.frames[-2].ravel(), capture.frames[-1].ravel()
+    values = contrast.values.ravel()
+    usable = contrast.is_enough & ~capture.saturated(capture.frames[-2:-1])
+    used = _spread(np.flatnonzero(usable))
+    if len(used) < MIN_PIXELS:
+        return None
+    used = used[values[used] >= np.median(values[used])]
+    total = white[used].astype(np.float64) + black[used]
+    fractions = []
+    for k in range(run.start, run.stop, 2):
+        pattern, inverse = (capture.frames[i].ravel()[used].astype(np.float64) for i in (k, k + 1))
+        fractions.append(float((np.abs(pattern + inverse - total) > MIN_UNPAIRED * values[used]).mean()))
+    unpaired = [k for k, fraction in enumerate(fractions) if fraction > MAX_UNPAIRED_FRACTION]
+    if not unpaired:
+        return None
+    worst = max(unpaired, key=fractions.__getitem__)
+    first = run.start + 2 * worst
+    return (
+        f"{len(unpaired)} of {len(fractions)} pairs of pattern and inverse along {axis} contradict white and black: "
+        f"frames {names[first]} and {names[first + 1]} do not add up to them at {100 * fractions[worst]:.0f} % of the "
+        "pixels: check the order of the frames, that none is missing or there twice, and that all have one exposure."
+    )
+
+
+def order_contradiction(gray: GrayCode, names: list[str], axis: str) -> str | None:
+    """A sentence if the bits of the Gray code seem to be in another order, inverted or repeated, None if not.
+
+    Neighbouring pixels see neighbouring cells. Other orders are tried; where one brings nearly all neighbours that it
+    moves nearer to each other, the frames were in that order.
+
+    Parameters
+    ----------
+    names : (2 b,) of the patterns and inverses, most significant bit first.
+    """
+    number = np.floor(gray.coordinate / gray.cell_px).astype(np.int64)
+    usable = ((gray.coordinate / gray.cell_px) % 1 == 0.5) & (gray.status != Status.LOW_SIGNAL)
+    usable &= gray.status != Status.SATURATED
+    word = number ^ (number >> 1)  # the bits as shown
+    pairs = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = np.flatnonzero((usable[here] & usable[there]).ravel())
+        both = both[:: 1 + len(both) // MAX_PAIRS]
+        pairs.append(np.stack([word[here].ravel()[both], word[there].ravel()[both]]))
+    bits = names[-2::-2]  # least significant first
+    across = max(pairs, key=lambda words: np.count_nonzero(words[0] != words[1]))
+    words = np.concatenate(pairs, axis=1)
+    words = words[:, words[0] != words[1]]
+    step = _coarse_step(across, len(bits))
+    text = None if step is None else _repeated_bit(words >> step, bits[step:])
+    text = text or _better_order(across, words, bits)
+    if text is None:
+        return None
+    return f"the bits along {axis} contradict Gray code, where neighbouring pixels see neighbouring cells: {text}."
+
+
+def _better_order(across: np.ndarray, words: np.ndarray, bits: list[str]) -> str | None:
+    """What was wrong with the frames if another order of them brings neighbours nearer together, None if none does.
+
+    Parameters
+    ----------
+    across : (2, n) Gray words of neighbours in the direction in which the code changes more. words : (2, m) of those
+        in both directions that differ. bits : (b,) names of the patterns, least significant first.
+    """
+    best, text = 0.0, None
+    for fault, reorder in _other_orders(bits):
+        step = _coarse_step(reorder(across), len(bits))
+        if step is None:
+            continue
+        octaves = np.log2(np.maximum(_apart(words, step), 0.5) / np.maximum(_apart(reorder(words), step), 0.5))
+        moved, nearer, gain = np.abs(octaves) >= 1, octaves >= 1, float(octaves.sum())
+        if moved.sum() >= MIN_STEPS and nearer.sum() > MAX_NEARER_FRACTION * moved.sum() and gain > best:
+            best, text = gain, fault
+    return text
+
+
+def _coarse_step(words: np.ndarray, n_bits: int) -> int | None:
+    """Finest bits to leave out, so that half of the neighbours with Gray words (2, n) see one cell.
+
+    What is finer than the camera's pixels does not tell neighbours. None if less than three bits are left.
+    """
+    first, second = binary_of_gray(words)
+    for step in range(n_bits - 2):
+        if np.count_nonzero(first >> step == second >> step) >= 0.5 * len(first):
+            return step
+    return None
+
+
+def _apart(words: np.ndarray, step: int) -> np.ndarray:
+    """(n,) int, cells of 2^step of the finest between the neighbours of Gray words (2, n)."""
+    first, second = binary_of_gray(words)
+    return np.asarray(np.abs((second >> step) - (first >> step)))
+
+
+def _other_orders(bits: list[str]) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
+    """What may be wrong with the order of the frames, and Gray words as they are without it.
+
+    Parameters
+    ----------
+    bits : (b,) names of the patterns, least significant first.
+    """
+    n = len(bits)
+    yield "every inverse seems to stand before its pattern", partial(np.bitwise_xor, (1 << n) - 1)
+    yield "the least significant bit seems to come first", partial(_reversed, n)
+    for i in range(n):
+        yield f"frame {bits[i]} and its inverse seem to be exchanged", partial(np.bitwise_xor, 1 << i)
+        for j in range(i):
+            both = f"frames {bits[i]} and {bits[j]}, each with its inverse,"
+            yield f"{both} seem to be exchanged", partial(_exchanged, i, j)
+
+
+def _reversed(n_bits: int, words: np.ndarray) -> np.ndarray:
+    """Words with their bits in the other order."""
+    result = np.zeros_like(words)
+    for k in range(n_bits):
+        result |= ((words >> k) & 1) << (n_bits - 1 - k)
+    return result
+
+
+def _exchanged(i: int, j: int, words: np.ndarray) -> np.ndarray:
+    """Words with bits i and j exchanged."""
+    differ = ((words >> i) ^ (words >> j)) & 1
+    return np.asarray(words ^ (differ << i) ^ (differ << j))
+
+
+def _repeated_bit(words: np.ndarray, bits: list[str]) -> str | None:
+    """That two bits always change together; None if no two do."""
+    changed = words[0] ^ words[1]
+    counts = [int(np.count_nonzero(changed & (1 << i))) for i in range(len(bits))]
+    for i in range(len(bits)):
+        for j in range(i):
+            two = (1 << i) | (1 << j)
+            both = int(np.count_nonzero((changed & two) == two))
+            if both < MIN_STEPS or both < MIN_REPEATED_FRACTION * max(counts[i], counts[j]):
+                continue
+            if np.count_nonzero(changed == two) > MIN_ALONE_FRACTION * both:
+                return f"frames {bits[i]} and {bits[j]} seem to be one pattern shown twice"
+    return None
 
 
 def behind_contradiction(behind_px: np.ndarray) -> str | None:

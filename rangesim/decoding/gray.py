@@ -100,7 +100,7 @@ def decode_gray(
     )
     for rows in bands(len(status)):
         code, uncertain = _classify(capture, frames[:, rows], contrast.values[rows], thresholds)
-        low, high = _binary(code), _binary(code ^ uncertain)
+        low, high = binary_of_gray(code), binary_of_gray(code ^ uncertain)
         on_edge = (uncertain & (uncertain - 1) == 0) & (np.abs(low - high) <= 1)
         coordinate[rows] = (0.5 * (low + high) + 0.5) * cell
         status[rows][coordinate[rows] >= size + cell / 2] = Status.CODE_ERROR
@@ -141,7 +141,7 @@ def _difference_noise(capture: Capture, a: np.ndarray, b: np.ndarray) -> np.ndar
     return None if noise_a is None or noise_b is None else np.sqrt(noise_a**2 + noise_b**2)
 
 
-def _binary(gray: np.ndarray) -> np.ndarray:
+def binary_of_gray(gray: np.ndarray) -> np.ndarray:
     """Number whose Gray code is `gray` (up to 32 bits): the running exclusive or of its bits from the top."""
     result = gray.copy()
     for step in (16, 8, 4, 2, 1):

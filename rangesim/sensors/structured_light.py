@@ -12,7 +12,13 @@ import numpy as np
 
 from rangesim import limits
 from rangesim.capture import Capture
-from rangesim.decoding.contradictions import binary_contradiction, fringe_contradiction, level_contradiction
+from rangesim.decoding.contradictions import (
+    binary_contradiction,
+    fringe_contradiction,
+    level_contradiction,
+    order_contradiction,
+    pair_contradiction,
+)
 from rangesim.decoding.gray import GrayCode, GrayThresholds, decode_gray, direct_contrast
 from rangesim.decoding.phase_shift import PhaseThresholds, refine_by_phase
 from rangesim.decoding.range_image import RangeImage
@@ -214,7 +220,11 @@ class StructuredLightDecoder(Decoder):
             if isinstance(response, GrayBits):
                 shift, size = response.shift, sensor.size(axis)
                 codes[axis] = decode_gray(capture, capture.frames[frames], shift, size, contrast, self.gray)
-                contradictions[axis] = binary_contradiction(codes[axis], axis)
+                contradictions[axis] = (
+                    pair_contradiction(capture, contrast, frames, sensor.frame_names(), axis)
+                    or binary_contradiction(codes[axis], axis)
+                    or order_contradiction(codes[axis], sensor.frame_names()[frames], axis)
+                )
             else:
                 fringes, least_swing = capture.frames[frames], self.gray.relative_bit * contrast.values
                 period_px = response.period_px
