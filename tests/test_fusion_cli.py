@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from browser import BROWSER, browser
 from scroll_hints import check_scroll_hints
 from typer.testing import CliRunner
 
-from rangesim import load_range_image
+from rangesim import limits, load_range_image
 from rangesim.cli import app
 from rangesim.errors import FileFormatError
 from rangesim.fusion import Dome, Turntable
@@ -125,6 +126,48 @@ def test_bad_input_leaves_nothing_behind(tmp_path: Path, arguments: list[str], m
     with pytest.raises((ValueError, FileFormatError), match=message):
         CliRunner().invoke(app, ["scan", *arguments, "--out", str(tmp_path / "out")], catch_exceptions=False)
     assert not list(tmp_path.iterdir())
+
+
+COST = re.compile(
+    r"about (?P<paths>\S+ [kMGT]?) ?light paths of up to 5 segments in (?P<passes>\d+) passes, "
+    r"(?P<memory>[\d.]+) GB of memory, (?P<disk>[\d.]+ [MG]B) on disk, "
+    r"(?P<time>[\d.]+) (?P<unit>s|min|h|d) on (\d+ idle cores?|an idle GPU)"
+)
+
+
+def test_what_a_scan_will_cost_is_said_before_it_starts(tmp_path: Path) -> None:
+    """4K, 256 paths per pixel, 100 views: more than a day of two cores."""
+    large = ("matte", "--width", "3840", "--height", "2160", "--spp", "256", "--views", "100")
+    with limits.raised(memory=10**13):
+        found = COST.fullmatch(run(*large, "--estimate").strip())
+    assert found is not None
+    assert found["paths"] == "212 G"  # 3840 x 2160 x 256 x 100
+    assert found["passes"] == "100"
+    assert 40 < float(found["memory"]) < 120  # 100 range images and their truths
+    assert found["disk"].endswith("GB")
+    assert 4 < float(found["disk"][:-3]) < 20
+    assert found["unit"] in ("h", "d")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scan_beyond_the_memory_is_refused_before_the_work(tmp_path: Path) -> None:
+    large = ("matte", "--width", "3840", "--height", "2160", "--views", "100", "--out", str(tmp_path / "out"))
+    with limits.raised(memory=10**10), pytest.raises(ValueError, match=r"within the 10\.0 GB of memory"):
+        run(*large)
+    assert not list(tmp_path.iterdir())
+    assert "expected --out DIRECTORY" in CliRunner().invoke(app, ["scan", "matte"]).output
+
+
+@pytest.mark.parametrize(("width", "views"), [(80, 3), (128, 2)])
+def test_the_cost_of_a_scan_is_as_counted(width: int, views: int, tmp_path: Path) -> None:
+    options = ("matte", "--width", str(width), "--views", str(views), "--spp", "4")
+    found = COST.fullmatch(run(*options, "--estimate").strip())
+    assert found is not None
+    assert found["passes"] == str(views)
+    run(*options, "--out", str(tmp_path / "out"))
+    size = sum(file.stat().st_size for file in (tmp_path / "out").rglob("*") if file.is_file())
+    assert found["disk"].endswith("MB")
+    assert size / 2 < 1e6 * float(found["disk"][:-3]) < 2 * size
 
 
 def test_poses_that_see_nothing_are_said(tmp_path: Path) -> None:

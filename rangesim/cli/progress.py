@@ -8,11 +8,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from rangesim.errors import TruncationWarning, one_line
+
+if TYPE_CHECKING:
+    from rangesim.experiment.cost import Cost
 
 
 @contextmanager
@@ -34,6 +37,12 @@ def progress_bar() -> Iterator[Callable[[str, float], None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("Starting", total=1.0)
         yield lambda stage, fraction: bar.update(task, description=escape(one_line(stage)), completed=fraction)
+
+
+def announce(cost: Cost) -> None:
+    """Print a line if the work is long or large."""
+    if cost.is_large:
+        typer.echo(f"rangesim: this takes {cost}.", err=True)
 
 
 def say_where(out: Path, target: Path) -> None:

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
+from rangesim.cli.progress import announce, light_left_out_in_a_line, progress_bar, say_where
 from rangesim.errors import one_line
 from rangesim.files.bundled_scenes import scene_names
 
 if TYPE_CHECKING:
     from rangesim.experiment import Experiment
-    from rangesim.experiment.cost import Cost
     from rangesim.experiment.instrument import Instrument
 
 
@@ -122,15 +121,9 @@ def run_command(
     target = check_directory(out, RESULT, inputs=[experiment.scene])
     say_where(out, target)
     with light_left_out_in_a_line(), progress_bar() as progress:
-        pipeline.run(experiment, out, progress, announce=_announce)
+        pipeline.run(experiment, out, progress, announce=announce)
     _say_what_measured_nothing(target, experiment.scene)
     typer.echo(one_line(out / "report.html"))
-
-
-def _announce(cost: Cost) -> None:
-    """A line on stderr if the run is long or large."""
-    if cost.is_large:
-        typer.echo(f"rangesim: this takes {cost}.", err=True)
 
 
 def _say_what_measured_nothing(out: Path, scene: str) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rangesim.cli.progress import light_left_out_in_a_line, progress_bar, say_where
+from rangesim.cli.progress import announce, light_left_out_in_a_line, progress_bar, say_where
 from rangesim.errors import one_line
 
 if TYPE_CHECKING:
@@ -26,8 +26,9 @@ def scan_command(
         typer.Argument(help="Scene (.xml), mesh, or name of a scene, as for `rangesim run`.", show_default=False),
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Directory for the results; an older scan is replaced.")
-    ] = ...,  # type: ignore[assignment]
+        Path | None,
+        typer.Option("--out", "-o", help="Directory for the results; an older scan is replaced. (required)"),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Settings of the scan (.toml); other options override them.")
     ] = None,
@@ -57,6 +58,9 @@ def scan_command(
         str | None, typer.Option(help="Of a bare mesh: matte, glossy, mirror, transparent. (default: matte)")
     ] = None,
     unit_m: Annotated[float | None, typer.Option(help="Metres per unit of a bare mesh. (default: 1)")] = None,
+    estimate: Annotated[
+        bool, typer.Option("--estimate", help="Print what the scan will cost, and end; nothing is written.")
+    ] = False,
 ) -> None:
     """Scan a scene from many sides and fuse the views: mesh.ply, poses, range images, statistics and report.html.
 
@@ -68,8 +72,10 @@ def scan_command(
 
       rangesim scan --config scan.toml --unknown-poses --out out/unknown
     """
+    if out is None and not estimate:
+        raise typer.BadParameter("expected --out DIRECTORY, unless --estimate is given.", param_hint="--out")
     from pcgraph.output import check_directory
-    from rangesim.fusion.scan_run import SCAN, run_scan
+    from rangesim.fusion.scan_run import SCAN, estimate_scan, run_scan
 
     given: dict[str, Any] = {"spp": spp, "width": width, "height": height, "seed": seed, "voxel_m": voxel}
     given |= {"material": material, "unit_m": unit_m}
@@ -84,10 +90,15 @@ def scan_command(
         settings = replace(settings, registration="unknown")
     if uniform:
         settings = replace(settings, weights="uniform")
+    if estimate or out is None:
+        cost = estimate_scan(settings)
+        typer.echo(cost)
+        cost.check_memory()
+        return
     target = check_directory(out, SCAN, inputs=[settings.scene])
     say_where(out, target)
     with light_left_out_in_a_line(), progress_bar() as progress:
-        result = run_scan(settings, out, progress)
+        result = run_scan(settings, out, progress, announce=announce)
     typer.echo(_table(result))
     typer.echo(one_line(out / "report.html"))
 

@@ -40,6 +40,9 @@ PATHS_PER_GPU_S = 5e7
 PHOTON_S = 3e-6
 PASS_S, START_S = 1.0, 4.0
 """Seconds to compile a pass, and to import, load the scene and write the report."""
+REPEATED_PASS_S = 0.3
+"""Seconds of a pass from another place, besides its paths and photons: nothing is compiled. 0.02 of `matte`, 0.5 of
+`tabletop`."""
 FRAME_S, PIXEL_S = 100e-9, 6e-6
 """Seconds per pixel of each frame (noise, files), and per pixel of each instrument (decoding, segments, report)."""
 BASE_BYTES = 4e8
@@ -64,7 +67,7 @@ class Cost:
 
     light_paths : camera paths of all passes. segments : at most so many in each. photons : of all passes.
     passes : of the light transport. memory_bytes : at the peak. seconds : on this machine if it is idle. machine : what
-    of it was counted on, in words.
+    of it was counted on, in words. disk_bytes : of the results; 0: not counted.
     """
 
     light_paths: int
@@ -74,6 +77,7 @@ class Cost:
     memory_bytes: int
     seconds: float
     machine: str = ""
+    disk_bytes: int = 0
 
     @property
     def is_large(self) -> bool:
@@ -82,9 +86,10 @@ class Cost:
 
     def __str__(self) -> str:
         photons = f" and {_count(self.photons)} photons" if self.photons else ""
+        disk = f" of memory, {_bytes(self.disk_bytes)} on disk" if self.disk_bytes else ""
         return (
             f"about {_count(self.light_paths)} light paths of up to {self.segments} segments{photons} in "
-            f"{self.passes} pass{'es' if self.passes > 1 else ''}, {self.memory_bytes / 1e9:.1f} GB, "
+            f"{self.passes} pass{'es' if self.passes > 1 else ''}, {self.memory_bytes / 1e9:.1f} GB{disk}, "
             f"{_duration(self.seconds)}{f' on {self.machine}' if self.machine else ''}"
         )
 
@@ -99,8 +104,27 @@ class Cost:
             )
 
 
+class Rest(NamedTuple):
+    """What comes with the light transport.
+
+    seconds : of all that is done with its signals. held_bytes : of results that are held while light is traced.
+    peak_bytes : of all arrays at once, while no light is traced. disk_bytes : of the results.
+    """
+
+    seconds: float
+    held_bytes: int
+    peak_bytes: int
+    disk_bytes: int
+
+
 def estimate_cost(
-    experiment: Experiment, scene: Scene, passes: Sequence[tuple[Rig, list[Instrument]]], trial: bool = True
+    experiment: Experiment,
+    scene: Scene,
+    passes: Sequence[tuple[Rig, list[Instrument]]],
+    trial: bool = True,
+    *,
+    places: int = 1,
+    rest: Rest | None = None,
 ) -> Cost:
     """Cost of an experiment.
 
@@ -108,6 +132,7 @@ def estimate_cost(
     ----------
     passes : as `rangesim.experiment.pipeline.group_by_rig` returns.
     trial : whether small passes may be timed where the run is long.
+    places : that each pass is traced from. rest : what is done with the signals; None: what a run does.
     """
     from rangesim.light_transport.photons import has_delta
 
@@ -118,13 +143,15 @@ def estimate_cost(
         limits.check("bytes", size, "bytes in the results of one pass")
         traced, n = _traced_pixels(experiment, rig, instruments)
         pixels, count = pixels + traced, count + n
-    paths, all_photons = pixels * (experiment.spp or TYPICAL_SPP), photons * count
-    rest_s = START_S + sum(_rest_s(rig, instruments) for rig, instruments in passes)
-    seconds = rest_s + count * PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
-    cost = Cost(paths, experiment.max_depth, all_photons, count, _memory_bytes(passes, photons), seconds, _machine())
+    paths, all_photons = places * pixels * (experiment.spp or TYPICAL_SPP), places * photons * count
+    rest = rest or _rest_of_run(passes)
+    rest_s, again = START_S + rest.seconds, (places - 1) * count
+    seconds = rest_s + count * PASS_S + again * REPEATED_PASS_S + all_photons * PHOTON_S + paths / _paths_per_s()
+    memory = int(BASE_BYTES + max(_tracing_bytes(passes, photons) + rest.held_bytes, rest.peak_bytes))
+    cost = Cost(paths, experiment.max_depth, all_photons, places * count, memory, seconds, _machine(), rest.disk_bytes)
     if trial and seconds > TRIAL_S:
         compile_s, fixed_s, path_s = _timed_trial(experiment, scene, passes[0])
-        traced_s = (len(passes) - 1) * compile_s + count * fixed_s + paths * path_s
+        traced_s = (len(passes) - 1) * compile_s + places * count * fixed_s + paths * path_s
         cost = replace(cost, seconds=rest_s + traced_s)
     return cost
 
@@ -149,14 +176,20 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
     return sum((w.bottom - w.top) * (w.right - w.left) for w in windows), len(planned)
 
 
-def _rest_s(rig: Rig, instruments: Sequence[Instrument]) -> float:
-    pixels = rig.camera.width * rig.camera.height
-    return sum(pixels * (PIXEL_S + FRAME_S * instrument.sensor.n_frames) for instrument in instruments)
+def _rest_of_run(passes: Sequence[tuple[Rig, list[Instrument]]]) -> Rest:
+    """What a run does with its signals; the report holds frames and results of all passes at once."""
+    seconds, report = 0.0, 0
+    for rig, instruments in passes:
+        pixels = rig.camera.width * rig.camera.height
+        for instrument in instruments:
+            seconds += pixels * (PIXEL_S + FRAME_S * instrument.sensor.n_frames)
+            report += pixels * (2 * instrument.sensor.n_frames + RESULT_BYTES)
+    return Rest(seconds, 0, report, 0)
 
 
-def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> int:
-    """The largest of what is held at once: while light is traced, while frames are exposed, and in the report."""
-    at_once, report = 0.0, 0.0
+def _tracing_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) -> float:
+    """The largest of what is held at once: while light is traced, and while frames are exposed."""
+    at_once = 0.0
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
         responses = dict.fromkeys(r for instrument in instruments for r in instrument.sensor.responses())
@@ -169,8 +202,7 @@ def _memory_bytes(passes: Sequence[tuple[Rig, list[Instrument]]], photons: int) 
         tracing = max(tiles, judged) + pixels * (4 * 4 * channels + TRUTH_BYTES) + photons * PHOTON_BYTES
         exposing = pixels * (2 * 4 * channels + 4 * largest + TRUTH_BYTES) + exposed  # signals and their error
         at_once = max(at_once, tracing, exposing)
-        report += pixels * sum(2 * instrument.sensor.n_frames + RESULT_BYTES for instrument in instruments)
-    return int(BASE_BYTES + max(at_once, report))
+    return at_once
 
 
 def _timed_trial(
@@ -291,6 +323,10 @@ def _count(n: int) -> str:
         if n >= scale:
             return f"{n / scale:.3g} {word}"
     return str(n)
+
+
+def _bytes(n: int) -> str:
+    return f"{n / 1e9:.1f} GB" if n >= 1e8 else f"{max(1, round(n / 1e6))} MB"
 
 
 def _duration(seconds: float) -> str:

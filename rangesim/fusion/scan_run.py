@@ -28,6 +28,7 @@ from rangesim.files.schema import write_json
 from rangesim.fusion.mesh_error import SurfaceError, distances_to, surface_error
 from rangesim.fusion.multiway_registration import PoseErrors, align, check_first_pair, pose_errors
 from rangesim.fusion.paths import Viewpoint
+from rangesim.fusion.scan_cost import VOXEL_SPACINGS, estimate_scan_cost
 from rangesim.fusion.scan_settings import ScanSettings, scan_settings_to_dict
 from rangesim.fusion.seen_volume import Occupancy, occupancy
 from rangesim.fusion.truncated_average import FusedSurface, fuse
@@ -37,6 +38,7 @@ from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from rangesim.decoding.range_image import RangeImage
+    from rangesim.experiment.cost import Cost
     from rangesim.scene import Scene
 
 SIDECAR = "scan.json"
@@ -45,8 +47,6 @@ SCAN = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold the results of a scan."""
 Progress = Callable[[str, float], None]
 """Called with the name of the stage and the fraction of the whole job done, 0..1."""
-VOXEL_SPACINGS = 1.5
-"""Voxel over the distance between readings, if none is given."""
 MAX_COMPARED_VOXELS = 1_000_000
 """Of the grid on which seen and true volume are compared."""
 BACKGROUND = 0.3
@@ -100,7 +100,11 @@ class ScanResult:
 
 
 def run_scan(
-    settings: ScanSettings, out: str | Path, progress: Progress | None = None, scene: Scene | None = None
+    settings: ScanSettings,
+    out: str | Path,
+    progress: Progress | None = None,
+    scene: Scene | None = None,
+    announce: Callable[[Cost], None] | None = None,
 ) -> ScanResult:
     """Carry out a scan and write its results, with `report.html`, to the directory `out`.
 
@@ -109,22 +113,34 @@ def run_scan(
     Parameters
     ----------
     scene : a scene that is loaded already; `settings.scene` then only names it.
+    announce : called with the estimated cost before the work starts.
 
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        A setting out of range, a scene that cannot be loaded, poses that cannot be found, no surface, or an `out` that
-        cannot take a result (see `pcgraph.output.check_directory`).
+        A setting out of range, more memory than there is, a scene that cannot be loaded, poses that cannot be found, no
+        surface, or an `out` that cannot take a result (see `pcgraph.output.check_directory`).
     """
     with new_directory(out, SCAN, inputs=[settings.scene]) as folder:
-        result = carry_out(settings, progress, scene)
+        result = carry_out(settings, progress, scene, announce)
         tell = progress or _unwatched
         tell("Writing the results", 0.93)
         write_scan(result, folder)
     return result
 
 
-def carry_out(settings: ScanSettings, progress: Progress | None = None, scene: Scene | None = None) -> ScanResult:
+def estimate_scan(settings: ScanSettings) -> Cost:
+    """Cost of `run_scan`; the scene is loaded, and rendered small if it may take long. Errors as `run_scan`."""
+    scene = rangesim.load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
+    return estimate_scan_cost(settings, scene)
+
+
+def carry_out(
+    settings: ScanSettings,
+    progress: Progress | None = None,
+    scene: Scene | None = None,
+    announce: Callable[[Cost], None] | None = None,
+) -> ScanResult:
     """The result of a scan; nothing is written. Errors as `run_scan`."""
     from rangesim.scene.triangles import true_surfaces
 
@@ -136,6 +152,10 @@ def carry_out(settings: ScanSettings, progress: Progress | None = None, scene: S
             settings.ambient.check_emitters(scene.has_ambient)
         rig = settings.instrument.rig(scene, settings.width, settings.height)
         surfaces = true_surfaces(scene)
+    cost = estimate_scan_cost(settings, scene, trial=announce is not None)
+    cost.check_memory()
+    if announce is not None:
+        announce(cost)
     poses = poses_of(settings.path, Viewpoint(rig.T_world_camera, scene.working_distance_m))
     registration_seed = settings.seed & 0x7FFFFFFF
     with _timed(times, "views"):
