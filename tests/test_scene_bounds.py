@@ -667,6 +667,36 @@ def test_a_camera_inside_absorbing_glass_is_refused() -> None:
         rangesim.transport(loaded, loaded.rig(width=8), [], spp=1)
 
 
+@pytest.mark.parametrize("medium", [FOG, SMOKE], ids=["fog", "smoke"])
+@pytest.mark.parametrize("kind", ["ball", "box", "glass"])
+def test_a_body_whose_normals_point_inwards_is_refused(kind: str, medium: dict[str, Any]) -> None:
+    """The medium would be around it: in front of it the light would not be weakened, and behind it would."""
+    if kind == "glass" and medium is FOG:
+        medium = {**SMOKE, "sigma_t": 0.1}
+    shape = {"type": "cube", "to_world": look(3.0, 4.0)} if kind == "box" else {"type": "sphere", "center": [0, 0, 3]}
+    body = {**shape, **({"bsdf": {"type": "dielectric"}} if kind == "glass" else MATCHED), "interior": medium}
+    for name, more, is_right in (("right", {}, True), ("turned", {"flip_normals": True}, False)):
+        loaded = load_scene(wall_behind(**{name: body | more}))
+        rig = loaded.rig(width=8)
+        if is_right:
+            rangesim.transport(loaded, rig, [], spp=1, photons=0)
+            continue
+        with pytest.raises(ValueError, match=r"normals of shape 'turned' to point out of .* the camera sees them"):
+            rangesim.transport(loaded, rig, [], spp=1)
+
+
+def test_an_exterior_medium_that_no_body_holds_is_refused() -> None:
+    """A bubble of air in smoke: refused in the open, taken inside a ball of smoke, whichever way it is modelled."""
+    bubble = {"type": "sphere", "radius": 0.3, "center": [0, 0, 3], "bsdf": {"type": "dielectric", "int_ior": 1.2}}
+    loaded = load_scene(wall_behind(bubble=bubble | {"exterior": SMOKE}))
+    with pytest.raises(ValueError, match=r"a body that holds the exterior medium of shape 'bubble'.* the camera would"):
+        rangesim.transport(loaded, loaded.rig(width=8), [], spp=1)
+    around = {"type": "sphere", "radius": 1.0, "center": [0, 0, 3], "bsdf": {"type": "dielectric"}, "interior": SMOKE}
+    for side in ({"exterior": SMOKE}, {"interior": SMOKE, "flip_normals": True}):
+        loaded = load_scene(wall_behind(around=around, bubble=bubble | side))
+        rangesim.transport(loaded, loaded.rig(width=8), [], spp=1, photons=0)
+
+
 # ---- Pipes and devices ---------------------------------------------------------------------------------------------
 
 

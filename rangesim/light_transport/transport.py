@@ -27,7 +27,7 @@ from rangesim.light_transport.truncation import estimate_truncation, warn_of_tru
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
-from rangesim.scene.media import body_around
+from rangesim.scene.media import body_around, inside_out
 from rangesim.sensor import Sensor
 from rangesim.settings.config import shown
 from rangesim.settings.seeds import derived_seed
@@ -37,6 +37,8 @@ MATTE_SPP, OTHER_SPP = 16, 64
 """Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
 PATHS_FRACTION = 0.95
 """Of the progress, that the samples make."""
+RAYS_TO_MEDIA = 16
+"""Columns and rows of rays that look for media on the wrong side."""
 TEXTURE_SAMPLES = 64
 """Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
 
@@ -98,7 +100,8 @@ def transport(
     ------
     ValueError
         A number out of its range, patterns that do not fit the projector, too little memory, rigs of different
-        emitters, or a camera or projector inside fog, water or another medium.
+        emitters, a camera or projector inside fog, water or another medium, or a medium
+        on the wrong side of its boundary.
 
     Warns
     -----
@@ -263,12 +266,30 @@ def _check(scene: Scene, rigs: Sequence[Rig], sensors: Sequence[Sensor | Respons
 
 
 def _check_in_air(scene: Scene, rig: Rig) -> None:
-    """Raise ValueError if the camera or the projector is inside a body of a medium: its light would start outside."""
+    """Raise ValueError if the camera or the projector is inside a body of a medium: its light would start outside.
+
+    Or if one sees a medium on the wrong side of its boundary.
+    """
     T_camera = scene.in_renderer(rig).T_world_camera
-    for name, T in (("camera", T_camera), ("projector", T_camera @ rig.T_camera_projector)):
+    devices = ("camera", rig.camera, T_camera), ("projector", rig.projector, T_camera @ rig.T_camera_projector)
+    for name, intrinsics, T in devices:
         body = body_around(scene.mitsuba, T[:3, 3])
         if body is not None:
             raise ValueError(
                 f"expected the {name} to stand in air, but it is inside the medium of shape {body!r}; move it out, or "
                 "let the body begin in front of it."
             )
+        steps = (np.arange(RAYS_TO_MEDIA) + 0.5) / RAYS_TO_MEDIA
+        pixels = np.stack(np.meshgrid(steps * intrinsics.width, steps * intrinsics.height), axis=-1)
+        directions = intrinsics.directions(pixels).reshape(-1, 3) @ T[:3, :3].T
+        match inside_out(scene.mitsuba, T[:3, 3], directions[np.isfinite(directions).all(axis=1)]):
+            case (shape, "interior"):
+                raise ValueError(
+                    f"expected the normals of shape {shape!r} to point out of the medium inside, but the {name} sees "
+                    "them from behind, as if the medium lay around the shape; turn them (flip_normals)."
+                )
+            case (shape, _):
+                raise ValueError(
+                    f"expected a body that holds the exterior medium of shape {shape!r}, but none is around it, so "
+                    f"the {name} would stand in that medium; put one in front of it, or leave the medium out."
+                )

@@ -85,6 +85,47 @@ def body_around(scene: Any, place: np.ndarray) -> str | None:
     return next((str(shape.id()) for shape, is_in in zip(filled, inside, strict=True) if is_in), None)
 
 
+def inside_out(scene: Any, place: np.ndarray, directions: np.ndarray) -> tuple[str, str] | None:
+    """Which medium the way from a place in air goes through although no body that holds it was entered.
+
+    Parameters
+    ----------
+    place : (3,) metres. directions : (n, 3), of rays from there.
+
+    Returns
+    -------
+    The id of a shape, and "interior" if most of the rays that first meet it outside of all bodies leave it there (its
+    normals point inwards), "exterior" if most enter it there from a medium that is around it; None if there is no such
+    shape.
+    """
+    filled, around = (
+        [s for s in scene.shapes() if m(s) is not None and medium_numbers(m(s))[0] > 0]
+        for m in (lambda s: s.interior_medium(), lambda s: s.exterior_medium())
+    )
+    if not filled and not around:
+        return None
+    ray = mi.Ray3f(o=mi.Point3f(*map(float, place)), d=mi.Vector3f(np.asarray(directions, np.float32).T))
+    bodies = np.zeros(len(directions), np.int64)  # that a ray is in
+    sides = [(s, "interior", 1) for s in filled] + [(s, "exterior", -1) for s in around]
+    votes, unmet = [0] * len(sides), [np.ones(len(directions), bool) for _ in sides]
+    active = mi.Bool(True)
+    for _ in range(MAX_SURFACES):
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        active = si.is_valid()
+        if not dr.any(active):
+            break
+        outward = (np.sign(dr.dot(ray.d, si.n).numpy()) * active.numpy()).astype(np.int64)
+        in_air = bodies == 0
+        for number, (shape, side, amiss) in enumerate(sides):
+            met = outward * (si.shape == mi.ShapePtr(shape)).numpy()
+            votes[number] += amiss * int(met[in_air & unmet[number]].sum())
+            unmet[number] &= met == 0
+            if side == "interior":
+                bodies = np.maximum(bodies - met, 0)
+        ray = si.spawn_ray(ray.d)
+    return next(((str(s.id()), side) for (s, side, _), n in zip(sides, votes, strict=True) if n > 0), None)
+
+
 def _why_not_homogeneous(medium: Any) -> str | None:
     if medium.class_name() != "HomogeneousMedium":
         return str(medium.class_name())
