@@ -490,3 +490,46 @@ def test_a_run_that_measures_nothing_for_another_reason_than_distance_says_which
     assert end.value.code == 0, said
     assert f"measured no pixel at all, most of all by {told}" in said
     assert "metres" not in said
+
+
+WRONG_WORDS = {  # what the plugins do not know; each was passed over, and the default taken
+    "roughness": '<shape type="cube"><bsdf type="roughconductor"><float name="roughness" value="0.3"/></bsdf></shape>',
+    "int_iro": '<shape type="sphere"><bsdf type="dielectric"><float name="int_iro" value="1.33"/></bsdf></shape>',
+    "center_": '<shape type="sphere"><point name="center_" x="1" y="0" z="0"/></shape>',
+    "to_wordl": '<shape type="cube"><transform name="to_wordl"><scale value="2"/></transform></shape>',
+    "raw_": """<shape type="cube"><bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
+        <boolean name="raw_" value="true"/></texture></bsdf></shape>""",
+    "flip": '<shape type="cube"/><emitter type="constant"><string name="flip" value="a"/></emitter>',
+}
+
+
+@pytest.mark.parametrize("far", [0.0, 5e4])
+@pytest.mark.parametrize("name", WRONG_WORDS)
+def test_properties_that_a_plugin_does_not_know_are_refused(name: str, far: float, tmp_path: Path) -> None:
+    body = f'<scene version="3.0.0">{SENSOR}{WRONG_WORDS[name]}</scene>'.replace("0,-3,0", f"{far},-3,0")
+    path = write(tmp_path / "a.xml", body.replace("0,0,0", f"{far},0,0"))
+    with pytest.raises(FileFormatError, match=rf"a\.xml is no scene .*1 unreferenced property .*{name}"):
+        rangesim.load_scene(path)
+
+
+def test_a_property_that_is_not_known_in_a_dictionary_is_refused(tmp_path: Path) -> None:
+    scene = {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 40.0, "film": {"type": "hdrfilm", "width": 64, "height": 48}},
+        "ball": {"type": "sphere", "center": [0.0, 0.0, 3.0], "bsdf": {"type": "roughconductor", "alpha": 0.2}},
+    }
+    assert rangesim.load_scene(scene).instances[0].name == "ball"
+    scene["ball"]["bsdf"]["aplha"] = 0.2
+    with pytest.raises(FileFormatError, match=r"1 unreferenced property .*aplha"):
+        rangesim.load_scene(scene)
+
+
+def test_properties_of_what_does_not_matter_may_be_any(tmp_path: Path) -> None:
+    film = '<film type="hdrfilm"><float name="gamma_" value="1"/>'
+    body = (
+        SENSOR.replace('<film type="hdrfilm">', film)
+        + '<integrator type="path"><float name="x" value="1"/></integrator>'
+    )
+    path = write(tmp_path / "a.xml", f'<scene version="3.0.0">{body}<shape type="sphere" id="ball"/></scene>')
+    scene = rangesim.load_scene(path)
+    assert (scene.camera.width, scene.instances[0].name) == (64, "ball")

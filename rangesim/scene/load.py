@@ -30,6 +30,7 @@ from rangesim.scene.nodes import (
     OF_MITSUBA,
     check_camera,
     check_types,
+    forget_reading,
     ids_of_shapes,
     replace_ignored_plugins,
     take_material_classes,
@@ -163,6 +164,7 @@ def _instantiate(
         return state, ids, classes
 
     def made_of(state: Any) -> Any:
+        forget_reading(state)
         loaded = mi.parser.instantiate(config, state)
         return loaded[0] if isinstance(loaded, list) else loaded
 

@@ -27,6 +27,8 @@ IGNORED_PLUGINS = {"Integrator": "path", "Film": "hdrfilm", "Sampler": "independ
 """What stands in for a plugin that Mitsuba lacks, by the kind of node, where the kind does not matter."""
 FILM_SIZES = ("width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
 """What of a film matters."""
+_OBJECTS = ("Any", "Object", "Reference", "ResolvedReference")
+"""Kinds of properties that hold other objects."""
 _LIBRARIES = (".so", ".dylib", ".dll")
 _PLAIN_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
 
@@ -150,6 +152,19 @@ def replace_ignored_plugins(state: Any) -> None:
             if key in node.props:
                 props[key] = node.props[key]
         node.props = props
+
+
+def forget_reading(state: Any) -> None:
+    """Let Mitsuba refuse values that their plugin does not ask for, as misspelt ones: checks have read them all.
+
+    Not those of integrators, films and samplers, which do not matter.
+    """
+    for node in state.nodes:
+        if node.type.name in IGNORED_PLUGINS:
+            continue
+        for key in node.props.keys():  # noqa: SIM118
+            if node.props.type(key).name not in _OBJECTS:
+                node.props.mark_queried(key, False)
 
 
 def take_material_classes(state: Any, label: str) -> dict[str, str]:
