@@ -45,6 +45,8 @@ REPEATED = 0.9
 """Share of the changes of one bit, from pixel to pixel, that another bit shares; none in Gray code, seen sharply."""
 LEAST_ALONE = 0.3
 """Share of these changes at which no third bit changes; at a step of the scene other bits change, too."""
+LEAST_SWING = 0.35
+"""Of white - black, that fringes as wide as a few pixels of the camera and more reach, out of focus too; 1 in focus."""
 MOST_BEHIND = 0.2
 """Share of pixels whose rays meet behind a device, and clearly so; a few do by interreflection."""
 CLEARLY_BEHIND_PX = 10.0
@@ -54,7 +56,7 @@ LEAST_CELLS = 8
 
 
 def fringe_contradiction(
-    gray: GrayCode, refined: GrayCode, frames: np.ndarray, period_px: float, axis: str
+    gray: GrayCode, refined: GrayCode, frames: np.ndarray, contrast: np.ndarray, period_px: float, axis: str
 ) -> str | None:
     """A sentence if the fringes contradict the Gray code as a whole, None if they agree.
 
@@ -63,13 +65,13 @@ def fringe_contradiction(
     Parameters
     ----------
     gray, refined : the code before and after the phase. frames : (N, h, w) the fringes of `axis`.
-    period_px : float, projector pixels.
+    contrast : (h, w) white - black. period_px : float, projector pixels.
     """
     used = _comparable(gray, refined)
     if len(used) < LEAST_PIXELS:
         return None
-    phase = phase_of(frames.reshape(len(frames), -1)[:, used]).normalised
-    off = _wrapped(phase - gray.coordinate.ravel()[used] / np.float32(period_px))
+    phase = phase_of(frames.reshape(len(frames), -1)[:, used])
+    off = _wrapped(phase.normalised - gray.coordinate.ravel()[used] / np.float32(period_px))
     half = gray.cell_px / (2 * period_px)
     far = float((np.abs(off) > half + 0.125).mean())
     above, below = float((off > half + 0.005).mean()), float((off < -half - 0.005).mean())
@@ -80,6 +82,12 @@ def fringe_contradiction(
         return None
     outside = 100 * float((np.abs(off) > half + 0.005).mean())
     text = f"the fringes along {axis} contradict the Gray code at {outside:.0f} % of the pixels"
+    swing = float(np.median(2 * phase.modulation / contrast.ravel()[used]))
+    if swing < LEAST_SWING:
+        return (
+            f"{text} and reach {100 * swing:.0f} % of white - black: a period of {period_px:g} projector pixels is too "
+            "fine for the camera, or out of focus; take a longer one."
+        )
     if far > MOST_FAR and _direction(gray, refined, frames) < 0:
         return f"{text}: they seem to be shifted in the other direction, so check the order of their frames."
     if resultant > 0.8 * np.sinc(2 * half):
