@@ -161,3 +161,21 @@ def test_patterns_of_one_brightness_are_not_clipped(code: str, level: int) -> No
     sensor = StructuredLight(320, 200, code=code)  # type: ignore[arg-type]
     image = decode(Capture(np.rint(10 + (level - 10) * sensor.patterns()).astype(np.uint8), sensor))
     assert (image.status == Status.OK).all()
+
+
+@pytest.mark.parametrize(
+    ("axis", "other", "baseline"), [("rows", "columns", [0.2, 0.002, 0]), ("columns", "rows", [0.0, 0.2, 0.003])]
+)
+def test_an_axis_along_the_baseline_is_named(axis: str, other: str, baseline: list[float], tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = baseline
+    rig = stereo_rig(T_camera_projector=pose)
+    save_calibration(rig, tmp_path / "rig.json")
+    for coded, is_named in ((axis, True), (other, False)):
+        sensor = StructuredLight(code="gray", axes=(coded,))  # type: ignore[arg-type]
+        capture = expose(plane_signals(rig, sensor), sensor, Detector(bits=8), exposure_s=4e-4)
+        bare = replace(capture, frames=capture.frames.astype(np.uint8), detector=None, rig=None)
+        text, info = decoded(bare, tmp_path / coded, "--calibration", str(tmp_path / "rig.json"))
+        said = f"{axis} tell no depth here, for camera and projector stand apart along them: code {other}"
+        assert (said in text) == is_named
+        assert info["likely_cause"] == (said if is_named else None)

@@ -211,3 +211,20 @@ def test_noise_on_what_is_far_away_is_silent() -> None:
     rig, sensor = stereo_rig(T_camera_projector=translation(0.2, 0, 0)), StructuredLight(code="gray")
     image = decode(expose(signals_of_depth(rig, np.full((120, 160), 500.0), [sensor]), sensor))
     assert not image.valid.any()
+
+
+@pytest.mark.parametrize(("period_px", "block"), [(16.0, 19), (16.0, 21), (24.0, 29)])
+@pytest.mark.parametrize("steps", [3, 4])
+def test_fringes_finer_than_the_pixels_of_the_camera_are_named_with_what_is_left(
+    period_px: float, block: int, steps: int
+) -> None:
+    """A pixel as wide as `block` projector pixels leaves |sin x / x|, x = pi block / period, of the fringes."""
+    sensor = StructuredLight(block * 60, 400, axes=("columns",), period_px=period_px, steps=steps)
+    seen = sensor.patterns().reshape(sensor.n_frames, 400, 60, block).mean(axis=-1)
+    noise = np.random.default_rng(1).normal(size=seen.shape)
+    with pytest.warns(RangesimWarning, match="too fine for the camera, or out of focus") as caught:
+        decode(Capture(np.rint(20 + 200 * seen + noise).astype(np.uint8), sensor))
+    found = re.search(r"reach (\d+) % of white - black: a period of (\d+)", str(caught[0].message))
+    assert found is not None
+    assert int(found[1]) == pytest.approx(100 * abs(np.sinc(block / period_px)), abs=2)
+    assert int(found[2]) == period_px

@@ -12,6 +12,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
 from rangesim.errors import one_line
 from rangesim.report.palette import STATUS_NAMES
+from rangesim.rig import Rig
 from rangesim.sensors import StructuredLight
 
 MIN_MEASURED = 0.5
@@ -23,6 +24,8 @@ MIN_BRIGHTEST = 1 / 8
 full scale may be less."""
 MAX_BASELINE_M = 10.0
 """Baseline beyond which the calibration is probably in millimetres."""
+MAX_ACROSS = 0.25
+"""Ratio of the baseline across the stripes to that along them, below which an axis tells little depth."""
 
 
 def status_fractions(image: RangeImage) -> dict[str, float]:
@@ -51,6 +54,9 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
                 f"black is brighter than white at {100 * inverted:.0f} % of the pixels: the last two images are white, "
                 "then black"
             )
+        if axis := _axis_along_baseline(image, capture.sensor, capture.rig):
+            other = "rows" if axis == "columns" else "columns"
+            return f"{axis} tell no depth here, for camera and projector stand apart along them: code {other}"
     if capture.is_digital and capture.detector is None:
         brightest = int(capture.frames.max())
         if brightest < MIN_BRIGHTEST * capture.full_scale:
@@ -61,6 +67,19 @@ def likely_cause(image: RangeImage, capture: Capture) -> str | None:
     if float((image.status == Status.CODE_ERROR).mean()) > float((image.status == Status.OK).mean()):
         return "codes miss their epipolar line or each other: check --calibration, --code-step and the patterns' order"
     return None
+
+
+def _axis_along_baseline(image: RangeImage, sensor: StructuredLight, rig: Rig | None) -> str | None:
+    """The only coded axis, if the baseline runs along its stripes and most decoded pixels are out of range for that."""
+    if rig is None or len(sensor.axes) != 1:
+        return None
+    decoded = np.isin(image.status, [Status.OK, Status.OUT_OF_RANGE])
+    if 2 * np.count_nonzero(image.status == Status.OUT_OF_RANGE) <= np.count_nonzero(decoded):
+        return None
+    x, y = np.abs(rig.T_camera_projector[:3, :3].T @ rig.T_camera_projector[:3, 3])[:2]
+    axis = sensor.axes[0]
+    across, along = (x, y) if axis == "columns" else (y, x)
+    return axis if across < MAX_ACROSS * along else None
 
 
 def _rows_come_first(image: RangeImage) -> bool:

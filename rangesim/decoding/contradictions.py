@@ -51,6 +51,9 @@ MIN_REPEATED_FRACTION = 0.9
 frame; none in Gray code, seen sharply."""
 MIN_ALONE_FRACTION = 0.3
 """Fraction of these changes at which no third bit changes; at a step of the scene other bits change, too."""
+MIN_SWING = 0.35
+"""Fraction of white - black that fringes reach where they are wider than a few pixels of the camera, also out of focus;
+1 in focus."""
 MAX_BEHIND_FRACTION = 0.2
 """Fraction of pixels whose rays may meet clearly behind a device; a few do by interreflection."""
 MIN_BEHIND_PX = 10.0
@@ -60,7 +63,7 @@ MIN_CELLS = 8
 
 
 def fringe_contradiction(
-    gray: GrayCode, refined: GrayCode, frames: np.ndarray, period_px: float, axis: str
+    gray: GrayCode, refined: GrayCode, frames: np.ndarray, contrast: np.ndarray, period_px: float, axis: str
 ) -> str | None:
     """A sentence if the fringes contradict the Gray code as a whole, None if they agree.
 
@@ -69,13 +72,13 @@ def fringe_contradiction(
     Parameters
     ----------
     gray, refined : the code before and after the phase. frames : (N, h, w) the fringes of `axis`.
-    period_px : float, projector pixels.
+    contrast : (h, w) white - black. period_px : float, projector pixels.
     """
     used = _comparable(gray, refined)
     if len(used) < MIN_PIXELS:
         return None
-    phase = phase_of(frames.reshape(len(frames), -1)[:, used]).normalised
-    off = _wrapped(phase - gray.coordinate.ravel()[used] / np.float32(period_px))
+    phase = phase_of(frames.reshape(len(frames), -1)[:, used])
+    off = _wrapped(phase.normalised - gray.coordinate.ravel()[used] / np.float32(period_px))
     half = gray.cell_px / (2 * period_px)
     far = float((np.abs(off) > half + 0.125).mean())
     above, below = float((off > half + 0.005).mean()), float((off < -half - 0.005).mean())
@@ -86,6 +89,12 @@ def fringe_contradiction(
         return None
     outside = 100 * float((np.abs(off) > half + 0.005).mean())
     text = f"the fringes along {axis} contradict the Gray code at {outside:.0f} % of the pixels"
+    swing = float(np.median(2 * phase.modulation / contrast.ravel()[used]))
+    if swing < MIN_SWING:
+        return (
+            f"{text} and reach {100 * swing:.0f} % of white - black: a period of {period_px:g} projector pixels is too "
+            "fine for the camera, or out of focus; take a longer one."
+        )
     if far > MAX_FAR_FRACTION and _direction(gray, refined, frames) < 0:
         return f"{text}: they seem to be shifted in the other direction, so check the order of their frames."
     if resultant > 0.8 * np.sinc(2 * half):

@@ -233,7 +233,7 @@ class StructuredLightDecoder(Decoder):
                 contradictions[axis] = (
                     contradictions[axis]
                     or level_contradiction(capture, gray, codes[axis], frames, sensor.frame_names(), axis)
-                    or fringe_contradiction(gray, codes[axis], fringes, period_px, axis)
+                    or fringe_contradiction(gray, codes[axis], fringes, contrast.values, period_px, axis)
                 )
         for contradiction in filter(None, contradictions.values()):
             warn(contradiction)
