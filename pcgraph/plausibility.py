@@ -18,6 +18,7 @@ _MIN_SPACING = 1e-7  # of the extent
 _MIN_SUPERVOXELS = 500  # of fewer, many objects are no surprise
 _OBJECTS_PER_SUPERVOXEL = 0.1
 _MIN_VOXELS = 200
+_MANY_POINTS = 1000  # of fewer, one voxel may be wanted
 _SOLID = 18.0  # voxels around one; on a surface some 6 to 13, on one as thick as voxels 17
 _MIN_SEEN = 0.1  # of the voxels, from a viewpoint
 
@@ -59,6 +60,17 @@ def warn_of_duplicates(cloud: CleanCloud, spacing: float) -> None:
         _warn(
             f"expected points apart from each other, but most have another within {spacing:.2g} m in a cloud of "
             f"{extent:.3g} m, as copies of a scan do, or parts far off; leave copies out, or give voxel_size"
+        )
+
+
+def warn_of_size(name: str, given: float | None, cloud: CleanCloud) -> None:
+    """Warn where a length given in metres is beyond the extent of a cloud of many points, as in another unit."""
+    low, high = cloud.bounds
+    extent = float((high - low).max())
+    if given is not None and float(given) > extent > 0.0 and len(cloud.points) >= _MANY_POINTS:
+        _warn(
+            f"expected a {name} far below the extent of the cloud, got {float(given):.4g} m for {extent:.3g} m, so "
+            "that next to nothing can be told apart; give it in the unit of the points"
         )
 
 

@@ -44,6 +44,7 @@ from pcgraph.plausibility import (
     warn_of_duplicates,
     warn_of_oversegmentation,
     warn_of_rounding,
+    warn_of_size,
     warn_of_viewpoint,
     warn_of_volume,
 )
@@ -207,6 +208,8 @@ def segment(
     if spacing is not None:
         warn_of_duplicates(found.voxelised.cloud, spacing)
         found = _with_adapted_size(found, asked)
+    warn_of_size("voxel_size", voxel_size, found.voxelised.cloud)
+    warn_of_size("seed_size", seed_size, found.voxelised.cloud)
     cloud, grid, viewpoint = _without(found.voxelised, detached_voxels(found.voxelised.grid))
     if n_supervoxels is not None and voxel_size is None:
         grid = _fine_enough(grid, cloud, found.warp, n_supervoxels)

@@ -81,3 +81,16 @@ def test_what_cannot_be_right_of_a_further_scan_is_noticed(one):
     far = (POINTS + np.array((5e5, 5e6, 0.0))).astype(np.float32)
     with pytest.warns(CloudWarning, match="comes in steps of"):
         pcgraph.update(one, far, viewpoint=VIEWPOINT)
+
+
+@pytest.mark.parametrize("name", ["voxel_size", "seed_size"])
+def test_lengths_in_another_unit_are_noticed(name):
+    """Millimetres in place of metres made one voxel of a cloud, and one object, without a word."""
+    extent = np.ptp(POINTS, axis=0).max()
+    for length in (1.001 * extent, 20.0 * extent):
+        with pytest.warns(
+            CloudWarning, match=f"expected a {name} far below the extent of the cloud, got .* unit of the"
+        ):
+            pcgraph.segment(POINTS, viewpoint=VIEWPOINT, **{name: length})
+    pcgraph.segment(POINTS, viewpoint=VIEWPOINT, **{name: 0.9 * extent})
+    pcgraph.segment(POINTS[:50], **{name: 20.0 * extent})
