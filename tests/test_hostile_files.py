@@ -113,6 +113,16 @@ def test_images_that_mitsuba_reads_by_their_contents_have_a_size(tmp_path: Path,
     check_pixels(path)
 
 
+@pytest.mark.parametrize("kind", ["hdr", "pfm", "tga"])
+@pytest.mark.parametrize(("width", "height"), [(4, 0), (0, 4), (0, 0)])
+def test_headers_that_state_no_pixels_are_refused(tmp_path: Path, kind: str, width: int, height: int) -> None:
+    """Mitsuba ended Python over a Radiance file of no rows."""
+    path = tmp_path / f"a.{kind}"
+    path.write_bytes(OTHER_IMAGES[kind](width, height) + bytes(64) * (kind != "tga"))
+    with pytest.raises(FileFormatError, match=rf"a\.{kind} cannot be read as an image: its header states \d by \d"):
+        check_pixels(path)
+
+
 @pytest.mark.parametrize(
     "start", [b"#?RADIANCE\n", b"#?\n-Y 9x +X 9\n", b"PF\n", b"PF\n-1 5\n1.0\n", b"PF 9" + b"9" * 30]
 )

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _STEPS = float(1 << 20)
 _PURE = 0.8  # fraction of a supervoxel's points that must agree before an edge at it teaches anything
 _PLATEAU = 0.002  # covering below the best that still counts as best
+_LARGEST = 1e100
+"""Of a model's numbers, and one over the least scale: a product of three of them is still finite."""
 _ALTITUDES = np.linspace(0.05, 0.95, 37)
 
 
@@ -170,6 +172,12 @@ class EdgeModel(msgspec.Struct, frozen=True):
             raise ValueError(f"expected one finite mean, scale and coefficient for each of {len(self.names)} names")
         if not all(scale > 0.0 for scale in self.scales):
             raise ValueError("expected scales above 0; fit the model again")
+        bad = [value for value in numbers if abs(value) > _LARGEST] + [s for s in self.scales if s < 1.0 / _LARGEST]
+        if bad:
+            raise ValueError(
+                f"expected numbers up to {_LARGEST:g}, scales from {1.0 / _LARGEST:g}, got {bad[0]:g}; "
+                "fit the model again"
+            )
 
     def __call__(self, graph: AdjacencyGraph) -> NDArray[np.float64]:
         """Probability of a boundary at each edge, (m,) float64, 0..1.

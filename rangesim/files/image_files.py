@@ -204,7 +204,10 @@ def _check_stated_size(path: Path) -> None:
         return
     if len(words) != 2 or not all(word.isdigit() and len(word) < 20 for word in words):
         raise ValueError("its header states no size")
-    limits.check("pixels", math.prod(map(int, words)), f"pixels in {path}", FileFormatError)
+    pixels = math.prod(map(int, words))
+    if pixels == 0:  # Mitsuba ends Python over a Radiance file of no rows
+        raise ValueError(f"its header states {int(words[0])} by {int(words[1])} pixels")
+    limits.check("pixels", pixels, f"pixels in {path}", FileFormatError)
 
 
 def _open_exr(path: Path) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import fields, replace
 
@@ -114,6 +115,10 @@ def good():
         json.dumps(good() | {"scales": [0.0, 1.0]}).encode(),
         json.dumps(good() | {"intercept": None}).encode(),
         json.dumps(good() | {"intercept": float("nan")}).encode(),
+        json.dumps(good() | {"coefficients": [1e308, 1.0]}).encode(),
+        json.dumps(good() | {"means": [0.0, -1e308]}).encode(),
+        json.dumps(good() | {"scales": [5e-324, 1.0]}).encode(),
+        json.dumps(good() | {"intercept": -1e101}).encode(),
         json.dumps(good() | {"more": 1}).encode(),
         json.dumps(good() | {"\x1b[31m\n" + "m" * 1000: 1}).encode(),
         json.dumps({name: value for name, value in good().items() if name != "format"}).encode(),
@@ -135,6 +140,24 @@ def test_other_files_are_refused(tmp_path, content):
         EdgeModel.load(path)
     assert str(refusal.value).isprintable()
     assert len(str(refusal.value)) < 300 + len(str(path))
+
+
+@pytest.mark.parametrize("name", ["means", "scales", "coefficients", "intercept"])
+@pytest.mark.parametrize("value", [1e308, 1e200, 1e101])
+def test_numbers_that_overflow_later_are_refused_at_once(name, value):
+    number = value if name == "intercept" else (value, 1.0)
+    with pytest.raises(ValueError, match="^expected numbers up to .*got " + re.escape(f"{value:g};")):
+        msgspec.structs.replace(MODEL, **{name: number})
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_largest_numbers_that_a_model_may_have_do_not_overflow(sign):
+    result, _ = _box_on_a_plane()
+    largest = (sign * 1e100, sign * 1e100)
+    model = msgspec.structs.replace(MODEL, coefficients=largest, means=largest, scales=(1e-100, 1e-100))
+    with np.errstate(all="raise"):
+        probability = model(result.graph)
+    assert (probability == 0.0).all()  # coefficient x (value - mean) / scale is -1e300
 
 
 def test_truth_of_leaves_by_hand():
