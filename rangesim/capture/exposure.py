@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,6 +76,17 @@ def noise_free_capture(
     unfiltered = 1.0 if ambient is None else ambient.scale
     frames = signals.frames(sensor, unfiltered, sampling_errors)
     return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
+
+
+def exposed_again(capture: Capture, signals: Signals, seed: int, sampling_errors: float = 0.0) -> Capture:
+    """Capture of the same signals with the same settings and other noise of the detector, which must be known; so many
+    times the sampling error of the signals is added to them."""
+    sensor, detector = capture.sensor, capture.detector
+    if detector is None:
+        raise ValueError("expected a capture whose detector is known, got one without.")
+    frames = signals.frames(sensor, detector.ambient_fraction(sensor.gate, capture.ambient), sampling_errors)
+    frames = detector.read_out(_through_lens(frames, signals.rig), sensor.gate, signals.rig, capture.exposure_s, seed)
+    return replace(capture, frames=frames)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:
