@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,9 +91,26 @@ def noise_free_capture(
     return Capture(_through_lens(frames, signals.rig), sensor, signals.rig, ambient=ambient)
 
 
-def _mean_radiance(signals: Signals, sensor: Sensor, detector: PhotoDetector, ambient: Ambient | None) -> np.ndarray:
-    """(k, h, w) W/m2/sr, of the frames that a detector takes, on average."""
-    return _through_lens(signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient)), signals.rig)
+def exposed_again(capture: Capture, signals: Signals, seed: int, sampling_errors: float = 0.0) -> Capture:
+    """Capture of the same signals with the same settings and other noise of the detector, which must be known; so many
+    times the sampling error of the signals is added to them."""
+    if capture.detector is None:
+        raise ValueError("expected a capture whose detector is known, got one without.")
+    radiance = _mean_radiance(signals, capture.sensor, capture.detector, capture.ambient, sampling_errors)
+    frames = capture.detector.read_out(radiance, capture.sensor.gate, signals.rig, capture.exposure_s, seed)
+    return replace(capture, frames=frames)
+
+
+def _mean_radiance(
+    signals: Signals,
+    sensor: Sensor,
+    detector: PhotoDetector,
+    ambient: Ambient | None,
+    sampling_errors: float = 0.0,
+) -> np.ndarray:
+    """(k, h, w) W/m2/sr, of the frames that a detector takes, on average; so many times the sampling error is added."""
+    lit = signals.frames(sensor, detector.ambient_fraction(sensor.gate, ambient), sampling_errors)
+    return _through_lens(lit, signals.rig)
 
 
 def _through_lens(frames: np.ndarray, rig: Rig) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.ambient import Ambient
-from rangesim.evaluation.range_noise import TO_SIGMA, range_noise
+from rangesim.evaluation.range_noise import TO_SIGMA, sampling_draw
 from rangesim.experiment.instrument import Instrument
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole
@@ -75,12 +75,14 @@ class AdaptiveSampling:
         for instrument in self.instruments:
             signals = signals_of(instrument.sensor)
             capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, 0, self.ambient)
-            noise = range_noise(decode(capture, instrument.decoder), capture, signals)
+            image = decode(capture, instrument.decoder)
+            middle, sampling = sampling_draw(image, capture, signals)
+            from_middle = (image.z - middle).astype(np.float32)  # at little cost, the detector's error, or more
             enough = np.full(len(excess), negligible)
             if capture.is_digital:  # where nothing can be read, samples are of no use
-                enough = np.maximum(enough, self.fraction * group_sigma(noise.detector, group, where_unknown=np.inf))
+                enough = np.maximum(enough, self.fraction * group_sigma(from_middle, group, where_unknown=np.inf))
             with np.errstate(divide="ignore", invalid="ignore"):
-                excess = np.fmax(excess, (group_sigma(noise.sampling, group) / enough) ** 2)
+                excess = np.fmax(excess, (group_sigma(sampling, group) / enough) ** 2)
         wanted = 4 * np.ceil(self.first_spp * np.minimum(excess, self.max_spp) / 4)  # whole pairs in both halves
         return np.clip(wanted, self.first_spp, max(self.first_spp, self.max_spp // 4 * 4)).astype(np.int64)[group]
 

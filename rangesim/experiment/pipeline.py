@@ -130,7 +130,7 @@ def run(
         _write_comparison(folder, list(tables.items()))
         write_report(result, folder / "report.html")
     warn_of_range(beyond)
-    warn_of_sampling(tables)
+    warn_of_sampling(tables, experiment.spp or experiment.max_spp)
 
 
 def estimate(experiment: Experiment) -> Cost:

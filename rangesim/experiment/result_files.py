@@ -144,6 +144,7 @@ class RowRecord(Record, frozen=True, kw_only=True):
     causes: dict[str, Fraction]
     detector_sigma_m: Metres | None = None
     sampling_sigma_m: Metres | None = None
+    completeness_error: Fraction | None = None
 
 
 class ComparisonRecord(Record, frozen=True, kw_only=True):

@@ -39,7 +39,8 @@ COLUMNS = (
         "completeness",
         "complete",
         "%",
-        "fraction of the pixels that the emitter lights which have a measurement",
+        "fraction of the pixels that the emitter lights which have a measurement, ± what a render with "
+        "very many light paths may change",
         "",  # a wrong reading completes nothing
     ),
     Column("bias_m", "bias", "mm", "mean of measured minus true z; positive is too far", "near zero"),
@@ -97,7 +98,7 @@ def comparison_table(measurements: Sequence[Measurement]) -> list[tuple[str, lis
         real = [rows[m.name] for m in measurements if m.name in rows and not is_reference(m)]
         rivals = [row for row in real if not is_unreliable(row)]  # the few pixels left of the others prove nothing
         best = {c.key: _best(c, rivals) for c in COLUMNS}
-        lines = [(n, [_cell(c, row[c.key], best[c.key], row in rivals) for c in COLUMNS]) for n, row in rows.items()]
+        lines = [(n, [_cell(c, row, best[c.key], row in rivals) for c in COLUMNS]) for n, row in rows.items()]
         table.append((material, lines))
     return table
 
@@ -149,7 +150,7 @@ def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
     heads = [f"{c.title} ({c.unit})" for c in COLUMNS]
     return "\n".join(
         [
-            _markdown(tables, heads, lambda row: [number(c, row[c.key]) for c in COLUMNS]),
+            _markdown(tables, heads, lambda row: [_text(c, row) for c in COLUMNS]),
             _markdown(tables, FAILURE_HEADS, _failures),
             _markdown(tables, ["detector noise (mm)", "sampling noise (mm)"], _noise),
         ]
@@ -257,6 +258,14 @@ def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
     return float(min(values, key=abs))
 
 
-def _cell(column: Column, value: float | None, best: float | None, rival: bool) -> Cell:
+def _cell(column: Column, row: dict[str, Any], best: float | None, rival: bool) -> Cell:
+    value = row[column.key]
     bar = value if column.unit == "%" else None
-    return Cell(number(column, value), best=rival and value is not None and value == best, bar=bar)
+    return Cell(_text(column, row), best=rival and value is not None and value == best, bar=bar)
+
+
+def _text(column: Column, row: dict[str, Any]) -> str:
+    """A value of a row in the column's unit, with its uncertainty by sampling where that is known and shows."""
+    text = number(column, row[column.key])
+    error = row.get(f"{column.key}_error")
+    return f"{text} ± {number(column, error)}" if error and number(column, error) != "0.0" else text
