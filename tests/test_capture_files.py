@@ -22,7 +22,7 @@ from rangesim.capture.exposure import expose
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
-from rangesim.files.image_files import write_grey
+from rangesim.files.image_files import read_grey, write_grey
 from rangesim.rig import Intrinsics
 from rangesim.rig.calibration_files import load_calibration, save_calibration
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
@@ -267,3 +267,14 @@ def test_images_on_a_disk_that_takes_no_more_are_an_error_of_the_system(tmp_path
     line = [sys.executable, "-c", code, str(tmp_path / name), dtype]
     done = subprocess.run(line, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("mode", ["L", "I;16", "F", "RGB"])
+def test_a_tiff_of_several_images_is_refused_and_a_preview_is_none(tmp_path: Path, mode: str) -> None:
+    """All but the first were left out without a word."""
+    first, second = (Image.new("RGB", (6, 4), (k, k, k)).convert("L").convert(mode) for k in (9, 90))
+    first.save(tmp_path / "three.tif", save_all=True, append_images=[second, second])
+    first.save(tmp_path / "preview.tif", save_all=True, append_images=[second.resize((3, 2), Image.Resampling.NEAREST)])
+    with pytest.raises(FileFormatError, match=r"three\.tif holds 3 images of one size, expected one"):
+        read_grey(tmp_path / "three.tif")
+    np.testing.assert_array_equal(read_grey(tmp_path / "preview.tif"), np.full((4, 6), 9))

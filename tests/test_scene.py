@@ -290,7 +290,9 @@ def test_one_side_alone_keeps_the_aspect_ratio() -> None:
 def test_a_second_sensor_can_be_the_camera(tmp_path: Path) -> None:
     xml = f'<scene version="3.0.0">{SENSOR}{CAMERAS["offset"]}<shape type="sphere"/></scene>'
     path = write(tmp_path / "scene.xml", xml)
-    assert rangesim.load_scene(path).camera.cx == pytest.approx(32)
+    with pytest.warns(RangesimWarning, match="2 sensors, and the first becomes the camera"):
+        assert rangesim.load_scene(path).camera.cx == pytest.approx(32)
+    assert rangesim.load_scene(path, sensor=0).camera.cx == pytest.approx(32)
     assert rangesim.load_scene(path, sensor=1).camera.cx == pytest.approx(32 - 0.2 * 64)
     with pytest.raises(ValueError, match="sensor from 0 to 1"):
         rangesim.load_scene(path, sensor=2)

@@ -469,6 +469,8 @@ WITHOUT_A_BAND: dict[str, tuple[Any, str]] = {
     "blackbody lamp": (lambda: ball(glow={"type": "area", "radiance": HOT}), "'blackbody' needs a spectrum"),
     "blackbody paint": (lambda: ball({"type": "diffuse", "reflectance": HOT}), "'blackbody' needs a spectrum"),
     "hair": (lambda: ball({"type": "hair"}), "'hair' needs a spectrum"),
+    "sun and sky": (lambda: ball() | {"light": {"type": "sunsky"}}, "'sunsky' needs a spectrum.*constant emitter"),
+    "sky of a day": (lambda: ball() | {"light": {"type": "timed_sunsky"}}, "'timed_sunsky' needs a spectrum"),
     "nested hair": (lambda: ball({"type": "mask", "opacity": 0.5, "b": {"type": "hair"}}), "'hair' needs a spectrum"),
     "regular": (
         lambda: ball({"type": "diffuse", "reflectance": {"type": "regular", "wavelength_min": 400.0,

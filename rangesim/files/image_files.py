@@ -274,6 +274,10 @@ def _open_raster(path: Path) -> Iterator[Any]:
 
 def _read_raster(path: Path) -> np.ndarray:
     with _open_raster(path) as image:
+        if image.format == "TIFF" and (pages := _pages_of_one_size(image)) > 1:
+            raise FileFormatError(
+                f"{path} holds {pages} images of one size, expected one; save each in a file of its own."
+            )
         if image.format == "PNG" and _is_deep_colour_png(path):
             raise FileFormatError(f"{path} is a colour PNG of 16 bits, which is not supported; convert it to grey.")
         if image.mode in ("I;16", "I;16L", "I;16B", "I;16N", "I"):
@@ -284,6 +288,16 @@ def _read_raster(path: Path) -> np.ndarray:
         if image.mode == "F":
             return np.asarray(image, dtype=np.float32)
         return np.asarray(image.convert("L"), dtype=np.uint8)
+
+
+def _pages_of_one_size(image: Any) -> int:
+    """Pages of a TIFF as large as the first, it included; a smaller one may be a preview. The first stays chosen."""
+    sizes = []
+    for page in range(image.n_frames):
+        image.seek(page)
+        sizes.append(image.size)
+    image.seek(0)
+    return sizes.count(sizes[0])
 
 
 def _is_deep_colour_png(path: Path) -> bool:

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from rangesim.environment.backend import images_can_be_read, select_variant
-from rangesim.errors import FileFormatError
+from rangesim.errors import FileFormatError, warn
 from rangesim.files.bundled_scenes import CATALOGUE, scene_file
 from rangesim.files.text_files import check_xml
 from rangesim.files.utf8_names import Utf8Names, is_utf8, utf8_names
@@ -74,7 +74,7 @@ def load_scene(
     *,
     material: str | None = None,
     unit_m: float | None = None,
-    sensor: int = 0,
+    sensor: int | None = None,
     variant: str | None = None,
 ) -> Scene:
     """A scene to measure.
@@ -90,7 +90,7 @@ def load_scene(
         files beside the scene come first. BSDFs of type `retroreflector` are known (`rangesim.scene.retroreflector`).
     material : material class of a bare mesh, one of matte (default), glossy, mirror, transparent.
     unit_m : metres per unit of length of a bare mesh, 0.001 for one in millimetres; default 1.
-    sensor : which of the scene's sensors becomes the camera.
+    sensor : which of the scene's sensors becomes the camera; default the first, with a warning if there are several.
     variant : Mitsuba variant; default CUDA where there is a GPU, else LLVM.
 
     Raises
@@ -116,9 +116,14 @@ def load_scene(
         check_number("unit_m", unit_m, Bounds("positive and finite metres per unit", 1e-9, 1e6))
     select_variant(variant)
     retroreflector.register()
+    chosen, sensor = sensor, sensor or 0
     instantiate = partial(_instantiate, source, material or "matte", unit_m or 1.0, sensor, label)
     loaded, ids, classes, origin_m = instantiate(advises=True)
     _check(loaded, ids, sensor, label)
+    if chosen is None and (n := len(loaded.sensors())) > 1:
+        warn(
+            f"{label} has {n} sensors, and the first becomes the camera; load_scene(sensor=...) in Python takes another."
+        )
     warn_of_lamps_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)

@@ -71,6 +71,8 @@ FAIL_IN_ONE_BAND = {
     "regular": "give the value at the sensor's wavelength as a number",
     "irregular": "give the value at the sensor's wavelength as a number",
     "hair": "give a roughplastic, principled or diffuse BSDF instead",
+    "sunsky": "give a constant emitter for the sky and a directional one for the sun",
+    "timed_sunsky": "give a constant emitter for the sky and a directional one for the sun",
 }
 """Plugins that load but cannot be evaluated without a spectrum, and what to do.
 
