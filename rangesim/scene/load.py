@@ -121,9 +121,7 @@ def load_scene(
     loaded, ids, classes, origin_m = instantiate(advises=True)
     _check(loaded, ids, sensor, label)
     if chosen is None and (n := len(loaded.sensors())) > 1:
-        warn(
-            f"{label} has {n} sensors, and the first becomes the camera; load_scene(sensor=...) in Python takes another."
-        )
+        warn(f"{label} has {n} sensors, and the first becomes the camera; Python's load_scene(sensor=) takes another.")
     warn_of_lamps_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)
