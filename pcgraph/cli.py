@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import pcgraph
-from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line
+from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
 from pcgraph.families import member
 from pcgraph.plain_files import said
 
@@ -143,7 +143,7 @@ def segment(
         _write(targets, read, result, labels)
     except (PcgraphError, ValueError, MemoryError, OSError) as error:
         message = said(error) if isinstance(error, OSError) else str(error)
-        message = " ".join(message.split()) or "the cloud does not fit into memory: choose a larger voxel size"
+        message = without_long_words(message) or "the cloud does not fit into memory: choose a larger voxel size"
         typer.echo(f"pcgraph: {one_line(message).rstrip('.')}.", err=True)
         raise typer.Exit(1) from None
     _print_summary(result, labels, targets, time.perf_counter() - start)

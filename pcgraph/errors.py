@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import re
 
+MAX_WORD = 160
+"""Characters of a word in a message: paths are seldom longer, and two of them still make a message that can be read."""
+
 
 class PcgraphError(Exception):
     """Base of every file error of pcgraph; the message is one sentence fit for a user."""
@@ -21,6 +24,12 @@ class CloudWriteError(PcgraphError):
 def one_line(text: object) -> str:
     """Text of others, such as a file's name, for one line of a terminal: as `visible`, line ends and tabs too."""
     return visible(str(text)).replace("\n", "\\n").replace("\t", "\\t")
+
+
+def without_long_words(message: str) -> str:
+    """A message on one line, the middles of its longest words left out: names may have thousands of letters."""
+    words = message.split()
+    return " ".join(w if len(w) <= MAX_WORD else f"{w[: MAX_WORD // 2]}...{w[3 - MAX_WORD // 2 :]}" for w in words)
 
 
 def visible(text: str) -> str:

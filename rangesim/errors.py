@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from pcgraph.errors import one_line, visible
+from pcgraph.errors import one_line, visible, without_long_words
 
 __all__ = [
     "AlignmentWarning",
@@ -82,7 +82,7 @@ def without_warnings() -> Iterator[None]:
 
 def sentence(message: str) -> str:
     """A message on one printable line, without its middle if it is too long to read."""
-    line = visible(" ".join(message.split()))
+    line = visible(without_long_words(message))
     if len(line) <= MAX_SENTENCE:
         return line
     return f"{line[: 2 * MAX_SENTENCE // 3]} ... {line[5 - MAX_SENTENCE // 3 :]}"

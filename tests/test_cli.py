@@ -332,6 +332,7 @@ def test_an_operating_systems_error_is_said_in_words(command: Command, letters: 
     assert answer.err.startswith("rangesim: cannot use nnn")
     assert answer.err.endswith("n/experiment.json: File name too long\n")
     assert "Errno" not in answer.err
+    assert len(answer.err) <= 300
 
 
 @pytest.mark.parametrize("order", ["\x1b[2J", "\u202e", "\n", "\x9b1m"])

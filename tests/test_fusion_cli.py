@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,9 @@ import numpy as np
 import pytest
 import trimesh
 from browser import BROWSER, browser
+from fusion_scenes import part
 from scroll_hints import check_scroll_hints
+from small_result import ROOT
 from typer.testing import CliRunner
 
 from rangesim import limits, load_range_image
@@ -209,3 +212,19 @@ def test_the_page_shows_its_pictures_and_breaks_none_of_its_rules(scanned: Path,
 def test_tables_wider_than_the_page_say_that_they_scroll(scanned: Path, tmp_path: Path) -> None:
     with browser(tmp_path) as page:
         check_scroll_hints(page, scanned / "report.html")
+
+
+@pytest.mark.validation
+def test_the_documented_scan_with_unknown_poses_works(tmp_path: Path) -> None:
+    """The line of docs/fusion.md as it stands, but for fewer pixels, of a part that looks different from all sides."""
+    line = next(s for s in (ROOT / "docs" / "fusion.md").read_text().splitlines() if "--unknown-poses" in s)
+    program, command, scene, *options = shlex.split(line, comments=True)
+    assert (program, command, scene) == ("rangesim", "scan", "part.ply")
+    mesh = part()
+    trimesh.Trimesh(1e3 * mesh.vertices, mesh.faces, process=False).export(tmp_path / scene)  # millimetres
+    options[options.index("--out") + 1] = str(tmp_path / "out")
+    run(str(tmp_path / scene), *options, "--width", "240")
+    views = json.loads((tmp_path / "out" / "scan.json").read_text())["statistics"]["views"]
+    assert len(views) == 24
+    assert max(view["angle_error_deg"] for view in views) < 0.1
+    assert max(view["centre_error_m"] for view in views) < 2e-3
