@@ -116,6 +116,7 @@ def test_step_is_the_height_between_parallel_planes():
     assert graph.edge_features.step[level_edges] == pytest.approx(0.0, abs=1e-7)  # voxels are exact to 2**-21
 
 
+@pytest.mark.filterwarnings("ignore:expected a voxel_size far below")  # one supervoxel each
 def test_shape_features_of_a_line_a_square_and_a_cloud():
     def features(points):
         return pcgraph.segment(points, voxel_size=10.0, viewpoint=(0, 0, 50)).graph.node_features
