@@ -493,3 +493,13 @@ def test_wrong_sensors_are_refused() -> None:
         AmcwDecoder().decode(capture)
     with pytest.raises(ValueError, match="expected a capture of amcw-tof, got one of ideal-tof"):
         Instrument("one", IdealToF(), decoder=AmcwDecoder())
+
+
+@pytest.mark.parametrize("bins", [20, 256])
+def test_a_pulse_that_fills_the_histogram_is_refused(bins: int) -> None:
+    """One as long as the period, with pile-up, was read 0.48 m off with status OK."""
+    half = 0.5 * bins * 100e-12
+    DirectToF(bins=bins, pulse_fwhm_s=half)
+    for pulse in (1.01 * half, 2 * half):
+        with pytest.raises(ValueError, match="pulse_fwhm_s to be at most half of the histogram"):
+            DirectToF(bins=bins, pulse_fwhm_s=pulse)

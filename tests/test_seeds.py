@@ -47,7 +47,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def signals(scene: Scene) -> rangesim.Signals:
-    return transport(scene, scene.rig(width=16, height=12), [AmcwToF(), DirectToF(bins=16)], spp=2, photons=0)
+    return transport(scene, scene.rig(width=16, height=12), [AmcwToF(), DirectToF(bins=32)], spp=2, photons=0)
 
 
 def digest(*arrays: np.ndarray) -> str:
@@ -128,7 +128,7 @@ def test_streams_of_different_seeds_have_nothing_in_common() -> None:
 def test_every_seed_makes_its_own_noise_at_the_detector(
     signals: rangesim.Signals, number: int, detector: Detector | SpadDetector
 ) -> None:
-    sensor = (AmcwToF(), DirectToF(bins=16))[number]
+    sensor = (AmcwToF(), DirectToF(bins=32))[number]
     digests = [digest(expose(signals, sensor, detector, seed=seed).frames) for seed in FEW_SEEDS]
     assert len(set(digests)) == len(FEW_SEEDS)
 

@@ -41,7 +41,8 @@ class DirectToF(Sensor):
     bins : int, number of time bins.
     bin_s : float, seconds, width of a bin.
     start_s : float, seconds, delay of the first bin after the pulse.
-    pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response; 0 for none. With a
+    pulse_fwhm_s : float, seconds, full width at half maximum of the Gaussian instrument response, at most half of the
+        histogram; 0 for none. With a
         pulse, a path is shared by the two bins next to it, so that its place within a bin is kept; bins of the pass are
         up to four times as fine where the pulse is narrow (`OVERSAMPLING`).
     laser : "periodic", or "single-shot": light that comes back after the histogram is full is lost.
@@ -58,10 +59,10 @@ class DirectToF(Sensor):
     def __post_init__(self) -> None:
         check_fields(self)
         limits.check("bins", self.bins * self._fine, f"bins, {self._fine} of the pass for each of the sensor")
-        if self.pulse_fwhm_s > self.bins * self.bin_s:
+        if self.pulse_fwhm_s > self.bins * self.bin_s / 2:
             raise ValueError(
-                f"expected pulse_fwhm_s to be within the histogram of {self.bins * self.bin_s:g} s, "
-                f"got {self.pulse_fwhm_s:g}."
+                f"expected pulse_fwhm_s to be at most half of the histogram of {self.bins * self.bin_s:g} s, which a "
+                f"longer pulse fills evenly, got {self.pulse_fwhm_s:g}."
             )
 
     @property
