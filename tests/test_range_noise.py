@@ -373,10 +373,10 @@ def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -
     assert rows["transparent"]["completeness_error"] > 0
     assert all(row["completeness_error"] is not None for row in ideal.rows)
     glass = rows["transparent"]
-    cell = f"{100 * glass['completeness']:.1f} ± {100 * glass['completeness_error']:.1f}"
-    assert cell in (tmp_path / "out" / "comparison.md").read_text()
-    assert cell in (tmp_path / "out" / "report.html").read_text()
+    value, error = f"{100 * glass['completeness']:.1f}", f"± {100 * glass['completeness_error']:.1f}"
     report = (tmp_path / "out" / "report.html").read_text()
+    assert f"{value} {error}" in (tmp_path / "out" / "comparison.md").read_text()
+    assert f'{value}</span><span class="error">{error}</span>' in report
     assert "sampling noise" in report
     assert "detector noise" in report
 

@@ -62,11 +62,13 @@ class Definition:
 
 @dataclass(frozen=True)
 class Cell:
-    """text; best : of the real sensors that are reliable on this material; bar : 0..1 for fractions, else None."""
+    """text; best : of the real sensors that are reliable on this material; bar : 0..1 for fractions, else None; error :
+    the uncertainty, empty if none shows, None in columns without."""
 
     text: str
     best: bool = False
     bar: float | None = None
+    error: str | None = None
 
 
 def titles(measurements: Sequence[Measurement]) -> dict[str, str]:
@@ -261,11 +263,19 @@ def _best(column: Column, rows: Sequence[dict[str, Any]]) -> float | None:
 def _cell(column: Column, row: dict[str, Any], best: float | None, rival: bool) -> Cell:
     value = row[column.key]
     bar = value if column.unit == "%" else None
-    return Cell(_text(column, row), best=rival and value is not None and value == best, bar=bar)
+    best_here = rival and value is not None and value == best
+    return Cell(number(column, value), best=best_here, bar=bar, error=_error(column, row))
 
 
 def _text(column: Column, row: dict[str, Any]) -> str:
     """A value of a row in the column's unit, with its uncertainty by sampling where that is known and shows."""
-    text = number(column, row[column.key])
-    error = row.get(f"{column.key}_error")
-    return f"{text} ± {number(column, error)}" if error and number(column, error) != "0.0" else text
+    return f"{number(column, row[column.key])} {_error(column, row) or ''}".rstrip()
+
+
+def _error(column: Column, row: dict[str, Any]) -> str | None:
+    """The uncertainty of a value by sampling; empty if it is not known or does not show, None in columns without."""
+    key = f"{column.key}_error"
+    if key not in row:
+        return None
+    text = number(column, row[key]) if row[key] else "0.0"
+    return "" if text == "0.0" else f"± {text}"
