@@ -140,6 +140,47 @@ def test_causes_do_not_depend_on_the_seed_of_the_noise_where_optics_fails() -> N
     assert np.mean(maps[0] == maps[1]) > 0.95
 
 
+@pytest.mark.parametrize(("name", "turn_deg"), [("amcw", 82), ("amcw", 85), ("direct", 85)])
+def test_a_steep_wall_is_no_depth_edge_where_other_light_spoils_the_reading(name: str, turn_deg: float) -> None:
+    """The depths of neighbours differ by more than 2 % all over it, so all of it was called a depth edge, though direct
+    light alone is read right. Beside the wall behind it, where direct light alone is misread, there is an edge."""
+    fine_bins = DirectToF(), SpadDetector()
+    (sensor, detector), board = SENSORS["amcw"] if name == "amcw" else fine_bins, cause_scenes.board
+    scene = cause_scenes.room(wall=board(0, 0, 1.2, 1.0), side=board(-0.25, 0, 0.9, 0.35, turn_deg=turn_deg))
+    rig = scene.rig(0.01, width=40, height=30)
+    signals, direct = (
+        rangesim.transport(scene, rig, [sensor], spp=256, max_depth=max_depth, photons=0) for max_depth in (6, 2)
+    )
+    capture = expose(signals, sensor, detector)
+    found = explain(decode(capture), capture, signals)
+    failed = cause_scenes.is_instance(signals, "side") & found.failed
+    healed = failed & cause_scenes.right(decode(expose(direct, sensor)), signals)
+    assert healed.sum() >= 15
+    assert np.mean(found.cause[healed] == Cause.MULTIPATH) > 0.9
+    assert (found.cause[failed & ~healed] == Cause.DEPTH_EDGE).all()
+
+
+@pytest.mark.parametrize(("width", "turn_deg"), [(24, 0), (40, 15), (64, 0)])
+def test_stripes_finer_than_a_pixel_are_too_coarse_and_not_multipath(width: int, turn_deg: float) -> None:
+    """A pixel of many stripes is misread in direct light alone. Most of the wall was called multipath, as there is some
+    of it and the path to the pixel's centre would be read right."""
+    (sensor, detector), board = SENSORS["gray"], cause_scenes.board
+    scene = cause_scenes.room(
+        wall=board(0, 0, 1.5, 2.0, turn_deg=turn_deg), side=board(-0.45, 0, 1.2, 0.3, turn_deg=70)
+    )
+    rig = scene.rig(0.2, width=width, height=3 * width // 4)
+    signals, direct = (
+        rangesim.transport(scene, rig, [sensor], spp=512, max_depth=max_depth, photons=0) for max_depth in (6, 2)
+    )
+    capture = expose(signals, sensor, detector)
+    found = explain(decode(capture), capture, signals)
+    healed = cause_scenes.right(decode(expose(direct, sensor)), signals)
+    wall = cause_scenes.is_instance(signals, "wall") & signals.truth.projector_visible & found.failed & ~healed
+    assert wall.sum() > 300
+    assert np.mean(found.cause[wall] == Cause.RESOLUTION) > 0.97
+    assert not (found.cause[wall] == Cause.MULTIPATH).any()
+
+
 # ---- The laws ---------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,13 @@ import numpy as np
 
 from rangesim.capture import Capture
 from rangesim.causes.light_budget import LightBudget, light_budget, white_radiance
-from rangesim.causes.reference_frames import clean_frames, points_in_projector, single_path_frames
+from rangesim.causes.reference_frames import (
+    clean_frames,
+    depth_on_plane,
+    footprint_frames,
+    points_in_projector,
+    single_path_frames,
+)
 from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
 from rangesim.decoding.status import Status
@@ -126,6 +132,28 @@ class Evidence:
         return depth_edges(self.truth.z, self.tolerance_m)
 
     @cached_property
+    def merely_inclined(self) -> np.ndarray:
+        """What looks like an edge is one steep surface, which is read right over the area of the pixel, without the
+        other light that disturbs it."""
+        return self.inclined & self._may_blur & ~self.blurred
+
+    @cached_property
+    def inclined(self) -> np.ndarray:
+        """All eight neighbours lie where the plane that touches the surface in the pixel's centre is: it holds one
+        surface, however steep."""
+        rig, where = self.signals.rig, self.failed & self.at_edge
+        rows, columns = np.nonzero(where)
+        fits = np.ones(len(rows), dtype=bool)
+        for y, x in ((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)):
+            at = np.clip(rows + y, 0, where.shape[0] - 1), np.clip(columns + x, 0, where.shape[1] - 1)
+            there = self.truth.z[at].astype(np.float64)
+            plane = depth_on_plane(rig, self.truth, where, rig.camera.directions(rig.camera.pixel_centres()[at]))
+            fits &= np.abs(there - plane) <= across(np.fmin(there, plane), self.tolerance_m) - np.fmin(there, plane)
+        result = np.zeros(where.shape, dtype=bool)
+        result[where] = fits
+        return result
+
+    @cached_property
     def fails_off_edge(self) -> np.ndarray:
         """Around the pixel, off the edge, the same surface is off by half as much or more: it is not the edge."""
         result, where = np.zeros(self.failed.shape, dtype=bool), self.failed & self.at_edge
@@ -201,6 +229,21 @@ class Evidence:
     def coarse(self) -> np.ndarray:
         """The straight path to the surface, alone, is not read to the tolerance, or makes half of the error or more."""
         return self._wrong(self._read(single_path_frames(self.capture.sensor, self.signals.rig, self.truth)))
+
+    @cached_property
+    def blurred(self) -> np.ndarray:
+        """Straight paths to all over the pixel's area, on one plane, are not read to the tolerance, or make half of the
+        error or more; where it matters, as other light disturbs the pixel too."""
+        rig, spread = self.signals.rig, self._may_blur
+        if not spread.any():
+            return spread
+        return spread & self._wrong(self._read(footprint_frames(self.capture.sensor, rig, self.truth, spread)))
+
+    @cached_property
+    def _may_blur(self) -> np.ndarray:
+        """Lit surfaces, neither mirrors nor glass, that fail without noise, and get other light."""
+        lit = ~self.in_shadow & ~self.is_a("transparent", "mirror")
+        return self.failed & self.optical & self.disturbed & lit
 
     @cached_property
     def beyond_range(self) -> np.ndarray:

@@ -101,9 +101,10 @@ def rules(e: Evidence) -> list[Rule]:
         (e.optical & e.coarse, Cause.RESOLUTION),
         # ---- The pixel holds more than one distance
         (e.moving, Cause.MOTION),
-        (e.at_edge & ~(disturbed & e.fails_off_edge), Cause.DEPTH_EDGE),
+        (e.at_edge & ~(disturbed & (e.fails_off_edge | e.merely_inclined)), Cause.DEPTH_EDGE),
         (e.in_shadow, Cause.SHADOWED),
         (e.optical & ~disturbed & e.beside_shadow, Cause.SHADOWED),
+        (e.optical & e.blurred, Cause.RESOLUTION),
         (disturbed & e.mostly(CAUSTIC, OTHER), Cause.CAUSTIC),
         (disturbed & e.mostly(SPECULAR, OTHER), Cause.MIRRORED_GHOST),
         (disturbed & e.mostly(MULTIPATH, OTHER), Cause.MULTIPATH),
