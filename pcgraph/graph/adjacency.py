@@ -250,7 +250,7 @@ class AdjacencyGraph(ShortRepr):
         Raises
         ------
         ValueError
-            `up` is no direction, or the occlusions are those of other supervoxels.
+            `up` is no direction, the occlusions are those of other supervoxels, or float32 does not hold a feature.
         """
         from pcgraph.graph.export import pyg
 

@@ -69,7 +69,7 @@ def pyg(graph: AdjacencyGraph, up: ArrayLike | None, occlusions: Occlusions | No
     arrays: dict[str, object] = {
         "x": _table(nodes, graph.n_nodes),
         "x_names": list(nodes),
-        "pos": (centroids - origin).astype(np.float32),
+        "pos": _single("pos", centroids - origin),
         "pos_origin": origin,
         "edge_index": _both_ways(graph.edges),
         "edge_attr": np.concatenate((attributes, attributes)),
@@ -129,6 +129,19 @@ def _both_ways(edges: NDArray[np.int32]) -> NDArray[np.int64]:
 
 def _table(columns: dict[str, NDArray[np.generic]], n: int) -> NDArray[np.float32]:
     table = np.empty((n, len(columns)), np.float32)
-    for i, column in enumerate(columns.values()):
-        table[:, i] = column
+    for i, (name, column) in enumerate(columns.items()):
+        table[:, i] = _single(name, column)
     return table
+
+
+def _single(name: str, values: NDArray[np.generic]) -> NDArray[np.float32]:
+    """The values as float32; raises ValueError where it does not hold them."""
+    with np.errstate(over="ignore"):
+        single = values.astype(np.float32)
+    lost = np.isinf(single)
+    if lost.any():
+        raise ValueError(
+            f"expected values that float32 holds, up to {np.finfo(np.float32).max:.2g}, "
+            f"got {values[lost][0]:.3g} in {name}; scale the points before they are segmented"
+        )
+    return single

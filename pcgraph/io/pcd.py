@@ -84,7 +84,10 @@ def _parse_header(content: bytes) -> tuple[PcdHeader, bytes]:
         words = [word.decode("latin-1") for word in content[position:end].split()]  # not at blanks of other codes
         position = end + 1
         if words and not words[0].startswith("#"):
-            entries[words[0].upper()] = words[1:]
+            key = words[0].upper()
+            if key in entries:
+                raise CloudReadError(f"expected one {key[:20]} line in the PCD header, got two")
+            entries[key] = words[1:]
     missing = [key for key in _REQUIRED if not entries.get(key)]
     if missing:
         raise CloudReadError(

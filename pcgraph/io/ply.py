@@ -96,6 +96,8 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
     for line in content[:end].split(b"\n")[1:]:  # as bytes: text has line ends and blanks that UTF-8 holds in letters
         words = [word.decode("latin-1") for word in line.split()]
         if words[:1] == ["format"] and len(words) == 3:
+            if code:
+                raise CloudReadError(f"expected one format line in the PLY header, got {code!r} and {words[1]!r}")
             code = words[1]
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
             elements.append(PlyElement(words[1], int(words[2])))
@@ -103,6 +105,10 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], bytes]:
             _add_property(elements[-1], words)
         elif words and words[0] not in ("comment", "obj_info"):
             raise CloudReadError(f"PLY header line not understood: {' '.join(words)[:80]!r}")
+    vertices = [element.count for element in elements if element.name == "vertex"]
+    if len(vertices) > 1:
+        counts = " and ".join(map(str, vertices[:2]))
+        raise CloudReadError(f"expected one element called vertex in the PLY header, got {len(vertices)}, of {counts}")
     if code not in _ORDERS:
         raise CloudReadError(f"expected PLY format {', '.join(_ORDERS)}, got {code!r}")
     return code, elements, content[newline + 1 :]

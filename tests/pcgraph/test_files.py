@@ -442,6 +442,35 @@ def test_lying_ply_files_are_refused(name):
         read_ply(PLY_LIES[name])
 
 
+@pytest.mark.parametrize("count", [b"3", b"4"])
+def test_two_vertex_elements_are_refused(count):
+    second = b"element vertex " + count + b"\nproperty float x\nproperty float y\nproperty float z\nend_header"
+    body = XYZ[: int(count)].tobytes()
+    with pytest.raises(
+        CloudReadError, match=f"one element called vertex in the PLY header, got 2, of 4 and {int(count)}"
+    ):
+        read_ply(PLY.replace(b"end_header", second) + body)
+    faces = b"element face 0\nelement face 0\nend_header"
+    assert np.array_equal(read_ply(PLY.replace(b"end_header", faces)).points, XYZ, equal_nan=True)
+
+
+@pytest.mark.parametrize("code", ["ascii", "binary_big_endian", "binary_little_endian"])
+def test_two_format_lines_are_refused(code):
+    for first, second in (("binary_little_endian", code), (code, "binary_little_endian")):
+        lines = f"format {first} 1.0\nformat {second} 1.0".encode()
+        with pytest.raises(CloudReadError, match=f"one format line in the PLY header, got '{first}' and '{second}'"):
+            read_ply(PLY.replace(b"format binary_little_endian 1.0", lines))
+
+
+@pytest.mark.parametrize(
+    "line", ["FIELDS z y x rgb label", "WIDTH 1", "height 1", "VIEWPOINT 0 0 0 1 0 0 0", "SIZE 4 4 4 4 4"]
+)
+def test_pcd_lines_that_come_twice_are_refused(line):
+    header = pcd_header("binary").replace(b"DATA", line.encode() + b"\nDATA")
+    with pytest.raises(CloudReadError, match=f"one {line.split()[0].upper()} line in the PCD header, got two"):
+        read_pcd(header + pcd_body())
+
+
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_damaged_files_never_crash(data):

@@ -131,6 +131,15 @@ def test_pyg_leaves_out_what_is_unknown(boxes):
     assert np.isfinite(data["x"]).all()
 
 
+@pytest.mark.parametrize("scale", [1e30, 1e45, 1e90])
+def test_pyg_refuses_what_float32_does_not_hold(scale):
+    points = two_boxes_on_a_plane()[0]
+    graph = pcgraph.segment(points * scale).graph
+    with pytest.raises(ValueError, match=r"expected values that float32 holds, up to 3.4e\+38, got -?\d.*e\+\d+ in "):
+        graph.to_pyg()
+    assert np.isfinite(pcgraph.segment(points * 1e15).graph.to_pyg()["x"]).all()
+
+
 @pytest.mark.parametrize("with_colors", [True, False])
 def test_graphml_reads_back_as_the_same_graph(coloured, boxes, with_colors, tmp_path):
     graph = coloured if with_colors else boxes[2].graph
