@@ -97,6 +97,35 @@ def test_a_pattern_shown_twice_is_named(projector: tuple[int, int], upper: int) 
     assert expected in message(reordered(captured(projector, width=240), repeated))
 
 
+@pytest.mark.parametrize("projector", [(1280, 800), (1024, 768)])
+@pytest.mark.parametrize("axis", ["columns", "rows"])
+def test_a_coarse_pattern_shown_twice_is_named_in_large_images(projector: tuple[int, int], axis: str) -> None:
+    """The coarsest bits change at one line of the image: a few hundred of a million pairs of neighbours."""
+    capture = captured(projector, width=720)
+
+    def repeated(pairs: np.ndarray) -> np.ndarray:
+        result = pairs.copy()
+        result[1] = pairs[0]
+        return result
+
+    n = int(np.ceil(np.log2(projector[0 if axis == "columns" else 1])))
+    expected = f"frames {axis}_bit{n - 1} and {axis}_bit{n - 2} seem to be one pattern shown twice"
+    assert expected in message(reordered(capture, repeated, axis))
+
+
+@pytest.mark.parametrize(
+    ("projector", "left", "width"),
+    [((8, 8), 15, 100), ((8, 8), 30, 70), ((8, 8), 75, 70), ((16, 12), 30, 40), ((16, 12), 60, 40)],
+)
+def test_inverses_before_their_patterns_are_no_plain_binary(projector: tuple[int, int], left: int, width: int) -> None:
+    """Of few cells in view, some lie nearer to each other if read as plain binary; but nearest in the right order."""
+    whole = reordered(captured(projector), lambda pairs: pairs[:, ::-1])
+    part = replace(whole, frames=np.ascontiguousarray(whole.frames[:, :, left : left + width]), rig=None)
+    text = message(part)
+    assert "along columns contradict Gray code, where neighbouring pixels see neighbouring cells" in text
+    assert "inverse" in text
+
+
 @pytest.mark.parametrize("bit", [0, 3])
 def test_an_inverse_that_is_the_pattern_again_is_named(bit: int) -> None:
     def doubled(pairs: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ MAX_LEVEL_ERROR = 0.03
 PHASE_BINS = 8
 """Into which a period is divided, to see at which phases the mean of the fringes is off."""
 MAX_PAIRS = 50_000
-"""Pairs of neighbouring pixels, across and down each, that are looked at in every order of the frames."""
+"""Pairs of neighbouring pixels, across and down each, that are looked at in every other order of the frames."""
 MIN_STEPS = 100
 """Pairs of neighbouring pixels in different cells; fewer do not tell plain binary from Gray code."""
 MAX_FARTHER = 0.3
@@ -166,21 +166,31 @@ def _medians(values: np.ndarray, members: list[np.ndarray]) -> tuple[np.ndarray,
     return medians, 1.253 * 1.483 * np.array(spread) / np.sqrt([len(m) for m in members])
 
 
-def binary_contradiction(gray: GrayCode, axis: str) -> str | None:
+def binary_contradiction(gray: GrayCode, names: list[str], axis: str) -> str | None:
     """A sentence if the patterns look like plain binary numbers, None if they look like Gray code.
 
-    Neighbouring pixels see neighbouring cells. Numbers in plain binary, read as Gray code, lie farther apart.
+    Neighbouring pixels see neighbouring cells. Numbers in plain binary, read as Gray code, lie farther apart. Those of
+    Gray code in another order of the frames may, too, but lie nearest if read in that order: None for them.
+
+    Parameters
+    ----------
+    names : (2 b,) of the patterns and inverses, most significant bit first.
     """
     cell = gray.coordinate / gray.cell_px
     usable = (cell % 1 == 0.5) & (gray.status == Status.OK)
     number = np.where(usable, cell, 0).astype(np.int64)
     plain = number ^ (number >> 1)  # the bits as shown
-    apart = []
+    pairs = []
     for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         both = usable[here] & usable[there] & (number[here] != number[there])
-        apart.append([np.abs(n[there][both] - n[here][both]) for n in (number, plain)])
-    as_gray, as_binary = (np.log2(np.concatenate(steps)) for steps in zip(*apart, strict=True))
+        pairs.append(np.stack([plain[here][both], plain[there][both]]))
+    words = np.concatenate(pairs, axis=1)
+    as_gray, as_binary = np.log2(_apart(words, 0)), np.log2(np.abs(words[1] - words[0]))
     if len(as_gray) < MIN_STEPS or as_gray.mean() < as_binary.mean() + MAX_FARTHER:
+        return None
+    few = words[:, :: 1 + words.shape[1] // MAX_PAIRS]
+    orders = [np.log2(_apart(reorder(few), 0)).mean() for _, reorder in _other_orders(names[-2::-2])]
+    if min(orders) < np.log2(np.abs(few[1] - few[0])).mean():
         return None
     return (
         f"the bits along {axis} contradict Gray code: read as plain binary numbers neighbouring pixels lie "
@@ -238,19 +248,24 @@ def order_contradiction(gray: GrayCode, names: list[str], axis: str) -> str | No
     word = number ^ (number >> 1)  # the bits as shown
     pairs = []
     for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        both = np.flatnonzero((usable[here] & usable[there]).ravel())
-        both = both[:: 1 + len(both) // MAX_PAIRS]
-        pairs.append(np.stack([word[here].ravel()[both], word[there].ravel()[both]]))
+        both = usable[here] & usable[there]
+        pairs.append(np.stack([word[here][both], word[there][both]]))
     bits = names[-2::-2]  # least significant first
-    across = max(pairs, key=lambda words: np.count_nonzero(words[0] != words[1]))
-    words = np.concatenate(pairs, axis=1)
-    words = words[:, words[0] != words[1]]
+    few = [words[:, :: 1 + words.shape[1] // MAX_PAIRS] for words in pairs]
+    across = max(few, key=lambda words: np.count_nonzero(words[0] != words[1]))
     step = _coarse_step(across, len(bits))
-    text = None if step is None else _repeated_bit(words >> step, bits[step:])
-    text = text or _better_order(across, words, bits)
+    # of all pairs: the coarsest bits change at a line or two of the image
+    text = None if step is None else _repeated_bit(_that_differ(pairs) >> step, bits[step:])
+    text = text or _better_order(across, _that_differ(few), bits)
     if text is None:
         return None
     return f"the bits along {axis} contradict Gray code, where neighbouring pixels see neighbouring cells: {text}."
+
+
+def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:
+    """(2, m) words of all pairs (2, n) whose two words differ."""
+    words = np.concatenate(pairs, axis=1)
+    return np.asarray(words[:, words[0] != words[1]])
 
 
 def _better_order(across: np.ndarray, words: np.ndarray, bits: list[str]) -> str | None:

@@ -220,10 +220,11 @@ class StructuredLightDecoder(Decoder):
             if isinstance(response, GrayBits):
                 shift, size = response.shift, sensor.size(axis)
                 codes[axis] = decode_gray(capture, capture.frames[frames], shift, size, contrast, self.gray)
+                names = sensor.frame_names()
                 contradictions[axis] = (
-                    pair_contradiction(capture, contrast, frames, sensor.frame_names(), axis)
-                    or binary_contradiction(codes[axis], axis)
-                    or order_contradiction(codes[axis], sensor.frame_names()[frames], axis)
+                    pair_contradiction(capture, contrast, frames, names, axis)
+                    or binary_contradiction(codes[axis], names[frames], axis)
+                    or order_contradiction(codes[axis], names[frames], axis)
                 )
             else:
                 fringes, least_swing = capture.frames[frames], self.gray.relative_bit * contrast.values
