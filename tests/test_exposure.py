@@ -4,15 +4,21 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import BRIGHT_PERCENTILE
+from rangesim.capture.capture_files import load_capture
 from rangesim.capture.exposure import TARGET_FRACTION, expose, photons_per_pulse
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
+from rangesim.errors import RangesimWarning
+from rangesim.experiment.instrument import Instrument
+from rangesim.experiment.pipeline import measure
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
@@ -84,6 +90,47 @@ def test_auto_exposure_puts_the_bright_pixels_at_its_target() -> None:
     assert expose(plane_signals(rig, SENSOR), SENSOR, limited).exposure_s == 0.05
     nothing = signals_of_depth(rig, np.full((120, 160), np.nan), [SENSOR])
     assert expose(nothing, SENSOR, detector).exposure_s == detector.max_exposure_s
+
+
+@pytest.mark.parametrize(
+    ("sensor", "detector"), [(SENSOR, Detector()), (AmcwToF(), Detector.time_of_flight())], ids=["lines", "amcw"]
+)
+@pytest.mark.parametrize("distance_m", [0.1, 1.0])
+def test_light_too_strong_for_the_shortest_exposure_is_said_with_its_share(
+    tmp_path: Path, sensor: Sensor, detector: Detector, distance_m: float
+) -> None:
+    """A part of 60 mm before the default lamp lost 78 % of its matte table to saturation, and nothing said why."""
+    rig, detector = stereo_rig(baseline_m=0.01), dataclasses.replace(detector, max_exposure_s=1.0)
+    z = np.where(np.arange(rig.camera.width) < 60, np.nan, distance_m) * np.ones((rig.camera.height, 1))
+    strong, weak = (
+        signals_of_depth(dataclasses.replace(rig, projector_power_w=power_w), z, [sensor]) for power_w in (1.0, 0.3)
+    )
+    faint = np.full_like(strong.energy.ambient, 1e-3 * strong.energy.direct.max())  # also where nothing reflects
+    signals = dataclasses.replace(strong, energy=dataclasses.replace(strong.energy, ambient=faint))
+    fitting_s = expose(signals, sensor, dataclasses.replace(detector, min_exposure_s=1e-12)).exposure_s
+    lit = signals.energy.projector > 0
+    assert lit.mean() < 0.7
+    # The bright pixels fill 70 % of the well in `fitting_s`, so all of it in 1.43 of that
+    short, long = (dataclasses.replace(detector, min_exposure_s=factor * fitting_s) for factor in (1.3, 3.0))
+    near = Instrument("near", sensor, long)
+    with pytest.warns(
+        RangesimWarning, match=r"near: the detector's shortest .* take less light .its power_w is 1."
+    ) as said:
+        measure(near, signals, tmp_path / "long", 0)
+    capture = load_capture(tmp_path / "long" / "capture")
+    saturated = np.mean(capture.saturated(capture.frames)[lit])
+    told = float(str(said[0].message).split("saturates ")[1].split(" %")[0])
+    assert saturated > 0.5
+    assert abs(told / 100 - saturated) <= 0.005
+    for name, instrument, light in (
+        ("short", dataclasses.replace(near, detector=short), signals),
+        ("stated", dataclasses.replace(near, exposure_s=long.min_exposure_s), signals),  # who says how long knows
+        ("weak", near, weak),
+    ):
+        with warnings.catch_warnings(record=True) as said_else:
+            warnings.simplefilter("always")
+            measure(instrument, light, tmp_path / name, 0)
+        assert not [w for w in said_else if "shortest exposure" in str(w.message)]
 
 
 @pytest.mark.parametrize(

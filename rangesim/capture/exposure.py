@@ -10,6 +10,7 @@ import numpy as np
 
 from rangesim.capture import Capture, bright_level
 from rangesim.electronics.detector import PhotoDetector
+from rangesim.errors import warn
 from rangesim.rig import Rig
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import SECONDS, check_number
@@ -133,3 +134,27 @@ def auto_exposure_s(radiance: np.ndarray, sensor: Sensor, detector: PhotoDetecto
         return detector.max_exposure_s
     wanted = TARGET_FRACTION * detector.capacity_e / level
     return float(np.clip(wanted, detector.min_exposure_s, detector.max_exposure_s))
+
+
+def warn_of_overexposure(name: str, capture: Capture, signals: Signals) -> None:
+    """Warn of a capture whose automatic exposure is as short as can be, and yet too long for its bright pixels.
+
+    name : of the instrument. signals : those that the capture was exposed from.
+
+    Warns
+    -----
+    RangesimWarning
+    """
+    detector, rig = capture.detector, signals.rig
+    if detector is None or capture.exposure_s > detector.min_exposure_s:
+        return
+    radiance = _mean_radiance(signals, capture.sensor, detector, capture.ambient)
+    level = bright_level(radiance.max(axis=0)) * detector.electrons_per_radiance(rig)
+    if level * capture.exposure_s > detector.capacity_e:
+        lit = signals.energy.projector > 0
+        share = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
+        warn(
+            f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * share:.0f} % of the "
+            f"pixels that get light of the projector; take less light (its power_w is {rig.projector_power_w:g}), or a "
+            "shorter min_exposure_s."
+        )

@@ -17,7 +17,7 @@ import rangesim
 from pcgraph.output import new_directory
 from rangesim.capture import Capture
 from rangesim.capture.capture_files import write_capture
-from rangesim.capture.exposure import photons_per_pulse
+from rangesim.capture.exposure import photons_per_pulse, warn_of_overexposure
 from rangesim.causes import explain
 from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
@@ -155,6 +155,8 @@ def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, a
     with timed(times, "exposure"):
         detector = _in_time(instrument) if moves else instrument.detector
         capture = rangesim.expose(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
+    if instrument.exposure_s is None:
+        warn_of_overexposure(instrument.name, capture, signals)
     with timed(times, "decode"):
         image = rangesim.decode(capture, instrument.decoder)
     noise = None
