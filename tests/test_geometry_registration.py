@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from geometry_scenes import rigid
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rangesim.geometry import Registration, icp, register
@@ -122,9 +123,9 @@ def test_far_from_the_origin_register_finds_the_same(metres: float) -> None:
 
 
 def corrugated(random: np.random.Generator, n: int) -> np.ndarray:
-    """A plate with waves of 30 mm along x, 12 mm from trough to crest."""
+    """A plate with waves of 30 mm along x, 12 mm from trough to crest, and of 60 mm along y, 4 mm, which hold it."""
     xy = random.uniform(-0.15, 0.15, (n, 2))
-    return np.column_stack([xy, 0.006 * np.sin(2 * np.pi * xy[:, 0] / 0.03)])
+    return np.column_stack([xy, np.sin(2 * np.pi * xy / [0.03, 0.06]) @ [0.006, 0.002]])
 
 
 @pytest.mark.parametrize(("turn", "seed"), [(0.3, 0), (1.57, 1), (1.0, 2)])
@@ -202,6 +203,31 @@ def test_too_small_an_overlap_that_fits_in_two_ways_is_refused() -> None:
 def test_what_slides_is_refused(shape, noise: float) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match="surfaces that hold each other"):
         icp(*pair(shape, noise, n=1500), TRUE)
+
+
+def gutter(random: np.random.Generator, n: int) -> np.ndarray:
+    """Waves of 30 mm along x alone: it slides along y."""
+    xy = random.uniform(-0.15, 0.15, (n, 2))
+    return np.column_stack([xy, 0.006 * np.sin(2 * np.pi * xy[:, 0] / 0.03)])
+
+
+def roof(random: np.random.Generator, n: int) -> np.ndarray:
+    xy = random.uniform(-0.15, 0.15, (n, 2))
+    return np.column_stack([xy, 0.5 * np.abs(xy[:, 0])])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("shape", "n", "noise"),
+    [(sphere, 600, 0.0), (sphere, 600, 1.0), (cylinder, 600, 0.5), (cylinder, 2500, 1.0), (roof, 600, 1.0),
+     (roof, 2500, 1.0), (plane, 600, 1.0), (gutter, 6000, 0.05)],
+)  # fmt: skip
+def test_few_points_and_noise_do_not_hold_what_slides(shape, n: int, noise: float, seed: int) -> None:  # type: ignore[no-untyped-def]
+    """Of noise (in spacings) in the normals, a constraint of 0.005 to 0.024 came; poses 2 to 4 spacings off passed."""
+    points = shape(np.random.default_rng(0), n)
+    spacing = float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+    with pytest.raises(ValueError, match="surfaces that hold each other"):
+        icp(*pair(shape, noise * spacing, n=n, seed=seed), TRUE)
 
 
 def test_a_symmetric_part_is_refused_without_a_first_guess() -> None:

@@ -627,7 +627,7 @@ def test_a_medium_in_the_sensor_of_a_file_is_refused(tmp_path: Path) -> None:
     second = XML_CAMERA.replace("<film", '<ref id="fog"/><film', 1)
     body = f'{fog}{XML_CAMERA}{second}<shape type="sphere" id="ball"/>'
     (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{body}</scene>')
-    assert load_scene(tmp_path / "a.xml").instances[0].name == "ball"  # the sensor in fog is not the camera
+    assert load_scene(tmp_path / "a.xml", sensor=0).instances[0].name == "ball"  # that in fog is not the camera
     with pytest.raises(FileFormatError, match="expected the camera to stand in air"):
         load_scene(tmp_path / "a.xml", sensor=1)
 
