@@ -79,9 +79,10 @@ def loads(soname: str) -> bool:
 
 def llvm_problem() -> str | None:
     """What rangesim itself says of this machine's LLVM; None if it is content."""
-    package = types.ModuleType("rangesim")  # stands for the package, whose dependencies are not there yet
-    package.__path__ = [str(Path(__file__).resolve().parents[1] / "rangesim")]
-    sys.modules["rangesim"] = package
+    for name in ("pcgraph", "rangesim"):  # stand for the packages, whose dependencies are not there yet
+        package = types.ModuleType(name)
+        package.__path__ = [str(Path(__file__).resolve().parents[1] / name)]
+        sys.modules[name] = package
     from rangesim.environment.llvm import find_llvm
     from rangesim.errors import EnvironmentProblem
 

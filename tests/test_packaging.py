@@ -109,3 +109,15 @@ def delivered(path: Path) -> list[Path]:
 def lines(path: Path) -> list[str]:
     """Requirements of a file, without comments."""
     return [line.split("#")[0].strip() for line in path.read_text().splitlines() if line.split("#")[0].strip()]
+
+
+def test_the_system_is_looked_at_before_anything_is_installed(tmp_path: Path) -> None:
+    """With the standard library alone, as on a new machine: the module's checks, which install nothing."""
+    check = (
+        "import runpy, sys; sys.argv[1:] = []\n"
+        f"names = runpy.run_path({str(ROOT / 'scripts' / 'system_libraries.py')!r}, run_name='checks')\n"
+        "print(sorted(names['missing_parts']()))"
+    )
+    done = subprocess.run([sys.executable, "-I", "-S", "-c", check], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "[]\n"
