@@ -9,7 +9,7 @@ from io import BytesIO
 from itertools import chain
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from pcgraph.errors import CloudReadError
 from pcgraph.short_repr import ShortRepr
@@ -291,3 +291,12 @@ def _rows_of_text(body: bytes, n_rows: int, n_columns: int, first_line: int) -> 
             reason = str(error)[:120]
             raise CloudReadError(f"expected numbers only in the ascii data, got in line {number}: {reason}") from None
         left -= 1
+
+
+def without_mask(values: ArrayLike) -> ArrayLike:
+    """Numbers as they are; of a masked array floats, NaN where it is masked."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    if values.dtype.kind not in "fiu" or not np.ma.getmaskarray(values).any():
+        return values.data
+    return np.ma.filled(values.astype(np.result_type(values.dtype, np.float32)), np.nan)

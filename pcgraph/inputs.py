@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.cloud import Cloud
+from pcgraph.cloud import Cloud, without_mask
 from pcgraph.columns import RobustScaling
 from pcgraph.short_repr import ShortRepr
 from pcgraph.voxels.cells import bounding_box
@@ -357,15 +357,6 @@ def _number(value: float) -> float:
         return float(value)
     except (TypeError, ValueError):
         return float("nan")
-
-
-def without_mask(values: ArrayLike) -> ArrayLike:
-    """Numbers as they are; of a masked array floats, NaN where it is masked."""
-    if not isinstance(values, np.ma.MaskedArray):
-        return values
-    if values.dtype.kind not in "fiu" or not np.ma.getmaskarray(values).any():
-        return values.data
-    return np.ma.filled(values.astype(np.result_type(values.dtype, np.float32)), np.nan)
 
 
 def _numbers(name: str, values: ArrayLike) -> NDArray[np.generic]:

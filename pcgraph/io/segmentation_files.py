@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pcgraph.cloud import COLOR_NAMES, LABEL_NAMES, NORMAL_NAMES, PACKED_NAMES, Cloud
+from pcgraph.cloud import COLOR_NAMES, LABEL_NAMES, NORMAL_NAMES, PACKED_NAMES, Cloud, without_mask
 from pcgraph.errors import CloudWriteError
-from pcgraph.inputs import without_mask
 from pcgraph.io.ply import encode_ply
 from pcgraph.plain_files import is_sealed, sealed, unsealed, write_file
 
@@ -81,13 +80,14 @@ def encode_segmentation(
     name: str, cloud: Cloud | ArrayLike, segmentation: Segmentation, labels: ArrayLike | None = None
 ) -> bytes:
     """What `write_segmentation` writes to a file of such a name."""
-    from pcgraph.segmentation import check_segmentation
-
-    check_segmentation(segmentation)
+    try:
+        shape = segmentation.supervoxels.shape
+    except AttributeError:  # the class itself is above this module
+        kind = type(segmentation).__name__
+        raise ValueError(f"expected a Segmentation, as pcgraph.segment returns it, got {kind}") from None
     cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(without_mask(cloud)))
     cloud = replace(cloud, points=np.asarray(without_mask(cloud.points)))
     labels = segmentation.labels if labels is None else _whole_labels(labels)
-    shape = segmentation.labels.shape
     if np.shape(cloud.points) != (*shape, 3):
         expected = f"the points that were segmented, of shape {(*shape, 3)}"
         raise ValueError(f"expected {expected}, got {np.shape(cloud.points)}; give the cloud of this segmentation")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import drjit as dr
@@ -69,20 +70,29 @@ def body_around(scene: Any, place: np.ndarray) -> str | None:
     filled = [shape for shape in filled if medium_numbers(shape.interior_medium())[0] > 0]
     if not filled:
         return None
-    ray = mi.Ray3f(o=mi.Point3f(*map(float, place)), d=mi.Vector3f(DIRECTIONS.T.astype(np.float32)))
     left = np.zeros((len(filled), len(DIRECTIONS)), np.int64)
+    for outward, met in _crossings(scene, place, DIRECTIONS):
+        for count, shape in zip(left, filled, strict=True):
+            count += outward * (met == mi.ShapePtr(shape)).numpy()
+    inside = (left > 0).sum(axis=1) > len(DIRECTIONS) / 2
+    return next((str(shape.id()) for shape, is_in in zip(filled, inside, strict=True) if is_in), None)
+
+
+def _crossings(scene: Any, place: np.ndarray, directions: np.ndarray) -> Iterator[tuple[np.ndarray, Any]]:
+    """The surfaces that rays from a place (3,), metres, in directions (n, 3) pass, one behind another.
+
+    Yields (n,) int64, 1 where a ray passes along the normal, -1 against it, 0 where there is no further surface; and
+    the shapes, n pointers of Mitsuba.
+    """
+    ray = mi.Ray3f(o=mi.Point3f(*map(float, place)), d=mi.Vector3f(np.asarray(directions, np.float32).T))
     active = mi.Bool(True)
     for _ in range(MAX_SURFACES):
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         active = si.is_valid()
         if not dr.any(active):
-            break
-        outward = np.sign(dr.dot(ray.d, si.n).numpy()) * active.numpy()
-        for count, shape in zip(left, filled, strict=True):
-            count += np.where((si.shape == mi.ShapePtr(shape)).numpy(), outward, 0).astype(np.int64)
+            return
+        yield (np.sign(dr.dot(ray.d, si.n).numpy()) * active.numpy()).astype(np.int64), si.shape
         ray = si.spawn_ray(ray.d)
-    inside = (left > 0).sum(axis=1) > len(DIRECTIONS) / 2
-    return next((str(shape.id()) for shape, is_in in zip(filled, inside, strict=True) if is_in), None)
 
 
 def inside_out(scene: Any, place: np.ndarray, directions: np.ndarray) -> tuple[str, str] | None:
@@ -104,25 +114,17 @@ def inside_out(scene: Any, place: np.ndarray, directions: np.ndarray) -> tuple[s
     )
     if not filled and not around:
         return None
-    ray = mi.Ray3f(o=mi.Point3f(*map(float, place)), d=mi.Vector3f(np.asarray(directions, np.float32).T))
     bodies = np.zeros(len(directions), np.int64)  # that a ray is in
     sides = [(s, "interior", 1) for s in filled] + [(s, "exterior", -1) for s in around]
     votes, unmet = [0] * len(sides), [np.ones(len(directions), bool) for _ in sides]
-    active = mi.Bool(True)
-    for _ in range(MAX_SURFACES):
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
-        active = si.is_valid()
-        if not dr.any(active):
-            break
-        outward = (np.sign(dr.dot(ray.d, si.n).numpy()) * active.numpy()).astype(np.int64)
+    for outward, shapes in _crossings(scene, place, directions):
         in_air = bodies == 0
         for number, (shape, side, amiss) in enumerate(sides):
-            met = outward * (si.shape == mi.ShapePtr(shape)).numpy()
+            met = outward * (shapes == mi.ShapePtr(shape)).numpy()
             votes[number] += amiss * int(met[in_air & unmet[number]].sum())
             unmet[number] &= met == 0
             if side == "interior":
                 bodies = np.maximum(bodies - met, 0)
-        ray = si.spawn_ray(ray.d)
     return next(((str(s.id()), side) for (s, side, _), n in zip(sides, votes, strict=True) if n > 0), None)
 
 
