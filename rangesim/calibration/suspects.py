@@ -25,11 +25,11 @@ MAX_NOISE = 1.5
 DEVICES = ("camera", "projector")
 
 COEFFICIENTS = 5
-"""Of distortion, that a lens has at most."""
+"""Largest number of coefficients of distortion that a lens has."""
 MAX_SHIFT = 2.0
 """Standard deviations by which the distortion that is left out may move a focal length or a principal point."""
 ROUNDING_PX = 1e-6
-"""Residuals below are none."""
+"""Residuals, in pixels, below which points fit exactly but for rounding."""
 
 
 class Suspect(NamedTuple):

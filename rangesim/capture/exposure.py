@@ -152,9 +152,9 @@ def warn_of_overexposure(name: str, capture: Capture, signals: Signals) -> None:
     level = bright_level(radiance.max(axis=0)) * detector.electrons_per_radiance(rig)
     if level * capture.exposure_s > detector.capacity_e:
         lit = signals.energy.projector > 0
-        share = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
+        fraction = np.mean(capture.saturated(capture.frames), where=lit) if lit.any() else 0.0
         warn(
-            f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * share:.0f} % of the "
-            f"pixels that get light of the projector; take less light (its power_w is {rig.projector_power_w:g}), or a "
-            "shorter min_exposure_s."
+            f"{name}: the detector's shortest exposure, {capture.exposure_s:g} s, saturates {100 * fraction:.0f} % of "
+            "the pixels that get light of the projector; take less light "
+            f"(its power_w is {rig.projector_power_w:g}), or a shorter min_exposure_s."
         )

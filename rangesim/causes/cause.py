@@ -76,7 +76,7 @@ TITLES = {
 
 
 class FailureFractions(list[dict[str, Any]]):
-    """What failed of each material class, and why; see `CauseMap.fractions`. Printed, it is a table in Markdown."""
+    """Failures of each material class, and why; see `CauseMap.fractions`. Printed, it is a table in Markdown."""
 
     def to_markdown(self) -> str:
         """Table in Markdown in the words of `TITLES`, as the report has them; fractions in percent of the pixels."""

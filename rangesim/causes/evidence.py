@@ -133,7 +133,7 @@ class Evidence:
 
     @cached_property
     def merely_inclined(self) -> np.ndarray:
-        """What looks like an edge is one steep surface, which is read right over the area of the pixel, without the
+        """Pixels whose edge is one steep surface, which is read right over the area of the pixel, without the
         other light that disturbs it."""
         return self.inclined & self._may_blur & ~self.blurred
 

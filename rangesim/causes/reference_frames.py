@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from rangesim.signals import Signals
 
 _CHUNK_VALUES = 32_000_000
-FOOTPRINT_PATHS, FOOTPRINT_STEP = 55, 34
-"""Light paths over the area of a pixel, on a lattice of Fibonacci numbers: even along both sides, hence fine enough for
+FOOTPRINT_PATHS = 55
+"""Number of light paths over the area of a pixel, on a Fibonacci lattice: even along both sides, hence fine enough for
 stripes of a twentieth of the pixel, and over its area."""
+FOOTPRINT_STEP = 34
+"""Step of the lattice along the second side, the Fibonacci number before."""
 
 
 def clean_frames(signals: Signals, sensor: Sensor) -> np.ndarray:
@@ -40,8 +42,8 @@ def single_path_frames(sensor: Sensor, rig: Rig, truth: GroundTruth) -> np.ndarr
 
 
 def footprint_frames(sensor: Sensor, rig: Rig, truth: GroundTruth, spread: np.ndarray) -> np.ndarray:
-    """As `single_path_frames`, but in the pixels `spread` (h, w) bool, which have a surface, the mean of straight paths
-    to all over the pixel's area, on the plane that touches the surface in the true point.
+    """Frames as of `single_path_frames`, but in the pixels `spread` (h, w) bool, which have a surface, the mean of
+    straight paths to all over the pixel's area, on the plane that touches the surface in the true point.
 
     Where a reading of these is wrong, the pixel is too coarse for the pattern, or mixes too many distances of its one
     surface. Where it is right, an inclined surface alone does no harm.
@@ -100,7 +102,7 @@ def _straight_path(rig: Rig, truth: GroundTruth, where: np.ndarray) -> LightPath
 
 
 def _path_beside(rig: Rig, truth: GroundTruth, where: np.ndarray, offset: np.ndarray) -> LightPath:
-    """As `_straight_path`, `offset` (2,) pixels beside the centres, on the plane that touches the surface."""
+    """Light paths as of `_straight_path`, but `offset` (2,) pixels beside the centres, on the tangent planes."""
     ray = rig.camera.directions(rig.camera.pixel_centres()[where] + offset)
     depth = depth_on_plane(rig, truth, where, ray)
     points = ray * np.where(np.isfinite(depth), depth, truth.z[where])[:, None]

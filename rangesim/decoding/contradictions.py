@@ -18,7 +18,7 @@ from rangesim.decoding.phase_shift import phase_of
 from rangesim.decoding.status import Status
 
 MIN_PIXELS = 200
-"""Pixels; fewer say nothing."""
+"""Least number of pixels that tell anything."""
 MAX_PIXELS = 200_000
 """Pixels that are looked at, evenly spread over the image; more say no more."""
 MAX_FAR_FRACTION = 0.2
@@ -31,7 +31,7 @@ MIN_OFFSET_PX = 0.25
 MAX_LEVEL_ERROR = 0.03
 """Fraction of white - black by which the mean of the fringes may miss the middle between black and white."""
 PHASE_BINS = 8
-"""Into which a period is divided, to see at which phases the mean of the fringes is off."""
+"""Number of parts into which a period is divided, to see at which phases the mean of the fringes is off."""
 MAX_PAIRS = 50_000
 """Pairs of neighbouring pixels, across and down each, that are looked at in every other order of the frames."""
 MIN_STEPS = 100
@@ -146,7 +146,7 @@ def level_contradiction(
 
 
 def _odd_frame(values: np.ndarray, members: list[np.ndarray], names: list[str]) -> str | None:
-    """What is wrong with one frame of fringes (N, n), as fractions from black to white; None if nothing stands out."""
+    """A clause on one wrong frame of fringes (N, n), fractions from black to white; None if nothing stands out."""
     for name, low, high in zip(names, *np.percentile(values, [5, 95], axis=1), strict=True):
         if high < 0.1 or low > 0.9:
             return f"frame {name} is {'black' if high < 0.1 else 'white'} everywhere"
@@ -269,7 +269,7 @@ def _that_differ(pairs: list[np.ndarray]) -> np.ndarray:
 
 
 def _better_order(across: np.ndarray, words: np.ndarray, bits: list[str]) -> str | None:
-    """What was wrong with the frames if another order of them brings neighbours nearer together, None if none does.
+    """The fault of the frames whose removal brings neighbours nearest together, None if none brings them nearer.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ def _apart(words: np.ndarray, step: int) -> np.ndarray:
 
 
 def _other_orders(bits: list[str]) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
-    """What may be wrong with the order of the frames, and Gray words as they are without it.
+    """Faults that the order of the frames may have, and how Gray words are without each.
 
     Parameters
     ----------
@@ -338,7 +338,7 @@ def _exchanged(i: int, j: int, words: np.ndarray) -> np.ndarray:
 
 
 def _repeated_bit(words: np.ndarray, bits: list[str]) -> str | None:
-    """That two bits always change together; None if no two do."""
+    """A clause that names two bits which always change together; None if no two do."""
     changed = words[0] ^ words[1]
     counts = [int(np.count_nonzero(changed & (1 << i))) for i in range(len(bits))]
     for i in range(len(bits)):

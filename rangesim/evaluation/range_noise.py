@@ -44,7 +44,7 @@ NOISE_SEEDS = (SEEDS - 3, SEEDS - 2, SEEDS - 1)
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Where the same decoder has no reading in repeated captures, each (h, w) bool.
+    """Pixels without a reading by the same decoder in repeated captures, each (h, w) bool.
 
     whole : of all samples, the range image itself. again : of all samples, with other noise of the detector.
     halves : of each half of the samples, with other noise of the detector.
@@ -55,7 +55,7 @@ class Repeats:
     halves: tuple[np.ndarray, np.ndarray]
 
     def completeness_error(self, mask: np.ndarray) -> float | None:
-        """How far the fraction of pixels of `mask` (h, w) bool with a reading may be from that of a pass of very many
+        """Bound on how far the fraction of pixels of `mask` (h, w) bool with a reading is from that of very many
         samples; None without pixels.
 
         A pixel that has a reading with half of the samples and none with all of them, or the other way round, is one

@@ -105,7 +105,7 @@ class Cost:
 
 
 class Rest(NamedTuple):
-    """What comes with the light transport.
+    """Cost of what comes with the light transport.
 
     seconds : of all that is done with its signals. held_bytes : of results that are held while light is traced.
     peak_bytes : of all arrays at once, while no light is traced. disk_bytes : of the results.
@@ -177,7 +177,7 @@ def _traced_pixels(experiment: Experiment, rig: Rig, instruments: Sequence[Instr
 
 
 def _rest_of_run(passes: Sequence[tuple[Rig, list[Instrument]]]) -> Rest:
-    """What a run does with its signals; the report holds frames and results of all passes at once."""
+    """Cost of what a run does with its signals; the report holds frames and results of all passes at once."""
     seconds, report = 0.0, 0
     for rig, instruments in passes:
         pixels = rig.camera.width * rig.camera.height
@@ -231,7 +231,7 @@ def _timed_trial(
 
 
 class _Took(NamedTuple):
-    """What some work took, in seconds.
+    """Time that some work took, in seconds.
 
     wall_s : on the clock. thread_s : of a processor, for this thread, which traces paths beside the others. process_s :
     of processors, for all threads of this process.
@@ -261,7 +261,7 @@ def _on_gpu() -> bool:
 
 
 def _machine() -> str:
-    """What the estimate assumes of the machine."""
+    """The machine that an estimate assumes, in words."""
     if _on_gpu():
         return "an idle GPU"
     return "1 idle core" if _cores() == 1 else f"{_cores()} idle cores"

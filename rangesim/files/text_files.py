@@ -84,13 +84,13 @@ def _is_container(value: Any) -> bool:
 
 
 class SearchPaths(Protocol):
-    """Where the files lie that an XML file names."""
+    """Folders in which the files lie that an XML file names."""
 
     def resolve(self, name: str) -> Path:
         """Path of the file of a name, which may be missing."""
 
     def within(self, folder: str, beside: Path) -> SearchPaths:
-        """These with a folder before them, as `<path value="folder"/>` in the file `beside` asks for."""
+        """Paths with a folder before those so far, as `<path value="folder"/>` in the file `beside` asks for."""
 
 
 def check_xml(path: str | Path, search: SearchPaths | None = None, ignored: tuple[str, ...] = ()) -> dict[str, str]:

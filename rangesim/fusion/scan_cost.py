@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan will cost: the light transport as of a run, and what becomes of its views, before the work starts."""
+"""Estimate of what a scan will cost, before it starts: light transport as of a run, and what is done with its views."""
 
 from __future__ import annotations
 
@@ -16,26 +16,33 @@ if TYPE_CHECKING:
     from rangesim.scene import Scene
 
 VOXEL_SPACINGS = 1.5
-"""Voxel over the distance between readings, if none is given."""
+"""Ratio of the voxel to the distance between readings, if none is given."""
 MAX_FINER = 10 * VOXEL_SPACINGS
 """That voxel over the least one that `fuse` accepts: a tenth of the distance between readings."""
 TRIANGLES = 4.0
-"""Of the surface at that voxel, per pixel of one view, however many views overlap: 3.1 to 3.9 of `matte`, `plane` and a
-part on a table, 160 to 640 pixels wide, 3 to 12 views."""
+"""Triangles of the surface at that voxel, per pixel of one view, however many views overlap: 3.1 to 3.9 of
+`matte`, `plane` and a part on a table, 160 to 640 pixels wide, 3 to 12 views."""
 VIEW_PIXEL_S = 4e-6
 """Seconds per pixel of each view: decoding 2e-6, fusion 1e-6, the file 1e-6."""
 TRIANGLE_S = 3e-6
 """Seconds per triangle and shape that it is compared with: 1.3e-6 of `plane`, 3.6e-6 of `matte`, on two cores."""
-ALIGNED_VIEW_S, ALIGNED_PAIR_S = 6.0, 0.3
-"""Seconds to find the pose of a view, and of each pair of views: 44 to 180 s of processor time of twelve, 240 of 24."""
+ALIGNED_VIEW_S = 6.0
+"""Seconds to find the pose of each view: with those of pairs 44 to 180 s of processor time for 12 views, 240 s
+for 24."""
+ALIGNED_PAIR_S = 0.3
+"""Seconds for each pair of views."""
 LIBRARY_BYTES = 2e8
-"""Of Open3D, which a run does without."""
+"""Memory that Open3D takes, which a run does without, in bytes."""
 VIEW_BYTES = 62
-"""Per pixel of each view: its range image 25, its truth 37."""
+"""Bytes per pixel of each view: 25 of its range image, 37 of its truth."""
 TRIANGLE_BYTES = 500
-"""Per triangle at the peak, voxels included: 1.2 GB in all at 1.2 million triangles."""
-FILE_BYTES, MESH_FILE_BYTES, REPORT_BYTES = 10, 19, 1.5e6
-"""On disk: per pixel of each view, compressed; per triangle of mesh.ply; the page."""
+"""Bytes per triangle at the peak, voxels included: 1.2 GB in all at 1.2 million triangles."""
+FILE_BYTES = 10
+"""Bytes on disk per pixel of each view, compressed."""
+MESH_FILE_BYTES = 19
+"""Bytes on disk per triangle of mesh.ply."""
+REPORT_BYTES = 1.5e6
+"""Bytes on disk of the page."""
 
 
 def estimate_scan_cost(settings: ScanSettings, scene: Scene, trial: bool = True) -> Cost:
@@ -57,7 +64,7 @@ def estimate_scan_cost(settings: ScanSettings, scene: Scene, trial: bool = True)
 
 
 def _rest(settings: ScanSettings, scene: Scene, rig: Rig, views: int) -> Rest:
-    """What becomes of the views."""
+    """Cost of what is done with the views."""
     pixels = rig.camera.width * rig.camera.height
     finer = 1.0
     if settings.voxel_m is not None:

@@ -160,7 +160,7 @@ def markdown(tables: Sequence[tuple[str, Rows]]) -> str:
 
 
 def failures_markdown(rows: Rows) -> str:
-    """What failed and why in Markdown, one row per material."""
+    """Table in Markdown of what failed and why, one row per material."""
     return markdown_table(["material", *FAILURE_HEADS], [[row["material"], *_failures(row)] for row in rows])
 
 
@@ -220,7 +220,7 @@ def seconds(value: float | None) -> str:
 
 
 def photons(per_pulse: PhotonsRecord) -> str:
-    """What a laser pulse brings, in the median pixel and in the brightest."""
+    """Photons that a laser pulse brings, in words: in the median pixel and in the brightest."""
     median, largest = (_amount(value) for value in (per_pulse.median, per_pulse.largest))
     return f"{median} photons detected per pulse in the median pixel, {largest} in the brightest"
 

@@ -93,7 +93,7 @@ def _best_error(real: Sequence[Measurement], names: dict[str, str]) -> str:
 
 
 def _most_right(real: Sequence[Measurement], names: dict[str, str]) -> str:
-    """By the pixels with a right reading: who measures everywhere, but wrong, is not complete."""
+    """Sentence that ranks sensors by right readings: one that measures everywhere, but wrong, is not complete."""
     failed = [(_total(m.rows)["failed"], names[m.name]) for m in real if _total(m.rows)["failed"] is not None]
     limit = _glued(f"{1e3 * OUTLIER_M:g} mm")
     entries = [(name, f"{_percent(1.0 - f)} of the pixels") for f, name in sorted(failed)]

@@ -236,7 +236,7 @@ class _SearchPaths:
         return Path(str(self.paths.resolve(name)))
 
     def within(self, folder: str, beside: Path) -> _SearchPaths:
-        """These with a folder before them: one beside the file, else one in the paths so far."""
+        """Paths with a folder before those so far: one beside the file, else one in these."""
         near, paths = beside.parent / folder, mi.FileResolver(self.paths)
         paths.prepend(str(near if os.path.exists(near) else self.resolve(folder)))
         return _SearchPaths(paths)

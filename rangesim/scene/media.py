@@ -96,7 +96,7 @@ def _crossings(scene: Any, place: np.ndarray, directions: np.ndarray) -> Iterato
 
 
 def inside_out(scene: Any, place: np.ndarray, directions: np.ndarray) -> tuple[str, str] | None:
-    """Which medium the way from a place in air goes through although no body that holds it was entered.
+    """A medium that the way from a place in air goes through although no body that holds it was entered.
 
     Parameters
     ----------

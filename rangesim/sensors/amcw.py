@@ -121,7 +121,7 @@ class AmcwToF(Sensor):
         return {"amcw": cls()}
 
     def is_beyond_range(self, path_length_m: np.ndarray) -> np.ndarray:
-        """Beyond the last of the wraps that are searched, which ends at `searched_m` or after it."""
+        """Path lengths beyond the last of the wraps that are searched, which ends at `searched_m` or after it."""
         longest_m = min(self.wraps * SPEED_OF_LIGHT / max(self.modulation_hz), 2 * self.unambiguous_range_m)
         return np.asarray(path_length_m > longest_m)
 
