@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.light_transport.transport import transport as transport
     from rangesim.light_transport.transport_settings import TransportSettings as TransportSettings
     from rangesim.point_cloud import PointCloud as PointCloud
+    from rangesim.report import errors_markdown as errors_markdown
+    from rangesim.report import failures_markdown as failures_markdown
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
     from rangesim.rig import Rig as Rig
@@ -68,8 +70,10 @@ _HOME = {
     "TransportSettings": "rangesim.light_transport.transport_settings",
     "compare": "rangesim.evaluation.comparison",
     "decode": "rangesim.decoding",
+    "errors_markdown": "rangesim.report",
     "explain": "rangesim.causes",
     "expose": "rangesim.capture.exposure",
+    "failures_markdown": "rangesim.report",
     "import_capture": "rangesim.capture.capture_files",
     "load_calibration": "rangesim.rig.calibration_files",
     "load_capture": "rangesim.capture.capture_files",

@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from rangesim import limits
 from rangesim.errors import TruncationWarning
 from rangesim.experiment import Experiment
 from rangesim.experiment.instrument import Instrument
+from rangesim.settings import limits
 
 if TYPE_CHECKING:
     from rangesim.rig import Rig

@@ -8,12 +8,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rangesim import limits
 from rangesim.electronics.ambient import Ambient
 from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument, instrument_from_dict
 from rangesim.files.settings_files import load_settings
 from rangesim.motion import Motion
 from rangesim.motion.track import motion_from_dict
+from rangesim.settings import limits
 from rangesim.settings.bounds import Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 from rangesim.settings.seeds import check_seed

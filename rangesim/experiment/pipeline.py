@@ -294,6 +294,6 @@ def _fraction(number: int, passes: int, of_pass: float) -> float:
 
 
 def _write_comparison(folder: Path, tables: list[tuple[str, list[dict[str, Any]]]]) -> None:
-    from rangesim.report.tables import markdown
+    from rangesim.report.tables import comparison_markdown
 
-    (folder / "comparison.md").write_text(markdown(tables), encoding="utf-8")
+    (folder / "comparison.md").write_text(comparison_markdown(tables), encoding="utf-8")

@@ -20,8 +20,8 @@ from typing import IO, Any
 import numpy as np
 
 from pcgraph.plain_files import check_file, sealed, unsealed, write_file
-from rangesim import limits
 from rangesim.errors import FileFormatError
+from rangesim.settings import limits
 from rangesim.settings.config import brief, shown
 
 Check = Callable[[str, str, tuple[int, ...], "np.dtype[Any]"], None]

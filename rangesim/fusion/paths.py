@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.rig import Array, look_at, pose
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Coordinate, Metres, check_fields, whole
 from rangesim.settings.config import Named, shown, to_dict
 from rangesim.settings.seeds import check_seed

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangesim import limits
 from rangesim.rig.distortion import distort, fold_radius2, undistort
+from rangesim.settings import limits
 from rangesim.settings.bounds import (
     MAX_COORDINATE_M,
     Bounds,

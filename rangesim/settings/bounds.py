@@ -18,7 +18,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from rangesim import limits
+from rangesim.settings import limits
 from rangesim.settings.config import nearest, shown
 
 
@@ -27,7 +27,8 @@ class Bounds:
     """The closed interval in which a number has to lie.
 
     words : what the number has to be, for messages: "positive".
-    or_zero : whether 0 is accepted too. limit : name of the entry of `rangesim.limits` that is the upper bound.
+    or_zero : whether 0 is accepted too.
+    limit : name of the entry of `rangesim.settings.limits` that is the upper bound.
     """
 
     words: str
@@ -47,7 +48,7 @@ class Bounds:
 
 
 def whole(low: int, limit: str = "") -> Bounds:
-    """Bounds of a whole number: at least `low`, at most the entry `limit` of `rangesim.limits`."""
+    """Bounds of a whole number: at least `low`, at most the entry `limit` of `rangesim.settings.limits`."""
     return Bounds(f"a whole number of at least {low}", low, limit=limit)
 
 

@@ -17,7 +17,7 @@ from fuzz.cloud_files import lies
 from fuzz.hostile import Made
 from fuzz.inputs import Input
 from fuzz.mutation import MAX_BYTES, mutate, mutate_arguments
-from rangesim import limits
+from rangesim.settings import limits
 
 Arguments = tuple[str, ...]
 
