@@ -13,13 +13,10 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from typing import Any
 
     from rangesim.capture import Capture as Capture
-    from rangesim.capture.capture_files import import_capture as import_capture
-    from rangesim.capture.capture_files import load_capture as load_capture
     from rangesim.capture.exposure import expose as expose
     from rangesim.causes import explain as explain
     from rangesim.decoding import decode as decode
     from rangesim.decoding.range_image import RangeImage as RangeImage
-    from rangesim.decoding.range_image_files import load_range_image as load_range_image
     from rangesim.decoding.status import Status as Status
     from rangesim.electronics.ambient import Ambient as Ambient
     from rangesim.electronics.detector import Detector as Detector
@@ -30,6 +27,13 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.report import errors_markdown as errors_markdown
     from rangesim.report import failures_markdown as failures_markdown
+    from rangesim.results.capture_files import import_capture as import_capture
+    from rangesim.results.capture_files import load_capture as load_capture
+    from rangesim.results.capture_files import save_capture as save_capture
+    from rangesim.results.range_image_files import load_range_image as load_range_image
+    from rangesim.results.range_image_files import save_range_image as save_range_image
+    from rangesim.results.signals_files import load_signals as load_signals
+    from rangesim.results.signals_files import save_signals as save_signals
     from rangesim.rig import Intrinsics as Intrinsics
     from rangesim.rig import Lens as Lens
     from rangesim.rig import Rig as Rig
@@ -45,7 +49,6 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.sensors import StructuredLight as StructuredLight
     from rangesim.signals import Signals as Signals
     from rangesim.signals import StillSignals as StillSignals
-    from rangesim.signals.signals_files import load_signals as load_signals
 
 _HOME = {
     "Ambient": "rangesim.electronics.ambient",
@@ -74,13 +77,16 @@ _HOME = {
     "explain": "rangesim.causes",
     "expose": "rangesim.capture.exposure",
     "failures_markdown": "rangesim.report",
-    "import_capture": "rangesim.capture.capture_files",
+    "import_capture": "rangesim.results.capture_files",
     "load_calibration": "rangesim.rig.calibration_files",
-    "load_capture": "rangesim.capture.capture_files",
-    "load_range_image": "rangesim.decoding.range_image_files",
+    "load_capture": "rangesim.results.capture_files",
+    "load_range_image": "rangesim.results.range_image_files",
     "load_scene": "rangesim.scene",
-    "load_signals": "rangesim.signals.signals_files",
+    "load_signals": "rangesim.results.signals_files",
     "look_at": "rangesim.rig",
+    "save_capture": "rangesim.results.capture_files",
+    "save_range_image": "rangesim.results.range_image_files",
+    "save_signals": "rangesim.results.signals_files",
     "transport": "rangesim.light_transport.transport",
 }
 

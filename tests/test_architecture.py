@@ -138,7 +138,7 @@ def test_no_imports_go_in_a_circle() -> None:
     room = {module: module.split(".")[1] for module in files}
     rooms = nx.DiGraph([(room[a], room[b]) for a, b in files.edges if room[a] != room[b]])
     circles = [sorted(c) for c in nx.strongly_connected_components(rooms) if len(c) > 1]
-    assert circles == [["capture", "decoding", "sensors"]]  # what a capture's files hold is a sensor
+    assert circles == []
 
 
 @pytest.mark.parametrize("path", modules("rangesim"), ids=relative)
@@ -345,6 +345,9 @@ def test_the_public_surface_is_this() -> None:
         "load_scene",
         "load_signals",
         "look_at",
+        "save_capture",
+        "save_range_image",
+        "save_signals",
         "transport",
     ]
 

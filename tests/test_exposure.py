@@ -12,7 +12,6 @@ import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
 from rangesim.capture import BRIGHT_PERCENTILE
-from rangesim.capture.capture_files import load_capture
 from rangesim.capture.exposure import TARGET_FRACTION, expose, photons_per_pulse
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
@@ -20,6 +19,7 @@ from rangesim.errors import RangesimWarning
 from rangesim.experiment.instrument import Instrument
 from rangesim.experiment.pipeline import measure
 from rangesim.response import SPEED_OF_LIGHT
+from rangesim.results.capture_files import load_capture
 from rangesim.rig import Intrinsics
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, Sensor, StructuredLight
 from rangesim.settings.config import from_dict, to_dict

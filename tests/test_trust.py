@@ -25,9 +25,9 @@ import pcgraph.cli
 import rangesim.cli
 import rangesim.report
 from pcgraph.output import MANIFEST, STAGING
-from rangesim.capture.capture_files import SIDECAR
 from rangesim.experiment.result_files import Result
 from rangesim.report import render_report
+from rangesim.results.capture_files import SIDECAR
 
 PLANE = str(ROOT / "scenes" / "plane.xml")
 TINY = ("--sensor", "ideal-tof", "--width", "32", "--height", "24", "--spp", "1", "--photons", "0")

@@ -99,7 +99,7 @@ def decode_command(
 def _refuse_what_would_be_ignored(context: typer.Context, capture: Path, calibration: Path | None) -> None:
     """ValueError if an option was given that has no effect on this input."""
     from rangesim.calibration.opencv_files import SUFFIXES
-    from rangesim.capture.capture_files import SIDECAR
+    from rangesim.results.capture_files import SIDECAR
 
     given = {name for name in context.params if _from_command_line(context, name)}
     if (capture / SIDECAR).is_file() and (surplus := _options(OF_BARE_IMAGES, given)):
@@ -126,8 +126,8 @@ def _options(names: tuple[str, ...], given: set[str]) -> str:
 def load_frames(folder: Path, sensor: Sensor | None, bits: int | None) -> Capture:
     """The capture of a directory with a sidecar, or of bare images."""
     import rangesim
-    from rangesim.capture.capture_files import SIDECAR
     from rangesim.errors import FileFormatError
+    from rangesim.results.capture_files import SIDECAR
 
     if not folder.is_dir():
         raise FileFormatError(f"{folder} is no directory; expected a capture or a folder of images.")

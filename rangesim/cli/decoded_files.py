@@ -16,6 +16,7 @@ from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
 from rangesim.files.schema import write_json
 from rangesim.report import figures, palette
+from rangesim.results.range_image_files import save_range_image
 from rangesim.settings.config import to_dict
 
 SIDECAR = "decoded.json"
@@ -34,7 +35,7 @@ def write_decoded(image: RangeImage, capture: Capture, directory: Path) -> None:
     outcome = {"status": status_fractions(image), "likely_cause": likely_cause(image, capture)}
     with new_directory(directory, DECODED) as folder:
         write_json(folder / SIDECAR, {"format": FORMAT, **settings, **outcome})
-        image.save(folder / "range.npz")
+        save_range_image(image, folder / "range.npz")
         for name, uri in _pictures(image).items():
             (folder / f"{name}.png").write_bytes(base64.b64decode(uri.partition(",")[2]))
         if image.camera is not None and image.valid.any():

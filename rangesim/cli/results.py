@@ -80,11 +80,11 @@ def verify_command(
       rangesim verify out/tabletop
     """
     from pcgraph.output import verify_directory
-    from rangesim.capture.capture_files import CAPTURE
     from rangesim.cli.decoded_files import DECODED
     from rangesim.errors import FileFormatError
     from rangesim.experiment.result_files import RESULT
     from rangesim.fusion.scan_run import SCAN
+    from rangesim.results.capture_files import CAPTURE
 
     kinds = (RESULT, SCAN, CAPTURE, DECODED)
     kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)

@@ -16,7 +16,6 @@ import numpy as np
 import rangesim
 from pcgraph.output import new_directory
 from rangesim.capture import Capture
-from rangesim.capture.capture_files import write_capture
 from rangesim.capture.exposure import photons_per_pulse, warn_of_overexposure
 from rangesim.causes import explain
 from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
@@ -37,8 +36,10 @@ from rangesim.experiment.result_files import (
 from rangesim.files.array_files import write_arrays
 from rangesim.files.schema import write_record
 from rangesim.motion import transport_moving
+from rangesim.results.capture_files import write_capture
+from rangesim.results.range_image_files import save_range_image
+from rangesim.results.signals_files import write_pass
 from rangesim.settings.seeds import derived_seed
-from rangesim.signals.signals_files import write_pass
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
@@ -175,7 +176,7 @@ def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, a
     enough = bool(cloud.valid.sum() >= MIN_POINTS)
 
     def write_readings() -> None:
-        image.save(folder / "range.npz")
+        save_range_image(image, folder / "range.npz")
         save_causes(causes, folder / "causes.npz")
         save_rows(comparison.outlier_m, rows, folder)
         if enough:

@@ -25,10 +25,8 @@ import numpy as np
 
 from pcgraph.output import DirectoryKind, recover
 from rangesim.capture import Capture
-from rangesim.capture.capture_files import load_capture
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
-from rangesim.decoding.range_image_files import load_range_image
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
@@ -46,10 +44,12 @@ from rangesim.files.schema import (
     read_record,
     write_record,
 )
+from rangesim.results.capture_files import load_capture
+from rangesim.results.range_image_files import load_range_image
+from rangesim.results.signals_files import read_pass
 from rangesim.rig import Rig
 from rangesim.settings.config import ShortRepr, from_dict, shown
 from rangesim.signals import ALL, EnergySplit, GroundTruth
-from rangesim.signals.signals_files import read_pass
 
 SETTINGS = "experiment.json"
 FORMAT = "rangesim-result"

@@ -34,6 +34,7 @@ from rangesim.fusion.seen_volume import Occupancy, occupancy
 from rangesim.fusion.truncated_average import FusedSurface, fuse
 from rangesim.fusion.views import Scan, poses_of, taken
 from rangesim.fusion.voxel_grid import VoxelGrid
+from rangesim.results.range_image_files import save_range_image
 from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
@@ -240,7 +241,7 @@ def write_scan(result: ScanResult, folder: Path) -> None:
     for number, image in enumerate(result.scan.images, 1):
         place = folder / f"view_{number:02d}"
         place.mkdir()
-        image.save(place / "range.npz")
+        save_range_image(image, place / "range.npz")
     (folder / "report.html").write_text(render_scan_page(result), encoding="utf-8")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -179,17 +178,3 @@ class StillSignals(Signals):
             got = f"{frames.shape} and {frames.dtype}" if isinstance(frames, np.ndarray) else type(frames).__name__
             raise ValueError(f"expected frames of {sensor.type_name} of shape {expected} and type float32, got {got}.")
         return frames
-
-    def save(self, path: str | Path) -> None:
-        """Write everything to a compressed .npz file, which `rangesim.load_signals` reads back equal.
-
-        Raises
-        ------
-        ValueError
-            A response holds arrays (`Images`).
-        FileFormatError
-            The place cannot be written.
-        """
-        from rangesim.signals.signals_files import save_signals
-
-        save_signals(self, path)

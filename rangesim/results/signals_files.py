@@ -15,7 +15,7 @@ from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
-from rangesim.signals.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
+from rangesim.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
 
 FORMAT = "rangesim-signals"
 FORMAT_VERSION = 1
@@ -41,7 +41,15 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:
-    """Write signals with their channels and sampling error; see `StillSignals.save`."""
+    """Write signals with their channels and sampling error to a compressed .npz file; `load_signals` reads them back.
+
+    Raises
+    ------
+    ValueError
+        A response holds arrays (`Images`).
+    FileFormatError
+        The place cannot be written.
+    """
     responses = list(signals.channels)
     settings = {
         "format": FORMAT,
@@ -58,7 +66,7 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
 
 
 def load_signals(path: str | Path) -> StillSignals:
-    """The signals that `StillSignals.save` wrote: `expose` makes captures of them as of those traced.
+    """Signals that `save_signals` wrote; `expose` makes captures of them as of traced ones.
 
     Raises
     ------
