@@ -24,9 +24,9 @@ from small_result import ROOT, small_result
 import pcgraph.cli
 import rangesim.cli
 import rangesim.report
-from pcgraph.output import MANIFEST, STAGING
 from rangesim.capture.capture_files import SIDECAR
 from rangesim.experiment.result_files import Result
+from rangesim.files.result_directories import MANIFEST, STAGING
 from rangesim.report import render_report
 
 PLANE = str(ROOT / "scenes" / "plane.xml")
