@@ -15,7 +15,7 @@ import typer
 import pcgraph
 from pcgraph.errors import CloudReadError, CloudWriteError, PcgraphError, one_line, without_long_words
 from pcgraph.families import member
-from pcgraph.plain_files import said
+from pcgraph.plumbing.plain_files import said
 
 if TYPE_CHECKING:
     import numpy as np
@@ -219,7 +219,7 @@ def _segmented(path: Path, cloud: Cloud, **settings: Any) -> Segmentation:
 
 def _write(targets: list[Path], cloud: Cloud, result: Segmentation, labels: NDArray[np.int32]) -> None:
     from pcgraph.io.segmentation_files import encode_segmentation
-    from pcgraph.plain_files import write_files
+    from pcgraph.plumbing.plain_files import write_files
 
     contents = {target: encode_segmentation(target.name, cloud, result, labels) for target in targets}
     _check_targets(targets)  # the segmentation took its time

@@ -12,7 +12,7 @@ from typing import Any
 
 import pcgraph
 from pcgraph.errors import PcgraphError
-from pcgraph.python_files import run_python_file
+from pcgraph.plumbing.python_files import run_python_file
 
 _SEPARATOR = ".py:"
 

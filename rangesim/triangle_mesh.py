@@ -128,7 +128,7 @@ class TriangleMesh(ShortRepr):
         FileFormatError
             The place cannot be written.
         """
-        from pcgraph.plain_files import write_file
+        from pcgraph.plumbing.plain_files import write_file
         from rangesim.errors import FileFormatError
 
         path = Path(path)

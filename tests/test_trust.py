@@ -24,8 +24,8 @@ from small_result import ROOT, small_result
 import pcgraph.cli
 import rangesim.cli
 import rangesim.report
-from pcgraph.output import MANIFEST, STAGING
 from rangesim.experiment.result_files import Result
+from rangesim.files.result_directories import MANIFEST, STAGING
 from rangesim.report import render_report
 from rangesim.results.capture_files import SIDECAR
 

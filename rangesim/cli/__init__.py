@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 import rangesim
-from pcgraph.plain_files import said
+from pcgraph.plumbing.plain_files import said
 from rangesim.cli.calibrate import calibrate_command
 from rangesim.cli.decode import decode_command
 from rangesim.cli.results import compare_command, report_command, verify_command

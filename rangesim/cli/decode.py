@@ -75,9 +75,9 @@ def decode_command(
       rangesim decode images --projector 1024x768 --calibration board.xml --code-step 2 --out out/board
     """
     import rangesim
-    from pcgraph.output import check_directory
     from rangesim.cli.decode_summary import summary
     from rangesim.cli.decoded_files import DECODED, write_decoded
+    from rangesim.files.result_directories import check_directory
 
     _refuse_what_would_be_ignored(context, capture, calibration)
     say_where(out, check_directory(out, DECODED, inputs=[capture]))
@@ -169,7 +169,7 @@ def _calibrated(capture: Capture, calibration: Path, code_step: int, unit_m: flo
 
 def _is_opencv(calibration: Path) -> bool:
     """Whether a file is one that `rangesim calibrate` writes for OpenCV; another .xml is procam-calibration's."""
-    from pcgraph.plain_files import read_file
+    from pcgraph.plumbing.plain_files import read_file
     from rangesim.errors import FileFormatError
 
     if calibration.suffix.lower() in (".yml", ".yaml"):

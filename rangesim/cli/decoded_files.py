@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 import rangesim
-from pcgraph.output import DirectoryKind, new_directory
 from rangesim.capture import Capture
 from rangesim.cli.decode_summary import likely_cause, status_fractions
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
+from rangesim.files.result_directories import DirectoryKind, new_directory
 from rangesim.files.schema import write_json
 from rangesim.report import figures, palette
 from rangesim.results.range_image_files import save_range_image

@@ -52,8 +52,8 @@ def report_command(
 
       rangesim report out/tabletop
     """
-    from pcgraph.output import replace_listed_file
     from rangesim.experiment.result_files import RESULT, load_result, read_settings
+    from rangesim.files.result_directories import replace_listed_file
     from rangesim.report import render_report
     from rangesim.sensors import sensor_of
 
@@ -79,10 +79,10 @@ def verify_command(
 
       rangesim verify out/tabletop
     """
-    from pcgraph.output import verify_directory
     from rangesim.cli.decoded_files import DECODED
     from rangesim.errors import FileFormatError
     from rangesim.experiment.result_files import RESULT
+    from rangesim.files.result_directories import verify_directory
     from rangesim.fusion.scan_run import SCAN
     from rangesim.results.capture_files import CAPTURE
 

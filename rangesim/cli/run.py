@@ -109,9 +109,9 @@ def run_command(
         )
     if noise_free:
         experiment = replace(experiment, instruments=tuple(replace(i, noise=False) for i in experiment.instruments))
-    from pcgraph.output import check_directory
     from rangesim.experiment import pipeline
     from rangesim.experiment.result_files import RESULT
+    from rangesim.files.result_directories import check_directory
 
     if estimate or out is None:
         cost = pipeline.estimate(experiment)

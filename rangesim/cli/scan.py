@@ -74,7 +74,7 @@ def scan_command(
     """
     if out is None and not estimate:
         raise typer.BadParameter("expected --out DIRECTORY, unless --estimate is given.", param_hint="--out")
-    from pcgraph.output import check_directory
+    from rangesim.files.result_directories import check_directory
     from rangesim.fusion.scan_run import SCAN, estimate_scan, run_scan
 
     given: dict[str, Any] = {"spp": spp, "width": width, "height": height, "seed": seed, "voxel_m": voxel}

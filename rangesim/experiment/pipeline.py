@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rangesim
-from pcgraph.output import new_directory
 from rangesim.capture import Capture
 from rangesim.capture.exposure import photons_per_pulse, warn_of_overexposure
 from rangesim.causes import explain
@@ -34,6 +33,7 @@ from rangesim.experiment.result_files import (
     save_rows,
 )
 from rangesim.files.array_files import write_arrays
+from rangesim.files.result_directories import new_directory
 from rangesim.files.schema import write_record
 from rangesim.motion import transport_moving
 from rangesim.results.capture_files import write_capture
@@ -67,7 +67,7 @@ def run(
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
     The files appear when all is done; a failure leaves nothing behind. An older result of that name is replaced; files
-    that somebody else put there stay. See `pcgraph.output`.
+    that somebody else put there stay. See `rangesim.files.result_directories`.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def run(
     ------
     ValueError, FileFormatError, EnvironmentProblem
         A setting out of range, more memory than there is, a scene that cannot be loaded, no suitable LLVM, or an `out`
-        that cannot take a result (see `pcgraph.output.check_directory`).
+        that cannot take a result (see `rangesim.files.result_directories.check_directory`).
 
     Warns
     -----

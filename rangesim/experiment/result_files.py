@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of an experiment as a directory, and back.
 
-DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.output`
+DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
     experiment.json      resolved settings, versions, and which instruments share which pass
     pass_1.npz           energy split and ground truth of each transport pass
     comparison.md        statistics of all instruments
@@ -23,13 +23,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from pcgraph.output import DirectoryKind, recover
 from rangesim.capture import Capture
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
+from rangesim.files.result_directories import DirectoryKind, recover
 from rangesim.files.schema import (
     ArraySpec,
     Count,

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.plain_files import DISK, check_file
+from pcgraph.plumbing.plain_files import DISK, check_file
 from rangesim.errors import FileFormatError
 from rangesim.files.utf8_names import utf8_name
 from rangesim.settings import limits

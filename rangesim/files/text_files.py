@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 from xml.parsers import expat
 
-from pcgraph.plain_files import check_file
+from pcgraph.plumbing.plain_files import check_file
 from rangesim.errors import FileFormatError
 from rangesim.settings import limits
 from rangesim.settings.config import brief

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole scan: scene -> views -> poses -> surface -> errors, what was seen, report; and its directory of results.
 
-DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.output`
+DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
     scan.json            resolved settings, versions, statistics of surface, shapes and views
     mesh.ply             the fused surface, metres, world
     poses.json           T_world_camera (n, 4, 4) of the views: as fused, and true
@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rangesim
-from pcgraph.output import DirectoryKind, new_directory
 from rangesim.errors import FileFormatError
+from rangesim.files.result_directories import DirectoryKind, new_directory
 from rangesim.files.schema import write_json
 from rangesim.fusion.mesh_error import SurfaceError, distances_to, surface_error
 from rangesim.fusion.multiway_registration import PoseErrors, align, check_first_pair, pose_errors
@@ -109,7 +109,7 @@ def run_scan(
 ) -> ScanResult:
     """Carry out a scan and write its results, with `report.html`, to the directory `out`.
 
-    The files appear when all is done; a failure leaves nothing behind. See `pcgraph.output`.
+    The files appear when all is done; a failure leaves nothing behind. See `rangesim.files.result_directories`.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def run_scan(
     ------
     ValueError, FileFormatError, EnvironmentProblem
         A setting out of range, more memory than there is, a scene that cannot be loaded, poses that cannot be found, no
-        surface, or an `out` that cannot take a result (see `pcgraph.output.check_directory`).
+        surface, or an `out` that cannot take a result (see `rangesim.files.result_directories.check_directory`).
     """
     with new_directory(out, SCAN, inputs=[settings.scene]) as folder:
         result = carry_out(settings, progress, scene, announce)

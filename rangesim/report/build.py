@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from pcgraph.plain_files import write_file
+from pcgraph.plumbing.plain_files import write_file
 from rangesim.errors import FileFormatError
 from rangesim.experiment.result_files import Measurement, Result
 from rangesim.report import cloud, figures, palette, tables

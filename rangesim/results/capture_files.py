@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.output import DirectoryKind, new_directory, recover, write_manifest
 from rangesim import __version__
 from rangesim.capture import DTYPES, Capture
 from rangesim.electronics.ambient import Ambient
 from rangesim.electronics.detector import PhotoDetector
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import SUFFIXES, read_stack, write_grey
+from rangesim.files.result_directories import DirectoryKind, new_directory, recover, write_manifest
 from rangesim.files.schema import write_json
 from rangesim.files.text_files import read_json
 from rangesim.rig import Rig

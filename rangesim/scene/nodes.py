@@ -12,7 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from pcgraph.plain_files import check_file
+from pcgraph.plumbing.plain_files import check_file
 from rangesim.errors import FileFormatError
 from rangesim.scene.materials import MATERIAL_CLASSES
 from rangesim.settings import limits
