@@ -25,10 +25,10 @@ import trimesh
 
 from rangesim import StructuredLight, load_scene
 from rangesim.environment.backend import select_variant
-from rangesim.experiment.instrument import Instrument
 from rangesim.fusion import Dome, Turntable, align, fuse, pose_errors, scan, surface_error
 from rangesim.fusion.mesh_error import distances_to
 from rangesim.fusion.views import Scan
+from rangesim.instrument.instrument import Instrument
 from rangesim.scene.triangles import true_surfaces
 from rangesim.triangle_mesh import TriangleMesh
 

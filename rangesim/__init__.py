@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.electronics.detector import Detector as Detector
     from rangesim.electronics.spad import SpadDetector as SpadDetector
     from rangesim.evaluation.comparison import compare as compare
-    from rangesim.light_transport.transport import transport as transport
+    from rangesim.instrument.transport import transport as transport
     from rangesim.light_transport.transport_settings import TransportSettings as TransportSettings
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.report import errors_markdown as errors_markdown
@@ -87,7 +87,7 @@ _HOME = {
     "save_capture": "rangesim.results.capture_files",
     "save_range_image": "rangesim.results.range_image_files",
     "save_signals": "rangesim.results.signals_files",
-    "transport": "rangesim.light_transport.transport",
+    "transport": "rangesim.instrument.transport",
 }
 
 __all__ = sorted(_HOME)

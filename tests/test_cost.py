@@ -17,7 +17,7 @@ from rangesim import load_scene
 from rangesim.cli import main
 from rangesim.experiment import Experiment, cost, pipeline
 from rangesim.experiment.cost import Cost, available_memory_bytes, estimate_cost
-from rangesim.experiment.instrument import instrument
+from rangesim.instrument.instrument import instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
 from rangesim.sensors import DirectToF
 from rangesim.settings import limits

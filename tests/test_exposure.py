@@ -16,8 +16,8 @@ from rangesim.capture.exposure import TARGET_FRACTION, expose, photons_per_pulse
 from rangesim.electronics.detector import Detector, PhotoDetector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import RangesimWarning
-from rangesim.experiment.instrument import Instrument
 from rangesim.experiment.pipeline import measure
+from rangesim.instrument.instrument import Instrument
 from rangesim.response import SPEED_OF_LIGHT
 from rangesim.results.capture_files import load_capture
 from rangesim.rig import Intrinsics

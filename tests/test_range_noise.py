@@ -14,8 +14,8 @@ from rangesim import AmcwToF, Capture, IdealToF, Scene, StructuredLight, compare
 from rangesim.causes import explain
 from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import Repeats, range_noise, robust_sigma, warn_of_sampling
-from rangesim.experiment.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
+from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.loop import SampleAllocation
 from rangesim.light_transport.sampling_error import Halves
 

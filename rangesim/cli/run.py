@@ -15,7 +15,7 @@ from rangesim.files.bundled_scenes import scene_names
 
 if TYPE_CHECKING:
     from rangesim.experiment import Experiment
-    from rangesim.experiment.instrument import Instrument
+    from rangesim.instrument.instrument import Instrument
 
 
 def run_command(
@@ -165,7 +165,7 @@ def _say_what_measured_nothing(out: Path, scene: str) -> None:
 
 def _instruments(sensors: list[str]) -> tuple[Instrument, ...]:
     """An instrument for each sensor; those of files are called by their NAME there where their types are the same."""
-    from rangesim.experiment.instrument import instrument
+    from rangesim.instrument.instrument import instrument
     from rangesim.sensors import is_file_name
 
     found = [instrument(name) for name in sensors]

@@ -104,8 +104,8 @@ def scan_command(
 
 
 def _settings(scene: Path | None, config: Path | None, given: dict[str, Any], sensor: str | None) -> ScanSettings:
-    from rangesim.experiment.instrument import instrument
     from rangesim.fusion.scan_settings import ScanSettings, load_scan_settings
+    from rangesim.instrument.instrument import instrument
 
     if config is None and scene is None:
         raise typer.BadParameter("expected a scene or --config FILE.", param_hint="SCENE")

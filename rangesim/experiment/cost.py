@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rangesim.errors import TruncationWarning
 from rangesim.experiment import Experiment
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.instrument import Instrument
 from rangesim.settings import limits
 
 if TYPE_CHECKING:

@@ -21,7 +21,6 @@ from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
 from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
 from rangesim.experiment import Experiment
 from rangesim.experiment.cost import Cost, estimate_cost
-from rangesim.experiment.instrument import Instrument
 from rangesim.experiment.provenance import provenance
 from rangesim.experiment.result_files import (
     RESULT,
@@ -35,6 +34,7 @@ from rangesim.experiment.result_files import (
 from rangesim.files.array_files import write_arrays
 from rangesim.files.result_directories import new_directory
 from rangesim.files.schema import write_record
+from rangesim.instrument.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.results.capture_files import write_capture
 from rangesim.results.range_image_files import save_range_image

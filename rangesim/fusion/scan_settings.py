@@ -9,9 +9,9 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rangesim.electronics.ambient import Ambient
-from rangesim.experiment.instrument import Instrument, instrument, instrument_from_dict
 from rangesim.files.settings_files import load_settings
 from rangesim.fusion.paths import Path, Turntable
+from rangesim.instrument.instrument import Instrument, instrument, instrument_from_dict
 from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict

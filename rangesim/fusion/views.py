@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim.decoding.range_image import RangeImage
-from rangesim.experiment.instrument import Instrument
 from rangesim.fusion.paths import Path, PoseList, Viewpoint
+from rangesim.instrument.instrument import Instrument
 from rangesim.rig import Array, Rig, pose
 from rangesim.sensor import Sensor
 from rangesim.settings.config import ShortRepr, shown

@@ -70,9 +70,9 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
     return Truncation(*(float(x) for x in parts / total)) if total else Truncation(0.0 * by_depth, 0.0, 0.0)
 
 
-def warn_of_truncation(truncation: Truncation, max_depth: int, of: str, stacklevel: int) -> None:
+def warn_of_truncation(truncation: Truncation | None, max_depth: int, of: str, stacklevel: int) -> None:
     """Warn if a pass left out more than `WORTH_A_WARNING`; `of` says of which camera, if there are several."""
-    if truncation.total <= WORTH_A_WARNING:
+    if truncation is None or truncation.total <= WORTH_A_WARNING:
         return
     why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
     if not truncation.depth > truncation.chains + truncation.photons:
