@@ -101,7 +101,7 @@ def _checked(hint: Any, value: Any, name: str) -> Any:
         hint, *others = (arg for arg in get_args(hint) if arg is not type(None))
         for other in others:
             is_literal = get_origin(other) is typing.Literal
-            if (isinstance(value, str) and value in get_args(other)) if is_literal else type(value) is other:
+            if (isinstance(value, str) and value in get_args(other)) if is_literal else _is_member(value, other):
                 return value
     bounds = None
     if get_origin(hint) is Annotated:
@@ -122,6 +122,11 @@ def _checked(hint: Any, value: Any, name: str) -> Any:
         words = {bool: "true or false", str: "a text"}.get(hint, f"a {hint.__name__}")
         raise ValueError(f"expected {name} to be {words}, got {shown(value)}.")
     return value
+
+
+def _is_member(value: Any, kind: Any) -> bool:
+    """Whether a value is of a class or of a subclass; a bool is no number."""
+    return isinstance(kind, type) and isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
 
 
 def _number(kind: type, value: Any, name: str, bounds: Bounds | None) -> Any:
