@@ -23,12 +23,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from rangesim import StructuredLight, load_scene
+from rangesim import StructuredLight, load_scene, scan
 from rangesim.environment.backend import select_variant
-from rangesim.fusion import Dome, Turntable, align, fuse, pose_errors, scan, surface_error
+from rangesim.experiment import Dome, Turntable
+from rangesim.fusion import align, fuse, pose_errors, surface_error
 from rangesim.fusion.mesh_error import distances_to
-from rangesim.fusion.views import Scan
 from rangesim.instrument.instrument import Instrument
+from rangesim.pipeline.views import Scan
 from rangesim.scene.triangles import true_surfaces
 from rangesim.triangle_mesh import TriangleMesh
 

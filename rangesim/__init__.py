@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # what editors and type checkers see of `_HOME`
     from rangesim.evaluation.comparison import compare as compare
     from rangesim.instrument.transport import transport as transport
     from rangesim.light_transport.transport_settings import TransportSettings as TransportSettings
+    from rangesim.pipeline.views import scan as scan
     from rangesim.point_cloud import PointCloud as PointCloud
     from rangesim.report import errors_markdown as errors_markdown
     from rangesim.report import failures_markdown as failures_markdown
@@ -87,6 +88,7 @@ _HOME = {
     "save_capture": "rangesim.results.capture_files",
     "save_range_image": "rangesim.results.range_image_files",
     "save_signals": "rangesim.results.signals_files",
+    "scan": "rangesim.pipeline.views",
     "transport": "rangesim.instrument.transport",
 }
 

@@ -281,12 +281,11 @@ FUSION = {
     "joint_registration": "refine_jointly",
     "mesh_error": "SurfaceError surface_error",
     "multiway_registration": "Alignment PairFit PoseErrors align pose_errors",
-    "paths": "Dome HandHeld Path PoseList Turntable Viewpoint",
+    "scan": "Scan",
     "sdf": "average_signed_distances reading_weights signed_distance",
     "seen_volume": "Occupancy SeenOfShape VoxelState occupancy true_occupancy voxel_states",
     "solids": "Solid attenuation_volume inside_voxels",
     "truncated_average": "FusedSurface fuse",
-    "views": "Scan scan",
     "voxel_grid": "VoxelGrid",
 }
 
@@ -344,6 +343,7 @@ def test_the_public_surface_is_this() -> None:
         "save_capture",
         "save_range_image",
         "save_signals",
+        "scan",
         "transport",
     ]
 

@@ -369,7 +369,7 @@ def test_names_of_directories_give_no_orders_to_a_terminal(command: Command, tmp
 )
 def test_a_wrong_list_of_poses_is_named(tmp_path: Path, poses: Any) -> None:
     from rangesim.cli.scan import _path
-    from rangesim.fusion.paths import Dome
+    from rangesim.experiment.camera_paths import Dome
 
     place = tmp_path / "poses.json"
     place.write_text(json.dumps(poses))

@@ -21,8 +21,8 @@ from typer.testing import CliRunner
 from rangesim import load_range_image
 from rangesim.cli import app
 from rangesim.errors import FileFormatError
-from rangesim.fusion import Dome, Turntable
-from rangesim.fusion.scan_settings import (
+from rangesim.experiment import Dome, Turntable
+from rangesim.experiment.scan_settings import (
     ScanSettings,
     load_scan_settings,
     scan_settings_from_dict,

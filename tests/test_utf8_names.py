@@ -16,12 +16,12 @@ from rangesim import save_capture
 from rangesim.capture.exposure import expose
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment
-from rangesim.experiment.pipeline import run
-from rangesim.experiment.result_files import load_result
 from rangesim.files.image_files import check_pixels, read_grey, write_grey
 from rangesim.files.utf8_names import is_utf8, utf8_name
 from rangesim.instrument.instrument import instrument
+from rangesim.pipeline.experiment_run import run
 from rangesim.results.capture_files import import_capture, load_capture
+from rangesim.results.run_files import load_result
 from rangesim.sensors import IdealToF
 
 NAMES = (b"caf\xe9", b"\xff\xfe", b"scan.\xe4", "Grüße".encode("utf-16-le"))

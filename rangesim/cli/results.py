@@ -24,8 +24,8 @@ def compare_command(
 
       rangesim compare out/tabletop out/matte
     """
-    from rangesim.experiment.result_files import read_rows, read_settings
     from rangesim.report.tables import comparison_markdown, comparison_tables
+    from rangesim.results.run_files import read_rows, read_settings
 
     tables = []
     for folder in results:
@@ -52,9 +52,9 @@ def report_command(
 
       rangesim report out/tabletop
     """
-    from rangesim.experiment.result_files import RESULT, load_result, read_settings
     from rangesim.files.result_directories import replace_listed_file
     from rangesim.report import render_report
+    from rangesim.results.run_files import RESULT, load_result, read_settings
     from rangesim.sensors import sensor_of
 
     for name in sensor or ():
@@ -79,12 +79,12 @@ def verify_command(
 
       rangesim verify out/tabletop
     """
-    from rangesim.cli.decoded_files import DECODED
     from rangesim.errors import FileFormatError
-    from rangesim.experiment.result_files import RESULT
     from rangesim.files.result_directories import verify_directory
-    from rangesim.fusion.scan_run import SCAN
     from rangesim.results.capture_files import CAPTURE
+    from rangesim.results.decoded_files import DECODED
+    from rangesim.results.run_files import RESULT
+    from rangesim.results.scan_files import SCAN
 
     kinds = (RESULT, SCAN, CAPTURE, DECODED)
     kind = next((k for k in kinds if (directory / k.sidecar).is_file()), None)

@@ -12,10 +12,10 @@ from rangesim.causes.cause import DEFINITIONS, TITLES, Cause
 from rangesim.evaluation.comparison import OUTLIER_M, Comparison, ErrorStatistics
 from rangesim.evaluation.range_noise import SMALL, noise_ratio
 from rangesim.experiment import Experiment
-from rangesim.experiment.result_files import Measurement, PhotonsRecord
 from rangesim.report import palette
 from rangesim.report.figures import LegendEntry
 from rangesim.report.markdown_table import Table
+from rangesim.results.run_files import Measurement, PhotonsRecord
 
 Rows = list[dict[str, Any]]
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from rangesim.files.array_files import read_arrays, write_arrays
 from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
 from rangesim.response import Response
 from rangesim.rig import Rig
-from rangesim.settings.config import check_keys, from_dict, shown, to_dict
+from rangesim.settings.config import ShortRepr, check_keys, from_dict, shown, to_dict
 from rangesim.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
 
 FORMAT = "rangesim-signals"
@@ -99,22 +99,57 @@ def load_signals(path: str | Path) -> StillSignals:
     sampling = None
     if all(has_error):
         sampling = SamplingError({r: data[f"error_{i}"] for i, r in enumerate(responses)}, data["error_projector"])
-    truncation = Truncation(*map(float, data["truncation"])) if "truncation" in data else None
     channels = {response: data[f"channels_{i}"] for i, response in enumerate(responses)}
-    return StillSignals(rig, energy, truth, truncation=truncation, channels=channels, sampling=sampling)
+    return StillSignals(rig, energy, truth, truncation=_truncation(data), channels=channels, sampling=sampling)
 
 
-def write_pass(signals: Signals, path: str | Path) -> None:
-    """Write energy split, ground truth and truncation alone, as a result keeps them of each pass."""
-    write_arrays(path, _pass_arrays(signals))
+@dataclass(frozen=True, eq=False, repr=False)
+class LightPass(ShortRepr):
+    """What a result keeps of a transport pass: all that signals hold besides their channels.
+
+    energy : EnergySplit. truth : GroundTruth.
+    motion_m : (h, w) float32, metres, as of `Signals.motion_m`; None: nothing moves.
+    truncation : Truncation, light that was left out; None: not known.
+    """
+
+    energy: EnergySplit
+    truth: GroundTruth
+    motion_m: np.ndarray | None = None
+    truncation: Truncation | None = None
+
+    @classmethod
+    def of(cls, signals: Signals) -> LightPass:
+        """The pass that signals come from."""
+        return cls(signals.energy, signals.truth, signals.motion_m, signals.truncation)
 
 
-def read_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
-    """Energy split and ground truth of a pass of h x w pixels, as `sizes` says; FileFormatError if it is broken."""
-    return _energy_and_truth(path, read_checked_arrays(path, _PASS, dict(sizes)))  # passes may see other instances
+def write_pass(light_pass: LightPass, path: str | Path) -> None:
+    """Write a pass to a compressed .npz file."""
+    write_arrays(path, _pass_arrays(light_pass))
 
 
-def _pass_arrays(signals: Signals) -> dict[str, np.ndarray]:
+def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
+    """The pass that `write_pass` wrote.
+
+    Parameters
+    ----------
+    sizes : its height h and width w, pixels.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or broken.
+    """
+    data = read_checked_arrays(path, _PASS, dict(sizes))  # a copy: passes may see other instances
+    energy, truth = _energy_and_truth(path, data)
+    return LightPass(energy, truth, data.get("motion_m"), _truncation(data))
+
+
+def _truncation(data: dict[str, np.ndarray]) -> Truncation | None:
+    return Truncation(*map(float, data["truncation"])) if "truncation" in data else None
+
+
+def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
     """Arrays of what signals hold besides channels, by name in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}

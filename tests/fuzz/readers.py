@@ -202,7 +202,7 @@ def _tof_calibration(path: Path, _: Arguments) -> Any:
 
 
 def _result(path: Path, _: Arguments) -> Any:
-    from rangesim.experiment.result_files import load_result
+    from rangesim.results.run_files import load_result
 
     return load_result(path)
 
