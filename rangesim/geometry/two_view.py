@@ -39,8 +39,13 @@ from rangesim.geometry.correspondences import (
     right_singular_vectors,
     unit_norm,
 )
-from rangesim.geometry.homography import PARAMETERS as OF_HOMOGRAPHY
-from rangesim.geometry.homography import homography_error, largest_plane, nearest_homography, rotation_homography_error
+from rangesim.geometry.homography import (
+    HOMOGRAPHY_PARAMETERS,
+    homography_error,
+    largest_plane,
+    nearest_homography,
+    rotation_homography_error,
+)
 from rangesim.geometry.least_squares import Minimum, minimise
 from rangesim.geometry.projective_plane import homogeneous
 from rangesim.rig import pose
@@ -494,7 +499,7 @@ def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_p
     """Raise ValueError if a homography explains the pairs to their noise, as a model of `parameters` with `cost`
     does."""
     n, rounding = len(a), consensus.rounding_of(np.concatenate([a, b]))
-    simple = homography_error(a, b), 2 * n - OF_HOMOGRAPHY
+    simple = homography_error(a, b), 2 * n - HOMOGRAPHY_PARAMETERS
     if consensus.simpler_model_suffices(simple, (cost, n - parameters), noise_px, rounding):
         apart = float(np.sqrt(simple[0] / simple[1]))
         same = np.sqrt(((a - b) ** 2).mean()) <= 3 * max(noise_px or 0.0, apart, rounding)
