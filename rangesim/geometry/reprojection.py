@@ -64,7 +64,7 @@ def reproject(device: Intrinsics, X: Array) -> Reprojection:
 
 
 def by_lens(device: Intrinsics, X: Array) -> Array:
-    """(m, 2, 9) float64 derivatives of the image of points X (m, 3) by the device's parameters, ordered as in `LENS`."""
+    """(m, 2, 9) float64 derivatives of the image of points X (m, 3) by the parameters of the device, as in `LENS`."""
     x, y = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2]
     image = distort(device.coefficients, x, y)
     r2 = x * x + y * y
