@@ -29,12 +29,12 @@ its neighbours."""
 
 PARTNER_SPACINGS = 3.0
 """Distance, in spacings as a ratio, within which a point has a partner when a pose is judged. On a randomly sampled
-surface the fraction without a partner is half to the power of its square: 0.2 % at 3 spacings. A larger value finds
-partners on other surfaces."""
+surface the fraction without a partner is 0.5^(d^2) at d spacings: 0.2 % at 3. A larger value finds partners on other
+surfaces."""
 
 FINAL_SPACINGS = 1.5
 """Distance of partners, in spacings as a ratio, in the last steps of ICP. The smaller it is, the less points beyond the
-border of the other cloud pull. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings, but
+border of the other cloud pull. On a randomly sampled surface 21 % of the points have no partner at 1.5 spacings, and
 half of them at 1."""
 
 START_SPACINGS = 12.0
