@@ -40,7 +40,7 @@ from rangesim.geometry.correspondences import Array, check_noise, checked_array
 from rangesim.geometry.least_squares import descend
 from rangesim.geometry.registration import nearest_similarity
 from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose, reproject, with_all_coefficients
-from rangesim.multiview.schur_complement import LEAST_DAMPING, NormalEquations, Sizes, Step, Term
+from rangesim.multiview.schur_complement import NormalEquations, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
 from rangesim.rig import Intrinsics
 from rangesim.settings.config import shown
@@ -57,6 +57,9 @@ next views change it anyway."""
 CONVERGED = 1e-8
 """Relative decrease of the cost at which a descent ends. For a million residuals it is 1 % of the variance of one
 residual, so the parameters are within about 0.1 standard deviations of the minimum."""
+MIN_DAMPING = 1e-10
+"""Smallest damping of Levenberg-Marquardt, relative to the diagonal of the normal equations. It keeps them regular
+where the residuals leave parameters open, such as the gauge. Larger values slow the descent near the minimum."""
 MAX_ROTATION_DEVIATION = 0.3
 """Largest standard deviation of a rotation, radians. Beyond about 17 degrees the covariance, which is linear in the
 rotation, means little, and the pose counts as undetermined."""
@@ -279,7 +282,7 @@ def adjusted_views(
         moved = moved_lens(state.camera, lens) if columns else state.camera
         return Views(moved, moved_pose(state.T, step.images), state.X + step.points)
 
-    found = descend(look, move, state, max_steps=max_steps, converged=CONVERGED, least_damping=LEAST_DAMPING)
+    found = descend(look, move, state, max_steps=max_steps, converged=CONVERGED, least_damping=MIN_DAMPING)
     T, X, gauge = _in_gauge(state.T, found.state.T, found.state.X, list(held), len(columns))
     equations = look(Views(found.state.camera, T, X))
     residuals = reprojection_errors(Views(found.state.camera, T, X), some)
@@ -594,7 +597,7 @@ def _cost_of_rotations(camera: Intrinsics, T: Array, tracks: Tracks) -> float:
     first = Views(with_all_coefficients(camera), start, X)
     if not np.isfinite(look(first).cost):
         return float("inf")  # a point behind a camera, or beyond the fold of its lens
-    return descend(look, move, first, max_steps=ROTATION_STEPS, converged=1e-4, least_damping=LEAST_DAMPING).here.cost
+    return descend(look, move, first, max_steps=ROTATION_STEPS, converged=1e-4, least_damping=MIN_DAMPING).here.cost
 
 
 def _rotations_alone(R: Array, rays: Array, tracks: Tracks) -> Array:
@@ -644,7 +647,7 @@ def _shape_deviation(
     known = np.isfinite(alone).all(axis=(1, 2))
     if not (extent > 0 and known.any() and noise > 0):
         return float("nan")
-    J = equations.response_of_points()[known].reshape(-1, sizes.eliminated)
+    J = equations.response_of_points()[known].reshape(-1, sizes.reduced)
     joint = J @ (covariance / noise**2) @ J.T + block_diag(*alone[known])
     Y = (X[known] - np.median(X[known], axis=0)) / extent
     along = np.zeros((len(Y), 3, 7))

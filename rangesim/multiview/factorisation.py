@@ -254,7 +254,7 @@ def _affine_descent(tracks: Tracks, start: AffineCameras) -> tuple[AffineCameras
     def look(cameras: AffineCameras) -> NormalEquations:
         X, M = cameras.X[tracks.point], cameras.M[tracks.image]
         values = (M @ X[:, :, None])[:, :, 0] + cameras.t[tracks.image] - tracks.pixels
-        by_images = np.zeros((len(tracks), 2, 1, sizes.of_image))
+        by_images = np.zeros((len(tracks), 2, 1, sizes.per_image))
         for k in range(2):
             by_images[:, k, 0, k * rank : (k + 1) * rank] = X
             by_images[:, k, 0, 2 * rank + k] = 1
@@ -421,7 +421,7 @@ def refuse_open_rotations(equations: NormalEquations, gauge: int, noise: float, 
     """Raise ValueError where rotations, the first parameters of each image, are known worse than within
     `MAX_ROTATION_DEVIATION`, the gauge spread over all of them. unit : pixels by which residuals were divided."""
     covariance = equations.free_covariance(gauge) * (0.0 if np.isnan(noise) else max(noise / unit, 1e-300)) ** 2
-    size = equations.sizes.of_image
+    size = equations.sizes.per_image
     with np.errstate(invalid="ignore"):
         turn = np.sqrt(np.diag(covariance).reshape(-1, size)[:, :3].sum(axis=1))
     if not (turn <= MAX_ROTATION_DEVIATION).all():
@@ -436,7 +436,7 @@ def shape_deviations(found: Descended[Shapes, NormalEquations], gauge: int) -> A
     of unit variance: what the points leave open, and what the images do, whose errors the points follow."""
     shapes, sizes = found.state, found.here.sizes
     n, K = shapes.coefficients.shape
-    p, c = len(shapes.basis), sizes.of_image
+    p, c = len(shapes.basis), sizes.per_image
     of_points = found.here.covariance_of_points().reshape(p, K, 3, K, 3)
     weights = shapes.coefficients
     variance = np.einsum("nk,pkdld,nl->np", weights, of_points, weights)
@@ -463,7 +463,7 @@ def _refuse_open_depth(found: Descended[Shapes, NormalEquations], noise: float) 
 
     Tilts w_i against the mean direction grow as the depths shrink: d log depth = -sum w_i dw_i / sum w_i^2.
     """
-    shapes, size = found.state, found.here.sizes.of_image
+    shapes, size = found.state, found.here.sizes.per_image
     n = len(shapes.R)
     # the first image stays, and so does the mean of the shape along its viewing direction
     conditions = np.zeros((7 if size > 5 else 6, n, size))

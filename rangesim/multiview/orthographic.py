@@ -131,7 +131,7 @@ def _look(
     seen = scale[:, None, None] * (basis @ np.swapaxes(R, 1, 2))
     y = (c[:, None, :] @ seen)[:, 0]
     values = y[:, :2] + shapes.t[image] - tracks.pixels
-    by_images = np.zeros((m, 2, 1, sizes.of_image))
+    by_images = np.zeros((m, 2, 1, sizes.per_image))
     by_images[:, 0, 0, 1], by_images[:, 0, 0, 2] = y[:, 2], -y[:, 1]
     by_images[:, 1, 0, 0], by_images[:, 1, 0, 2] = -y[:, 2], y[:, 0]
     by_images[:, 0, 0, 3] = by_images[:, 1, 0, 4] = float(has_translation)
@@ -163,7 +163,7 @@ def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
     weights = np.array([1.0, -2.0, 1.0])
     change = np.einsum("mek,e->mk", shapes.coefficients[images], weights)
     basis = shapes.basis[point]
-    by_images = np.zeros((len(point), 3, 3, sizes.of_image))
+    by_images = np.zeros((len(point), 3, 3, sizes.per_image))
     by_images[..., 5 : 4 + K] = np.swapaxes(basis[:, 1:], 1, 2)[:, :, None] * weights[:, None]
     by_point = change[:, None, :, None] * np.eye(3)[:, None, :]
     values = np.einsum("mk,mkd->md", change, basis)
@@ -173,7 +173,7 @@ def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
 
 def _turn_steps(shapes: Shapes, sizes: Sizes, deviation: float) -> Prior:
     """Residuals (3 (n - 1),) of the rotation between consecutive images, as rotation vectors."""
-    n, c = sizes.images, sizes.of_image
+    n, c = sizes.images, sizes.per_image
     between = shapes.R[1:] @ np.swapaxes(shapes.R[:-1], 1, 2)
     vectors = Rotation.from_matrix(between).as_rotvec()
     by_step = np.zeros((n - 1, 3, n * c))
