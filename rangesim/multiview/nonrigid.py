@@ -40,8 +40,7 @@ from rangesim.geometry.least_squares import Descended
 from rangesim.multiview import orthographic
 from rangesim.multiview.factorisation import (
     AffineCameras,
-    determined,
-    everywhere,
+    checked_tracks,
     first_upright,
     low_rank,
     metric_upgrade,
@@ -49,6 +48,7 @@ from rangesim.multiview.factorisation import (
     refuse_open_rotations,
     refuse_rank,
     renumbered,
+    residuals_of_all,
     shape_deviations,
     whitened,
 )
@@ -229,7 +229,7 @@ def _factorised(
     count_unknowns(1, 1, K)  # the check of K
     rank = 3 * K
     purpose = f"{K} basis shapes, a factorisation of rank {rank}"
-    some, points = determined(tracks, -(-rank // 2), rank + 1, 0.5 * (rank + 2), purpose)
+    some, points = checked_tracks(tracks, -(-rank // 2), rank + 1, 0.5 * (rank + 2), purpose)
     n, p = some.n_images, some.n_points
     freedom = 2 * len(some) - count_unknowns(n, p, K).determinable
     if len(some) == n * p:
@@ -353,7 +353,7 @@ def _judged(
     basis[points] = shapes.basis
     everyone = np.full((tracks.n_images, tracks.n_points), np.nan)
     everyone[:, points] = deviations
-    left = everywhere(tracks, points, residuals)
+    left = residuals_of_all(tracks, points, residuals)
     return NonRigidShape(shapes.R, shapes.t, shapes.coefficients, basis, everyone, left, noise, prior)
 
 

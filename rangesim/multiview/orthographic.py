@@ -22,7 +22,7 @@ from rangesim.geometry.least_squares import Descended, descend
 from rangesim.multiview.schur_complement import NormalEquations, Prior, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
 
-LEAST_DAMPING = 1e-12
+MIN_DAMPING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def adjust(
     def settled(shapes: Shapes) -> Shapes:
         return replace(shapes, basis=shapes.basis + look(shapes).step_of_points().reshape(shapes.basis.shape))
 
-    return descend(look, move, settled(start), max_steps=max_steps, converged=converged, least_damping=LEAST_DAMPING)
+    return descend(look, move, settled(start), max_steps=max_steps, converged=converged, least_damping=MIN_DAMPING)
 
 
 def _moved(shapes: Shapes, step: Step, has_scale: bool) -> Shapes:
