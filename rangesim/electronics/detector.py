@@ -119,8 +119,8 @@ class PhotoDetector(Named, ABC):
         """Smallest unsigned integer that holds a digital number."""
         return np.uint8 if self.bits <= 8 else np.uint16
 
-    def electrons_per_radiance(self, rig: Rig) -> float:
-        """Electrons per second of exposure for a radiance of 1 W/m2/sr."""
+    def electron_rate_per_radiance(self, rig: Rig) -> float:
+        """Electrons per second of exposure and per W/m2/sr of radiance."""
         camera = rig.camera
         etendue = np.pi * rig.camera_lens.aperture_radius_m**2 / (camera.fx * camera.fy)
         return float(etendue * self.quantum_efficiency * self.wavelength_m / PLANCK_TIMES_C)
@@ -136,13 +136,17 @@ class PhotoDetector(Named, ABC):
 
 
 class LinearPixel(NamedTuple):
-    """What an exposure makes of radiance, in a `Detector`.
+    """The linear response of a `Detector` to radiance, for one exposure time.
 
-    electrons : per W/m2/sr. dark_e, max_mean_e, read_noise_e : electrons; beyond max_mean_e the pixel is saturated,
-    whatever its noise. gain_dn_e : digital numbers per electron. offset_dn, max_dn : digital numbers.
+    electrons_per_radiance : electrons per W/m2/sr.
+    dark_e : electrons of the dark current.
+    max_mean_e : electrons, largest expected number that is drawn; the pixel is saturated there, whatever its noise.
+    read_noise_e : electrons rms.
+    gain_dn_e : digital numbers per electron.
+    offset_dn, max_dn : digital numbers, black level and largest number.
     """
 
-    electrons: float
+    electrons_per_radiance: float
     dark_e: float
     max_mean_e: float
     read_noise_e: float
@@ -234,7 +238,7 @@ class Detector(PhotoDetector):
 
     def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
         pixel = self._pixel(rig, exposure_s)
-        return np.asarray(pixel.electrons * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
+        return np.asarray(pixel.electrons_per_radiance * np.asarray(radiance, dtype=np.float64) + pixel.dark_e)
 
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         self.check(gate)
@@ -253,7 +257,7 @@ class Detector(PhotoDetector):
 
     def _pixel(self, rig: Rig, exposure_s: float) -> LinearPixel:
         return LinearPixel(
-            electrons=self.electrons_per_radiance(rig) * exposure_s,
+            electrons_per_radiance=self.electron_rate_per_radiance(rig) * exposure_s,
             dark_e=float(self.dark_current_e_s * exposure_s),
             max_mean_e=10.0 * self.full_well_e + 1000,
             read_noise_e=float(self.read_noise_e),

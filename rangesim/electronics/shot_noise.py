@@ -42,7 +42,7 @@ def read_frame(rng, radiance, pixel, dn):  # type: ignore[no-untyped-def]
     """
     for row in range(len(radiance)):
         for column in range(radiance.shape[1]):
-            mean = _within(pixel.electrons * radiance[row, column] + pixel.dark_e, pixel.max_mean_e)
+            mean = _within(pixel.electrons_per_radiance * radiance[row, column] + pixel.dark_e, pixel.max_mean_e)
             electrons = poisson(rng, mean) + pixel.read_noise_e * rng.standard_normal()
             number = np.rint(pixel.gain_dn_e * electrons + pixel.offset_dn)
             dn[row, column] = min(max(number, 0.0), pixel.max_dn)
@@ -56,7 +56,7 @@ def count_photons(rng, radiance, pixel, counts):  # type: ignore[no-untyped-def]
     """
     for b in range(len(radiance)):
         for column in range(radiance.shape[1]):
-            mean = _within(pixel.photons * radiance[b, column] + pixel.dark, pixel.max_mean)
+            mean = _within(pixel.counts_per_radiance * radiance[b, column] + pixel.dark, pixel.max_mean)
             counts[b, column] = min(poisson(rng, mean), pixel.max_dn)
 
 
@@ -64,7 +64,7 @@ def count_photons(rng, radiance, pixel, counts):  # type: ignore[no-untyped-def]
 def count_first_photons(rng, radiance, pixel, pulses, counts):  # type: ignore[no-untyped-def]
     """As `count_photons`, but only the first photon of each of `pulses` pulses counts."""
     unused = np.full(radiance.shape[1], pulses)
-    photons, dark, most = pixel.photons / pulses, pixel.dark / pulses, pixel.max_mean / pulses
+    photons, dark, most = pixel.counts_per_radiance / pulses, pixel.dark / pulses, pixel.max_mean / pulses
     for b in range(len(radiance)):
         for column in range(radiance.shape[1]):
             mean = _within(photons * radiance[b, column] + dark, most)

@@ -21,12 +21,15 @@ MAX_MEAN = 1e9
 
 
 class CountingPixel(NamedTuple):
-    """What an exposure makes of radiance, in one bin of a `SpadDetector`.
+    """The linear response of one bin of a `SpadDetector` to radiance, for one exposure time.
 
-    photons : per W/m2/sr. dark, max_mean : counts. max_dn : digital numbers.
+    counts_per_radiance : expected counts per W/m2/sr.
+    dark : expected counts without light.
+    max_mean : counts, largest expected number that is drawn.
+    max_dn : digital numbers, largest count that the counter holds.
     """
 
-    photons: float
+    counts_per_radiance: float
     dark: float
     max_mean: float
     max_dn: int
@@ -84,7 +87,7 @@ class SpadDetector(PhotoDetector):
 
     def mean_electrons(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float) -> np.ndarray:
         pixel = self._pixel(_counting(gate), rig, exposure_s)
-        return np.asarray(pixel.photons * np.asarray(radiance, dtype=np.float64) + pixel.dark)
+        return np.asarray(pixel.counts_per_radiance * np.asarray(radiance, dtype=np.float64) + pixel.dark)
 
     def photons_per_pulse(self, radiance: np.ndarray, gate: Gate | None, rig: Rig) -> np.ndarray:
         """(h, w) float64, photons that a pixel detects per laser pulse, on average, ambient light and dark counts
@@ -92,7 +95,9 @@ class SpadDetector(PhotoDetector):
         """
         gate = _counting(gate)
         pixel = self._pixel(gate, rig, gate.period_s)  # an exposure of one pulse
-        return np.asarray(pixel.photons * radiance.sum(axis=0, dtype=np.float64) + len(radiance) * pixel.dark)
+        return np.asarray(
+            pixel.counts_per_radiance * radiance.sum(axis=0, dtype=np.float64) + len(radiance) * pixel.dark
+        )
 
     def read_out(self, radiance: np.ndarray, gate: Gate | None, rig: Rig, exposure_s: float, seed: int) -> np.ndarray:
         from pcgraph.parallel import MIN_ROWS, in_blocks
@@ -116,7 +121,7 @@ class SpadDetector(PhotoDetector):
     def _pixel(self, gate: Gate, rig: Rig, exposure_s: float) -> CountingPixel:
         pulses = self.pulses(gate, exposure_s)
         return CountingPixel(
-            photons=self.electrons_per_radiance(rig) * pulses * gate.period_s,
+            counts_per_radiance=self.electron_rate_per_radiance(rig) * pulses * gate.period_s,
             dark=float(self.dark_counts_hz * pulses * gate.open_s / gate.bins),
             max_mean=MAX_MEAN,
             max_dn=self.max_dn,

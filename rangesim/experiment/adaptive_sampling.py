@@ -12,8 +12,9 @@ import numpy as np
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.ambient import Ambient
-from rangesim.evaluation.range_noise import TO_SIGMA, sampling_draw
+from rangesim.evaluation.range_noise import sampling_draw
 from rangesim.experiment.instrument import Instrument
+from rangesim.robust_scale import TO_SIGMA
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole
 

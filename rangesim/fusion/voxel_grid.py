@@ -60,8 +60,3 @@ class VoxelGrid:
         place = np.floor((P - np.asarray(self.corner_m)) / self.voxel_m)
         inside = ((place >= 0) & (place < self.shape)).all(axis=-1)  # False with NaN
         return np.where(inside[..., None], place, 0).astype(np.int64), inside
-
-    @property
-    def voxel_volume_m3(self) -> float:
-        """Volume of one voxel."""
-        return self.voxel_m**3
