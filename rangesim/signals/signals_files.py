@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals as files: whole, to be exposed again without a new trace, and without channels, as results keep each pass."""
+"""Files of signals: complete ones, to expose them again without a new pass, and those of results, without channels."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from rangesim.signals.signals import EnergySplit, GroundTruth, SamplingError, Si
 
 FORMAT = "rangesim-signals"
 FORMAT_VERSION = 1
+"""Number of the file format, as a count from 1; a change that older versions cannot read increases it."""
 MAX_SETTINGS = 1_000_000
-"""Bytes of the settings in a file."""
+"""Largest size of the settings in a file, in bytes. Real settings have a few kilobytes; the limit protects from files
+that would fill the memory."""
 
 _RADIANCE = ArraySpec("float32", low=0)
 _TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
@@ -41,7 +43,7 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:
-    """Write signals with their channels and sampling error; see `StillSignals.save`."""
+    """Write signals with their channels and their sampling error; see `StillSignals.save`."""
     responses = list(signals.channels)
     settings = {
         "format": FORMAT,
@@ -58,12 +60,18 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
 
 
 def load_signals(path: str | Path) -> StillSignals:
-    """The signals that `StillSignals.save` wrote: `expose` makes captures of them as of those traced.
+    """Signals that `StillSignals.save` wrote; `rangesim.expose` takes them like those of a new pass.
 
     Raises
     ------
     FileFormatError
         The file is missing or broken, or holds a response of a class that is not loaded.
+
+    Examples
+    --------
+    >>> from rangesim import expose, load_signals
+    >>> signals = load_signals("signals.npz")  # doctest: +SKIP
+    >>> capture = expose(signals, sensor)  # doctest: +SKIP
     """
     path = Path(path)
     settings = _settings(path)
@@ -97,17 +105,20 @@ def load_signals(path: str | Path) -> StillSignals:
 
 
 def write_pass(signals: Signals, path: str | Path) -> None:
-    """Write energy split, ground truth and truncation alone, as a result keeps them of each pass."""
+    """Write the energy split, the ground truth and the truncation of a pass, which a result stores for each pass."""
     write_arrays(path, _pass_arrays(signals))
 
 
 def read_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
-    """Energy split and ground truth of a pass of h x w pixels, as `sizes` says; FileFormatError if it is broken."""
-    return _energy_and_truth(path, read_checked_arrays(path, _PASS, dict(sizes)))  # passes may see other instances
+    """Energy split and ground truth that `write_pass` wrote; FileFormatError if the file is broken.
+
+    sizes : "h" and "w", the expected height and width in pixels.
+    """
+    return _energy_and_truth(path, read_checked_arrays(path, _PASS, dict(sizes)))  # each pass has its own instances
 
 
 def _pass_arrays(signals: Signals) -> dict[str, np.ndarray]:
-    """Arrays of what signals hold besides channels, by name in files."""
+    """Arrays of everything in signals but the channels and the sampling error, by their names in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}
     if signals.motion_m is not None:
@@ -152,7 +163,7 @@ def _plain(response: Response) -> dict[str, Any]:
 
 
 def _response(table: Any, place: str) -> Response:
-    """The response of a table whose `type` is the name of its class."""
+    """The response that a table describes; `type` is the name of its class."""
     if not isinstance(table, dict):
         raise ValueError(f"{place}: expected a table, got {shown(table)}.")
     values = dict(table)
@@ -163,7 +174,7 @@ def _response(table: Any, place: str) -> Response:
 
 
 def _kinds() -> dict[str, type[Response]]:
-    """Classes of responses by name, those of the package first."""
+    """All loaded classes of responses by name; of two with the same name, the one nearer to `Response` in the tree."""
     found: dict[str, type[Response]] = {}
     level = Response.__subclasses__()
     while level:
