@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.decoding.range_image import RangeImage
-from rangesim.fusion.sdf import depth_at, placed
+from rangesim.fusion.sdf import camera_and_pose, depth_at
 from rangesim.point_cloud import lattice_normals
 from rangesim.rig import Array, Intrinsics
 from rangesim.robust_scale import sigma_from_median
@@ -52,7 +52,7 @@ class _View(NamedTuple):
     def of(cls, image: RangeImage, random: np.random.Generator) -> _View:
         from scipy.ndimage import binary_erosion
 
-        camera, _ = placed(image)
+        camera, _ = camera_and_pose(image)
         rays = camera.directions(camera.pixel_centres())
         z = image.z.astype(np.float64)
         normals = lattice_normals(z, rays)
