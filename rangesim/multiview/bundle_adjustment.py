@@ -43,6 +43,7 @@ from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose
 from rangesim.multiview.schur_complement import NormalEquations, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
 from rangesim.rig import Intrinsics
+from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.config import shown
 
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -748,8 +749,7 @@ def _noise(residuals: Array, loss: str, freedom: int) -> float:
         return float("nan")
     if loss == "linear":
         return float(np.sqrt((residuals**2).sum() / freedom))
-    to_deviation = 1.4826  # from a median of absolute values to the standard deviation, for Gaussian noise
-    return float(to_deviation * np.median(np.abs(residuals)) * np.sqrt(residuals.size / freedom))
+    return float(sigma_from_median(residuals) * np.sqrt(residuals.size / freedom))
 
 
 def _in_gauge(start: Array, T: Array, X: Array, held: list[int], shared: int) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from rangesim.fusion.mesh_error import distances_to, nearest_on
 from rangesim.fusion.sdf import signed_distance
-from rangesim.fusion.seen_volume import SLANTED, VoxelState
+from rangesim.fusion.seen_volume import MAX_SLANT_TOLERANCES, VoxelState
 from rangesim.report import figures, palette
 from rangesim.report.build import _asset
 from rangesim.report.mesh_pictures import mesh_picture
@@ -176,7 +176,7 @@ def _seen(result: ScanResult, points: np.ndarray, normals: np.ndarray) -> np.nda
         to_camera = image.T_world_camera[:3, 3] - points
         cosine = np.abs((to_camera * np.nan_to_num(normals)).sum(axis=-1)) / np.linalg.norm(to_camera, axis=-1)
         off = np.abs(signed_distance(points, image, lookup="bilinear"))
-        seen |= (off * cosine <= tolerance) & (off <= SLANTED * tolerance)
+        seen |= (off * cosine <= tolerance) & (off <= MAX_SLANT_TOLERANCES * tolerance)
     return seen
 
 

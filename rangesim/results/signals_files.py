@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals as files: whole, to be exposed again without a new trace, and without channels, as results keep each pass."""
+"""Files of signals: complete ones, to expose them again without a new pass, and those of results, without channels."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from rangesim.signals import EnergySplit, GroundTruth, SamplingError, Signals, S
 
 FORMAT = "rangesim-signals"
 FORMAT_VERSION = 1
+"""Number of the file format, as a count from 1; a change that older versions cannot read increases it."""
 MAX_SETTINGS = 1_000_000
-"""Bytes of the settings in a file."""
+"""Largest size of the settings in a file, in bytes. Real settings have a few kilobytes; the limit protects from files
+that would fill the memory."""
 
 _RADIANCE = ArraySpec("float32", low=0)
 _TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
@@ -72,6 +74,12 @@ def load_signals(path: str | Path) -> StillSignals:
     ------
     FileFormatError
         The file is missing or broken, or holds a response of a class that is not loaded.
+
+    Examples
+    --------
+    >>> from rangesim import expose, load_signals
+    >>> signals = load_signals("signals.npz")  # doctest: +SKIP
+    >>> capture = expose(signals, sensor)  # doctest: +SKIP
     """
     path = Path(path)
     settings = _settings(path)
@@ -195,7 +203,7 @@ def _plain(response: Response) -> dict[str, Any]:
 
 
 def _response(table: Any, place: str) -> Response:
-    """The response of a table whose `type` is the name of its class."""
+    """The response that a table describes; `type` is the name of its class."""
     if not isinstance(table, dict):
         raise ValueError(f"{place}: expected a table, got {shown(table)}.")
     values = dict(table)
@@ -206,7 +214,7 @@ def _response(table: Any, place: str) -> Response:
 
 
 def _kinds() -> dict[str, type[Response]]:
-    """Classes of responses by name, those of the package first."""
+    """All loaded classes of responses by name; of two with the same name, the one nearer to `Response` in the tree."""
     found: dict[str, type[Response]] = {}
     level = Response.__subclasses__()
     while level:
