@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 SAME_PLACE = 1e-5
 """Metres and radians; emitters no farther apart are in one place."""
 ROTATION_TOLERANCE = 1e-4
-"""Largest entry of |R R^T - I|, dimensionless, of a matrix that counts as a rotation. A matrix written with five decimals
-is off by at most 2e-5 and passes; a scale of 1.0001 does not."""
+"""Largest entry of |R R^T - I|, dimensionless, of a matrix that counts as a rotation. A matrix written with five
+decimals is off by at most 2e-5 and passes; a scale of 1.0001 does not."""
 RESIDUAL_PX = 1e-3
 """Where the inverse of a lens model reprojects worse than this, there is none."""
 
