@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ from rangesim import (
 )
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.errors import FileFormatError
-from rangesim.response import Images
+from rangesim.response import DenseResponse, Images, LightPath, Math
 from rangesim.sensors import AmcwDecoder
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -73,11 +73,40 @@ def test_signals_without_a_sampling_error_have_none_afterwards(tmp_path: Path) -
     np.testing.assert_array_equal(loaded.frames(AmcwToF()), signals.frames(AmcwToF()))
 
 
+@dataclass(frozen=True)
+class Nearby(DenseResponse):
+    """Light that travelled at most so far: a response from outside the package."""
+
+    farthest_m: float
+    channels: ClassVar[int] = 1  # type: ignore[misc]
+    type_name: ClassVar[str] = "nearby"
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        return [m.select(path.path_length_m < self.farthest_m, 1.0, 0.0)]
+
+
+@dataclass(frozen=True)
+class Nameless(DenseResponse):
+    channels: ClassVar[int] = 1  # type: ignore[misc]
+
+    def weights(self, path: LightPath, m: Math) -> list[Any]:
+        return [1.0]
+
+
+def test_a_response_of_your_own_comes_back(tmp_path: Path) -> None:
+    signals = plane_signals(stereo_rig(40, 30), AmcwToF())
+    channels = {Nearby(3.0): np.ones((1, 30, 40), np.float32), **signals.channels}
+    replace(signals, channels=channels).save(tmp_path / "own.npz")
+    assert list(load_signals(tmp_path / "own.npz").channels) == list(channels)
+
+
 def test_what_cannot_be_read_back_is_not_written(tmp_path: Path) -> None:
     signals = plane_signals(stereo_rig(40, 30), AmcwToF())
     images = Images(np.ones((2, 800, 1280), np.float32))
     with pytest.raises(ValueError, match="expected responses of numbers, got Images"):
         save_signals(replace(signals, channels={images: np.ones((2, 30, 40), np.float32)}), tmp_path / "images.npz")
+    with pytest.raises(ValueError, match=r"expected responses with a type_name, .* got Nameless without one"):
+        save_signals(replace(signals, channels={Nameless(): np.ones((1, 30, 40), np.float32)}), tmp_path / "n.npz")
     assert not list(tmp_path.iterdir())
 
 

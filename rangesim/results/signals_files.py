@@ -86,7 +86,9 @@ def load_signals(path: str | Path) -> StillSignals:
     try:
         check_keys(settings, ("format", "format_version", "rig", "responses"), str(path))
         rig = Rig.from_dict(settings.get("rig"))
-        responses = [_response(table, f"responses[{i}]") for i, table in enumerate(settings.get("responses", ()))]
+        responses = [
+            from_dict(Response, table, f"responses[{i}]") for i, table in enumerate(settings.get("responses", ()))
+        ]
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     if len(set(responses)) < len(responses):
@@ -196,29 +198,11 @@ def _settings(path: Path) -> dict[str, Any]:
 
 
 def _plain(response: Response) -> dict[str, Any]:
-    table = {"type": type(response).__name__, **to_dict(response)}
+    """Plain data of a response; ValueError if it cannot be read back."""
+    name = type(response).__name__
+    if not hasattr(response, "type_name"):
+        raise ValueError(f"expected responses with a type_name, which names them in files, got {name} without one.")
     if any(isinstance(value, np.ndarray) for value in vars(response).values()):
-        raise ValueError(f"expected responses of numbers, got {type(response).__name__}, which holds arrays.")
+        raise ValueError(f"expected responses of numbers, got {name}, which holds arrays.")
+    table: dict[str, Any] = to_dict(response)
     return table
-
-
-def _response(table: Any, place: str) -> Response:
-    """The response that a table describes; `type` is the name of its class."""
-    if not isinstance(table, dict):
-        raise ValueError(f"{place}: expected a table, got {shown(table)}.")
-    values = dict(table)
-    name, kinds = values.pop("type", None), _kinds()
-    if not isinstance(name, str) or name not in kinds:
-        raise ValueError(f"{place}: expected 'type' to be one of {', '.join(kinds)}, got {shown(name)}.")
-    return from_dict(kinds[name], values, place)
-
-
-def _kinds() -> dict[str, type[Response]]:
-    """All loaded classes of responses by name; of two with the same name, the one nearer to `Response` in the tree."""
-    found: dict[str, type[Response]] = {}
-    level = Response.__subclasses__()
-    while level:
-        for kind in level:
-            found.setdefault(kind.__name__, kind)
-        level = [deeper for kind in level for deeper in kind.__subclasses__()]
-    return found
