@@ -71,6 +71,7 @@ STOREYS = [
     "plausibility",
     "warmup",
     "scan",
+    "all_kernels",
 ]
 """Of pcgraph, from the ground up: nobody imports from above."""
 ON_TOP = {"detection", "learning", "io", "families", "cli"}

@@ -88,7 +88,7 @@ def run(
     """
     import mitsuba as mi
 
-    from pcgraph.warmup import compile_kernels
+    from pcgraph.all_kernels import compile_kernels
     from rangesim.light_transport.kernel_launches import report_part
     from rangesim.report import write_report
 
