@@ -96,7 +96,7 @@ class Nameless(DenseResponse):
 def test_a_response_of_your_own_comes_back(tmp_path: Path) -> None:
     signals = plane_signals(stereo_rig(40, 30), AmcwToF())
     channels = {Nearby(3.0): np.ones((1, 30, 40), np.float32), **signals.channels}
-    replace(signals, channels=channels).save(tmp_path / "own.npz")
+    save_signals(replace(signals, channels=channels), tmp_path / "own.npz")
     assert list(load_signals(tmp_path / "own.npz").channels) == list(channels)
 
 

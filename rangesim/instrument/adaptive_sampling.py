@@ -12,10 +12,9 @@ import numpy as np
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.ambient import Ambient
-from rangesim.evaluation.range_noise import TO_SIGMA, sampling_draw
+from rangesim.evaluation.range_noise import sampling_draw
 from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.sampler import Sampler
-from rangesim.evaluation.range_noise import sampling_draw
 from rangesim.robust_scale import TO_SIGMA
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole

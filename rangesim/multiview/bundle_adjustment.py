@@ -42,8 +42,8 @@ from rangesim.geometry.registration import nearest_similarity
 from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose, reproject, with_all_coefficients
 from rangesim.multiview.schur_complement import NormalEquations, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
-from rangesim.robust_scale import sigma_from_median
 from rangesim.rig import Intrinsics, check_rigid
+from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.config import shown
 
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

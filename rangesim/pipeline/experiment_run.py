@@ -145,7 +145,7 @@ def _computed(
     """The result, before anything is warned about."""
     import mitsuba as mi
 
-    from pcgraph.warmup import compile_kernels
+    from pcgraph.all_kernels import compile_kernels
     from rangesim.light_transport.kernel_launches import report_part
     from rangesim.scene import load_scene
 
