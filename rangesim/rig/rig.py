@@ -18,6 +18,7 @@ from rangesim.settings.bounds import (
     Exponent,
     Metres,
     Watts,
+    Wavelength,
     check_fields,
     check_number,
     whole,
@@ -240,6 +241,7 @@ class Rig:
     T_camera_projector : (4, 4) float64, maps projector coordinates to camera coordinates, metres.
     camera_lens, projector_lens : Lens
     projector_power_w : float, mean radiant power that leaves the projector when it shows white.
+    wavelength_m : metres, of the emitter's light; None: not stated.
     """
 
     camera: Intrinsics
@@ -249,6 +251,7 @@ class Rig:
     camera_lens: Lens = CAMERA_LENS
     projector_lens: Lens = PROJECTOR_LENS
     projector_power_w: Watts = 1.0
+    wavelength_m: Wavelength | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_camera", pose(self.T_world_camera, "T_world_camera"))
@@ -312,7 +315,9 @@ class Rig:
     def differences_of_emitter(self, other: Rig) -> list[str]:
         """What is not the same of the emitters of two rigs, by name; places may differ by `SAME_PLACE`."""
         found = [
-            k for k in ("projector", "projector_lens", "projector_power_w") if getattr(self, k) != getattr(other, k)
+            k
+            for k in ("projector", "projector_lens", "projector_power_w", "wavelength_m")
+            if getattr(self, k) != getattr(other, k)
         ]
         same = is_same_pose(self.T_world_projector, other.T_world_projector)
         return found if same else [*found, "T_world_projector"]
