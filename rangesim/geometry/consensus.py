@@ -206,7 +206,7 @@ def refuse_misfit(cost: float, freedom: int, noise_px: float | None, model: str)
     excess = cost / noise_px**2
     if excess > MAX_EXCESS**2 * freedom and excess > chi2_limit(freedom):
         raise ValueError(
-            f"expected pairs that {model} explains to their noise of {noise_px:.3g} px, got residuals of "
+            f"expected pairs that {model} explains within their noise of {noise_px:.3g} px, got residuals of "
             f"{np.sqrt(cost / freedom):.3g} px; some pairs are wrong (the robust function finds them), or noise_px "
             "is too small."
         )

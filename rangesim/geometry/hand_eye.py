@@ -202,8 +202,8 @@ def _start(hand: Array, seen: Array) -> Array:
 
 
 _PARALLEL = (
-    "expected robot poses that turn about two different axes, got {what}: the camera's place along the axis is open; "
-    "turn the gripper by 30 degrees or more about a second axis."
+    "expected robot poses that turn about two different axes, got {what}: the camera's position along the axis is not "
+    "determined; turn the gripper by 30 degrees or more about a second axis."
 )
 
 

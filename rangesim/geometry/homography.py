@@ -343,8 +343,8 @@ def _refuse_collinear(name: str, points: Array, noise_px: float) -> None:
         others = np.delete(np.arange(n), odd).tolist()
         which = f"points {others} of {name}" if n == 4 else f"{n - 1} of the {n} points of {name}, or all,"
         raise ValueError(
-            f"expected four points with no three collinear, got {which} on one line to their noise of {noise_px:.3g} "
-            "px; add points away from it."
+            f"expected four points with no three collinear, got {which} on one line within their noise of "
+            f"{noise_px:.3g} px; add points away from it."
         )
 
 

@@ -474,7 +474,7 @@ def fit_fundamental(first: ArrayLike, second: ArrayLike, *, noise_px: float | No
     normal = tangent @ in_tangent @ tangent.T
     if not np.sqrt(np.trace(normal)) <= MAX_STANDARD_DEVIATION:
         raise ValueError(
-            "expected points that determine the fundamental matrix, got some that leave it open at a noise of "
+            "expected points that determine the fundamental matrix, got some that do not at a noise of "
             f"{noise:.3g} px: near a plane, near a surface that contains both centres, or with too small a baseline; "
             "add points at other depths."
         )
@@ -815,7 +815,7 @@ def _refuse_homography(a: Array, b: Array, cost: float, parameters: int, noise_p
         hint = "" if noise_px is not None or n > 12 else " With so few pairs, state noise_px if you know it."
         raise ValueError(
             f"expected two views with parallax, got {n} pairs that a homography maps to each other within {apart:.3g} "
-            f"px: {what}; the epipoles are then open, or two poses fit. Add points at other depths or move the "
+            f"px: {what}; the epipoles are not determined, or two poses fit. Add points at other depths or move the "
             f"camera.{hint}"
         )
 
@@ -863,8 +863,8 @@ def _refuse_open_epipole(
             if distances @ distances <= allowed:
                 raise ValueError(
                     f"expected points that determine the fundamental matrix, got {len(a)} pairs of which all but "
-                    f"{len(off)} lie on one plane: these leave the epipole open at a noise of {noise_px:.3g} px, and a "
-                    "family of matrices explains all pairs; add points off the plane."
+                    f"{len(off)} lie on one plane: these do not determine the epipole at a noise of {noise_px:.3g} px; "
+                    "a family of matrices explains all pairs; add points off the plane."
                 )
 
 
