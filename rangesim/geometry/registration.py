@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.geometry.correspondences import Array, check_distinct, checked_array
 from rangesim.rig import pose
+from rangesim.robust_scale import sigma_from_median
 
 MIN_POINTS = 20
 """Least number of different points of a cloud, a count: as many as `NORMAL_NEIGHBOURS`, so that every normal has all
@@ -464,7 +465,7 @@ def _roughness(points: Array, spacing: float) -> float:
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
     partner = cKDTree(points).query(points, k=NORMAL_NEIGHBOURS)[1][:, 1:]
     off = ((points[partner] - points[:, None]) * np.asarray(cloud.normals)[:, None]).sum(axis=-1)
-    return float(1.4826 * np.median(np.abs(off)))
+    return sigma_from_median(off)
 
 
 def _refuse_others(best: Registration, tried: list[Registration], source: Array, surface: _Surface) -> None:
