@@ -34,7 +34,7 @@ from rangesim.geometry.reprojection import reproject
 from rangesim.rig import Intrinsics
 
 POSE_PARAMETERS = 6
-"""Number of parameters of a pose, a count: three for its rotation and three for its translation, as in any motion."""
+"""Number of parameters of a pose: three of the rotation and three of the translation."""
 
 MAX_PLANAR_FRACTION = 1e-3
 """Ratio of the third principal extent of the points to the first up to which they are also treated as a plane. The
@@ -46,16 +46,16 @@ MAX_ROTATION_DEVIATION = 0.3
 linear covariance no longer holds; nobody measured a closer limit."""
 
 TRIPLES = 20
-"""Number of triples of points, a count, that P3P solves to find starts. More triples cost time and help only where the
-other solvers fail and noise spoils the first triples."""
+"""Number of triples of points that P3P solves to find starts. More triples cost time and help only where the other
+solvers fail and noise spoils the first triples."""
 
 STARTS = 6
-"""Number of different starts, a count, from which the reprojection error is minimised: the best by that error. P3P has
-up to four solutions and a plane two, so that six leave room for both."""
+"""Number of different starts from which the reprojection error is minimised: the best by that error. P3P has up to four
+solutions and a plane two, so that six leave room for both."""
 
 SAME_POSE = 1e-3
-"""Difference in radians, and as a ratio to the distance, up to which two minima are one and the same pose. Descents end
-far nearer to each other than this if their minimum is the same."""
+"""Difference in radians, and as a ratio to the distance, up to which two minima are one and the same pose, because
+descents to one minimum end far nearer to each other."""
 
 SAME_START = 0.03
 """Difference in radians, and as a ratio to the distance, up to which two starts count as one, because the descents from

@@ -36,15 +36,15 @@ MIN_TURN_OVER_NOISE = 5.0
 standard deviations are hardly noise alone; a smaller ratio lets the place along the axis be guessed from noise."""
 
 DERIVATIVE_STEP = 1e-6
-"""Step of the numerical derivatives, in radians or metres. With central differences of numbers about 1, rounding then
-leaves a relative error of about 1e-10 and the third derivative one of 1e-12."""
+"""Step of the numerical derivatives, in radians or metres. Chosen so that, with central differences of numbers about 1,
+rounding leaves a relative error of only 1e-10 and the third derivative one of 1e-12."""
 
 MIN_NOISE = 1e-12
 """Least noise, in radians or metres, that residuals are weighted by, so that exact poses do not divide by 0."""
 
 REWEIGHTINGS = 3
-"""Number of minimisations, a count, between which rotations and translations are weighted anew by their own noise. The
-first starts with equal weights; more change little, as the noise hardly depends on the weights."""
+"""Number of times that the residuals are minimised; before each but the first, rotations and translations are weighted
+anew by their own noise. More change little, because the noise hardly depends on the weights."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ from rangesim.geometry.correspondences import (
 from rangesim.geometry.least_squares import Minimum, minimise
 
 HOMOGRAPHY_PARAMETERS = 8
-"""Number of degrees of freedom, a count: the 9 entries of H less its scale, as in HZ table 2.4."""
+"""Number of degrees of freedom of a homography: 9 entries of H less its scale; source: HZ table 2.4."""
 
 COLLINEAR_FRACTION = 1e-7
 """Distance from a line, as a fraction of the spread of the points, up to which a point without noise lies on it. It is

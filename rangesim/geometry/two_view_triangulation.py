@@ -41,30 +41,30 @@ CONVERGED_CORRECTION = 1e-5
 would change it by about the square, which is rounding."""
 
 MAX_CORRECTION_STEPS = 20
-"""Largest number of steps, a count. Two suffice for most pixels (Lindstrom 2010); a pair that needs more than 20 is
-decided by the search over all epipolar lines."""
+"""Largest number of steps. Two suffice for most pixels (Lindstrom 2010); a pair that needs more than 20 is decided by
+the search over all epipolar lines."""
 
 PARALLEL_RAD = 1e-12
 """Angle between two rays, in radians, up to which they are parallel. It is far above rounding, 1e-16, and a billionth
 of a pixel for a focal length of 1000 px, so that no measured pixels distinguish it from 0."""
 
 UNIFORM_ANGLES = 64
-"""Number of angles, a count, that the search samples evenly over all epipolar lines. There are at most three minima,
-and narrow ones lie near the two zeros, which are sampled apart; more take time in proportion."""
+"""Number of angles that the search samples evenly over all epipolar lines. It need not be large, because narrow minima
+lie near the two zeros, which are sampled apart."""
 
 ANGLES_BESIDE_ZERO = 40
-"""Number of angles, a count, that the search samples on either side of each zero, from 1e-8 to 1.5 rad in geometric
-steps of a factor 1.6, so that minima of any width are met."""
+"""Number of angles that the search samples on either side of each zero, from 1e-8 to 1.5 rad in geometric steps of a
+factor 1.6, so that minima of any width are met."""
 
 GOLDEN_RATIO = 0.5 * (np.sqrt(5) - 1)
-"""Ratio of two intervals of a golden-section search, half of (the root of 5, less 1)."""
+"""Ratio of two successive intervals of a golden-section search, (sqrt(5) - 1) / 2."""
 
 GOLDEN_STEPS = 45
-"""Number of golden sections, a count. They shorten an interval by a factor 4e-10, below which a minimum is flat in
-double precision."""
+"""Number of times that a golden section shortens an interval, by a factor of 4e-10 in all, because a minimum is flat in
+double precision below that."""
 
 PAIRS_AT_ONCE = 4096
-"""Number of pairs whose angles are sampled at once, a count. It bounds the memory to some ten megabytes per array; the
+"""Number of pairs whose angles are sampled at once, so that the memory stays at some ten megabytes per array; the
 result does not depend on it."""
 
 
