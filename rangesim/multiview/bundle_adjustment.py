@@ -42,7 +42,8 @@ from rangesim.geometry.registration import nearest_similarity
 from rangesim.geometry.reprojection import POSE, by_lens, moved_lens, moved_pose, reproject, with_all_coefficients
 from rangesim.multiview.schur_complement import NormalEquations, Sizes, Step, Term
 from rangesim.multiview.tracks import Tracks
-from rangesim.rig import Intrinsics
+from rangesim.rig import Intrinsics, check_rigid
+from rangesim.robust_scale import sigma_from_median
 from rangesim.settings.config import shown
 
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -341,7 +342,7 @@ def _checked(
     T = checked_array("T_camera_world", T_camera_world, 4, 4)
     if T.shape != (tracks.n_images, 4, 4):
         raise ValueError(f"expected T_camera_world of shape ({tracks.n_images}, 4, 4), got {T.shape}.")
-    check_rigid(T)
+    check_rigid(T, "T_camera_world")
     X = np.array(points, dtype=np.float64)
     if X.shape != (tracks.n_points, 3) or np.isinf(X).any():
         raise ValueError(f"expected points as ({tracks.n_points}, 3) finite numbers or NaN, got shape {X.shape}.")
@@ -382,19 +383,6 @@ def _checked(
             f"{len(np.unique(some.point))} points; add observations."
         )
     return sizes, some, state
-
-
-def check_rigid(T: Array) -> None:
-    """Raise ValueError unless each pose (n, 4, 4) is a rotation and a translation."""
-    R = T[:, :3, :3]
-    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
-    sound = (off <= 1e-4) & (np.linalg.det(R) > 0) & (np.abs(T[:, 3] - [0, 0, 0, 1]) <= 1e-9).all(axis=1)
-    if not sound.all():
-        i = int(np.argmin(sound))
-        raise ValueError(
-            f"expected rigid poses T_camera_world, a rotation and a translation each, got {int((~sound).sum())} that "
-            f"are not rigid, such as the pose of image {i}: {T[i].tolist()}."
-        )
 
 
 def check_connected(tracks: Tracks) -> None:
@@ -748,8 +736,7 @@ def _noise(residuals: Array, loss: str, freedom: int) -> float:
         return float("nan")
     if loss == "linear":
         return float(np.sqrt((residuals**2).sum() / freedom))
-    to_deviation = 1.4826  # from a median of absolute values to the standard deviation, for Gaussian noise
-    return float(to_deviation * np.median(np.abs(residuals)) * np.sqrt(residuals.size / freedom))
+    return float(sigma_from_median(residuals) * np.sqrt(residuals.size / freedom))
 
 
 def _in_gauge(start: Array, T: Array, X: Array, held: list[int], shared: int) -> tuple[Array, Array, Array]:

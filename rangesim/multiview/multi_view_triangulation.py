@@ -20,13 +20,12 @@ from rangesim.geometry.correspondences import Array
 from rangesim.multiview.bundle_adjustment import (
     MAX_RELATIVE_DEVIATION,
     Views,
-    check_rigid,
     normal_equations,
     reprojection_errors,
 )
 from rangesim.multiview.schur_complement import Sizes
 from rangesim.multiview.tracks import Tracks
-from rangesim.rig import Intrinsics
+from rangesim.rig import Intrinsics, check_rigid
 
 GAUSS_NEWTON_STEPS = 5
 """Number of Gauss-Newton steps after the linear solution. Measured with 5 cameras around 200 points at 5 m and 5 px of
@@ -105,8 +104,8 @@ def triangulate_many(
     known = np.asarray(np.isfinite(T).all(axis=(1, 2)))
     if known.sum() < 2:
         raise ValueError(f"expected at least two images with a pose, got {int(known.sum())}.")
-    check_rigid(T[known])
     T = np.where(known[:, None, None], T, np.eye(4))
+    check_rigid(T, "T_camera_world")
     # The linear equations mix directions and positions, so they lose precision far from the origin, as in map
     # coordinates. Move the origin to the mean of the cameras.
     origin = -np.einsum("nji,nj->ni", T[known, :3, :3], T[known, :3, 3]).mean(axis=0)
