@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from synthetic import plane_signals, signals_of_depth, stereo_rig
 
-from rangesim import Ambient, AmcwToF, Capture, Detector, DirectToF, SpadDetector, StructuredLight, expose
+from rangesim import Ambient, AmcwToF, Capture, Detector, DirectToF, SpadDetector, StructuredLight, expose, save_capture
 from rangesim import load_capture as load
 from rangesim.electronics.ambient import LUMINOUS_EFFICACY, Sun, Tungsten, WhiteLed, photopic
 from rangesim.electronics.detector import PhotoDetector
@@ -199,7 +199,7 @@ def test_settings_round_trip(tmp_path: Path) -> None:
     assert from_dict(PhotoDetector, to_dict(detector)) == detector  # type: ignore[type-abstract]
     for i, ambient in enumerate((None, Ambient("led", illuminance_lux=500.0))):
         capture = expose(plane_signals(stereo_rig(), SENSOR, ambient=0.1), SENSOR, detector, ambient=ambient)
-        capture.save(tmp_path / f"capture{i}")
+        save_capture(capture, tmp_path / f"capture{i}")
         loaded = load(tmp_path / f"capture{i}")
         assert (loaded.detector, loaded.ambient) == (detector, ambient)
 

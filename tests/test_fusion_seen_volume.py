@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from fusion_scenes import ball, block, mesh_depth, range_image, sphere_depth
 
-from rangesim.fusion import (
-    VoxelGrid,
-    VoxelState,
-    occupancy,
-    true_occupancy,
-    voxel_states,
-)
+from rangesim.fusion import VoxelGrid, VoxelState, occupancy, true_occupancy, voxel_states
 from rangesim.fusion.seen_volume import seen_surface
 from rangesim.rig import Intrinsics, look_at
 from rangesim.triangle_mesh import TriangleMesh

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -444,6 +445,19 @@ def test_patterns_fit_the_projector(corner: rangesim.Scene) -> None:
         transport(corner, rig, [Images(np.ones((2, 10, 10), np.float32))], spp=1)
     with pytest.raises(ValueError, match="a rig whose projector has 1280 x 800"):
         transport(corner, rig, [StructuredLight(640, 400)], spp=1)
+
+
+def test_equal_pattern_stacks_share_their_channels(corner: rangesim.Scene) -> None:
+    pixels = np.random.default_rng(0).random((2, 40, 64), dtype=np.float32)
+    images = Images(pixels)
+    copy, unpickled, other = Images(pixels.copy()), pickle.loads(pickle.dumps(images)), Images(pixels[:1])
+    assert images == copy == unpickled != other
+    assert hash(images) == hash(copy) == hash(unpickled)
+    signals = transport(corner, corner.rig(**SIZE, projector_size=(64, 40)), [images, copy, unpickled, other], spp=1)
+    assert list(signals.channels) == [images, other]
+    assert signals.channels[unpickled] is signals.channels[images]
+    pixels[:] = 0
+    assert images == copy  # it holds a copy
 
 
 def test_unlit_pixels_never_reach_a_response(tabletop: rangesim.Scene) -> None:

@@ -23,11 +23,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangesim import limits
 from rangesim.errors import EnvironmentProblem
 from rangesim.fusion.mesh_error import raycasting_scene
 from rangesim.fusion.solids import Solid, outermost_first, steps_of_attenuation
 from rangesim.fusion.voxel_grid import VoxelGrid
+from rangesim.settings import limits
 from rangesim.settings.config import ShortRepr, nearest, shown
 from rangesim.settings.seeds import check_seed
 from rangesim.triangle_mesh import TriangleMesh

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from pcgraph.parallel import in_blocks, kernel, routine
-from rangesim import limits
 from rangesim.decoding.range_image import RangeImage
 from rangesim.errors import AlignmentWarning
 from rangesim.fusion.sdf import (
@@ -29,6 +28,7 @@ from rangesim.fusion.sdf import (
     check_lookup,
     relative_weights,
 )
+from rangesim.settings import limits
 from rangesim.settings.bounds import MAX_COORDINATE_M, Bounds, check_number
 from rangesim.settings.config import ShortRepr, shown
 from rangesim.triangle_mesh import TriangleMesh

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangesim import limits
+from rangesim.settings import limits
 from rangesim.settings.bounds import Coordinate, Metres, check_fields, whole
 from rangesim.settings.config import shown
 

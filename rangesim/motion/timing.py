@@ -8,9 +8,9 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.rig import Array, Intrinsics
 from rangesim.sensor import Sensor
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Pause, check_fields, whole
 
 

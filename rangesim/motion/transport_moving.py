@@ -74,27 +74,31 @@ def transport_moving(
     >>> signals = transport_moving(scene, rig, {sensor: Timing(frame_period_s=0.01)}, motion)  # doctest: +SKIP
     >>> signals[sensor].motion_m.max()  # doctest: +SKIP
     """
-    from rangesim.experiment.adaptive_sampling import AdaptiveSampling
-    from rangesim.light_transport.transport import transport
+    from rangesim.light_transport.light_pass import trace_light
+    from rangesim.light_transport.sampler import Sampler
     from rangesim.light_transport.transport_settings import chosen
+    from rangesim.light_transport.truncation import warn_of_truncation
     from rangesim.scene.rigid_motion import MovingScene
 
     _check(scene, rig, timings, motion)
     settings = chosen(settings, options)
-    if isinstance(settings.spp, AdaptiveSampling):
-        raise ValueError('expected a number of samples or "auto" where something moves, got AdaptiveSampling.')
+    if isinstance(settings.spp, Sampler):
+        raise ValueError(
+            f'expected a number of samples or "auto" where something moves, got {type(settings.spp).__name__}.'
+        )
     passes = plan(rig, timings, motion)
     stage = MovingScene(scene, tuple(motion.objects))
     at_once: dict[Sensor, Signals] = {}
     stacks: dict[Sensor, FrameStack] = {}
     for number, one in enumerate(passes):
-        signals = transport(
+        (signals,) = trace_light(
             stage.at(one.poses.objects),
-            one.rig(rig),
+            [one.rig(rig)],
             [response for sensor in one.sensors for response in sensor.responses()],
             replace(settings, seed=one.seed(settings.seed)),
-            progress=progress and partial(_report, progress, number, len(passes)),
+            progress and partial(_report, progress, number, len(passes)),
         )
+        warn_of_truncation(signals.truncation, settings.max_depth, "", stacklevel=2)
         for sensor in one.reference_of:
             if any(sensor in other.sensors for other in passes if other is not one):
                 stacks[sensor] = FrameStack(sensor, timings[sensor], rig, one, signals)

@@ -15,9 +15,11 @@ the renderer evaluates them per light path.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
+
+from rangesim.settings.config import Named
 
 KINDS = ("direct", "multipath", "specular", "caustic", "glint")
 """Kinds of projector light, in the order of `rangesim.signals.EnergySplit`; a path's `kind` is an index."""
@@ -86,13 +88,20 @@ class NumpyMath:
         return table[index]
 
 
-class Response(ABC):
-    """A linear functional of light paths."""
+class Response(Named, ABC):
+    """A linear functional of light paths. Subclasses are frozen dataclasses.
+
+    A response with a `type_name` can be written to files of signals and read back, also one from outside the package.
+    """
+
+    known: ClassVar[dict[str, type[Any]]] = {}
+    type_name: ClassVar[str]
+    """Name in files of signals; a response without one can be used, but not saved."""
 
     channels: int
     """Number of channels (dense) or bins (sparse)."""
 
-    def check(self, width: int, height: int) -> None:  # noqa: B027 (most responses fit any projector)
+    def check(self, width: int, height: int) -> None:
         """Raise ValueError if a projector of that many pixels cannot show this response."""
 
 

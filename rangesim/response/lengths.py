@@ -31,6 +31,7 @@ class Phasor(DenseResponse):
     modulation_hz: Hertz
     square: bool = False
     channels: ClassVar[int] = 2  # type: ignore[misc]
+    type_name: ClassVar[str] = "Phasor"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -52,6 +53,7 @@ class FirstReturn(DenseResponse):
     """Radiance, and radiance times path length, of the paths that are lit where the camera looks."""
 
     channels: ClassVar[int] = 2  # type: ignore[misc]
+    type_name: ClassVar[str] = "FirstReturn"
 
     def weights(self, path: LightPath, m: Math) -> list[Any]:
         first = m.select(path.is_first, 1.0, 0.0)
@@ -72,6 +74,8 @@ class TransientHistogram(SparseResponse):
     channels: Annotated[int, whole(1, "bins")]  # type: ignore[misc]
     period_m: Period | None = None
     is_shared: bool = False
+
+    type_name: ClassVar[str] = "TransientHistogram"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -108,6 +112,8 @@ class LengthSplit(SparseResponse):
     width_m: BinLength
     bins: Annotated[int, whole(1, "bins")]
     period_m: Period | None = None
+
+    type_name: ClassVar[str] = "LengthSplit"
 
     def __post_init__(self) -> None:
         check_fields(self)

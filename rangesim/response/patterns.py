@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.response.base import DenseResponse, LightPath, Math
 from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields
 from rangesim.settings.config import shown
 
@@ -30,6 +31,8 @@ class GrayBits(DenseResponse):
     bits: Annotated[int, Bounds("a number of bits", 1, 32)]
     shift: Annotated[int, Bounds("a number of bits", 0, 31)] = 0
     """Finest bits left out."""
+
+    type_name: ClassVar[str] = "GrayBits"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -59,6 +62,7 @@ class Fringes(DenseResponse):
     axis: Axis
     period_px: Annotated[float, Bounds("positive and finite", 1e-3, 1e6)]
     channels: ClassVar[int] = 2  # type: ignore[misc]
+    type_name: ClassVar[str] = "Fringes"
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -73,27 +77,70 @@ class Fringes(DenseResponse):
 
 @dataclass(frozen=True, eq=False)
 class Images(DenseResponse):
-    """Arbitrary patterns, (k, height, width) float32 in 0..1, each projector pixel a uniform square.
+    """Arbitrary patterns, read at the projector pixel that the light left.
 
-    Out of focus, they are read from blurred copies.
+    Two stacks with the same pixels are equal, also after pickling, so sensors that show them share their channels. Out
+    of focus, the patterns are read from blurred copies.
+
+    Parameters
+    ----------
+    patterns : (k, height, width) float32, fraction of full power per projector pixel, each a uniform square. The array
+        is copied, and the copy is read-only.
+
+    Raises
+    ------
+    ValueError
+        `patterns` is no such array, has no pixels, or has some that are not finite.
+
+    Examples
+    --------
+    >>> stripes = np.tile([[0.0, 1.0]], (2, 4, 4)).astype(np.float32)
+    >>> images = Images(stripes)
+    >>> images.channels
+    2
+    >>> images == Images(stripes.copy())
+    True
     """
 
     patterns: np.ndarray
+
+    type_name: ClassVar[str] = "Images"
 
     def __post_init__(self) -> None:
         values = self.patterns
         if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub" or values.ndim != 3 or not values.size:
             raise ValueError(f"expected patterns to be an array (k, height, width) of numbers, got {shown(values)}.")
         limits.check("frames", len(values), "patterns")
-        if not np.isfinite(values).all():
+        with np.errstate(over="ignore"):
+            kept = np.array(values, dtype=np.float32, order="C")
+        if not np.isfinite(kept).all():
             raise ValueError("expected patterns to be finite, got NaN or infinite pixels.")
+        kept.setflags(write=False)
+        object.__setattr__(self, "patterns", kept)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._digest == other._digest  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+    def __reduce__(self) -> tuple[type[Images], tuple[np.ndarray]]:
+        """The class and its patterns, for pickle: the blurred copies are made anew instead of stored."""
+        return type(self), (self.patterns,)
+
+    @cached_property
+    def _digest(self) -> str:
+        """SHA-256 of the shape and the pixels: the same in every process, unlike `hash` of bytes."""
+        digest = hashlib.sha256(repr(self.patterns.shape).encode())
+        digest.update(self.patterns.data)
+        return digest.hexdigest()
 
     @property
     def channels(self) -> int:  # type: ignore[override]
         return len(self.patterns)
 
     def check(self, width: int, height: int) -> None:
-        if self.patterns.ndim != 3 or self.patterns.shape[1:] != (height, width):
+        if self.patterns.shape[1:] != (height, width):
             raise ValueError(
                 f"expected patterns of shape (k, {height}, {width}) for a projector of {width} x {height} pixels, "
                 f"got {self.patterns.shape}."
@@ -106,7 +153,7 @@ class Images(DenseResponse):
         column = m.unsigned(m.select(path.u < width, path.u, width - 1.0))
         row = m.unsigned(m.select(path.v < height, path.v, height - 1.0))
         index = row * width + column
-        return [m.lookup(np.ascontiguousarray(p, dtype=np.float32).ravel(), index) for p in self.patterns]
+        return [m.lookup(pattern.ravel(), index) for pattern in self.patterns]
 
     @cached_property
     def _blurred(self) -> list[BlurredImage]:

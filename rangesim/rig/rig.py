@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangesim import limits
 from rangesim.rig.distortion import distort, fold_radius2, undistort
+from rangesim.settings import limits
 from rangesim.settings.bounds import (
     MAX_COORDINATE_M,
     Bounds,
@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 SAME_PLACE = 1e-5
 """Metres and radians; emitters no farther apart are in one place."""
+ROTATION_TOLERANCE = 1e-4
+"""Largest entry of |R R^T - I|, dimensionless, of a matrix that counts as a rotation. A matrix written with five
+decimals is off by at most 2e-5 and passes; a scale of 1.0001 does not."""
 RESIDUAL_PX = 1e-3
 """Where the inverse of a lens model reprojects worse than this, there is none."""
 
@@ -145,12 +148,24 @@ def pose(matrix: ArrayLike, name: str) -> Array:
         raise ValueError(f"expected {name} to hold finite numbers, got {result.tolist()}.")
     if np.abs(result).max() > MAX_COORDINATE_M:
         raise ValueError(f"expected {name} to move by at most {MAX_COORDINATE_M:g} m, got {np.abs(result).max():g}.")
-    rotation = result[:3, :3]
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
-    if not rigid or not np.allclose(result[3], [0, 0, 0, 1]):
-        raise ValueError(f"expected {name} to be rigid (a rotation and metres of translation), got {result.tolist()}.")
+    check_rigid(result, name)
     result.setflags(write=False)
     return result
+
+
+def check_rigid(T: NDArray[np.floating[Any]], name: str) -> None:
+    """Raise ValueError unless a pose (4, 4), or each of several (n, 4, 4), is a rotation and a translation.
+
+    name : what the poses are, for the message; the first one that is not rigid is named by its index.
+    """
+    R = T[..., :3, :3]
+    is_rotation = np.isclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=ROTATION_TOLERANCE).all(axis=(-2, -1))
+    is_rigid = is_rotation & (np.linalg.det(R) > 0) & np.isclose(T[..., 3, :], [0, 0, 0, 1]).all(axis=-1)
+    if not is_rigid.all():
+        if T.ndim > 2:
+            first = int(np.argmin(is_rigid))
+            name, T = f"{name}[{first}]", T[first]
+        raise ValueError(f"expected {name} to be rigid (a rotation and metres of translation), got {T.tolist()}.")
 
 
 def is_same_pose(first: np.ndarray, second: np.ndarray) -> bool:

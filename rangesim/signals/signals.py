@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -213,17 +212,3 @@ class StillSignals(Signals):
             got = f"{frames.shape} and {frames.dtype}" if isinstance(frames, np.ndarray) else type(frames).__name__
             raise ValueError(f"expected frames of {sensor.type_name} of shape {expected} and type float32, got {got}.")
         return frames
-
-    def save(self, path: str | Path) -> None:
-        """Write everything to a compressed .npz file, from which `rangesim.load_signals` reads equal signals.
-
-        Raises
-        ------
-        ValueError
-            A response holds arrays (`Images`), which this file format has no place for.
-        FileFormatError
-            The file cannot be written.
-        """
-        from rangesim.signals.signals_files import save_signals
-
-        save_signals(self, path)

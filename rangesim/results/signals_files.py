@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from rangesim.files.array_files import read_arrays, write_arrays
 from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
 from rangesim.response import Response
 from rangesim.rig import Rig
-from rangesim.settings.config import check_keys, from_dict, shown, to_dict
-from rangesim.signals.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
+from rangesim.settings.config import ShortRepr, check_keys, from_dict, shown, to_dict
+from rangesim.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
 
 FORMAT = "rangesim-signals"
 FORMAT_VERSION = 1
@@ -43,7 +43,15 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:
-    """Write signals with their channels and their sampling error; see `StillSignals.save`."""
+    """Write signals with their channels and sampling error to a compressed .npz file; `load_signals` reads them back.
+
+    Raises
+    ------
+    ValueError
+        A response holds arrays (`Images`).
+    FileFormatError
+        The place cannot be written.
+    """
     responses = list(signals.channels)
     settings = {
         "format": FORMAT,
@@ -60,7 +68,7 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
 
 
 def load_signals(path: str | Path) -> StillSignals:
-    """Signals that `StillSignals.save` wrote; `rangesim.expose` takes them like those of a new pass.
+    """Signals that `save_signals` wrote; `expose` makes captures of them as of traced ones.
 
     Raises
     ------
@@ -78,7 +86,9 @@ def load_signals(path: str | Path) -> StillSignals:
     try:
         check_keys(settings, ("format", "format_version", "rig", "responses"), str(path))
         rig = Rig.from_dict(settings.get("rig"))
-        responses = [_response(table, f"responses[{i}]") for i, table in enumerate(settings.get("responses", ()))]
+        responses = [
+            from_dict(Response, table, f"responses[{i}]") for i, table in enumerate(settings.get("responses", ()))
+        ]
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     if len(set(responses)) < len(responses):
@@ -99,26 +109,58 @@ def load_signals(path: str | Path) -> StillSignals:
     sampling = None
     if all(has_error):
         sampling = SamplingError({r: data[f"error_{i}"] for i, r in enumerate(responses)}, data["error_projector"])
-    truncation = Truncation(*map(float, data["truncation"])) if "truncation" in data else None
     channels = {response: data[f"channels_{i}"] for i, response in enumerate(responses)}
-    return StillSignals(rig, energy, truth, truncation=truncation, channels=channels, sampling=sampling)
+    return StillSignals(rig, energy, truth, truncation=_truncation(data), channels=channels, sampling=sampling)
 
 
-def write_pass(signals: Signals, path: str | Path) -> None:
-    """Write the energy split, the ground truth and the truncation of a pass, which a result stores for each pass."""
-    write_arrays(path, _pass_arrays(signals))
+@dataclass(frozen=True, eq=False, repr=False)
+class LightPass(ShortRepr):
+    """What a result keeps of a transport pass: all that signals hold besides their channels.
 
-
-def read_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
-    """Energy split and ground truth that `write_pass` wrote; FileFormatError if the file is broken.
-
-    sizes : "h" and "w", the expected height and width in pixels.
+    energy : EnergySplit. truth : GroundTruth.
+    motion_m : (h, w) float32, metres, as of `Signals.motion_m`; None: nothing moves.
+    truncation : Truncation, light that was left out; None: not known.
     """
-    return _energy_and_truth(path, read_checked_arrays(path, _PASS, dict(sizes)))  # each pass has its own instances
+
+    energy: EnergySplit
+    truth: GroundTruth
+    motion_m: np.ndarray | None = None
+    truncation: Truncation | None = None
+
+    @classmethod
+    def of(cls, signals: Signals) -> LightPass:
+        """The pass that signals come from."""
+        return cls(signals.energy, signals.truth, signals.motion_m, signals.truncation)
 
 
-def _pass_arrays(signals: Signals) -> dict[str, np.ndarray]:
-    """Arrays of everything in signals but the channels and the sampling error, by their names in files."""
+def write_pass(light_pass: LightPass, path: str | Path) -> None:
+    """Write a pass to a compressed .npz file."""
+    write_arrays(path, _pass_arrays(light_pass))
+
+
+def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
+    """The pass that `write_pass` wrote.
+
+    Parameters
+    ----------
+    sizes : its height h and width w, pixels.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or broken.
+    """
+    data = read_checked_arrays(path, _PASS, dict(sizes))  # a copy: passes may see other instances
+    energy, truth = _energy_and_truth(path, data)
+    return LightPass(energy, truth, data.get("motion_m"), _truncation(data))
+
+
+def _truncation(data: dict[str, np.ndarray]) -> Truncation | None:
+    return Truncation(*map(float, data["truncation"])) if "truncation" in data else None
+
+
+def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
+    """Arrays of what signals hold besides channels, by name in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}
     if signals.motion_m is not None:
@@ -156,29 +198,11 @@ def _settings(path: Path) -> dict[str, Any]:
 
 
 def _plain(response: Response) -> dict[str, Any]:
-    table = {"type": type(response).__name__, **to_dict(response)}
+    """Plain data of a response; ValueError if it cannot be read back."""
+    name = type(response).__name__
+    if not hasattr(response, "type_name"):
+        raise ValueError(f"expected responses with a type_name, which names them in files, got {name} without one.")
     if any(isinstance(value, np.ndarray) for value in vars(response).values()):
-        raise ValueError(f"expected responses of numbers, got {type(response).__name__}, which holds arrays.")
+        raise ValueError(f"expected responses of numbers, got {name}, which holds arrays.")
+    table: dict[str, Any] = to_dict(response)
     return table
-
-
-def _response(table: Any, place: str) -> Response:
-    """The response that a table describes; `type` is the name of its class."""
-    if not isinstance(table, dict):
-        raise ValueError(f"{place}: expected a table, got {shown(table)}.")
-    values = dict(table)
-    name, kinds = values.pop("type", None), _kinds()
-    if not isinstance(name, str) or name not in kinds:
-        raise ValueError(f"{place}: expected 'type' to be one of {', '.join(kinds)}, got {shown(name)}.")
-    return from_dict(kinds[name], values, place)
-
-
-def _kinds() -> dict[str, type[Response]]:
-    """All loaded classes of responses by name; of two with the same name, the one nearer to `Response` in the tree."""
-    found: dict[str, type[Response]] = {}
-    level = Response.__subclasses__()
-    while level:
-        for kind in level:
-            found.setdefault(kind.__name__, kind)
-        level = [deeper for kind in level for deeper in kind.__subclasses__()]
-    return found
