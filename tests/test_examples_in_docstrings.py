@@ -9,7 +9,14 @@ import pkgutil
 
 import pytest
 
-ROOMS = ["rangesim.geometry", "rangesim.multiview"]
+ROOMS = [
+    "rangesim.electronics",
+    "rangesim.fusion",
+    "rangesim.geometry",
+    "rangesim.motion",
+    "rangesim.multiview",
+    "rangesim.signals",
+]
 """Packages whose docstrings are run, all of their modules."""
 
 

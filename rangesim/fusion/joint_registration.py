@@ -27,22 +27,23 @@ from rangesim.rig import Array, Intrinsics
 from rangesim.robust_scale import sigma_from_median
 
 POINTS_PER_VIEW = 4000
-"""Number of random readings of each view that are fitted. The time grows in proportion; the error of a pose falls with
-the root of it."""
+"""Number of random readings of each view that are fitted: twice as many take twice the time, and make the error of a
+pose smaller by the root of two."""
 BORDER_PX = 3
 """Distance in pixels from a border or a failed pixel within which readings are not used, because normals and
 interpolated depths are wrong there."""
 MIN_COSINE = 0.3
-"""Smallest cosine (no unit) of the angle between the normals of two partners, and of the angle of incidence. Readings
-at more than 73 degrees are inaccurate, and partners whose normals differ by more lie on different surfaces."""
+"""Smallest cosine (a ratio) of the angle between the normals of two partners, and of the angle of incidence. It is that
+of 73 degrees, because readings beyond are inaccurate, and partners beyond lie on different surfaces."""
 TUKEY = 4.685
 """Standard deviations beyond which a residual has the weight 0: the standard value, which gives 95 % efficiency for
 normally distributed errors (Holland, Welsch 1977)."""
 MAX_ROUNDS = 30
-"""Largest number of Gauss-Newton steps; the fit usually ends earlier, see `CONVERGED`."""
+"""Largest number of Gauss-Newton steps. The fit normally ends earlier, see `CONVERGED`; the count is limited so that
+poses which go to and fro end, too."""
 CONVERGED = 1e-7
-"""Largest entry of a step at which the fit ends: radians, and metres as a fraction of the size of the scene. It is far
-below the errors of the poses."""
+"""Largest entry of a step at which the fit ends: radians, and metres as a fraction of the size of the scene. It is
+chosen far below the errors of the poses, so a larger value would save a step or two."""
 
 
 class _View(NamedTuple):

@@ -44,36 +44,38 @@ from rangesim.settings.bounds import whole as whole_number
 from rangesim.settings.config import ShortRepr, shown
 
 POINTS_PER_VIEW = 4000
-"""Number of points of each view that are registered, about, if no spacing is given. The time grows with it; with fewer
-points, small features that tell poses apart are lost."""
+"""Number of points of each view that are registered, about, if no spacing is given. More take longer, and fewer lose
+the small features from which a pose can be told."""
 MIN_POINTS = 200
 """Smallest number of points of a view, because fewer rarely show enough of a shape to find its pose."""
 DOMINANT_FRACTION = 0.5
 """Fraction of a view's points from which on a plane is removed. It has to be the majority: a smaller plane does not
 keep the rest from being registered."""
 MAX_PLANES = 3
-"""Largest number of planes that are removed from a view, such as a table and two walls."""
+"""Largest number of planes that are removed from a view: a corner of a room has three. A view with more dominant planes
+than that has no object left."""
 MAX_STEPS_BACK = 3
-"""Number of views before a view that it may be registered to. More could find a partner for a view after a gap, at the
-price of more failed registrations in a scan that is refused in the end."""
+"""Number of views before a view that it may be registered to. More could bridge a longer gap, but each failed
+registration takes seconds (docs/fusion.md)."""
 MIN_OVERLAP = 0.3
-"""Smallest fraction of the smaller view's points that lie on the other view, for a pair in the chain. `align` asks its
-user for a third."""
+"""Smallest fraction of the smaller view's points that lie on the other view, for a pair in the chain. It is a little
+below the third that `align` asks for, so that views taken as asked are not refused."""
 NEAR_SPACINGS = 6.0
-"""Distance in spacings within which points of two views belong to one surface, when the views are placed by the chain.
-It has to exceed the errors that add up along the chain."""
+"""Distance within which points of two views belong to one surface, when the chain places the views, in spacings of the
+points. It is large because errors add up along the chain."""
 MIN_LOOP_OVERLAP = 0.5
 """Smallest overlap of a loop, as a fraction like `MIN_OVERLAP`. Pairs with less overlap pull each other's borders
 together, and add little, because the chain holds the views already."""
 MAX_DISAGREEMENT_SPACINGS = 2.0
-"""Largest disagreement of a pair with the pose graph, in spacings, root mean square over the pair's points. A good pair
-agrees to about the spacing. A larger limit keeps wrong loops, a smaller one leaves out good ones."""
+"""Largest disagreement of a pair with the pose graph, in spacings of the points, root mean square over the pair's
+points. A larger limit keeps wrong loops; a smaller one leaves out good ones, because ICP is exact to a fraction of the
+spacing only."""
 THROUGH_SPACINGS = 4.0
-"""Distance in spacings, besides 1 % of the depth, by which a point has to be in front of another view's surface to
-contradict it. It has to exceed the noise of readings and the errors of poses."""
+"""Distance by which a point has to be in front of another view's surface to contradict it, in spacings of the points,
+besides 1 % of the depth. It is large because readings are noisy and poses have errors."""
 MAX_CONTRADICTION = 0.15
-"""Largest fraction of a view's points that another view may look through. Edges and ghosts cause small fractions, a
-wrong pose a large one."""
+"""Largest fraction of a view's points that another view may look through. It is not zero because edges and ghosts are
+looked through, too; a wrong pose makes it large."""
 EARLY_SPACINGS = (1.0, 0.8, 1.25)
 """Spacings at which `check_first_pair` tries the first two views, as multiples of the spacing of these two. The spacing
 of a whole scan differs from it by less."""
