@@ -140,7 +140,10 @@ class PhotoDetector(Named, ABC):
     def _check(self) -> None:
         check_fields(self)
         if self.band_width_m >= 2 * self.wavelength_m:
-            raise ValueError(f"expected a band_width_m whose filter ends above 0 m, got {self.band_width_m}.")
+            raise ValueError(
+                f"expected a band_width_m below {2 * self.wavelength_m:g}, twice the wavelength_m, "
+                f"got {self.band_width_m}."
+            )
         if self.min_exposure_s > self.max_exposure_s:
             raise ValueError(
                 f"expected min_exposure_s <= max_exposure_s, got {self.min_exposure_s} > {self.max_exposure_s}."

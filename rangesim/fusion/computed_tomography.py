@@ -193,7 +193,7 @@ def filtered_back_projection(sinogram: Sinogram, filter_name: str = "ramp") -> n
             f"expected a filter out of {', '.join(FILTERS)}, got {filter_name!r}{nearest(filter_name, FILTERS)}."
         )
     if len(sinogram.angles) < 2:
-        raise ValueError(f"expected at least two angles to see depth by, got {len(sinogram.angles)}.")
+        raise ValueError(f"expected at least two angles, got {len(sinogram.angles)}.")
     grid, degrees = sinogram.grid, np.degrees(sinogram.angles)
     n, (nx, ny, nz) = sinogram.values.shape[1], grid.shape
     left, top = n // 2 - nx // 2, n // 2 - ny // 2
@@ -273,7 +273,7 @@ class _Caster:
         if not closed.all():
             raise ValueError(
                 f"expected a closed mesh that rays leave as often as they enter, but {np.count_nonzero(~closed)} of "
-                f"{len(closed)} do not through {self.name}; mend its holes and turned faces."
+                f"{len(closed)} rays through {self.name} do not; close its holes, and turn faces that point inward."
             )
         return found
 

@@ -112,7 +112,8 @@ def refine_jointly(images: Sequence[RangeImage], poses: Array, reach_m: float, s
         values = np.linalg.eigvalsh(normal[6:, 6:])
         if not values[0] > 1e-8 * values[-1]:
             raise ValueError(
-                "expected views whose readings hold each other, got some that slide or have no partners in the others."
+                "expected readings that fix the poses of all views, but some views slide on the others, or do not "
+                "overlap them."
             )
         step = np.concatenate([np.zeros(6), -np.linalg.solve(normal[6:, 6:], right[6:])]).reshape(-1, 6)
         for k, twist in enumerate(step):

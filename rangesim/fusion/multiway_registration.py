@@ -417,9 +417,9 @@ def _refuse_disagreement(pairs: tuple[PairFit, ...], spacing: float) -> None:
     worst = max(pairs, key=lambda e: e.disagreement_m)
     if not worst.disagreement_m <= MAX_DISAGREEMENT_SPACINGS * spacing:
         raise ValueError(
-            f"expected pairs of views that agree, but the pair {worst.target}, {worst.source} is "
-            f"{1e3 * worst.disagreement_m:.2g} mm off the poses by all pairs (spacing {1e3 * spacing:.2g} mm): one "
-            f"fits wrongly; {REMEDY}"
+            f"expected pairs of views that agree, but the pair {worst.target}, {worst.source} differs by "
+            f"{1e3 * worst.disagreement_m:.2g} mm from the poses of all pairs (spacing {1e3 * spacing:.2g} mm): "
+            f"one pair fits wrongly; {REMEDY}"
         )
 
 
