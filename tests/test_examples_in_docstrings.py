@@ -9,7 +9,15 @@ import pkgutil
 
 import pytest
 
-ROOMS = ["rangesim.calibration", "rangesim.geometry", "rangesim.multiview"]
+ROOMS = [
+    "rangesim.calibration",
+    "rangesim.electronics",
+    "rangesim.fusion",
+    "rangesim.geometry",
+    "rangesim.motion",
+    "rangesim.multiview",
+    "rangesim.signals",
+]
 """Packages whose docstrings are run, all of their modules."""
 
 
