@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangesim import limits
-from rangesim.rig.distortion import distort, fold_radius2, undistort
+from rangesim.rig import camera_model
+from rangesim.rig.camera_model import CameraModel, fold_radius2
 from rangesim.settings.bounds import (
     MAX_COORDINATE_M,
     Bounds,
@@ -94,28 +95,27 @@ class Intrinsics:
         NaN where the distortion has no inverse: beyond the radius at which its polynomial turns round.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
-        target_x, target_y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        u, v = pixels[..., 0], pixels[..., 1]
         if not any(self.distortion):
-            return np.stack([target_x, target_y], axis=-1)
+            return np.stack(camera_model.from_pixel(self.model, u, v), axis=-1)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            x, y = undistort(self.coefficients, target_x, target_y)
-            image = distort(self.coefficients, x, y)
-            off = np.hypot((image.x - target_x) * self.fx, (image.y - target_y) * self.fy)
-            inverse = (off <= RESIDUAL_PX) & (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
-        return np.where(inverse[..., None], np.stack([x, y], axis=-1), np.nan)
+            x, y, exists = camera_model.unproject(self.model, u, v, RESIDUAL_PX)
+        result = np.stack([x, y], axis=-1)
+        result[~exists] = np.nan
+        return result
 
     def project(self, points: ArrayLike) -> Array:
         """(..., 2) pixel coordinates of points (..., 3) in coordinates of this device; NaN behind it and beyond the
         radius at which the distortion turns round."""
         points = np.asarray(points, dtype=np.float64)
-        z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-        xy = points[..., :2] / z
-        if any(self.distortion):
-            x, y = xy[..., 0], xy[..., 1]
-            image = distort(self.coefficients, x, y)
-            appears = (x * x + y * y < self.fold_radius2) & (image.jacobian > 0)
-            xy = np.where(appears[..., None], np.stack([image.x, image.y], axis=-1), np.nan)
-        return xy * [self.fx, self.fy] + [self.cx, self.cy]
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        x, y = points[..., 0] / z, points[..., 1] / z
+        if not any(self.distortion):
+            return np.stack(camera_model.to_pixel(self.model, x, y), axis=-1)
+        u, v, appears = camera_model.project(self.model, x, y)
+        result = np.stack([u, v], axis=-1)
+        result[~appears] = np.nan
+        return result
 
     def directions(self, pixels: ArrayLike) -> Array:
         """(..., 3) ray directions with z = 1 (not unit length) through pixel coordinates (..., 2); NaN where
@@ -132,8 +132,14 @@ class Intrinsics:
 
     @property
     def fold_radius2(self) -> float:
-        """See `rangesim.rig.distortion.fold_radius2`."""
+        """Squared radius on the image plane at which the distortion folds the image; infinity if it does not."""
         return fold_radius2(self.coefficients)
+
+    @property
+    def model(self) -> CameraModel:
+        """The parameters as `rangesim.rig.camera_model` and kernels take them."""
+        fx, fy, cx, cy, *coefficients = map(float, (self.fx, self.fy, self.cx, self.cy, *self.coefficients))
+        return CameraModel(fx, fy, cx, cy, tuple(coefficients), self.fold_radius2)
 
 
 def pose(matrix: ArrayLike, name: str) -> Array:
