@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rangesim.settings.config import ShortRepr, shown
+
+_FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
+"""Layout of a triangle in a PLY file."""
+_HEAD = (
+    "ply\nformat binary_little_endian 1.0\ncomment coordinates world, metres\n"
+    "element vertex {vertices}\nproperty double x\nproperty double y\nproperty double z\n"
+    "element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+)
+"""Header of the PLY files that are written."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,17 +138,38 @@ class TriangleMesh(ShortRepr):
         FileFormatError
             The place cannot be written.
         """
-        from pcgraph.plain_files import write_file
+        from pcgraph.plumbing.plain_files import write_file
         from rangesim.errors import FileFormatError
 
         path = Path(path)
         if path.suffix.lower() != ".ply":
             raise ValueError(f"expected a file name ending in .ply, got {path.name!r}.")
-        table = np.empty(len(self.faces), [("n", "u1"), ("v", "<i4", 3)])
+        table = np.empty(len(self.faces), _FACE)
         table["n"], table["v"] = 3, self.faces
-        head = (
-            "ply\nformat binary_little_endian 1.0\ncomment coordinates world, metres\n"
-            f"element vertex {len(self.vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
-            f"element face {len(self.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-        )
+        head = _HEAD.format(vertices=len(self.vertices), faces=len(self.faces))
         write_file(path, head.encode() + self.vertices.astype("<f8").tobytes() + table.tobytes(), FileFormatError)
+
+    @classmethod
+    def load(cls, path: str | Path) -> TriangleMesh:
+        """The mesh that `save` wrote; `rangesim.load_scene` and Open3D read meshes of other programs.
+
+        Raises
+        ------
+        FileFormatError
+            The file is missing, or is not one that `save` wrote.
+        """
+        from pcgraph.plumbing.plain_files import read_file
+        from rangesim.errors import FileFormatError
+
+        content = read_file(Path(path), FileFormatError)
+        head, end, body = content.partition(b"end_header\n")
+        counts = re.findall(rb"element (?:vertex|face) ([0-9]{1,10})\n", head)
+        n, m = map(int, counts) if len(counts) == 2 else (0, 0)
+        is_own = head + end == _HEAD.format(vertices=n, faces=m).encode()
+        if not is_own or len(body) != 24 * n + _FACE.itemsize * m:
+            raise FileFormatError(f"{path}: expected a mesh that rangesim wrote, complete.")
+        table = np.frombuffer(body, _FACE, offset=24 * n)
+        try:
+            return cls(np.frombuffer(body, "<f8", 3 * n).reshape(n, 3), table["v"])
+        except ValueError as error:
+            raise FileFormatError(f"{path}: {error}") from error

@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 
 from rangesim.experiment import Experiment
-from rangesim.experiment.instrument import Instrument
-from rangesim.experiment.pipeline import run
+from rangesim.instrument.instrument import Instrument
+from rangesim.pipeline.experiment_run import run
 from rangesim.sensors import AmcwToF, DirectToF, IdealToF, StructuredLight
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,13 +13,14 @@ from pathlib import Path
 import pytest
 from small_result import ROOT
 
-from rangesim import limits, load_scene
+from rangesim import load_scene
 from rangesim.cli import main
 from rangesim.experiment import Experiment, cost, pipeline
-from rangesim.experiment.cost import Cost, available_memory_bytes, estimate_cost
-from rangesim.experiment.instrument import instrument
+from rangesim.instrument.instrument import instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
+from rangesim.pipeline.cost import Cost, available_memory_bytes, estimate_cost
 from rangesim.sensors import DirectToF
+from rangesim.settings import limits
 
 MATTE = str(ROOT / "scenes" / "matte.xml")
 

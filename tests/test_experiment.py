@@ -21,11 +21,11 @@ from rangesim.electronics.detector import Detector
 from rangesim.electronics.spad import SpadDetector
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict, experiment_to_dict, load_experiment
-from rangesim.experiment.instrument import DEFAULT_SENSORS, Instrument, instrument
-from rangesim.experiment.pipeline import group_by_rig, noise_seed, run
-from rangesim.experiment.result_files import load_result
-from rangesim.fusion.scan_settings import scan_settings_from_dict
+from rangesim.experiment.scan_settings import scan_settings_from_dict
+from rangesim.instrument.instrument import DEFAULT_SENSORS, Instrument, instrument
 from rangesim.motion import ConstantTwist, Motion, Timing
+from rangesim.pipeline.experiment_run import group_by_rig, noise_seed, run
+from rangesim.results.run_files import load_result
 from rangesim.rig import Lens
 from rangesim.sensors import DirectToF, IdealToF
 
@@ -127,7 +127,7 @@ def test_results_print_in_a_few_lines() -> None:
         one.image,
         one.truth,
         one.causes,
-        result.energy[0],
+        result.passes[0].energy,
         one.image.to_point_cloud(),
     ):
         assert len(repr(thing)) < 600

@@ -18,17 +18,18 @@ from scroll_hints import check_scroll_hints
 from small_result import ROOT
 from typer.testing import CliRunner
 
-from rangesim import limits, load_range_image
+from rangesim import load_range_image
 from rangesim.cli import app
 from rangesim.errors import FileFormatError
-from rangesim.fusion import Dome, Turntable
-from rangesim.fusion.scan_settings import (
+from rangesim.experiment import Dome, Turntable
+from rangesim.experiment.scan_settings import (
     ScanSettings,
     load_scan_settings,
     scan_settings_from_dict,
     scan_settings_to_dict,
 )
 from rangesim.rig import look_at
+from rangesim.settings import limits
 
 Run = Callable[..., str]
 

@@ -21,11 +21,11 @@ from rangesim import AmcwToF, DirectToF, IdealToF, Intrinsics, Rig, Scene, Senso
 from rangesim.causes import Cause
 from rangesim.decoding.phase_shift import phase_of, tap_phase
 from rangesim.experiment import experiment_from_dict, experiment_to_dict
-from rangesim.experiment.pipeline import run
-from rangesim.experiment.result_files import load_result
 from rangesim.motion import ConstantTwist, Motion, MovingSignals, PoseTrack, Timing, transport_moving
 from rangesim.motion.passes import plan
+from rangesim.pipeline.experiment_run import run
 from rangesim.response import SPEED_OF_LIGHT
+from rangesim.results.run_files import load_result
 from rangesim.rig import translation
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"

@@ -394,7 +394,7 @@ def test_a_narrow_lens_that_sees_no_shape_is_refused() -> None:
 
 def test_a_descent_that_was_cut_short_says_so() -> None:
     scene = around(6, 60)
-    with pytest.warns(RangesimWarning, match="still goes down"):
+    with pytest.warns(RangesimWarning, match="still lowers the cost"):
         found = bundle_adjust(scene.tracks, scene.camera, *perturbed(scene, 0.02, 0.05, 0.1), max_steps=1)
     assert not found.has_converged
 

@@ -34,7 +34,7 @@ from rangesim.causes import Cause
 from rangesim.decoding.gray import GrayThresholds
 from rangesim.errors import FileFormatError
 from rangesim.experiment import experiment_from_dict, load_experiment
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.instrument import Instrument
 from rangesim.sensor import Background
 from rangesim.sensors import AmcwDecoder, StructuredLightDecoder, presets, sensor_from_dict, sensor_of
 

@@ -14,8 +14,8 @@ from rangesim import AmcwToF, Capture, IdealToF, Scene, StructuredLight, compare
 from rangesim.causes import explain
 from rangesim.errors import RangesimWarning, SamplingWarning, warn
 from rangesim.evaluation.range_noise import Repeats, range_noise, robust_sigma, warn_of_sampling
-from rangesim.experiment.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.adaptive_sampling import FIRST_SPP, AdaptiveSampling, group_sigma, groups
+from rangesim.instrument.instrument import Instrument
 from rangesim.light_transport.loop import SampleAllocation
 from rangesim.light_transport.sampling_error import Halves
 
@@ -355,8 +355,8 @@ def test_samples_that_are_no_number_are_refused(matte: Scene) -> None:
 
 def test_a_run_keeps_the_noise_of_its_readings_and_warns_of_it(tmp_path: Path) -> None:
     from rangesim.experiment import Experiment
-    from rangesim.experiment.pipeline import run
-    from rangesim.experiment.result_files import load_result
+    from rangesim.pipeline.experiment_run import run
+    from rangesim.results.run_files import load_result
 
     instruments = (Instrument("amcw", AmcwToF()), Instrument("ideal", IdealToF()))
     experiment = Experiment("glassware", width=96, height=72, spp=4, instruments=instruments)

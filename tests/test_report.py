@@ -21,9 +21,9 @@ from small_result import SENSORS, small_result
 from rangesim.causes import Cause
 from rangesim.decoding.status import Status
 from rangesim.environment.doctor import find_browser
-from rangesim.experiment.result_files import PhotonsRecord, load_result
 from rangesim.report import cloud, palette, tables
 from rangesim.report.verdict import verdict
+from rangesim.results.run_files import PhotonsRecord, load_result
 
 BROWSER = find_browser()
 CANVAS = (16, 21, 29)

@@ -27,6 +27,8 @@ from rangesim import (
     expose,
     load_range_image,
     load_signals,
+    save_range_image,
+    save_signals,
 )
 from rangesim.decoding.phase_shift import PhaseThresholds
 from rangesim.errors import FileFormatError
@@ -49,7 +51,7 @@ def traced() -> Signals:
 
 
 def test_signals_are_exposed_again_as_those_traced(traced: Signals, tmp_path: Path) -> None:
-    traced.save(tmp_path / "signals.npz")
+    save_signals(traced, tmp_path / "signals.npz")
     loaded = load_signals(tmp_path / "signals.npz")
     assert loaded.rig == traced.rig
     assert loaded.truncation == traced.truncation
@@ -64,7 +66,7 @@ def test_signals_are_exposed_again_as_those_traced(traced: Signals, tmp_path: Pa
 
 def test_signals_without_a_sampling_error_have_none_afterwards(tmp_path: Path) -> None:
     signals = plane_signals(stereo_rig(40, 30), AmcwToF())
-    signals.save(tmp_path / "plane.npz")
+    save_signals(signals, tmp_path / "plane.npz")
     loaded = load_signals(tmp_path / "plane.npz")
     assert loaded.sampling is None
     assert loaded.truncation is None
@@ -94,7 +96,7 @@ class Nameless(DenseResponse):
 def test_a_response_of_your_own_comes_back(tmp_path: Path) -> None:
     signals = plane_signals(stereo_rig(40, 30), AmcwToF())
     channels = {Nearby(3.0): np.ones((1, 30, 40), np.float32), **signals.channels}
-    replace(signals, channels=channels).save(tmp_path / "own.npz")
+    save_signals(replace(signals, channels=channels), tmp_path / "own.npz")
     assert list(load_signals(tmp_path / "own.npz").channels) == list(channels)
 
 
@@ -102,9 +104,9 @@ def test_what_cannot_be_read_back_is_not_written(tmp_path: Path) -> None:
     signals = plane_signals(stereo_rig(40, 30), AmcwToF())
     images = Images(np.ones((2, 800, 1280), np.float32))
     with pytest.raises(ValueError, match="expected responses of numbers, got Images"):
-        replace(signals, channels={images: np.ones((2, 30, 40), np.float32)}).save(tmp_path / "images.npz")
+        save_signals(replace(signals, channels={images: np.ones((2, 30, 40), np.float32)}), tmp_path / "images.npz")
     with pytest.raises(ValueError, match=r"expected responses with a type_name, .* got Nameless without one"):
-        replace(signals, channels={Nameless(): np.ones((1, 30, 40), np.float32)}).save(tmp_path / "nameless.npz")
+        save_signals(replace(signals, channels={Nameless(): np.ones((1, 30, 40), np.float32)}), tmp_path / "n.npz")
     assert not list(tmp_path.iterdir())
 
 
@@ -141,7 +143,7 @@ def changed(path: Path, settings: dict[str, Any] | None = None, **arrays: Any) -
 )
 def test_damaged_signals_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     path = tmp_path / "signals.npz"
-    plane_signals(stereo_rig(40, 30), AmcwToF()).save(path)
+    save_signals(plane_signals(stereo_rig(40, 30), AmcwToF()), path)
     changed(path, **change)
     with pytest.raises(FileFormatError, match=message) as error:
         load_signals(path)
@@ -162,7 +164,7 @@ def test_range_images_come_back_with_camera_and_decoder(is_calibrated: bool, tmp
     sensor, decoder = AmcwToF(), AmcwDecoder(phase=PhaseThresholds(max_sigma_rad=0.1))
     capture = expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor, sensor.default_detector)
     image = decode(capture if is_calibrated else replace(capture, rig=None), decoder)
-    image.save(tmp_path / "range.npz")
+    save_range_image(image, tmp_path / "range.npz")
     loaded = load_range_image(tmp_path / "range.npz")
     assert loaded.decoder == decoder
     assert loaded.camera == image.camera
@@ -173,7 +175,9 @@ def test_range_images_come_back_with_camera_and_decoder(is_calibrated: bool, tmp
 
 def test_a_range_image_is_read_where_no_sensor_is_loaded_yet(tmp_path: Path) -> None:
     sensor = AmcwToF()
-    decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)).save(tmp_path / "range.npz")
+    save_range_image(
+        decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)), tmp_path / "range.npz"
+    )
     code = f"import rangesim; print(rangesim.load_range_image({str(tmp_path / 'range.npz')!r}).decoder)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.startswith("AmcwDecoder(")
@@ -193,7 +197,7 @@ def test_a_range_image_is_read_where_no_sensor_is_loaded_yet(tmp_path: Path) -> 
 def test_damaged_range_images_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     sensor = AmcwToF()
     path = tmp_path / "range.npz"
-    decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)).save(path)
+    save_range_image(decode(expose(plane_signals(stereo_rig(40, 30, baseline_m=0.03), sensor), sensor)), path)
     changed(path, **change)
     with pytest.raises(FileFormatError, match=message) as error:
         load_range_image(path)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.plain_files import read_file, sealed, unsealed, write_file
+from pcgraph.plumbing.plain_files import read_file, sealed, unsealed, write_file
 from rangesim.errors import FileFormatError
 from rangesim.geometry.camera_matrix import calibration_matrix
 from rangesim.rig import Intrinsics, Rig, pose

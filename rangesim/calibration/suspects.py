@@ -15,6 +15,7 @@ from rangesim.geometry.consensus import simpler_model_suffices
 from rangesim.geometry.correspondences import Array
 from rangesim.geometry.least_squares import Minimum
 from rangesim.rig import Intrinsics
+from rangesim.robust_scale import sigma_from_median
 
 LIMIT = 6.0
 """Robust standard deviations of a coordinate: noise goes beyond once in 10^8 points."""
@@ -69,7 +70,7 @@ def _beyond(
     found = []
     for device in {seen.device for seen in observations}:
         of_device = [k for k, seen in enumerate(observations) if seen.device == device]
-        robust = 1.4826 * float(np.median(np.abs(np.concatenate([residuals[k] for k in of_device]))))
+        robust = sigma_from_median(np.concatenate([residuals[k] for k in of_device]))
         limit = max(LIMIT * robust, LEAST_PX)
         for k in of_device:
             errors = np.linalg.norm(residuals[k], axis=-1)

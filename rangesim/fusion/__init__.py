@@ -18,12 +18,7 @@ if TYPE_CHECKING:
     from rangesim.fusion.multiway_registration import PoseErrors as PoseErrors
     from rangesim.fusion.multiway_registration import align as align
     from rangesim.fusion.multiway_registration import pose_errors as pose_errors
-    from rangesim.fusion.paths import Dome as Dome
-    from rangesim.fusion.paths import HandHeld as HandHeld
-    from rangesim.fusion.paths import Path as Path
-    from rangesim.fusion.paths import PoseList as PoseList
-    from rangesim.fusion.paths import Turntable as Turntable
-    from rangesim.fusion.paths import Viewpoint as Viewpoint
+    from rangesim.fusion.scan import Scan as Scan
     from rangesim.fusion.sdf import average_signed_distances as average_signed_distances
     from rangesim.fusion.sdf import reading_weights as reading_weights
     from rangesim.fusion.sdf import signed_distance as signed_distance
@@ -38,8 +33,6 @@ if TYPE_CHECKING:
     from rangesim.fusion.solids import inside_voxels as inside_voxels
     from rangesim.fusion.truncated_average import FusedSurface as FusedSurface
     from rangesim.fusion.truncated_average import fuse as fuse
-    from rangesim.fusion.views import Scan as Scan
-    from rangesim.fusion.views import scan as scan
     from rangesim.fusion.voxel_grid import VoxelGrid as VoxelGrid
 else:
     import lazy_loader
@@ -58,11 +51,10 @@ else:
             "joint_registration": ["refine_jointly"],
             "mesh_error": ["SurfaceError", "surface_error"],
             "multiway_registration": ["Alignment", "PairFit", "PoseErrors", "align", "pose_errors"],
-            "paths": ["Dome", "HandHeld", "Path", "PoseList", "Turntable", "Viewpoint"],
+            "scan": ["Scan"],
             "sdf": ["average_signed_distances", "reading_weights", "signed_distance"],
             "seen_volume": ["Occupancy", "SeenOfShape", "VoxelState", "occupancy", "true_occupancy", "voxel_states"],
             "truncated_average": ["FusedSurface", "fuse"],
-            "views": ["Scan", "scan"],
             "voxel_grid": ["VoxelGrid"],
         },
     )

@@ -20,9 +20,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesim.decoding.range_image import RangeImage
-from rangesim.fusion.sdf import depth_at, placed
+from rangesim.fusion.sdf import camera_and_pose, depth_at
 from rangesim.point_cloud import lattice_normals
 from rangesim.rig import Array, Intrinsics
+from rangesim.robust_scale import sigma_from_median
 
 POINTS = 4000
 """Of each view."""
@@ -51,7 +52,7 @@ class _View(NamedTuple):
     def of(cls, image: RangeImage, random: np.random.Generator) -> _View:
         from scipy.ndimage import binary_erosion
 
-        camera, _ = placed(image)
+        camera, _ = camera_and_pose(image)
         rays = camera.directions(camera.pixel_centres())
         z = image.z.astype(np.float64)
         normals = lattice_normals(z, rays)
@@ -95,7 +96,7 @@ def refine_jointly(images: Sequence[RangeImage], poses: Array, reach_m: float, s
             move[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
             move[:3, 3] = size * twist[3:]
             T[k] = move @ T[k]
-        scale = max(0.7 * scale, 1e-9) if np.median(np.abs(residuals)) * 1.4826 < 0.7 * scale else scale
+        scale = max(0.7 * scale, 1e-9) if sigma_from_median(residuals) < 0.7 * scale else scale
         if np.abs(step).max() < CONVERGED:
             break
     return T

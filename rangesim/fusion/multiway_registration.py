@@ -33,8 +33,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesim.errors import AlignmentWarning
 from rangesim.fusion.joint_registration import refine_jointly
+from rangesim.fusion.scan import Scan
 from rangesim.fusion.sdf import signed_distance
-from rangesim.fusion.views import Scan
 from rangesim.geometry import icp, register
 from rangesim.rig import Array
 from rangesim.settings.bounds import check_number

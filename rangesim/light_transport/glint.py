@@ -28,6 +28,7 @@ from rangesim.light_transport.sampling import Continued, Seed, aligned, of_part,
 from rangesim.light_transport.scattering import bounded
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, spawn_specular_ray, survival
+from rangesim.light_transport.strategies import delta_only, is_delta, owner
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.response import GLINT, LightPath, Response
 from rangesim.rig import Rig
@@ -294,8 +295,7 @@ def _probe(lanes: GlintLanes, lens: LensDisc, state: ProbeState, most: Any) -> t
     random, k, chain = state.chain.random, state.chain.k, state.chain.length
     origin, direction = state.chain.origin, state.chain.direction
     nearest, spread, before = state.nearest, state.spread, state.before  # where the last one crossed
-    context = mi.BSDFContext()
-    context.type_mask = mi.BSDFFlags.Delta
+    context = delta_only(mi.TransportMode.Radiance)
     left = most + dr.zeros(mi.UInt32, dr.width(k))  # iterations
     while (k < lanes.paths) & (left > 0):
         rng = lanes.random.at(random)
@@ -314,7 +314,12 @@ def _probe(lanes: GlintLanes, lens: LensDisc, state: ProbeState, most: Any) -> t
         bs, weight = si.bsdf(ray).sample(context, si, way, mi.Point2f(0.5), hit)
         ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
         chain += 1
-        ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (mono(weight) <= 0) | (chain >= MAX_CHAIN)
+        ends = (
+            ~hit
+            | ~owner(has_vertex=~is_delta(bs), delta_interactions=chain).glint
+            | (mono(weight) <= 0)
+            | (chain >= MAX_CHAIN)
+        )
         chain = dr.select(ends, 0, chain)
         k = dr.select(ends, k + 1, k)
         random, origin, direction = rng.state, ray.o, ray.d
@@ -338,8 +343,7 @@ def _paths_to_the_lens(
         state.total,
         state.nearest,
     )
-    context = mi.BSDFContext()
-    context.type_mask = mi.BSDFFlags.Delta
+    context = delta_only(mi.TransportMode.Radiance)
     left = most + dr.zeros(mi.UInt32, dr.width(k))  # iterations
     while (k < lanes.paths) & (left > 0):
         rng = lanes.random.at(random)
@@ -384,7 +388,12 @@ def _paths_to_the_lens(
         ray = spawn_specular_ray(si, si.p, si.to_world(bs.wo))
         chain += 1
         chance = survival(chain, throughput * dr.square(ray_state.ior))
-        ends = ~hit | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (throughput <= 0) | (chain >= MAX_CHAIN)
+        ends = (
+            ~hit
+            | ~owner(has_vertex=~is_delta(bs), delta_interactions=chain).glint
+            | (throughput <= 0)
+            | (chain >= MAX_CHAIN)
+        )
         ends |= rng.next_float32() >= chance
         throughput /= chance
         ray_state = ray_state.entering(traced, si, ray.d, hit, mi.Bool(False)).reset(traced, ends)

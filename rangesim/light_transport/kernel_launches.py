@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pcgraph import interrupts
+from pcgraph.plumbing import interrupts
 
 LAUNCH_S = 1.0
 """What a launch should take, seconds."""

@@ -1,40 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """The path loop: one pass of light paths serves every pattern, frequency and bin.
 
-One lane owns one pixel and traces its samples one after the other; where a path ends, the lane starts the
-next sample in the same iteration of the loop. So no lane idles while its neighbours finish, every channel is a
-register instead of a film, and each sum is made by one thread in one order: same seed, same bytes,
-whatever the number of threads. The loop is run in launches of bounded time, each of which takes some lanes so many
-iterations further: what a lane has done is its `State`, so that neither the lanes of a launch nor its iterations change
-a byte.
+One lane owns one pixel and traces its samples one after the other. Where a path ends, the lane starts the next sample
+in the same iteration of the loop. Three things follow. No lane idles while its neighbours finish. Every channel is a
+register instead of a film. Each sum is made by one thread in one order, so the same seed gives the same bytes, whatever
+the number of threads.
 
-A path has two limits. `max_depth` counts the surfaces that scatter it; delta interactions (glass, mirrors, coats,
-holes) scatter nothing and have a limit of their own, of so many in a row (`rangesim.light_transport.specular_chain`).
+The loop runs in launches of bounded time (`rangesim.light_transport.kernel_launches`). A launch takes some of the lanes
+and moves each of them on by a bounded number of iterations. `LaneState` holds everything that a lane has done, so
+neither the choice of lanes nor the number of iterations changes a byte.
 
-Inside a translucent object an iteration of the loop is a scattering event instead of a surface; a stay inside counts as
+A path has two limits. `max_depth` counts the surfaces that scatter it. Delta interactions (glass, mirrors, coats,
+holes) scatter nothing; a limit of their own counts them in a row (`rangesim.light_transport.specular_chain`).
+
+Inside a translucent object an iteration of the loop is a scattering event instead of a surface. A stay inside counts as
 one surface towards the depth, however often it scatters (`rangesim.light_transport.scattering`). Inside glass that
-absorbs, what a segment leaves of the throughput is exp(-sigma_a d) (`rangesim.light_transport.absorption`).
+absorbs, a segment of length d keeps the fraction exp(-sigma_a d) of the light (`rangesim.light_transport.absorption`).
 
-The strategies that bring projector light to the camera partition all light paths: next-event estimation (here),
-caustic photons gathered at every non-delta vertex (here, from maps made before), and glint, paths without any
-non-delta vertex (`rangesim.light_transport.glint`).
+The loop carries out two of the three strategies that bring the projector's light to the camera: next-event estimation,
+and the gathering of caustic photons. `rangesim.light_transport.strategies` says which paths each strategy owns.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from rangesim.light_transport.accumulators import Accumulators
+from rangesim.light_transport.ambient_light import ambient_on_ray, sampled_ambient, sampled_ambient_through_media
 from rangesim.light_transport.caustics import Vertex, caustic_light, gather
 from rangesim.light_transport.device import connect
-from rangesim.light_transport.emitters import emission, emission_through, sampled_emission
 from rangesim.light_transport.kernel_launches import Launches, Report, min_lanes
 from rangesim.light_transport.photon_maps import PhotonMaps
 from rangesim.light_transport.photons import has_delta
@@ -42,6 +43,7 @@ from rangesim.light_transport.sampling import Continued, Seed, Stream, aligned, 
 from rangesim.light_transport.scattering import MAX_EVENTS, ROULETTE_BELOW
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
+from rangesim.light_transport.strategies import can_be_vertex, is_delta, next_event_kind, owner
 from rangesim.light_transport.traced_scene import TracedScene
 from rangesim.light_transport.transport_settings import TransportSettings
 from rangesim.light_transport.truncation import Tally
@@ -49,44 +51,59 @@ from rangesim.response import DIRECT, MULTIPATH, SPECULAR, LightPath
 from rangesim.scene import Scene
 
 NEIGHBOURS = 256
-"""Pixels in a row that share a launch. Launches take such runs from all over the image: so their times are alike."""
+"""Number of pixels in a row that share a launch. A launch takes such runs from all over the image, so that launches
+take about equally long. Longer runs spread less evenly; runs shorter than a vector of the processor (16 lanes) would
+put pixels into one vector whose paths differ."""
 ITERATIONS_PER_SAMPLE = 2
-"""Iterations of the loop that a sample takes, before any were counted."""
+"""Iterations of the loop that a sample is taken to need, before any were counted. It sets the size of the first launch
+alone: later ones go by the count."""
+GOLDEN_STEP = 2654435769
+"""2^32 divided by the golden ratio. Its multiples modulo 2^32 are spread evenly, however many there are."""
+
+Array = TypeVar("Array")
 
 
 class PathSettings(NamedTuple):
-    """Sampling of the loop. Numbers are opaque; the flags shape the kernel.
+    """How the loop samples paths. Numbers are opaque to the kernel cache; the flags shape the kernel.
 
+    seed : Seed. max_depth, rr_depth : UInt32, see `TransportSettings`.
     delta : whether some surface of the scene has a delta interaction.
     ambient : whether the scene has light of its own.
-    lamps : whether that light has a direction worth sampling; uniform surroundings are found best by the BSDF alone.
+    samples_ambient : whether directions to that light are sampled. Uniform surroundings are found best by samples of
+        the BSDF alone.
     """
 
     seed: Seed
-    max_depth: Any
-    rr_depth: Any
+    max_depth: mi.UInt32
+    rr_depth: mi.UInt32
     delta: bool
     ambient: bool
-    lamps: bool
+    samples_ambient: bool
 
     @classmethod
     def of(cls, scene: Scene, settings: TransportSettings) -> PathSettings:
-        """Those of a pass."""
-        max_depth, rr_depth = dr.opaque(mi.UInt32, settings.max_depth), dr.opaque(mi.UInt32, settings.rr_depth)
+        """The settings of the loop for a scene, out of those of a pass."""
         return cls(
-            Seed.of(settings.seed), max_depth, rr_depth, has_delta(scene.mitsuba), scene.has_ambient, scene.has_lamps
+            seed=Seed.of(settings.seed),
+            max_depth=dr.opaque(mi.UInt32, settings.max_depth),
+            rr_depth=dr.opaque(mi.UInt32, settings.rr_depth),
+            delta=has_delta(scene.mitsuba),
+            ambient=scene.has_ambient,
+            samples_ambient=scene.has_lamps,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class SampleAllocation:
-    """Samples that some pixels get, and the projector's light.
+    """How many samples some of the pixels get, and the projector's light.
 
-    pixels : (n,) flat indices in the whole image. samples : (n,) uint32, how many of each pixel are taken.
-    total : (n,) uint32, samples of each pixel all in all, those taken at other times included.
-    first, stride : number of the first of the samples taken, and numbers from a pair of samples to the next.
-    part : int, numbers the parts of a pass; their random numbers are independent.
-    irradiance : of the projector, W/m2 at z = 1 m.
+    pixels : (n,) int, flat indices in the whole image.
+    samples : (n,) uint32, number of samples to be taken of each pixel.
+    total : (n,) uint32, number of samples of each pixel all in all, those taken at other times included.
+    irradiance : W/m2, irradiance that the projector makes at z = 1 m.
+    first : int, number of the first of the samples among all samples of a pixel.
+    stride : int, difference between the numbers of successive pairs of samples.
+    part : int, number of the part of a pass. Parts have independent random numbers.
     """
 
     pixels: np.ndarray
@@ -102,7 +119,7 @@ class SampleAllocation:
         return replace(self, pixels=self.pixels[some], samples=self.samples[some], total=self.total[some])
 
     def halves(self) -> list[SampleAllocation]:
-        """Two budgets that have every second pair of samples each, so that both fill the pixel evenly."""
+        """Two allocations that have every second pair of samples each, so that both fill the pixel evenly."""
         pairs, odd = (self.samples + 1) >> 1, self.samples & 1
         return [
             replace(
@@ -116,22 +133,27 @@ class SampleAllocation:
         ]
 
 
-class Radiance(NamedTuple):
-    """Sums over the samples of one pixel by kind of light path (see `rangesim.signals.EnergySplit`)."""
+@dataclass
+class Radiance(Generic[Array]):
+    """Radiance of the projector and of ambient light by kind of light path (see `rangesim.signals.EnergySplit`).
 
-    direct: Any
-    multipath: Any
-    specular: Any
-    caustic: Any
-    ambient: Any
-    smooth_caustic: Any
-    """Caustics that were gathered from afar, and are smooth therefore; `caustic` has the others."""
+    Sums over the samples of the lanes as `mi.Float`, or means of an image as (h, w) float32; W/m2/sr.
+    """
+
+    direct: Array
+    multipath: Array
+    specular: Array
+    caustic: Array
+    ambient: Array
+    smooth_caustic: Array
+    """Caustics gathered over wide circles, which are smooth therefore; `caustic` has the others."""
 
 
 class PathSums(NamedTuple):
     """Sums over the samples of each pixel, besides channels.
 
-    radiance : (6, n) float32, in the order of `Radiance`. tally : (6, n) float32, in the order of `Tally`.
+    radiance : (6, n) float32, in the order of the fields of `Radiance`.
+    tally : (6, n) float32, in the order of the fields of `Tally`.
     """
 
     radiance: np.ndarray
@@ -139,40 +161,77 @@ class PathSums(NamedTuple):
 
 
 @dataclass
-class State:
-    """What a lane carries from one iteration of the loop to the next; see `start`.
+class RandomStates:
+    """States of the random numbers of the lanes.
 
-    A dataclass, not frozen: Dr.Jit looks into no named tuple when it evaluates. What never changes is not in it (None
-    instead), or Dr.Jit would trace the loop twice.
+    path : UInt64, of the stream that makes the light path.
+    photon : UInt64, of the stream that chooses photons. It is a stream of its own, so that photons change no byte of
+        any other light. None without photon maps.
+    level : UInt32, a fraction of 2^32 that decides which levels of photons are gathered. 16 neighbours start with the
+        same fraction, so that they skip a level together. None without photon maps.
     """
 
-    random: Any
-    choice: Any
-    rotation: Any
-    channels: list[list[Any]]
-    radiance: list[Any]
-    tally: list[Any]
-    sample: Any
-    depth: Any
-    chain: Any
-    origin: Any
-    direction: Any
-    throughput: Any
+    path: mi.UInt64
+    photon: mi.UInt64
+    level: mi.UInt32
+
+
+@dataclass
+class PathState:
+    """The light path at work in each lane, from its last interaction on.
+
+    depth : UInt32, surfaces that scattered it so far; a stay inside a medium counts as one.
+    chain : UInt32, delta interactions since the last one that scattered it; None in scenes without delta interactions.
+    origin, direction : Point3f and Vector3f, the ray that leaves the last interaction; world, metres and unit.
+    throughput : Float, radiance at the camera per radiance along the ray.
+    ray_state : RayState. Its optical length counts from the camera.
+    is_first : Bool, whether the path has met no vertex so far (`rangesim.light_transport.strategies`).
+    via_delta : Bool, whether it has met a delta interaction so far, holes aside.
+    left_delta : Bool, whether the ray leaves a delta interaction.
+    unsampled : Bool, whether no other strategy than this ray finds the ambient light that it meets: it leaves the
+        camera, a delta interaction or an event inside a medium.
+    pdf : Float, 1/sr, density of the BSDF sample that made the ray.
+    events : UInt32, scattering events inside media and crossed boundaries so far; None in scenes without media.
+    scattered_inside : Bool, whether the path has scattered since it entered the medium; None in scenes without media.
+    """
+
+    depth: mi.UInt32
+    chain: mi.UInt32
+    origin: mi.Point3f
+    direction: mi.Vector3f
+    throughput: mi.Float
     ray_state: RayState
-    first: Any
-    via: Any
-    previous_pdf: Any
-    previous_delta: Any
-    was_bent: Any
-    events: Any
-    stays: Any
+    is_first: mi.Bool
+    via_delta: mi.Bool
+    left_delta: mi.Bool
+    unsampled: mi.Bool
+    pdf: mi.Float
+    events: mi.UInt32
+    scattered_inside: mi.Bool
+
+
+@dataclass
+class LaneState:
+    """Everything that an iteration of the loop changes in a lane; `start` makes it, `walk` changes it.
+
+    Dr.Jit carries it through the loop as one structure. Its classes are dataclasses, and not frozen, because Dr.Jit
+    does not look into named tuples. A field that the loop of a scene would never change is None instead: Dr.Jit would
+    trace the loop a second time for it.
+
+    sample : UInt32, samples of the pixel that are finished.
+    channels : per response its dense channels, Float each (`Accumulators.zeros`).
+    """
+
+    sample: mi.UInt32
+    random: RandomStates
+    path: PathState
+    channels: list[list[mi.Float]]
+    radiance: Radiance[mi.Float]
+    tally: Tally[mi.Float]
 
 
 class View(NamedTuple):
-    """What the loop is run in: the scene with its devices, and photons; the same for all lanes.
-
-    maps : PhotonMaps, or None.
-    """
+    """Everything that the lanes look into: the scene with its devices, and photon maps (None: no photons)."""
 
     traced: TracedScene
     maps: PhotonMaps | None = None
@@ -186,16 +245,22 @@ def trace(
     launches: Launches,
     report: Report,
 ) -> PathSums:
-    """Radiance by kind of path, and what tells how much is left out; channels go to the accumulators.
+    """Trace the allocated samples, and return the sums over them; channels go to the accumulators.
 
-    The pixels of the allocation are those of the accumulators. `report` gets the fraction done.
+    Parameters
+    ----------
+    accumulators : Accumulators, of the pixels of the allocation in the same order.
+    launches : Launches, which remember how much work fits into a launch.
+    report : called with the fraction done after each launch.
     """
     pixels, runs = accumulators.pixels, _dealt(-(-accumulators.pixels // NEIGHBOURS))
-    traced = PathSums(*(np.empty((len(kind._fields), pixels), np.float32) for kind in (Radiance, Tally)))
+    traced = PathSums(
+        np.empty((len(fields(Radiance)), pixels), np.float32), np.empty((len(fields(Tally)), pixels), np.float32)
+    )
     samples = allocation.samples
     total, begin, finished, iterations = int(samples.sum(dtype=np.int64)), 0, 0, 0
 
-    def tell(state: State) -> None:
+    def tell(state: LaneState) -> None:
         report((finished + float(state.sample.numpy().sum(dtype=np.int64))) / total)
 
     while begin < len(runs):
@@ -209,27 +274,33 @@ def trace(
         loop, state = partial(walk, view, settings, accumulators, lanes), start(view, settings, accumulators, lanes)
         state, taken = launches.run(loop, state, len(places), accumulators.pending, tell)
         accumulators.store(state.channels, places)
-        for images, sums in zip(traced, (state.radiance, state.tally), strict=True):
-            for image, values in zip(images, sums, strict=True):
-                image[places] = 0 if values is None else values.numpy()
+        _store(state.radiance, traced.radiance, places)
+        _store(state.tally, traced.tally, places)
         begin, finished, iterations = end, finished + int(samples[places].sum(dtype=np.int64)), iterations + taken
     return traced
 
 
+def _store(sums: Radiance[mi.Float] | Tally[mi.Float], images: np.ndarray, places: np.ndarray) -> None:
+    """Write the evaluated sums of lanes to `images` (6, n) at these places; 0 where there are none."""
+    for image, field in zip(images, fields(sums), strict=True):
+        values = getattr(sums, field.name)
+        image[places] = 0 if values is None else values.numpy()
+
+
 def _dealt(n: int) -> np.ndarray:
-    """The numbers 0..n in an order of which any few are spread evenly (multiples of the golden ratio)."""
+    """The numbers 0..n-1 in an order of which any few are spread evenly (multiples of the golden ratio modulo n)."""
     step = next(k for k in range(round(0.6180339887498949 * n), 2 * n + 2) if math.gcd(k, n) == 1)
     return np.arange(n) * step % n
 
 
 class Lanes:
-    """Pixels at work, a lane for each: what of a lane never changes.
+    """The pixels that a launch works on, one for each lane: everything that the loop does not change.
 
     Parameters
     ----------
     view, settings, allocation : View, PathSettings and SampleAllocation.
-    places : (lanes,) int, numbers of the pixels in allocation and accumulators. Random numbers depend on a pixel's flat
-        index in the whole image, the part and the seed alone.
+    places : (lanes,) int, indices of the pixels in the allocation and in the accumulators. Random numbers do not depend
+        on them, but on the flat index of a pixel in the whole image, the part and the seed.
     """
 
     def __init__(self, view: View, settings: PathSettings, allocation: SampleAllocation, places: np.ndarray) -> None:
@@ -248,124 +319,135 @@ class Lanes:
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(of_part(rng, self.part))
-        self.choice = Continued(of_part(random_stream(settings.seed, self.pixel, Stream.SECOND), self.part))
+        self.photon = Continued(of_part(random_stream(settings.seed, self.pixel, Stream.SECOND), self.part))
 
-    def number(self, taken: Any) -> Any:
-        """Number among all samples of the pixel of the next one, after so many were taken."""
+    def number(self, taken: mi.UInt32) -> mi.UInt32:
+        """Number of the next sample among all samples of its pixel, after `taken` of the allocated ones."""
         return self.first + (taken >> 1) * self.stride + (taken & 1)
 
 
-def start(view: View, settings: PathSettings, accumulators: Accumulators, at: Lanes) -> State:
+def start(view: View, settings: PathSettings, accumulators: Accumulators, lanes: Lanes) -> LaneState:
     """The state of lanes that have done nothing yet."""
-    lanes, gathers, in_media = dr.width(at.pixel), view.maps is not None, view.traced.media is not None
-    shines = [True, True, True, gathers, settings.ambient, gathers]
-    return State(
-        # ---- Of the lane: its random numbers, its sums -----------------------------------------------
-        random=mi.UInt64(at.random.rng.state),
-        choice=mi.UInt64(at.choice.rng.state) if gathers else None,  # of photons; they change no other light
-        # Shared by neighbours; evenly spread from here on
-        rotation=of_part(random_stream(settings.seed, at.pixel >> 4, Stream.THIRD), at.part).next_uint32()
-        if gathers
-        else None,
-        channels=accumulators.zeros(lanes),
-        radiance=[dr.zeros(mi.Float, lanes) if any_of_it else None for any_of_it in shines],
-        tally=[dr.zeros(mi.Float, lanes) for _ in range(5)] + [dr.zeros(mi.Float, lanes) if settings.delta else None],
-        sample=dr.zeros(mi.UInt32, lanes),  # samples of this pixel finished so far, of those to be taken
-        # ---- Of the path -----------------------------------------------------------------------------
-        depth=dr.zeros(mi.UInt32, lanes),  # surfaces that scattered it so far
-        chain=dr.zeros(mi.UInt32, lanes) if settings.delta else None,  # delta interactions since
-        origin=dr.zeros(mi.Point3f, lanes),  # of the ray
-        direction=dr.zeros(mi.Vector3f, lanes),
-        throughput=dr.ones(mi.Float, lanes),  # radiance at the camera per radiance along the ray
-        ray_state=RayState.start(view.traced, lanes),  # from the last vertex on; its length counts from the camera
-        first=dr.full(mi.Bool, True, lanes),  # no non-delta surface so far
-        via=dr.full(mi.Bool, False, lanes),  # some delta surface so far
-        previous_pdf=dr.zeros(mi.Float, lanes),  # of the BSDF sample that made the ray; for MIS with ambient light
-        previous_delta=dr.full(mi.Bool, True, lanes),
-        was_bent=dr.full(mi.Bool, False, lanes),  # the ray left a delta surface
-        events=dr.zeros(mi.UInt32, lanes) if in_media else None,  # scatterings in media and crossed boundaries so far
-        stays=dr.full(mi.Bool, False, lanes) if in_media else None,  # scattered since it entered the medium
+    n, gathers, in_media = dr.width(lanes.pixel), view.maps is not None, view.traced.media is not None
+
+    def zeros(exist: bool = True) -> mi.Float:
+        return dr.zeros(mi.Float, n) if exist else None
+
+    level = of_part(random_stream(settings.seed, lanes.pixel >> 4, Stream.THIRD), lanes.part).next_uint32()
+    return LaneState(
+        sample=dr.zeros(mi.UInt32, n),
+        random=RandomStates(
+            path=mi.UInt64(lanes.random.rng.state),
+            photon=mi.UInt64(lanes.photon.rng.state) if gathers else None,
+            level=level if gathers else None,
+        ),
+        path=PathState(
+            depth=dr.zeros(mi.UInt32, n),
+            chain=dr.zeros(mi.UInt32, n) if settings.delta else None,
+            origin=dr.zeros(mi.Point3f, n),
+            direction=dr.zeros(mi.Vector3f, n),
+            throughput=dr.ones(mi.Float, n),
+            ray_state=RayState.start(view.traced, n),
+            is_first=dr.full(mi.Bool, True, n),
+            via_delta=dr.full(mi.Bool, False, n),
+            left_delta=dr.full(mi.Bool, False, n),
+            unsampled=dr.full(mi.Bool, True, n),
+            pdf=dr.zeros(mi.Float, n),
+            events=dr.zeros(mi.UInt32, n) if in_media else None,
+            scattered_inside=dr.full(mi.Bool, False, n) if in_media else None,
+        ),
+        channels=accumulators.zeros(n),
+        radiance=Radiance(
+            direct=zeros(),
+            multipath=zeros(),
+            specular=zeros(),
+            caustic=zeros(gathers),
+            ambient=zeros(settings.ambient),
+            smooth_caustic=zeros(gathers),
+        ),
+        tally=Tally(
+            first=zeros(),
+            further=zeros(),
+            before_last=zeros(),
+            last=zeros(),
+            indirect=zeros(),
+            cut=zeros(settings.delta),
+        ),
     )
 
 
 @dr.syntax
 def walk(
-    view: View, settings: PathSettings, accumulators: Accumulators, at: Lanes, state: State, most: Any
-) -> tuple[State, Any]:
-    """The state of the lanes after at most so many iterations of the loop, and those that each one took."""
+    view: View,
+    settings: PathSettings,
+    accumulators: Accumulators,
+    lanes: Lanes,
+    state: LaneState,
+    max_iterations: mi.UInt32,
+) -> tuple[LaneState, mi.UInt32]:
+    """The state of the lanes after at most that many iterations of the loop, and the number that each lane took."""
     traced, maps = view
     scene, surfaces, camera, projector, media, cutouts, absorbers = traced
-    # ---- The state, by name ------------------------------------------------------------------------
-    random, choice, rotation, channels, sample = (
-        state.random,
-        state.choice,
-        state.rotation,
-        state.channels,
-        state.sample,
-    )
-    origin, towards = state.origin, state.direction
-    direct, multipath, specular, caustic, ambient, smooth_caustic = state.radiance
-    at_first, further, before_last, at_last, indirect, cut = state.tally
-    depth, chain, throughput, ray_state = state.depth, state.chain, state.throughput, state.ray_state
-    first, via, was_bent = state.first, state.via, state.was_bent
-    previous_pdf, previous_delta = state.previous_pdf, state.previous_delta
-    events, stays = state.events, state.stays
-    lanes = dr.width(sample)
-    left = most + dr.zeros(mi.UInt32, lanes)  # iterations
-    active = (sample < at.samples) & (left > 0)
+    n = dr.width(state.sample)
+    left = max_iterations + dr.zeros(mi.UInt32, n)  # iterations
+    active = (state.sample < lanes.samples) & (left > 0)
 
     while active:
-        rng = at.random.at(random)
-        scatters, crosses = (
-            mi.Bool(False),
-            mi.Bool(False),
-        )  # in this iteration: an event inside a medium, or its boundary
+        path, radiance, tally = state.path, state.radiance, state.tally  # parts of the state, changed in place
+        rng = lanes.random.at(state.random.path)
+        # In this iteration: an event inside a medium, or the boundary of one
+        scatters, crosses = mi.Bool(False), mi.Bool(False)
 
         # ---- A new sample starts at the camera -------------------------------------------------------
-        starts = depth == 0
+        starts = path.depth == 0
         if dr.hint(settings.delta, mode="scalar"):
-            starts &= chain == 0
+            starts &= path.chain == 0
         if dr.hint(media is not None, mode="scalar"):
-            starts &= events == 0
-        number = at.number(sample)
-        jitter, lens = in_pairs(at.shift, at.lens_shift, number, at.total)
-        primary = camera.sample_ray(at.corner + jitter, lens)
-        ray = mi.Ray3f(dr.select(starts, primary.origin, origin), dr.select(starts, primary.direction, towards))
-        ray_state = ray_state.restarted(starts, primary.origin, primary.path_offset)
+            starts &= path.events == 0
+        number = lanes.number(state.sample)
+        jitter, lens = in_pairs(lanes.shift, lanes.lens_shift, number, lanes.total)
+        primary = camera.sample_ray(lanes.corner + jitter, lens)
+        ray = mi.Ray3f(
+            dr.select(starts, primary.origin, path.origin), dr.select(starts, primary.direction, path.direction)
+        )
+        path.ray_state = path.ray_state.restarted(starts, primary.origin, primary.path_offset)
         if dr.hint(camera.distortion is not None, mode="scalar"):
-            throughput = dr.select(starts & ~primary.exists, 0, throughput)  # no ray, no light
+            path.throughput = dr.select(starts & ~primary.exists, 0, path.throughput)  # no ray, no light
 
         # ---- Next surface ----------------------------------------------------------------------------
         si = surfaces.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         hit = si.is_valid() & active
         met = mi.Point3f(si.p)
-        si.p = dr.select(was_bent, corrected_point(si, ray_state.previous, ray.d), met)
+        si.p = dr.select(path.left_delta, corrected_point(si, path.ray_state.previous, ray.d), met)
         if dr.hint(media is not None, mode="scalar"):
-            scatters, crosses = media.event(ray_state.inside, ray_state.previous, ray.d, si, hit, rng.next_float32())
+            scatters, crosses = media.event(
+                path.ray_state.inside, path.ray_state.previous, ray.d, si, hit, rng.next_float32()
+            )
         at_surface = hit & ~scatters
         # It counts if it scatters the path; whether it does is known when the next direction is
         if dr.hint(media is not None, mode="scalar"):
-            arrives = ~(crosses | (scatters & stays))
-            depth += dr.select(arrives, mi.UInt32(1), mi.UInt32(0))
+            arrives = ~(crosses | (scatters & path.scattered_inside))
+            path.depth += dr.select(arrives, mi.UInt32(1), mi.UInt32(0))
         else:
             arrives = mi.Bool(True)
-            depth += 1
-        ray_state.length = ray_state.length_to(si.p, hit)
+            path.depth += 1
+        path.ray_state.length = path.ray_state.length_to(si.p, hit)
         if dr.hint(absorbers is not None, mode="scalar"):
-            throughput *= ray_state.unabsorbed(traced, si.p, hit)
+            path.throughput *= path.ray_state.unabsorbed(traced, si.p, hit)
         bsdf = si.bsdf(ray)
-        may_connect = hit & (depth < settings.max_depth) & (scatters | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+        is_vertex = hit & (path.depth < settings.max_depth) & (scatters | can_be_vertex(bsdf))
 
-        # ---- What is left when paths end: see `truncation` -------------------------------------------
-        arriving = dr.select(may_connect & arrives, throughput, 0)
-        is_later = depth > 1
-        at_first += dr.select(is_later, 0, arriving)
-        further += dr.select(is_later, arriving, 0)
-        before_last += dr.select(depth + 2 == settings.max_depth, arriving, 0)
-        at_last += dr.select(depth + 1 == settings.max_depth, arriving, 0)
+        # ---- Throughput that tells what is left out when paths end: see `truncation` -------------------
+        arriving = dr.select(is_vertex & arrives, path.throughput, 0)
+        is_later = path.depth > 1
+        tally.first += dr.select(is_later, 0, arriving)
+        tally.further += dr.select(is_later, arriving, 0)
+        tally.before_last += dr.select(path.depth + 2 == settings.max_depth, arriving, 0)
+        tally.last += dr.select(path.depth + 1 == settings.max_depth, arriving, 0)
 
         # ---- Next-event estimation: straight to the projector ----------------------------------------
-        link = connect(scene, projector, si, may_connect, media, ray_state.inside)
+        is_connected = owner(is_vertex, delta_interactions=0).next_event
+        link = connect(scene, projector, si, is_connected, media, path.ray_state.inside)
         value, _, bs, bs_weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
@@ -377,131 +459,113 @@ def walk(
         value, bs_weight = mono(value), mono(bs_weight)
         wo = si.to_world(bs.wo)
         if dr.hint(media is not None, mode="scalar"):
-            medium = ray_state.inside
+            medium = path.ray_state.inside
             value = dr.select(scatters, medium.albedo * medium.phase(dr.dot(ray.d, link.direction)), value)
             bs_weight = dr.select(scatters, medium.albedo, bs_weight)
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
             wo = dr.select(scatters, medium.scattered(ray.d, xi), wo)
-        radiance = dr.select(link.lit, throughput * value * link.geometry * at.irradiance, 0)
+        light = dr.select(link.lit, path.throughput * value * link.geometry * lanes.irradiance, 0)
         # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
         u, v, path_length = (
-            dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, ray_state.length + link.distance)
+            dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, path.ray_state.length + link.distance)
         )
-        kind = dr.select(first, dr.select(via, mi.UInt32(SPECULAR), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
-        light = LightPath(u, v, path_length, first, kind, link.blur_px)
-        channels = accumulators.add(channels, light, radiance, at.place, link.lit, kind == MULTIPATH)
-        direct += dr.select(kind == DIRECT, radiance, 0)
-        specular += dr.select(kind == SPECULAR, radiance, 0)
-        multipath += dr.select(kind == MULTIPATH, radiance, 0)
-        indirect += dr.select(is_later, radiance, 0)
+        kind = next_event_kind(path.is_first, path.via_delta)
+        light_path = LightPath(u, v, path_length, path.is_first, kind, link.blur_px)
+        state.channels = accumulators.add(state.channels, light_path, light, lanes.place, link.lit, kind == MULTIPATH)
+        radiance.direct += dr.select(kind == DIRECT, light, 0)
+        radiance.specular += dr.select(kind == SPECULAR, light, 0)
+        radiance.multipath += dr.select(kind == MULTIPATH, light, 0)
+        tally.indirect += dr.select(is_later, light, 0)
 
         # ---- Caustic photons: light that reached this point through glass or off mirrors -------------
         if dr.hint(maps is not None, mode="scalar"):
-            vertex = Vertex(si, bsdf, throughput, ray_state.length, first & ~link.lit)
-            chosen = at.choice.at(choice)
+            vertex = Vertex(si, bsdf, path.throughput, path.ray_state.length, path.is_first & ~link.lit)
+            chosen = lanes.photon.at(state.random.photon)
             xi = [chosen.next_float32() for _ in range(3)]
-            choice = chosen.state
-            rotation += 2654435769  # 2^32 over the golden ratio
-            chance, gathers = mi.Float(rotation >> 8) * 2**-24, may_connect & ~scatters
-            brought = gather(maps, vertex, number, xi, chance, gathers)
-            channels, radiance = caustic_light(maps, accumulators, channels, vertex, brought, at.place)
-            caustic += dr.select(brought.is_wide, 0, radiance)
-            smooth_caustic += dr.select(brought.is_wide, radiance, 0)
-            indirect += dr.select(is_later, radiance, 0)
+            state.random.photon = chosen.state
+            state.random.level += GOLDEN_STEP
+            chance = mi.Float(state.random.level >> 8) * 2**-24
+            brought = gather(maps, vertex, number, xi, chance, is_vertex & ~scatters)
+            state.channels, light = caustic_light(maps, accumulators, state.channels, vertex, brought, lanes.place)
+            radiance.caustic += dr.select(brought.is_wide, 0, light)
+            radiance.smooth_caustic += dr.select(brought.is_wide, light, 0)
+            tally.indirect += dr.select(is_later, light, 0)
 
         # ---- Ambient light: next-event estimation and emission, weighted by MIS ----------------------
         if dr.hint(settings.ambient, mode="scalar"):
-            alone = previous_delta | (not settings.lamps)  # no other strategy finds this light
-            before = dr.zeros(mi.Interaction3f, lanes)
-            before.p = ray_state.previous
-            ambient += throughput * emission(scene, si, before, previous_pdf, alone, active & ~scatters)
-            if dr.hint(settings.lamps, mode="scalar"):
+            before = dr.zeros(mi.Interaction3f, n)
+            before.p = path.ray_state.previous
+            alone = path.unsampled | (not settings.samples_ambient)
+            radiance.ambient += path.throughput * ambient_on_ray(scene, si, before, path.pdf, alone, active & ~scatters)
+            if dr.hint(settings.samples_ambient, mode="scalar"):
                 xi = mi.Point2f(rng.next_float32(), rng.next_float32())
                 if dr.hint(media is None, mode="scalar"):
-                    lamp = sampled_emission(traced, bsdf, si, ray_state, xi, may_connect)
-                    ambient += throughput * lamp
+                    light = sampled_ambient(traced, bsdf, si, path.ray_state, xi, is_vertex)
                 else:
-                    lamp = emission_through(traced, bsdf, si, ray.d, ray_state, scatters, xi, may_connect)
-                    ambient += throughput * lamp
+                    light = sampled_ambient_through_media(
+                        traced, bsdf, si, ray.d, path.ray_state, scatters, xi, is_vertex
+                    )
+                radiance.ambient += path.throughput * light
 
         # ---- Next direction --------------------------------------------------------------------------
-        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        throughput *= bs_weight
-        ray_state = ray_state.refracted(bs, at_surface)
-        was_bent = is_delta & ~crosses
+        goes_delta = is_delta(bs)
+        path.throughput *= bs_weight
+        path.ray_state = path.ray_state.refracted(bs, at_surface)
+        path.left_delta = goes_delta & ~crosses
         if dr.hint(settings.delta, mode="scalar"):
-            depth -= dr.select(was_bent, mi.UInt32(1), mi.UInt32(0))
-            chain = dr.select(crosses, chain, dr.select(was_bent, chain + 1, 0))
-        fraction = throughput * dr.square(ray_state.ior)  # of the light, that this path stands for
-        chance = dr.select(depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
+            path.depth -= dr.select(path.left_delta, mi.UInt32(1), mi.UInt32(0))
+            path.chain = dr.select(crosses, path.chain, dr.select(path.left_delta, path.chain + 1, 0))
+        fraction = path.throughput * dr.square(path.ray_state.ior)  # of the light, that this path stands for
+        chance = dr.select(path.depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
-            chance = dr.minimum(chance, survival(chain, fraction))
+            chance = dr.minimum(chance, survival(path.chain, fraction))
         if dr.hint(media is not None, mode="scalar"):
-            chance = dr.select(scatters, dr.minimum(throughput / ROULETTE_BELOW, 1), dr.select(crosses, 1, chance))
+            inside_chance = dr.minimum(path.throughput / ROULETTE_BELOW, 1)
+            chance = dr.select(scatters, inside_chance, dr.select(crosses, 1, chance))
         survives = rng.next_float32() < chance
-        throughput /= chance
+        path.throughput /= chance
         passes = mi.Bool(False)  # through a hole, as if nothing were there
         if dr.hint(cutouts is not None, mode="scalar"):
             passes = cutouts.passed(si, bs, at_surface)
-        first &= ~scatters & (passes | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
-        via |= is_delta & ~passes
-        ray_state = ray_state.restarted(True, si.p, ray_state.length)
-        previous_pdf = mi.Float(bs.pdf)
-        previous_delta = is_delta | scatters
+        path.is_first &= ~scatters & (passes | ~can_be_vertex(bsdf))
+        path.via_delta |= goes_delta & ~passes
+        path.ray_state = path.ray_state.restarted(True, si.p, path.ray_state.length)
+        path.pdf = mi.Float(bs.pdf)
+        path.unsampled = goes_delta | scatters
         ray = si.spawn_ray(wo)
-        ray.o = dr.select(was_bent, spawn_specular_ray(si, met, wo).o, ray.o)
+        ray.o = dr.select(path.left_delta, spawn_specular_ray(si, met, wo).o, ray.o)
         if dr.hint(media is not None, mode="scalar"):
-            events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
-            stays = scatters | (stays & ~crosses)
-        ray_state = ray_state.entering(traced, si, wo, at_surface, crosses)
+            path.events += dr.select(scatters | crosses, mi.UInt32(1), mi.UInt32(0))
+            path.scattered_inside = scatters | (path.scattered_inside & ~crosses)
+        path.ray_state = path.ray_state.entering(traced, si, wo, at_surface, crosses)
 
         # ---- Or next sample --------------------------------------------------------------------------
         # The last surface can only be seen to emit, so it is needed for ambient light alone
         last = settings.max_depth if settings.ambient else settings.max_depth - 1
-        goes_on = depth < last
+        goes_on = path.depth < last
         if dr.hint(media is not None, mode="scalar"):
-            goes_on |= (scatters | crosses) & (depth < settings.max_depth) & (events < MAX_EVENTS)
-        goes_on &= hit & survives & (throughput > 0)
+            goes_on |= (scatters | crosses) & (path.depth < settings.max_depth) & (path.events < MAX_EVENTS)
+        goes_on &= hit & survives & (path.throughput > 0)
         if dr.hint(settings.delta, mode="scalar"):
-            cut += dr.select(goes_on & (chain >= MAX_CHAIN), throughput * dr.square(ray_state.ior), 0)
-            goes_on &= chain < MAX_CHAIN
+            too_long = goes_on & (path.chain >= MAX_CHAIN)
+            tally.cut += dr.select(too_long, path.throughput * dr.square(path.ray_state.ior), 0)
+            goes_on &= path.chain < MAX_CHAIN
         ends = ~goes_on
-        sample = dr.select(ends, sample + 1, sample)
-        depth = dr.select(ends, 0, depth)
+        state.sample = dr.select(ends, state.sample + 1, state.sample)
+        path.depth = dr.select(ends, 0, path.depth)
         if dr.hint(settings.delta, mode="scalar"):
-            chain = dr.select(ends, 0, chain)
-        throughput = dr.select(ends, 1, throughput)
-        ray_state = ray_state.reset(traced, ends)
-        first |= ends
-        via &= ~ends
-        previous_delta |= ends
-        was_bent &= ~ends
+            path.chain = dr.select(ends, 0, path.chain)
+        path.throughput = dr.select(ends, 1, path.throughput)
+        path.ray_state = path.ray_state.reset(traced, ends)
+        path.is_first |= ends
+        path.via_delta &= ~ends
+        path.unsampled |= ends
+        path.left_delta &= ~ends
         if dr.hint(media is not None, mode="scalar"):
-            events = dr.select(ends, 0, events)
-            stays &= ~ends
-        random, origin, towards = rng.state, ray.o, ray.d
+            path.events = dr.select(ends, 0, path.events)
+            path.scattered_inside &= ~ends
+        state.random.path, path.origin, path.direction = rng.state, ray.o, ray.d
         left -= 1
-        active = (sample < at.samples) & (left > 0)
+        active = (state.sample < lanes.samples) & (left > 0)
 
-    return State(
-        random=random,
-        choice=choice,
-        rotation=rotation,
-        channels=channels,
-        radiance=[direct, multipath, specular, caustic, ambient, smooth_caustic],
-        tally=[at_first, further, before_last, at_last, indirect, cut],
-        sample=sample,
-        depth=depth,
-        chain=chain,
-        origin=origin,
-        direction=towards,
-        throughput=throughput,
-        ray_state=ray_state,
-        first=first,
-        via=via,
-        previous_pdf=previous_pdf,
-        previous_delta=previous_delta,
-        was_bent=was_bent,
-        events=events,
-        stays=stays,
-    ), most - left
+    return state, max_iterations - left

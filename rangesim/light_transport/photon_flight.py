@@ -12,6 +12,7 @@ import numpy as np
 from rangesim.light_transport.sampling import Continued, Seed, aligned, random_stream
 from rangesim.light_transport.spectrum import mono
 from rangesim.light_transport.specular_chain import MAX_CHAIN, RayState, corrected_point, spawn_specular_ray, survival
+from rangesim.light_transport.strategies import can_be_vertex, delta_only, is_delta, owner
 from rangesim.light_transport.traced_scene import TracedScene
 
 LANDING_FRACTION = 0.75
@@ -60,8 +61,7 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
     position, direction = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
     cosine = dr.ones(mi.Float, lanes)
     direct, stored, absorbed, escaped, truncated = (dr.zeros(mi.Float, lanes) for _ in range(5))
-    context = mi.BSDFContext(mi.TransportMode.Importance)
-    context.type_mask = mi.BSDFFlags.Delta
+    context = delta_only(mi.TransportMode.Importance)
     active = emitted > 0
 
     random, numbers = mi.UInt64(rng.state), Continued(rng)
@@ -88,13 +88,13 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
             absorbed += dr.select(chain == 0, 0, lost)
         ray_state.length = ray_state.length_to(point, hit)
         bsdf = si.bsdf(ray)
-        scatters = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        scatters = hit & can_be_vertex(bsdf)
         mirrors = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
 
         # ---- It lands: beyond a delta surface for the map, else for next-event estimation ------------
         direct += dr.select(hit & ~mirrors & (chain == 0), flux, 0)
         mixed = scatters & mirrors & (chain > 0)
-        lands = scatters & (chain > 0) & (~mixed | (rng.next_float32() < LANDING_FRACTION))
+        lands = owner(scatters, chain).photons & (~mixed | (rng.next_float32() < LANDING_FRACTION))
         landing_flux = dr.select(mixed, flux / LANDING_FRACTION, flux)
         stored = dr.select(lands, landing_flux, stored)
         position = dr.select(lands, point, position)
@@ -107,7 +107,7 @@ def _chain(traced: TracedScene, uv: Any, power: Any, rng: Any, max_chain: Any) -
             context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), goes_on
         )
         remains = flux * dr.select(mixed, 1 / (1 - LANDING_FRACTION), 1) * mono(weight)
-        goes_on &= (remains > 0) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        goes_on &= (remains > 0) & is_delta(bs)
         chance = survival(chain, remains / emitted)
         goes_on &= rng.next_float32() < chance
         remains = dr.select(goes_on, remains / chance, 0)  # on average nothing is absorbed by this

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from functools import partial
 
 import numpy as np
@@ -21,7 +22,7 @@ BYTES_PER_LANE = 512
 """State of one lane besides its channels, an upper bound."""
 MIN_FOR_HALVES = 3
 """Samples of a pixel: two and one."""
-SMOOTH = [Radiance._fields.index("multipath"), Radiance._fields.index("smooth_caustic")]
+SMOOTH = [i for i, field in enumerate(fields(Radiance)) if field.name in ("multipath", "smooth_caustic")]
 """Light that neighbouring pixels may share."""
 
 
@@ -36,7 +37,7 @@ class Sums:
         self.shape = h, w
         self.channels: dict[Response, np.ndarray] = {}
         self.smooth: dict[Response, np.ndarray] = {}
-        self.radiance = np.zeros((len(Radiance._fields), h, w), np.float32)
+        self.radiance = np.zeros((len(fields(Radiance)), h, w), np.float32)
 
     def add(self, pixels: np.ndarray, traced: PathSums, accumulators: Accumulators) -> None:
         """Add the sums of pixels with these flat indices, in ascending order."""
@@ -114,7 +115,7 @@ class Estimate:
         self.shape = rig.camera.height, rig.camera.width
         self.halves = [Sums(*self.shape) for _ in range(1 + has_halves)]
         self.samples = [np.zeros(self.shape, np.uint32) for _ in self.halves]
-        self.tally = np.zeros((len(Tally._fields), *self.shape), np.float32)
+        self.tally = np.zeros((len(fields(Tally)), *self.shape), np.float32)
         self.rounds = 0
 
     def sample(self, pixels: np.ndarray, samples: np.ndarray, report: Report) -> None:

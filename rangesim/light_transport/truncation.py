@@ -16,7 +16,8 @@ land where the others do.
 from __future__ import annotations
 
 import warnings
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -32,21 +33,28 @@ MIN_DECAY, MAX_DECAY = 0.0, 0.99
 """Bounds of t: nothing is known about a closed room that absorbs next to nothing."""
 
 
-class Tally(NamedTuple):
-    """Sums over the samples of a pixel.
+Array = TypeVar("Array")
 
-    first, further : throughput at the first vertex that scatters, and at all later ones up to the last.
-    before_last, last : throughput at the last vertex at which a pass looks for the projector, and at the one before.
-    indirect : radiance that the projector brings at vertices after the first.
-    cut : throughput of paths that ended in a chain of delta interactions which was too long.
+
+@dataclass
+class Tally(Generic[Array]):
+    """Sums over the samples of a pixel, from which the light that a pass leaves out is estimated.
+
+    Throughput is radiance at the camera per radiance at the place; it has no unit.
+
+    first : throughput at the first vertex that scatters.
+    further : throughput at all later vertices up to the last, added up.
+    before_last, last : throughput at the last vertex but one at which a pass looks for the projector, and at the last.
+    indirect : W/m2/sr, radiance that the projector brings at vertices after the first.
+    cut : throughput of paths that ended because a chain of delta interactions was too long.
     """
 
-    first: Any
-    further: Any
-    before_last: Any
-    last: Any
-    indirect: Any
-    cut: Any
+    first: Array
+    further: Array
+    before_last: Array
+    last: Array
+    indirect: Array
+    cut: Array
 
 
 def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, photons_cut: float) -> Truncation:
@@ -70,9 +78,9 @@ def estimate_truncation(tally: np.ndarray, energy: EnergySplit, max_depth: int, 
     return Truncation(*(float(x) for x in parts / total)) if total else Truncation(0.0 * by_depth, 0.0, 0.0)
 
 
-def warn_of_truncation(truncation: Truncation, max_depth: int, of: str, stacklevel: int) -> None:
+def warn_of_truncation(truncation: Truncation | None, max_depth: int, of: str, stacklevel: int) -> None:
     """Warn if a pass left out more than `WORTH_A_WARNING`; `of` says of which camera, if there are several."""
-    if truncation.total <= WORTH_A_WARNING:
+    if truncation is None or truncation.total <= WORTH_A_WARNING:
         return
     why = f"a max_depth of {max_depth} ends light paths early; a larger one brings it"
     if not truncation.depth > truncation.chains + truncation.photons:

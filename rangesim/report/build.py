@@ -10,12 +10,12 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from pcgraph.plain_files import write_file
+from pcgraph.plumbing.plain_files import write_file
 from rangesim.errors import FileFormatError
-from rangesim.experiment.result_files import Measurement, Result
 from rangesim.report import cloud, figures, palette, tables
 from rangesim.report.policy import StyleRules, content_policy, visible_text
 from rangesim.report.verdict import verdict
+from rangesim.results.run_files import Measurement, Result
 
 SCRIPTS = ("scroll.js", "viewer.js", "report.js")
 
@@ -58,7 +58,7 @@ def context(result: Result) -> dict[str, Any]:
         "references": [m.name for m in measurements if tables.is_reference(m)],
         "settings_line": tables.settings_line(result.experiment, camera[2], camera[1]),
         "verdict": verdict(measurements),
-        "scene_picture": figures.scene_picture(result.energy[0]),
+        "scene_picture": figures.scene_picture(result.passes[0].energy),
         "materials": materials,
         "material_legend": legend,
         "columns": tables.COLUMNS,
@@ -71,7 +71,7 @@ def context(result: Result) -> dict[str, Any]:
         "depth_bar": {"uri": figures.color_bar(depth), "ticks": palette.depth_ticks(*limits)},
         "error_bar": {"uri": figures.color_bar(error), "ticks": palette.error_ticks()},
         "captures": [_frames(m) for m in measurements],
-        "light": [_light(result, number) for number in range(len(result.energy))],
+        "light": [_light(result, number) for number in range(len(result.passes))],
         "costs": tables.cost_table(measurements),
         "transport": _transport(result, names),
         "viewer": _viewer_data(result, names, error),
@@ -117,7 +117,7 @@ def _light(result: Result, number: int) -> dict[str, Any]:
         "names": [m.name for m in of_pass],
         "baseline_mm": f"{1e3 * rig.baseline_m:.0f}",
         "power_w": f"{rig.projector_power_w:g}",
-        "pictures": figures.light_pictures(result.energy[number]),
+        "pictures": figures.light_pictures(result.passes[number].energy),
     }
 
 
@@ -129,7 +129,7 @@ def _transport(result: Result, names: dict[str, str]) -> list[dict[str, str]]:
             "frames": str(sum(m.metadata.frames for m in result.measurements if m.light_pass == number)),
             "time": tables.seconds(times[f"transport_{number}"]),
         }
-        for number in range(1, len(result.energy) + 1)
+        for number in range(1, len(result.passes) + 1)
     ]
 
 

@@ -12,7 +12,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from pcgraph.plain_files import sealed, unsealed
+from pcgraph.plumbing.plain_files import sealed, unsealed
 from rangesim.report.figures import grey
 from rangesim.report.policy import StyleRules, content_policy, visible_text
 from rangesim.rig.calibration_files import SEAL

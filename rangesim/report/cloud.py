@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rangesim.experiment.result_files import Measurement, Segmentation
 from rangesim.report import palette
+from rangesim.results.run_files import Measurement, Segmentation
 
 NO_ERROR = -32768
 ERROR_STEP_M = 1e-5

@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.response.base import DenseResponse, LightPath, Math
 from rangesim.response.defocus import BlurredImage, blurred_stripes, fringe_contrast
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, check_fields
 from rangesim.settings.config import shown
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcgraph.plain_files import sealed, unsealed, write_file
+from pcgraph.plumbing.plain_files import sealed, unsealed, write_file
 from rangesim.errors import FileFormatError
 from rangesim.files.text_files import check_xml, read_json
 from rangesim.rig import Intrinsics, Rig
@@ -23,7 +23,7 @@ from rangesim.settings.bounds import Bounds, check_number, whole
 from rangesim.settings.config import shown, to_dict
 
 SEAL = "rangesim-calibration"
-"""By which `rangesim calibrate` knows the files that it may replace; see `pcgraph.plain_files.sealed`."""
+"""By which `rangesim calibrate` knows the files that it may replace; see `pcgraph.plumbing.plain_files.sealed`."""
 MAX_NUMBER = 1e9
 """Of a number in a calibration file: pixels, millimetres, coefficients."""
 _SHAPES = {

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangesim import limits
 from rangesim.rig import camera_model
 from rangesim.rig.camera_model import CameraModel, fold_radius2
+from rangesim.settings import limits
 from rangesim.settings.bounds import (
     MAX_COORDINATE_M,
     Bounds,

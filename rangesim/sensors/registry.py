@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pcgraph.python_files import run_python_file
+from pcgraph.plumbing.python_files import run_python_file
 from rangesim.errors import FileFormatError
 from rangesim.sensor import Decoder, Sensor
 from rangesim.settings.config import brief, from_dict, nearest, shown, to_dict

@@ -32,7 +32,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from rangesim import limits
+from rangesim.settings import limits
 from rangesim.settings.config import nearest, shown
 
 
@@ -45,7 +45,7 @@ class Bounds:
     words : description of the allowed numbers, for messages: "positive and finite".
     low, high : the smallest and the largest allowed number.
     or_zero : whether 0 is allowed too, although it lies outside the interval.
-    limit : name of the entry of `rangesim.limits` that is the upper bound; "": none.
+    limit : name of the entry of `rangesim.settings.limits` that is the upper bound; "": none.
     kind : `int` if only whole numbers are allowed. `check_number` reads it; on the field of a dataclass, the type in
         its annotation decides instead.
 
@@ -76,7 +76,7 @@ class Bounds:
 
 
 def whole(low: int, limit: str = "") -> Bounds:
-    """Bounds of a whole number: at least `low`, and at most the entry `limit` of `rangesim.limits`.
+    """Bounds of a whole number: at least `low`, and at most the entry `limit` of `rangesim.settings.limits`.
 
     Examples
     --------
@@ -152,7 +152,7 @@ def _checked(hint: Any, value: Any, name: str) -> Any:
         hint, *others = (arg for arg in get_args(hint) if arg is not type(None))
         for other in others:
             is_literal = get_origin(other) is typing.Literal
-            if (isinstance(value, str) and value in get_args(other)) if is_literal else type(value) is other:
+            if (isinstance(value, str) and value in get_args(other)) if is_literal else _is_member(value, other):
                 return value
     bounds = None
     if get_origin(hint) is Annotated:
@@ -173,6 +173,11 @@ def _checked(hint: Any, value: Any, name: str) -> Any:
         words = {bool: "true or false", str: "a text"}.get(hint, f"a {hint.__name__}")
         raise ValueError(f"expected {name} to be {words}, got {shown(value)}.")
     return value
+
+
+def _is_member(value: Any, kind: Any) -> bool:
+    """Whether a value is of a class or of a subclass; a bool is no number."""
+    return isinstance(kind, type) and isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
 
 
 def _number(kind: type, value: Any, name: str, bounds: Bounds | None) -> Any:

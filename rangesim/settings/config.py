@@ -20,8 +20,8 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import msgspec
 import numpy as np
 
-from pcgraph.short_repr import SHORT
-from pcgraph.short_repr import ShortRepr as ShortRepr
+from pcgraph.plumbing.short_repr import SHORT
+from pcgraph.plumbing.short_repr import ShortRepr as ShortRepr
 
 T = TypeVar("T")
 

@@ -56,8 +56,8 @@ def directory(folder: Path, under: str) -> dict[str, bytes]:
 def result_files() -> dict[str, bytes]:
     """Files of a small result, under `result/`: structured light and an ideal ranger before a plane."""
     from rangesim.experiment import Experiment
-    from rangesim.experiment.instrument import Instrument
-    from rangesim.experiment.pipeline import run
+    from rangesim.instrument.instrument import Instrument
+    from rangesim.pipeline.experiment_run import run
     from rangesim.sensors import AmcwToF, IdealToF, StructuredLight
 
     instruments = (

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pcgraph.python_files import run_python_file
+from pcgraph.plumbing.python_files import run_python_file
 
 
 @pytest.fixture(autouse=True)

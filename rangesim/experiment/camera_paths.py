@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from rangesim import limits
 from rangesim.rig import Array, look_at, pose
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Coordinate, Metres, check_fields, whole
 from rangesim.settings.config import Named, shown, to_dict
 from rangesim.settings.seeds import check_seed
@@ -43,7 +43,7 @@ class Viewpoint(NamedTuple):
         return float(np.degrees(np.arcsin(np.clip(-self.T_world_camera[2, 2], -1, 1))))
 
 
-class Path(Named, ABC):
+class CameraPath(Named, ABC):
     """Poses of a rig's camera, one for each view. Subclasses are frozen dataclasses."""
 
     known: ClassVar[dict[str, type[Any]]] = {}
@@ -59,7 +59,7 @@ class Path(Named, ABC):
 
 
 @dataclass(frozen=True)
-class Turntable(Path):
+class Turntable(CameraPath):
     """Views on a circle about a vertical axis, all looking at one point: as of a thing that turns before the rig.
 
     Parameters
@@ -91,7 +91,7 @@ class Turntable(Path):
 
 
 @dataclass(frozen=True)
-class Dome(Path):
+class Dome(CameraPath):
     """Views spread evenly over a zone of a sphere, all looking at its centre.
 
     Heights are in equal steps, each view the golden angle further on: a Fibonacci lattice (Gonzalez: "Measurement of
@@ -127,7 +127,7 @@ class Dome(Path):
 
 
 @dataclass(frozen=True)
-class HandHeld(Path):
+class HandHeld(CameraPath):
     """Views along a walk around a thing, up and down once, with the unrest of a hand.
 
     Position, aim and roll swing about the walk by random sums of three sine waves each; neighbouring views are near
@@ -176,7 +176,7 @@ class HandHeld(Path):
 
 
 @dataclass(frozen=True, eq=False)
-class PoseList(Path):
+class PoseList(CameraPath):
     """Views from given poses.
 
     matrices : (n, 4, 4) float64, T_world_camera of each, rigid, metres, OpenCV's axes.

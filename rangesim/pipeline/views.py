@@ -4,18 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rangesim.capture.exposure import expose
+from rangesim.decoding import decode
 from rangesim.decoding.range_image import RangeImage
-from rangesim.experiment.instrument import Instrument
-from rangesim.fusion.paths import Path, PoseList, Viewpoint
-from rangesim.rig import Array, Rig, pose
+from rangesim.experiment.camera_paths import CameraPath, PoseList, Viewpoint
+from rangesim.fusion.scan import Scan
+from rangesim.instrument.instrument import Instrument
+from rangesim.rig import Array, Rig
 from rangesim.sensor import Sensor
-from rangesim.settings.config import ShortRepr, shown
+from rangesim.settings.config import shown
 from rangesim.settings.seeds import check_seed, derived_seed
 
 if TYPE_CHECKING:
@@ -25,49 +28,11 @@ if TYPE_CHECKING:
     from rangesim.signals import GroundTruth
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Scan(ShortRepr):
-    """Range images of one scene from several places.
-
-    images : one for each view, each with `camera`, `T_world_camera` and the `confidence` of its readings. `fuse` takes
-    them as they are. truths : ground truth of each; empty where there is none. true_poses : (n, 4, 4) float64,
-    T_world_camera that the views were rendered from; None of a real scan.
-    """
-
-    images: tuple[RangeImage, ...]
-    truths: tuple[GroundTruth, ...] = ()
-    true_poses: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    @property
-    def poses(self) -> Array:
-        """(n, 4, 4) float64, T_world_camera of each view as its image has it: known, or found by `align`."""
-        return np.stack([np.asarray(i.T_world_camera) for i in self.images])
-
-    def with_poses(self, poses: ArrayLike) -> Scan:
-        """The same readings, taken from other places (n, 4, 4)."""
-        matrices = np.asarray(poses, dtype=np.float64)
-        if matrices.shape != (len(self.images), 4, 4):
-            raise ValueError(f"expected poses of shape ({len(self.images)}, 4, 4), got {matrices.shape}.")
-        placed = [
-            replace(i, T_world_camera=pose(T, f"pose {k}"))
-            for k, (i, T) in enumerate(zip(self.images, matrices, strict=True))
-        ]
-        return replace(self, images=tuple(placed))
-
-    def points(self) -> list[Array]:
-        """(n, 3) float64, metres, camera coordinates of each view's readings."""
-        clouds = (image.to_point_cloud().points.reshape(-1, 3).astype(np.float64) for image in self.images)
-        return [p[np.isfinite(p).all(axis=1)] for p in clouds]
-
-
 def scan(
     scene: Scene,
     rig: Rig,
     sensor: Sensor | Instrument,
-    path: Path | ArrayLike,
+    path: CameraPath | ArrayLike,
     settings: TransportSettings | None = None,
     *,
     ambient: Ambient | None = None,
@@ -82,7 +47,7 @@ def scan(
     rig : camera and emitter, which move together; its own pose does not count, but where a path names no centre: then
         that is what the rig looks at, at the scene's working distance.
     sensor : Sensor with its default electronics and decoder, or an Instrument with its own.
-    path : Path, or poses (n, 4, 4) T_world_camera.
+    path : CameraPath, or poses (n, 4, 4) T_world_camera.
     settings, options : of the light transport, as for `transport`; the seed is derived, other noise in each view.
     ambient : as for `expose`.
     seed : of light transport and noise, 0 to 2^64 - 1.
@@ -123,19 +88,17 @@ def taken(
 
     poses : (n, 4, 4) T_world_camera. The rest as of `scan`.
     """
-    import rangesim
+    from rangesim.instrument.transport import transport
 
     for number, T in enumerate(poses):
         placed = replace(rig, T_world_camera=T)
         here = replace(settings, seed=derived_seed(seed, number, 0))
-        signals = rangesim.transport(scene, placed, [instrument.sensor], here)
+        signals = transport(scene, placed, [instrument.sensor], here)
         noise_seed = derived_seed(seed, number, 1)
-        capture = rangesim.expose(
-            signals, instrument.sensor, instrument.detector, instrument.exposure_s, noise_seed, ambient
-        )
-        yield rangesim.decode(capture, instrument.decoder), signals.truth
+        capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, noise_seed, ambient)
+        yield decode(capture, instrument.decoder), signals.truth
 
 
-def poses_of(path: Path | ArrayLike | Sequence[ArrayLike], viewpoint: Viewpoint | None = None) -> Array:
+def poses_of(path: CameraPath | ArrayLike | Sequence[ArrayLike], viewpoint: Viewpoint | None = None) -> Array:
     """(n, 4, 4) poses of a path, or as they are given."""
-    return (path if isinstance(path, Path) else PoseList(np.asarray(path))).poses(viewpoint)
+    return (path if isinstance(path, CameraPath) else PoseList(np.asarray(path))).poses(viewpoint)

@@ -1,13 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole scan: scene -> views -> poses -> surface -> errors, what was seen, report; and its directory of results.
-
-DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.output`
-    scan.json            resolved settings, versions, statistics of surface, shapes and views
-    mesh.ply             the fused surface, metres, world
-    poses.json           T_world_camera (n, 4, 4) of the views: as fused, and true
-    view_01/range.npz    range image of each view, with its pose
-    report.html
-"""
+"""A whole scan: scene -> views -> poses -> surface -> errors, what was seen, report; and its directory of results."""
 
 from __future__ import annotations
 
@@ -15,36 +7,31 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-import rangesim
-from pcgraph.output import DirectoryKind, new_directory
-from rangesim.errors import FileFormatError
-from rangesim.files.schema import write_json
+from rangesim import __version__
+from rangesim.experiment.camera_paths import Viewpoint
+from rangesim.experiment.scan_settings import ScanSettings
+from rangesim.files.result_directories import new_directory
 from rangesim.fusion.mesh_error import SurfaceError, distances_to, surface_error
-from rangesim.fusion.multiway_registration import PoseErrors, align, check_first_pair, pose_errors
-from rangesim.fusion.paths import Viewpoint
-from rangesim.fusion.scan_cost import VOXEL_SPACINGS, estimate_scan_cost
-from rangesim.fusion.scan_settings import ScanSettings, scan_settings_to_dict
-from rangesim.fusion.seen_volume import Occupancy, occupancy
-from rangesim.fusion.truncated_average import FusedSurface, fuse
-from rangesim.fusion.views import Scan, poses_of, taken
+from rangesim.fusion.multiway_registration import align, check_first_pair, pose_errors
+from rangesim.fusion.scan import Scan
+from rangesim.fusion.seen_volume import occupancy
+from rangesim.fusion.truncated_average import fuse
 from rangesim.fusion.voxel_grid import VoxelGrid
+from rangesim.pipeline.scan_cost import VOXEL_SPACINGS, estimate_scan_cost
+from rangesim.pipeline.views import poses_of, taken
+from rangesim.results.scan_files import SCAN, ScanResult, ShapeStatistics, write_scan
 from rangesim.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from rangesim.decoding.range_image import RangeImage
-    from rangesim.experiment.cost import Cost
+    from rangesim.pipeline.cost import Cost
     from rangesim.scene import Scene
 
-SIDECAR = "scan.json"
-FORMAT = "rangesim-scan"
-SCAN = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
-"""Directories that hold the results of a scan."""
 Progress = Callable[[str, float], None]
 """Called with the name of the stage and the fraction of the whole job done, 0..1."""
 MAX_COMPARED_VOXELS = 1_000_000
@@ -52,51 +39,6 @@ MAX_COMPARED_VOXELS = 1_000_000
 BACKGROUND = 0.3
 """Shapes with a larger fraction of the scene's extent are background (a table, a wall), as long as there are others."""
 SAMPLES = 20_000
-
-
-@dataclass(frozen=True, eq=False)
-class ScanResult:
-    """What a scan comes to.
-
-    settings : as resolved. scan : the views, with the poses they were fused with. fused : the surface. surfaces : true
-    one of each shape. errors : of the part of the mesh that is nearest to each shape; None where there is none. things
-    : names of the shapes that are no background. seen : what the views saw of these, and of the space around them.
-    poses : errors of poses that were found; None where they were known. times_s : seconds by stage.
-    """
-
-    settings: ScanSettings
-    scan: Scan
-    fused: FusedSurface
-    surfaces: dict[str, TriangleMesh]
-    materials: dict[str, str]
-    errors: dict[str, SurfaceError | None]
-    things: tuple[str, ...]
-    seen: Occupancy | None
-    poses: PoseErrors | None
-    times_s: dict[str, float]
-
-    def statistics(self) -> dict[str, Any]:
-        """Plain data for `scan.json`; None where a value is not defined."""
-        shapes = {}
-        for name, error in self.errors.items():
-            numbers = {} if error is None else {k: v for k, v in asdict(error).items() if isinstance(v, float)}
-            seen = {} if self.seen is None or name not in self.seen.shapes else asdict(self.seen.shapes[name])
-            shapes[name] = {"material": self.materials[name], **numbers, "seen": _without_nan(seen)}
-        views: list[dict[str, Any]] = []
-        for number, image in enumerate(self.scan.images):
-            views.append({"readings": int(image.valid.sum()), "pixels": int(image.valid.size)})
-            if self.poses is not None:
-                views[-1]["angle_error_deg"] = float(self.poses.angle_deg[number])
-                views[-1]["centre_error_m"] = float(self.poses.centre_m[number])
-        return {
-            "voxel_m": self.fused.voxel_m,
-            "truncation_m": self.fused.truncation_m,
-            "min_weight": self.fused.min_weight,
-            "triangles": len(self.fused.mesh.faces),
-            "area_m2": self.fused.mesh.area_m2,
-            "shapes": shapes,
-            "views": views,
-        }
 
 
 def run_scan(
@@ -108,7 +50,7 @@ def run_scan(
 ) -> ScanResult:
     """Carry out a scan and write its results, with `report.html`, to the directory `out`.
 
-    The files appear when all is done; a failure leaves nothing behind. See `pcgraph.output`.
+    The files appear when all is done; a failure leaves nothing behind. See `rangesim.files.result_directories`.
 
     Parameters
     ----------
@@ -119,35 +61,42 @@ def run_scan(
     ------
     ValueError, FileFormatError, EnvironmentProblem
         A setting out of range, more memory than there is, a scene that cannot be loaded, poses that cannot be found, no
-        surface, or an `out` that cannot take a result (see `pcgraph.output.check_directory`).
+        surface, or an `out` that cannot take a result (see `rangesim.files.result_directories.check_directory`).
     """
+    from rangesim.report.scan_page import render_scan_page
+
     with new_directory(out, SCAN, inputs=[settings.scene]) as folder:
-        result = carry_out(settings, progress, scene, announce)
+        result = carry_out_scan(settings, progress, scene, announce)
         tell = progress or _unwatched
         tell("Writing the results", 0.93)
-        write_scan(result, folder)
+        write_scan(result, folder, {"report.html": render_scan_page(result).encode()})
     return result
 
 
 def estimate_scan(settings: ScanSettings) -> Cost:
     """Cost of `run_scan`; the scene is loaded, and rendered small if it may take long. Errors as `run_scan`."""
-    scene = rangesim.load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
+    from rangesim.scene import load_scene
+
+    scene = load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
     return estimate_scan_cost(settings, scene)
 
 
-def carry_out(
+def carry_out_scan(
     settings: ScanSettings,
     progress: Progress | None = None,
     scene: Scene | None = None,
     announce: Callable[[Cost], None] | None = None,
 ) -> ScanResult:
     """The result of a scan; nothing is written. Errors as `run_scan`."""
+    import mitsuba as mi
+
+    from rangesim.scene import load_scene
     from rangesim.scene.triangles import true_surfaces
 
     tell, times = progress or _unwatched, dict[str, float]()
     tell("Loading the scene", 0.0)
     with _timed(times, "load"):
-        scene = scene or rangesim.load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
+        scene = scene or load_scene(settings.scene, material=settings.material, unit_m=settings.unit_m)
         if settings.ambient is not None:
             settings.ambient.check_emitters(scene.has_ambient)
         rig = settings.instrument.rig(scene, settings.width, settings.height)
@@ -196,7 +145,9 @@ def carry_out(
         grid = VoxelGrid.around(around, coarse, 2 * fused.voxel_m)
         seen = occupancy(views.images, {n: surfaces[n] for n in things}, grid)
     materials = {i.name: i.material for i in scene.instances}
-    return ScanResult(settings, views, fused, surfaces, materials, errors, things, seen, found, times)
+    shapes = {n: ShapeStatistics.of(materials[n], errors[n], seen.shapes.get(n)) for n in surfaces}
+    versions = {"python": platform.python_version(), "rangesim": __version__}
+    return ScanResult(settings, views, fused, surfaces, shapes, things, seen, found, versions, mi.variant(), times)
 
 
 def errors_by_shape(
@@ -211,37 +162,6 @@ def errors_by_shape(
         has_area = len(of_shape.faces) and of_shape.area_m2 > 0 and surface.area_m2 > 0
         result[name] = surface_error(of_shape, surface, threshold_m, samples=SAMPLES) if has_area else None
     return result
-
-
-def write_scan(result: ScanResult, folder: Path) -> None:
-    """Write the files of a scan to an empty directory."""
-    import mitsuba as mi
-
-    from rangesim.report.scan_page import render_scan_page
-
-    versions = {"python": platform.python_version(), "rangesim": rangesim.__version__}
-    settings = scan_settings_to_dict(result.settings)
-    write_json(
-        folder / SIDECAR,
-        {
-            "format": FORMAT,
-            "format_version": 1,
-            "settings": settings,
-            "statistics": result.statistics(),
-            "versions": versions,
-            "variant": mi.variant(),
-            "times_s": result.times_s,
-        },
-    )
-    true_poses = result.scan.true_poses
-    poses = {"T_world_camera": result.scan.poses.tolist(), "true": None if true_poses is None else true_poses.tolist()}
-    write_json(folder / "poses.json", {"unit": "metres, OpenCV axes", **poses})
-    result.fused.mesh.save(folder / "mesh.ply")
-    for number, image in enumerate(result.scan.images, 1):
-        place = folder / f"view_{number:02d}"
-        place.mkdir()
-        image.save(place / "range.npz")
-    (folder / "report.html").write_text(render_scan_page(result), encoding="utf-8")
 
 
 def _voxel_m(views: Scan) -> float:
@@ -265,10 +185,6 @@ def _things(surfaces: Mapping[str, TriangleMesh]) -> tuple[str, ...]:
     sizes = {name: float(np.linalg.norm(np.ptp(m.vertices, axis=0))) for name, m in surfaces.items()}
     largest = max(sizes.values())
     return tuple(n for n, size in sizes.items() if size <= BACKGROUND * largest) or tuple(surfaces)
-
-
-def _without_nan(data: dict[str, float]) -> dict[str, float | None]:
-    return {key: None if np.isnan(value) else value for key, value in data.items()}
 
 
 def _unwatched(stage: str, fraction: float) -> None:

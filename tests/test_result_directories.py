@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No file of the user's is ever lost, and output is whole or not there: the laws of `pcgraph.output`."""
+"""No file of the user is ever lost, and a directory is whole or not there: laws of `result_directories`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pcgraph import output
-from pcgraph.output import (
+from pcgraph.plumbing.plain_files import write_file
+from rangesim.files import result_directories
+from rangesim.files.result_directories import (
     MANIFEST,
     STAGING,
     DirectoryKind,
@@ -30,7 +31,6 @@ from pcgraph.output import (
     replace_listed_file,
     verify_directory,
 )
-from pcgraph.plain_files import write_file
 
 
 class Refused(Exception):
@@ -232,7 +232,7 @@ def test_links_to_directories_are_written_through(tmp_path: Path, monkeypatch: p
 
 def test_a_place_that_never_comes_into_being_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in /proc, where making a directory says that there is none; it was once tried for ever."""
-    monkeypatch.setattr(output, "_ATTEMPTS", 20)
+    monkeypatch.setattr(result_directories, "_ATTEMPTS", 20)
 
     def vanishes(path: Path, *_: object, **__: object) -> None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
@@ -355,13 +355,13 @@ def steps_of_a_replacement(tmp_path: Path) -> int:
     with pytest.MonkeyPatch.context() as patch:
         publish(tmp_path / "count", OLD)
         before_each_change(patch, lambda: calls.append(None))
-        patch.setattr(output._Staging, "release", end_of_process)
+        patch.setattr(result_directories._Staging, "release", end_of_process)
         publish(tmp_path / "count", NEW)
-    output._claims.clear()
+    result_directories._claims.clear()
     return len(calls)
 
 
-def end_of_process(claim: output._Staging) -> None:
+def end_of_process(claim: result_directories._Staging) -> None:
     """What is left to do for a claim whose process is killed: the system closes its files."""
     if claim.handle is not None:
         os.close(claim.handle)
@@ -378,10 +378,10 @@ def test_a_process_that_dies_at_any_step_leaves_the_old_or_the_new(tmp_path: Pat
         target = shutil.copytree(tmp_path / "before", tmp_path / f"n{step}")
         with pytest.MonkeyPatch.context() as patch:
             count_down(patch, step, Stop)
-            patch.setattr(output._Staging, "release", end_of_process)
+            patch.setattr(result_directories._Staging, "release", end_of_process)
             with pytest.raises(Stop):
                 publish(target, NEW)
-        output._claims.clear()
+        result_directories._claims.clear()
         recover(target, Refused)
         assert is_whole(target)
         found = {k: v for k, v in contents(target).items() if not k.startswith(STAGING)}
@@ -416,7 +416,7 @@ def test_a_disk_that_fails_at_any_step_leaves_the_old_or_the_new(tmp_path: Path)
 def test_a_killed_process_leaves_staging_that_the_next_one_clears(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys; from pathlib import Path\n"
-        "from pcgraph.output import DirectoryKind, new_directory\n"
+        "from rangesim.files.result_directories import DirectoryKind, new_directory\n"
         "kind = DirectoryKind('test-kind', 'sidecar.json', OSError)\n"
         "with new_directory(sys.argv[1], kind) as folder:\n"
         "    (folder / 'half').write_text('x')\n"
@@ -445,11 +445,11 @@ def test_abandon_waits_for_a_replacement_and_clears_the_rest(tmp_path: Path) -> 
     thread = threading.Thread(target=work)
     thread.start()
     assert entered.wait(10)
-    assert output.abandon()
+    assert result_directories.abandon()
     assert list(tmp_path.iterdir()) == []
     ended.set()
     thread.join(10)
-    assert not output.abandon()
+    assert not result_directories.abandon()
 
 
 def test_work_that_goes_on_while_it_is_abandoned_leaves_nothing(tmp_path: Path) -> None:
@@ -469,7 +469,7 @@ def test_work_that_goes_on_while_it_is_abandoned_leaves_nothing(tmp_path: Path) 
         thread = threading.Thread(target=work, args=(entered,))
         thread.start()
         assert entered.wait(10)
-        assert output.abandon()
+        assert result_directories.abandon()
         thread.join(20)
         assert list(tmp_path.iterdir()) == []
 
@@ -540,7 +540,7 @@ def test_any_sequence_keeps_what_is_the_users(tmp_path_factory: pytest.TempPathF
 def in_another_process(code: str, *arguments: object) -> subprocess.Popen[str]:
     """A process that has the module's names, KIND and `publish` at hand."""
     lines = (
-        "import json, os, sys; from pathlib import Path\nfrom pcgraph.output import *\n"
+        "import json, os, sys; from pathlib import Path\nfrom rangesim.files.result_directories import *\n"
         "KIND = DirectoryKind('test-kind', 'sidecar.json', OSError)\n"
         "def fill(folder, name):\n"
         "    (folder / 'sidecar.json').write_text(json.dumps({'format': 'test-kind'}))\n"

@@ -12,13 +12,16 @@ import numpy as np
 from rangesim.capture.exposure import expose
 from rangesim.decoding import decode
 from rangesim.electronics.ambient import Ambient
-from rangesim.evaluation.range_noise import TO_SIGMA, sampling_draw
-from rangesim.experiment.instrument import Instrument
+from rangesim.evaluation.range_noise import sampling_draw
+from rangesim.instrument.instrument import Instrument
+from rangesim.light_transport.sampler import Sampler
+from rangesim.robust_scale import TO_SIGMA
 from rangesim.sensor import Sensor
 from rangesim.settings.bounds import Bounds, check_fields, whole
 
 if TYPE_CHECKING:
-    from rangesim.signals import GroundTruth, Signals
+    from rangesim.response import Response
+    from rangesim.signals import GroundTruth, StillSignals
 
 FIRST_SPP = 8
 """Samples that all pixels get."""
@@ -31,7 +34,7 @@ BLOCK_PX = 16
 
 
 @dataclass(frozen=True)
-class AdaptiveSampling:
+class AdaptiveSampling(Sampler):
     """Some samples of every pixel, and then as many more as the noise of its readings asks for.
 
     The variance of a mean falls with the number of samples, so the first ones tell how many there have to be (two-stage
@@ -63,17 +66,26 @@ class AdaptiveSampling:
 
     @property
     def first_spp(self) -> int:
-        """Samples that all pixels get."""
         return min(FIRST_SPP, self.max_spp)
 
-    def samples(self, truth: GroundTruth, signals_of: Callable[[Sensor], Signals]) -> np.ndarray:
-        """(h, w) int, samples that pixels should have; `signals_of` gives a sensor's signals after the first ones."""
+    @property
+    def most_spp(self) -> int:
+        return self.max_spp
+
+    def check(self, responses: Sequence[Response]) -> None:
+        for instrument in self.instruments:
+            if missing := set(instrument.sensor.responses()) - set(responses):
+                raise ValueError(
+                    f"expected sensors that have {missing.pop()}, for instrument {instrument.name!r} of spp."
+                )
+
+    def samples(self, truth: GroundTruth, signals_of: Callable[[Sequence[Response]], StillSignals]) -> np.ndarray:
         group = groups(truth.instance)
         excess = np.zeros(group.max() + 1)  # of the variance, over what is small enough
         z = truth.z[np.isfinite(truth.z)]
         negligible = NEGLIGIBLE * float(np.median(z)) if z.size else 0.0
         for instrument in self.instruments:
-            signals = signals_of(instrument.sensor)
+            signals = signals_of(instrument.sensor.responses())
             capture = expose(signals, instrument.sensor, instrument.detector, instrument.exposure_s, 0, self.ambient)
             image = decode(capture, instrument.decoder)
             middle, sampling = sampling_draw(image, capture, signals)

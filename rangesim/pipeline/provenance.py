@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesim.experiment import Experiment, experiment_to_dict
-from rangesim.experiment.instrument import Instrument
-from rangesim.experiment.result_files import InstrumentRecord, ResultRecord, SceneRecord, ShapeRecord
+from rangesim.instrument.instrument import Instrument
+from rangesim.results.run_files import InstrumentRecord, ResultRecord, SceneRecord, ShapeRecord
 from rangesim.settings.config import to_dict
 
 if TYPE_CHECKING:

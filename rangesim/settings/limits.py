@@ -107,7 +107,7 @@ def check(name: str, value: int, what: str, error: type[Exception] = ValueError)
     if value > most:
         raise error(
             f"expected at most {most} {what}, got {shown(value)}; if this is meant, raise the limit with "
-            f"{VARIABLE}={name}=N or rangesim.limits.raised({name}=N)."
+            f"{VARIABLE}={name}=N or rangesim.settings.limits.raised({name}=N)."
         )
 
 

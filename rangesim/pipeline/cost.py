@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from rangesim import limits
 from rangesim.errors import TruncationWarning
 from rangesim.experiment import Experiment
-from rangesim.experiment.instrument import Instrument
+from rangesim.instrument.instrument import Instrument
+from rangesim.settings import limits
 
 if TYPE_CHECKING:
     from rangesim.rig import Rig
@@ -130,7 +130,7 @@ def estimate_cost(
 
     Parameters
     ----------
-    passes : as `rangesim.experiment.pipeline.group_by_rig` returns.
+    passes : as `rangesim.pipeline.experiment_run.group_by_rig` returns.
     trial : whether small passes may be timed where the run is long.
     places : that each pass is traced from. rest : what is done with the signals; None: what a run does.
     """
@@ -212,7 +212,7 @@ def _timed_trial(
 
     All of an idle machine, see `_Took`.
     """
-    import rangesim
+    from rangesim.instrument.transport import transport
 
     rig, instruments = one_pass
     camera = rig.camera.resized(TRIAL_WIDTH, max(1, round(TRIAL_WIDTH * rig.camera.height / rig.camera.width)))
@@ -223,7 +223,7 @@ def _timed_trial(
         warnings.simplefilter("ignore", TruncationWarning)  # the run itself will tell
         for spp in (TRIAL_SPP[0], *TRIAL_SPP):  # the first compiles
             start = _Took.now()
-            rangesim.transport(scene, replace(rig, camera=camera), sensors, settings, spp=spp)
+            transport(scene, replace(rig, camera=camera), sensors, settings, spp=spp)
             took.append((_Took.now() - start).idle_s)
     paths = camera.width * camera.height * (TRIAL_SPP[1] - TRIAL_SPP[0])
     path_s = max((took[2] - took[1]) / paths, 0.1 / _paths_per_s())

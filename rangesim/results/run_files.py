@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of an experiment as a directory, and back.
 
-DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.output`
+DIR/manifest.json        size and SHA-256 of every file below; see `rangesim.files.result_directories`
     experiment.json      resolved settings, versions, and which instruments share which pass
     pass_1.npz           energy split and ground truth of each transport pass
     comparison.md        statistics of all instruments
@@ -15,23 +15,23 @@ DIR/manifest.json        size and SHA-256 of every file below; see `pcgraph.outp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from pcgraph.output import DirectoryKind, recover
+from pcgraph.parallel import side_by_side
 from rangesim.capture import Capture
-from rangesim.capture.capture_files import load_capture
 from rangesim.causes import Cause, CauseMap
 from rangesim.decoding.range_image import RangeImage
-from rangesim.decoding.range_image_files import load_range_image
 from rangesim.errors import FileFormatError
 from rangesim.experiment import Experiment, experiment_from_dict
 from rangesim.files.array_files import write_arrays
+from rangesim.files.result_directories import DirectoryKind, recover
 from rangesim.files.schema import (
     ArraySpec,
     Count,
@@ -46,10 +46,12 @@ from rangesim.files.schema import (
     read_record,
     write_record,
 )
+from rangesim.results.capture_files import load_capture, write_capture
+from rangesim.results.range_image_files import load_range_image, save_range_image
+from rangesim.results.signals_files import LightPass, read_pass, write_pass
 from rangesim.rig import Rig
 from rangesim.settings.config import ShortRepr, from_dict, shown
-from rangesim.signals import ALL, EnergySplit, GroundTruth
-from rangesim.signals.signals_files import read_pass
+from rangesim.signals import ALL, GroundTruth
 
 SETTINGS = "experiment.json"
 FORMAT = "rangesim-result"
@@ -206,32 +208,64 @@ class Measurement(ShortRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(ShortRepr):
-    """An experiment and its outcome. energy : one EnergySplit per pass. info : scene, versions, times."""
+    """An experiment and its outcome.
+
+    measurements : one for each instrument, in the order of the experiment.
+    passes : one LightPass for each transport pass.
+    info : ResultRecord, scene, versions, times.
+    """
 
     experiment: Experiment
     measurements: tuple[Measurement, ...]
-    energy: tuple[EnergySplit, ...]
+    passes: tuple[LightPass, ...]
     info: ResultRecord
+
+
+def complete_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Statistics per material class with all keys of `RowRecord`; None for what is not known."""
+    return [msgspec.to_builtins(RowRecord(**row)) for row in rows]
 
 
 # ---- Writing -------------------------------------------------------------------------------------------------------
 
 
-def save_causes(causes: CauseMap, path: Path) -> None:
-    """Write a cause map to a compressed .npz file: `cause`, values of `rangesim.causes.Cause`, and `tolerance_m`."""
-    write_arrays(path, {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
+def write_result(result: Result, folder: Path, pages: Mapping[str, bytes]) -> None:
+    """Write the files of a result to an empty directory.
+
+    Parameters
+    ----------
+    pages : contents of files for people, such as `report.html`, by name.
+    """
+    for number, light_pass in enumerate(result.passes, 1):
+        write_pass(light_pass, folder / f"pass_{number}.npz")
+    for measurement in result.measurements:
+        place = folder / measurement.name
+        (place / "capture").mkdir(parents=True)
+        side_by_side(
+            partial(write_capture, measurement.capture, place / "capture"), partial(_write_readings, measurement, place)
+        )
+    write_record(folder / SETTINGS, result.info)
+    for name, content in pages.items():
+        (folder / name).write_bytes(content)
 
 
-def save_rows(outlier_m: float, rows: Sequence[dict[str, Any]], folder: Path) -> None:
-    """Write statistics per material class as `comparison.json`."""
-    write_record(folder / "comparison.json", ComparisonRecord(outlier_m=outlier_m, rows=[RowRecord(**r) for r in rows]))
+def _write_readings(measurement: Measurement, folder: Path) -> None:
+    """Write what the frames of a measurement came to."""
+    causes, rows = measurement.causes, [RowRecord(**row) for row in measurement.rows]
+    save_range_image(measurement.image, folder / "range.npz")
+    write_arrays(folder / "causes.npz", {"cause": causes.cause, "tolerance_m": np.asarray(causes.tolerance_m)})
+    write_record(folder / "comparison.json", ComparisonRecord(outlier_m=causes.tolerance_m, rows=rows))
+    write_record(folder / "measurement.json", measurement.metadata)
+    if measurement.segmentation is not None:
+        measurement.image.to_point_cloud().save(folder / "cloud.ply")
+        write_arrays(folder / "segmentation.npz", vars(measurement.segmentation))
 
 
 # ---- Reading -------------------------------------------------------------------------------------------------------
 
 
 def load_result(directory: str | Path) -> Result:
-    """The result that `rangesim.experiment.pipeline.run` wrote.
+    """The result that `rangesim.pipeline.experiment_run.run` wrote.
 
     Raises
     ------
@@ -251,13 +285,15 @@ def load_result(directory: str | Path) -> Result:
         raise FileFormatError(f"{folder / SETTINGS}: expected each of {info.passes} passes to serve an instrument.")
     if missing := [f"transport_{n}" for n in range(1, info.passes + 1) if f"transport_{n}" not in info.times_s]:
         raise FileFormatError(f"{folder / SETTINGS}: expected the time {missing[0]} in times_s.")
-    sizes = _image_size(info, folder / SETTINGS)
-    passes = [read_pass(folder / f"pass_{n}.npz", sizes) for n in range(1, info.passes + 1)]
+    sizes = _image_sizes(info, folder / SETTINGS)
+    passes = [read_pass(folder / f"pass_{n}.npz", sizes[n]) for n in range(1, info.passes + 1)]
     measurements = tuple(
-        _load_measurement(folder / entry.name, passes[entry.light_pass - 1][1], entry.light_pass, sizes)
+        _load_measurement(
+            folder / entry.name, passes[entry.light_pass - 1].truth, entry.light_pass, sizes[entry.light_pass]
+        )
         for entry in info.instruments
     )
-    return Result(experiment, measurements, tuple(energy for energy, _ in passes), info)
+    return Result(experiment, measurements, tuple(passes), info)
 
 
 def read_settings(folder: Path) -> ResultRecord:
@@ -284,17 +320,20 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     return [msgspec.to_builtins(row) for row in record.rows]
 
 
-def _image_size(info: ResultRecord, path: Path) -> dict[str, int]:
-    """Height and width of the camera that all instruments share."""
-    try:
-        cameras = [from_dict(Rig, entry.rig, f"rig of {entry.name}").camera for entry in info.instruments]
-    except ValueError as error:
-        raise FileFormatError(f"{path}: {error}") from error
-    sizes = {(camera.height, camera.width) for camera in cameras}
-    if len(sizes) != 1:
-        raise FileFormatError(f"{path}: expected instruments whose cameras have one size, got {shown(sorted(sizes))}.")
-    ((h, w),) = sizes
-    return {"h": h, "w": w}
+def _image_sizes(info: ResultRecord, path: Path) -> dict[int, dict[str, int]]:
+    """Height and width of the camera of each pass, by the number of the pass."""
+    sizes: dict[int, dict[str, int]] = {}
+    for entry in info.instruments:
+        try:
+            camera = from_dict(Rig, entry.rig, f"rig of {entry.name}").camera
+        except ValueError as error:
+            raise FileFormatError(f"{path}: {error}") from error
+        size = {"h": camera.height, "w": camera.width}
+        if sizes.setdefault(entry.light_pass, size) != size:
+            raise FileFormatError(
+                f"{path}: expected one size of the cameras of pass {entry.light_pass}, got another of {entry.name}."
+            )
+    return sizes
 
 
 def _load_measurement(folder: Path, truth: GroundTruth, light_pass: int, sizes: dict[str, int]) -> Measurement:

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rangesim import limits
 from rangesim.electronics.ambient import Ambient
-from rangesim.experiment.instrument import Instrument, instrument, instrument_from_dict
+from rangesim.experiment.camera_paths import CameraPath, Turntable
 from rangesim.files.settings_files import load_settings
-from rangesim.fusion.paths import Path, Turntable
+from rangesim.instrument.instrument import Instrument, instrument, instrument_from_dict
+from rangesim.settings import limits
 from rangesim.settings.bounds import Bounds, Metres, check_fields, whole
 from rangesim.settings.config import check_keys, from_dict, shown, to_dict
 from rangesim.settings.seeds import check_seed
@@ -50,7 +50,7 @@ class ScanSettings:
     seed: int = 0
     ambient: Ambient | None = None
     instrument: Instrument = field(default_factory=lambda: instrument(SENSOR))
-    path: Path = field(default_factory=Turntable)
+    path: CameraPath = field(default_factory=Turntable)
     registration: Literal["known", "unknown"] = "known"
     voxel_m: Metres | None = None
     truncation_m: Metres | None = None
@@ -74,7 +74,7 @@ class ScanSettings:
         )
 
 
-def load_scan_settings(file: str | FilePath) -> ScanSettings:
+def load_scan_settings(file: str | Path) -> ScanSettings:
     """The scan of a TOML file: the fields of `ScanSettings`, tables `[instrument]` and `[path]` with their `type`.
 
     A relative scene path counts from the file's directory.
@@ -87,14 +87,14 @@ def load_scan_settings(file: str | FilePath) -> ScanSettings:
     return load_settings(file, "the settings of a scan", scan_settings_from_dict)
 
 
-def scan_settings_from_dict(data: Mapping[str, Any], files_in: FilePath | None = None) -> ScanSettings:
+def scan_settings_from_dict(data: Mapping[str, Any], files_in: Path | None = None) -> ScanSettings:
     """The settings of plain data; ValueError as `from_dict`. files_in : as of `instrument_from_dict`."""
     check_keys(data, [f.name for f in fields(ScanSettings)], "scan")
     settings = from_dict(ScanSettings, {k: v for k, v in data.items() if k not in ("instrument", "path")})
     if data.get("instrument") is not None:
         settings = replace(settings, instrument=instrument_from_dict(data["instrument"], "instrument", files_in))
     if data.get("path") is not None:
-        settings = replace(settings, path=from_dict(Path, data["path"], "path"))  # type: ignore[type-abstract]
+        settings = replace(settings, path=from_dict(CameraPath, data["path"], "path"))  # type: ignore[type-abstract]
     return settings
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Single files: read only if they are plain, written whole or not at all.
 
-Only the standard library is imported, as in `pcgraph.output`.
+Only the standard library is imported, as the entry points of both packages need this before anything else.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Set
 from contextlib import suppress
 from pathlib import Path
 
-from pcgraph import interrupts
+from pcgraph.plumbing import interrupts
 
 try:
     import fcntl

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Directories that appear whole or not at all, and never cost a user a file.
 
-Every command and every `save` of pcgraph and rangesim that writes a directory does so here, by four rules; those that
-write single files, in `pcgraph.plain_files`.
+Every command and every `save` of rangesim that writes a directory does so here, by four rules; those that write single
+files do so in `pcgraph.plumbing.plain_files`.
 
 1. Work goes on in a hidden staging directory, `STAGING`, inside the directory that is asked for. A lock says that the
    work is alive. What a killed process left is cleared, or its replacement completed, by the next one.
@@ -12,7 +12,7 @@ write single files, in `pcgraph.plain_files`.
    new result stands: whoever looks next carries it out to the end. Before that, the old one stands.
 4. Files and directories are flushed to the disk before they take a place.
 
-Only the standard library is imported, as both packages' entry points need this before anything else.
+Only the standard library and `pcgraph.plumbing` are imported: commands check their output before they load the rest.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from pcgraph import interrupts
-from pcgraph.plain_files import DISK, clear_parts, flush, is_plain_file, remove_empty, replace_file, why
+from pcgraph.plumbing import interrupts
+from pcgraph.plumbing.plain_files import DISK, clear_parts, flush, is_plain_file, remove_empty, replace_file, why
 
 try:
     import fcntl

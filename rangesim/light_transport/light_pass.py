@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One entry point to the renderer: scene + rig + sensors -> signals."""
+"""One pass of light paths: scene + rigs + responses -> signals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Unpack, overload
+from typing import Any
 
 import numpy as np
 
-from rangesim.experiment.adaptive_sampling import AdaptiveSampling
 from rangesim.light_transport.caustics import caustic_maps, caustic_photons
 from rangesim.light_transport.device import Device
 from rangesim.light_transport.glint import Glint, trace_glint
@@ -20,10 +19,11 @@ from rangesim.light_transport.kernel_launches import Launches, Progress, Report,
 from rangesim.light_transport.loop import PathSettings, Radiance, View
 from rangesim.light_transport.narrow_lobes import warn_of_narrow_lobes
 from rangesim.light_transport.photons import Photons
+from rangesim.light_transport.sampler import Sampler
 from rangesim.light_transport.sampling_error import MIN_FOR_HALVES, Estimate
 from rangesim.light_transport.traced_scene import TracedScene
-from rangesim.light_transport.transport_settings import TransportOptions, TransportSettings, chosen
-from rangesim.light_transport.truncation import estimate_truncation, warn_of_truncation
+from rangesim.light_transport.transport_settings import TransportSettings
+from rangesim.light_transport.truncation import estimate_truncation
 from rangesim.response import Response
 from rangesim.rig import Rig
 from rangesim.scene import Scene
@@ -31,103 +31,56 @@ from rangesim.scene.media import body_around, inside_out
 from rangesim.sensor import Sensor
 from rangesim.settings.config import shown
 from rangesim.settings.seeds import derived_seed
-from rangesim.signals import EnergySplit, StillSignals, Truncation
+from rangesim.signals import EnergySplit, StillSignals
 
 MATTE_SPP, OTHER_SPP = 16, 64
 """Samples of a pixel that shares its indirect light, and of others, where no sensor says how many it needs."""
 PATHS_FRACTION = 0.95
-"""Of the progress, that the samples make."""
+"""Fraction of the progress that is reported when all samples are taken; the filter and the sums take the rest."""
 RAYS_TO_MEDIA = 16
 """Columns and rows of rays that look for media on the wrong side."""
 TEXTURE_SAMPLES = 64
 """Samples of a pixel, at most, over which the reflectance of a texture is averaged."""
 
 
-@overload
-def transport(
-    scene: Scene,
-    rig: Rig,
-    sensors: Sequence[Sensor | Response],
-    settings: TransportSettings | None = ...,
-    *,
-    progress: Callable[[float], None] | None = ...,
-    **options: Unpack[TransportOptions],
-) -> StillSignals: ...
-
-
-@overload
-def transport(
-    scene: Scene,
-    rig: Sequence[Rig],
-    sensors: Sequence[Sensor | Response],
-    settings: TransportSettings | None = ...,
-    *,
-    progress: Callable[[float], None] | None = ...,
-    **options: Unpack[TransportOptions],
-) -> list[StillSignals]: ...
-
-
 @raised_as_it_is()
-def transport(
+def trace_light(
     scene: Scene,
-    rig: Rig | Sequence[Rig],
+    rigs: Sequence[Rig],
     sensors: Sequence[Sensor | Response],
-    settings: TransportSettings | None = None,
-    *,
+    settings: TransportSettings,
     progress: Callable[[float], None] | None = None,
-    **options: Unpack[TransportOptions],
-) -> StillSignals | list[StillSignals]:
-    """Signals of any number of sensors that share a rig, from one pass of light paths.
+) -> list[StillSignals]:
+    """Signals of each camera from one pass of light paths, with the channels of all sensors.
 
     Parameters
     ----------
-    scene : Scene
-    rig : Rig, or a list of rigs that differ in their cameras alone: one emitter and several cameras, as in active
-        stereo (see `Rig.with_camera`). Photons are then traced once for all.
-    sensors : sensors, or bare responses; none for energy split and ground truth alone.
-    settings : TransportSettings, how the light is sampled; None: the defaults.
-    progress : called with the fraction done, 0..1, after each kernel launch, at most ten times a second. What it raises
-        ends the pass.
-    options : fields of `settings` in place of those, such as spp=64 or seed=1.
-
-    Returns
-    -------
-    StillSignals
-        With a list of rigs, a list of them, one for each camera. The first has the bytes of its camera alone, if pixels
-        take equally many samples; cameras do not share random numbers.
+    rigs : rigs that differ in their cameras alone. Photons are traced once for all.
+    sensors : sensors, or bare responses. Equal responses share their channels.
+    settings : of the pass. spp "auto": 16 samples where pixels share their indirect light, 64 elsewhere.
+    progress : as of `rangesim.transport`.
 
     Raises
     ------
     ValueError
-        A number out of its range, patterns that do not fit the projector, too little memory, rigs of different
-        emitters, a camera or projector inside fog, water or another medium, or a medium
-        on the wrong side of its boundary.
-
-    Warns
-    -----
-    TruncationWarning
-        By estimate (`Signals.truncation`), more than 2 % of the projector's light is left out.
+        As `rangesim.transport`.
     """
-    rigs = [rig] if isinstance(rig, Rig) else rig
-    settings = chosen(settings, options)
     _check(scene, rigs, sensors, progress)
     report, launches = Progress(progress), Launches(is_watched=progress is not None)
     responses = list(dict.fromkeys(r for s in sensors for r in ([s] if isinstance(s, Response) else s.responses())))
-    adaptive = _adaptive(settings, sensors, responses)
+    if isinstance(settings.spp, Sampler):
+        settings.spp.check(responses)
     traced = TracedScene.of(scene.mitsuba, scene.in_renderer(rigs[0]))
     warn_of_narrow_lobes(traced, [instance.name for instance in scene.instances])
-    views = [_CameraPass(scene, traced, one, settings, adaptive, number) for number, one in enumerate(rigs)]
+    views = [_CameraPass(scene, traced, one, settings, number) for number, one in enumerate(rigs)]
     fewest = min(int(view.samples.min()) for view in views)
     at_work = partial(report, 0.0)
     photons = caustic_photons(traced, rigs[0], settings, fewest, at_work)
     signals = []
     for number, view in enumerate(views):
         part = partial(report_part, report, number / len(views), 1 / len(views))
-        one, truncation = view.trace(responses, photons, launches, part)
-        of = f" of camera {number}" if len(views) > 1 else ""
-        warn_of_truncation(truncation, settings.max_depth, of, stacklevel=3)  # where `transport` was called
-        signals.append(replace(one, truncation=truncation))
-    return signals[0] if isinstance(rig, Rig) else signals
+        signals.append(view.trace(responses, photons, launches, part))
+    return signals
 
 
 class _CameraPass:
@@ -137,7 +90,6 @@ class _CameraPass:
     ----------
     scene, rig, settings : of the pass.
     traced : TracedScene, of some camera with the same emitter.
-    adaptive : AdaptiveSampling, or None.
     number : int, of the camera; each has random numbers of its own.
     """
 
@@ -147,16 +99,15 @@ class _CameraPass:
         traced: TracedScene,
         rig: Rig,
         settings: TransportSettings,
-        adaptive: AdaptiveSampling | None,
         number: int,
     ) -> None:
-        self.scene, self.rig, self.here, self.adaptive = scene, rig, scene.in_renderer(rig), adaptive
+        self.scene, self.rig, self.here = scene, rig, scene.in_renderer(rig)
         self.settings = replace(settings, seed=derived_seed(settings.seed, number)) if number else settings
         self.traced = traced._replace(camera=Device.camera(self.here))
         self.truth, self.guides = ground_truth(scene, self.traced, rig)
         spp, pixels = settings.spp, rig.camera.height * rig.camera.width
-        if adaptive:
-            self.samples = np.full(pixels, adaptive.first_spp)
+        if isinstance(spp, Sampler):
+            self.samples = np.full(pixels, spp.first_spp)
         elif isinstance(spp, int):
             self.samples = np.full(pixels, spp)
         else:
@@ -169,9 +120,10 @@ class _CameraPass:
         photons: Photons | None,
         launches: Launches,
         report: Report,
-    ) -> tuple[StillSignals, Truncation]:
-        """Signals of this camera, and how much of the light they lack; photons are those of its emitter."""
-        settings, rig, guides, adaptive = self.settings, self.rig, self.guides, self.adaptive
+    ) -> StillSignals:
+        """Signals of this camera; photons are those of its emitter."""
+        settings, rig, guides = self.settings, self.rig, self.guides
+        sampler = settings.spp if isinstance(settings.spp, Sampler) else None
         fewest = int(self.samples.min())
         maps = caustic_maps(photons, self.here, settings.caustic_radius_m)
         view, of_paths = View(self.traced, maps), PathSettings.of(self.scene, settings)
@@ -194,35 +146,19 @@ class _CameraPass:
             energy = _energy(channels, radiance, glints)
             return StillSignals(rig, energy, self.truth, channels=channels, sampling=error)
 
-        left = 0.5 * PATHS_FRACTION if adaptive else 0.0  # how much follows is not known
+        left = 0.5 * PATHS_FRACTION if sampler else 0.0  # how much follows is not known
         pixels = np.arange(len(self.samples))
         estimate.sample(pixels, self.samples, partial(report_part, report, 0.0, PATHS_FRACTION - left))
-        if adaptive and adaptive.max_spp > fewest:
-            more = adaptive.samples(self.truth, lambda sensor: signals_of(sensor.responses())).ravel() - self.samples
+        if sampler and sampler.most_spp > fewest:
+            more = sampler.samples(self.truth, signals_of).ravel() - self.samples
             pixels = np.flatnonzero(more)
             if len(pixels):
                 estimate.sample(pixels, more[pixels], partial(report_part, report, PATHS_FRACTION - left, left))
         signals = signals_of(None)
         report(1.0)
         cut = photons.energy.cut if photons else 0.0
-        return signals, estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
-
-
-def _adaptive(
-    settings: TransportSettings, sensors: Sequence[Sensor | Response], responses: Sequence[Response]
-) -> AdaptiveSampling | None:
-    """How the number of samples follows from readings; None: it does not."""
-    if isinstance(settings.spp, AdaptiveSampling):
-        for instrument in settings.spp.instruments:
-            if missing := set(instrument.sensor.responses()) - set(responses):
-                raise ValueError(
-                    f"expected sensors that have {missing.pop()}, for instrument {instrument.name!r} of spp."
-                )
-        return settings.spp
-    if settings.spp != "auto" or not settings.sampling_error:
-        return None
-    readers = [s for s in sensors if isinstance(s, Sensor)]
-    return AdaptiveSampling.of(readers) if readers and len(readers) == len(sensors) else None
+        truncation = estimate_truncation(estimate.mean_tally(), signals.energy, settings.max_depth, cut)
+        return replace(signals, truncation=truncation)
 
 
 def _energy(channels: dict[Response, np.ndarray], radiance: Radiance, glints: Glint | None) -> EnergySplit:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals as files: whole, to be exposed again without a new trace, and without channels, as results keep each pass."""
+"""Files of signals: complete ones, to expose them again without a new pass, and those of results, without channels."""
 
 from __future__ import annotations
 
-from dataclasses import astuple, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,15 @@ from rangesim.files.array_files import read_arrays, write_arrays
 from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
 from rangesim.response import Response
 from rangesim.rig import Rig
-from rangesim.settings.config import check_keys, from_dict, shown, to_dict
-from rangesim.signals.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
+from rangesim.settings.config import ShortRepr, check_keys, from_dict, shown, to_dict
+from rangesim.signals import EnergySplit, GroundTruth, SamplingError, Signals, StillSignals, Truncation
 
 FORMAT = "rangesim-signals"
 FORMAT_VERSION = 1
+"""Number of the file format, as a count from 1; a change that older versions cannot read increases it."""
 MAX_SETTINGS = 1_000_000
-"""Bytes of the settings in a file."""
+"""Largest size of the settings in a file, in bytes. Real settings have a few kilobytes; the limit protects from files
+that would fill the memory."""
 
 _RADIANCE = ArraySpec("float32", low=0)
 _TRUE_DEPTH = ArraySpec("float32", low=1e-9, high=MAX_METRES, nan=True)
@@ -41,7 +43,15 @@ _PASS = {f"energy_{f.name}": _RADIANCE for f in fields(EnergySplit)} | {
 
 
 def save_signals(signals: StillSignals, path: str | Path) -> None:
-    """Write signals with their channels and sampling error; see `StillSignals.save`."""
+    """Write signals with their channels and sampling error to a compressed .npz file; `load_signals` reads them back.
+
+    Raises
+    ------
+    ValueError
+        A response holds arrays (`Images`).
+    FileFormatError
+        The place cannot be written.
+    """
     responses = list(signals.channels)
     settings = {
         "format": FORMAT,
@@ -58,12 +68,18 @@ def save_signals(signals: StillSignals, path: str | Path) -> None:
 
 
 def load_signals(path: str | Path) -> StillSignals:
-    """The signals that `StillSignals.save` wrote: `expose` makes captures of them as of those traced.
+    """Signals that `save_signals` wrote; `expose` makes captures of them as of traced ones.
 
     Raises
     ------
     FileFormatError
         The file is missing or broken, or holds a response of a class that is not loaded.
+
+    Examples
+    --------
+    >>> from rangesim import expose, load_signals
+    >>> signals = load_signals("signals.npz")  # doctest: +SKIP
+    >>> capture = expose(signals, sensor)  # doctest: +SKIP
     """
     path = Path(path)
     settings = _settings(path)
@@ -93,22 +109,57 @@ def load_signals(path: str | Path) -> StillSignals:
     sampling = None
     if all(has_error):
         sampling = SamplingError({r: data[f"error_{i}"] for i, r in enumerate(responses)}, data["error_projector"])
-    truncation = Truncation(*map(float, data["truncation"])) if "truncation" in data else None
     channels = {response: data[f"channels_{i}"] for i, response in enumerate(responses)}
-    return StillSignals(rig, energy, truth, truncation=truncation, channels=channels, sampling=sampling)
+    return StillSignals(rig, energy, truth, truncation=_truncation(data), channels=channels, sampling=sampling)
 
 
-def write_pass(signals: Signals, path: str | Path) -> None:
-    """Write energy split, ground truth and truncation alone, as a result keeps them of each pass."""
-    write_arrays(path, _pass_arrays(signals))
+@dataclass(frozen=True, eq=False, repr=False)
+class LightPass(ShortRepr):
+    """What a result keeps of a transport pass: all that signals hold besides their channels.
+
+    energy : EnergySplit. truth : GroundTruth.
+    motion_m : (h, w) float32, metres, as of `Signals.motion_m`; None: nothing moves.
+    truncation : Truncation, light that was left out; None: not known.
+    """
+
+    energy: EnergySplit
+    truth: GroundTruth
+    motion_m: np.ndarray | None = None
+    truncation: Truncation | None = None
+
+    @classmethod
+    def of(cls, signals: Signals) -> LightPass:
+        """The pass that signals come from."""
+        return cls(signals.energy, signals.truth, signals.motion_m, signals.truncation)
 
 
-def read_pass(path: Path, sizes: dict[str, int]) -> tuple[EnergySplit, GroundTruth]:
-    """Energy split and ground truth of a pass of h x w pixels, as `sizes` says; FileFormatError if it is broken."""
-    return _energy_and_truth(path, read_checked_arrays(path, _PASS, dict(sizes)))  # passes may see other instances
+def write_pass(light_pass: LightPass, path: str | Path) -> None:
+    """Write a pass to a compressed .npz file."""
+    write_arrays(path, _pass_arrays(light_pass))
 
 
-def _pass_arrays(signals: Signals) -> dict[str, np.ndarray]:
+def read_pass(path: Path, sizes: dict[str, int]) -> LightPass:
+    """The pass that `write_pass` wrote.
+
+    Parameters
+    ----------
+    sizes : its height h and width w, pixels.
+
+    Raises
+    ------
+    FileFormatError
+        The file is missing or broken.
+    """
+    data = read_checked_arrays(path, _PASS, dict(sizes))  # a copy: passes may see other instances
+    energy, truth = _energy_and_truth(path, data)
+    return LightPass(energy, truth, data.get("motion_m"), _truncation(data))
+
+
+def _truncation(data: dict[str, np.ndarray]) -> Truncation | None:
+    return Truncation(*map(float, data["truncation"])) if "truncation" in data else None
+
+
+def _pass_arrays(signals: Signals | LightPass) -> dict[str, np.ndarray]:
     """Arrays of what signals hold besides channels, by name in files."""
     arrays = {f"energy_{f.name}": getattr(signals.energy, f.name) for f in fields(EnergySplit)}
     arrays |= {f"truth_{f.name}": np.asarray(getattr(signals.truth, f.name)) for f in fields(GroundTruth)}

@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pcgraph.output import DirectoryKind, new_directory, recover, write_manifest
 from rangesim import __version__
 from rangesim.capture import DTYPES, Capture
 from rangesim.electronics.ambient import Ambient
-from rangesim.electronics.detector import Detector, PhotoDetector
-from rangesim.electronics.spad import SpadDetector
+from rangesim.electronics.detector import PhotoDetector
 from rangesim.errors import FileFormatError
 from rangesim.files.image_files import SUFFIXES, read_stack, write_grey
+from rangesim.files.result_directories import DirectoryKind, new_directory, recover, write_manifest
 from rangesim.files.schema import write_json
 from rangesim.files.text_files import read_json
 from rangesim.rig import Rig
@@ -29,8 +28,6 @@ FORMAT = "rangesim-capture"
 FORMAT_VERSION = 1
 CAPTURE = DirectoryKind(FORMAT, SIDECAR, FileFormatError)
 """Directories that hold a capture."""
-DETECTORS = (Detector, SpadDetector)
-"""What the key `detector` of a sidecar may hold."""
 _KEYS = (
     "format",
     "format_version",
@@ -80,7 +77,7 @@ def write_capture(capture: Capture, folder: Path) -> None:
 
 
 def load_capture(directory: str | Path) -> Capture:
-    """The capture that `Capture.save` wrote, bytes and settings equal.
+    """The capture that `save_capture` wrote, bytes and settings equal.
 
     Raises
     ------

@@ -6,10 +6,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rangesim.experiment import Experiment
-from rangesim.experiment.cost import FRAME_S, Cost, Rest, estimate_cost
-from rangesim.fusion.paths import Viewpoint
-from rangesim.fusion.scan_settings import ScanSettings
-from rangesim.fusion.views import poses_of
+from rangesim.experiment.camera_paths import Viewpoint
+from rangesim.experiment.scan_settings import ScanSettings
+from rangesim.pipeline.cost import FRAME_S, Cost, Rest, estimate_cost
+from rangesim.pipeline.views import poses_of
 
 if TYPE_CHECKING:
     from rangesim.rig import Rig

@@ -15,7 +15,7 @@ from rangesim.errors import FileFormatError
 from rangesim.files.array_files import write_arrays
 from rangesim.files.schema import MAX_METRES, SETTINGS, ArraySpec, read_checked_arrays, settings_array, settings_of
 from rangesim.rig import Intrinsics
-from rangesim.sensor import Decoder
+from rangesim.sensors import Decoder  # with those of the package, which are known from then on
 from rangesim.settings.config import check_keys, from_dict, to_dict
 
 _DEPTH = ArraySpec("float32", low=-MAX_METRES, high=MAX_METRES, nan=True)
@@ -34,14 +34,17 @@ _RANGE = {
 
 
 def save_range_image(image: RangeImage, path: str | Path) -> None:
-    """Write the arrays of a range image, its camera and its decoder to a compressed .npz file."""
+    """Write the arrays of a range image, its camera and its decoder to a compressed .npz file.
+
+    `load_range_image` reads it back equal.
+    """
     arrays = {f.name: getattr(image, f.name) for f in fields(image) if isinstance(getattr(image, f.name), np.ndarray)}
     settings = {"camera": to_dict(image.camera), "decoder": to_dict(image.decoder)}
     write_arrays(path, {**arrays, "settings": settings_array(settings)})
 
 
 def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> RangeImage:
-    """The range image that `RangeImage.save` wrote.
+    """The range image that `save_range_image` wrote.
 
     sizes : its height h and width w, where they are known.
 
@@ -50,8 +53,6 @@ def load_range_image(path: str | Path, sizes: dict[str, int] | None = None) -> R
     FileFormatError
         The file is missing or broken, or its decoder is of a class that is not loaded.
     """
-    import rangesim.sensors  # noqa: F401  (so that its decoders are known)
-
     path = Path(path)
     arrays: dict[str, Any] = read_checked_arrays(path, _RANGE, dict(sizes or {}))
     settings = settings_of(arrays.pop("settings"), path) if "settings" in arrays else {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole experiment: scene -> transport -> capture -> range image -> points -> comparison, segments, report."""
+"""The whole experiment: scene -> light -> captures -> range images -> points -> comparison, segments; and its files."""
 
 from __future__ import annotations
 
@@ -9,36 +9,35 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-import rangesim
-from pcgraph.output import new_directory
 from rangesim.capture import Capture
-from rangesim.capture.capture_files import write_capture
-from rangesim.capture.exposure import photons_per_pulse, warn_of_overexposure
+from rangesim.capture.exposure import expose, photons_per_pulse, warn_of_overexposure
 from rangesim.causes import explain
 from rangesim.causes.range_limits import fraction_beyond_range, warn_of_range
+from rangesim.decoding import decode
+from rangesim.evaluation.comparison import compare
 from rangesim.evaluation.range_noise import range_noise, warn_of_sampling
 from rangesim.experiment import Experiment
-from rangesim.experiment.cost import Cost, estimate_cost
-from rangesim.experiment.instrument import Instrument
-from rangesim.experiment.provenance import provenance
-from rangesim.experiment.result_files import (
+from rangesim.files.result_directories import new_directory
+from rangesim.instrument.instrument import Instrument
+from rangesim.motion import transport_moving
+from rangesim.pipeline.cost import Cost, estimate_cost
+from rangesim.pipeline.provenance import provenance
+from rangesim.results.run_files import (
     RESULT,
-    SETTINGS,
+    Measurement,
     MeasurementRecord,
     PhotonsRecord,
-    load_result,
-    save_causes,
-    save_rows,
+    Result,
+    Segmentation,
+    complete_rows,
+    write_result,
 )
-from rangesim.files.array_files import write_arrays
-from rangesim.files.schema import write_record
-from rangesim.motion import transport_moving
+from rangesim.results.signals_files import LightPass
 from rangesim.settings.seeds import derived_seed
-from rangesim.signals.signals_files import write_pass
 
 if TYPE_CHECKING:
     from rangesim.electronics.ambient import Ambient
@@ -62,22 +61,57 @@ def run(
     progress: Progress | None = None,
     scene: Scene | None = None,
     announce: Callable[[Cost], None] | None = None,
-) -> None:
+) -> Result:
     """Carry out an experiment and write its results, with `report.html`, to the directory `out`.
 
     The files appear when all is done; a failure leaves nothing behind. An older result of that name is replaced; files
-    that somebody else put there stay. See `pcgraph.output`.
+    that somebody else put there stay. See `rangesim.files.result_directories`.
 
     Parameters
     ----------
+    experiment, progress, scene, announce : as of `carry_out`.
+
+    Raises
+    ------
+    ValueError, FileFormatError, EnvironmentProblem
+        As `carry_out`, or an `out` that cannot take a result (see `rangesim.files.result_directories.check_directory`).
+
+    Warns
+    -----
+    RangesimWarning, SamplingWarning
+        As `carry_out`.
+    """
+    from rangesim.report import render_report
+    from rangesim.report.tables import comparison_markdown
+
+    with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
+        result = _computed(experiment, progress or _unwatched, scene, announce)
+        if progress:
+            progress("Writing the report", 0.97)
+        tables = comparison_markdown([(m.name, m.rows) for m in result.measurements])
+        write_result(result, folder, {"comparison.md": tables.encode(), "report.html": render_report(result).encode()})
+    _warn(result)
+    return result
+
+
+def carry_out(
+    experiment: Experiment,
+    progress: Progress | None = None,
+    scene: Scene | None = None,
+    announce: Callable[[Cost], None] | None = None,
+) -> Result:
+    """The result of an experiment; nothing is written.
+
+    Parameters
+    ----------
+    progress : called with the name of the stage and the fraction done, 0..1.
     scene : a scene that is loaded already, for example from a dictionary; `experiment.scene` then only names it.
     announce : called with the estimated cost before the work starts.
 
     Raises
     ------
     ValueError, FileFormatError, EnvironmentProblem
-        A setting out of range, more memory than there is, a scene that cannot be loaded, no suitable LLVM, or an `out`
-        that cannot take a result (see `pcgraph.output.check_directory`).
+        A setting out of range, more memory than there is, a scene that cannot be loaded, or no suitable LLVM.
 
     Warns
     -----
@@ -86,51 +120,9 @@ def run(
     SamplingWarning
         See `warn_of_sampling`.
     """
-    import mitsuba as mi
-
-    from pcgraph.warmup import compile_kernels
-    from rangesim.light_transport.kernel_launches import report_part
-    from rangesim.report import write_report
-
-    tell = progress or _unwatched
-    with new_directory(out, RESULT, inputs=[experiment.scene]) as folder:
-        times: dict[str, float] = {}
-        beyond: list[tuple[str, float, float]] = []
-        tell("Loading the scene", 0.0)
-        with timed(times, "load"):
-            scene = scene or rangesim.load_scene(
-                experiment.scene, material=experiment.material, unit_m=experiment.unit_m
-            )
-        if experiment.ambient is not None:
-            experiment.ambient.check_emitters(scene.has_ambient)
-        passes = group_by_rig(experiment, scene)
-        cost = estimate_cost(experiment, scene, passes, trial=announce is not None)
-        cost.check_memory()
-        if announce is not None:
-            announce(cost)
-        with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
-            compile_kernels()
-        for number, (rig, instruments) in enumerate(passes, 1):
-            stage = f"Tracing light, pass {number} of {len(passes)} ({', '.join(i.name for i in instruments)})"
-            begin, end = (_fraction(number, len(passes), of_pass) for of_pass in (0.0, 1.0))
-            tell(stage, begin)
-            told = progress and partial(report_part, partial(tell, stage), begin, end - begin)
-            with timed(times, f"transport_{number}"):
-                signals = _trace(experiment, scene, rig, instruments, told)
-            write_pass(signals, folder / f"pass_{number}.npz")
-            for instrument in instruments:
-                beyond.append((instrument.name, *fraction_beyond_range(instrument.sensor, signals.rig, signals.truth)))
-                tell(f"Measuring with {instrument.name}", _fraction(number, len(passes), 1.0))
-                seed = noise_seed(experiment, instrument)
-                measure(instrument, signals, folder / instrument.name, seed, experiment.ambient)
-        write_record(folder / SETTINGS, provenance(experiment, scene, passes, mi.variant(), times))
-        tell("Writing the report", 0.97)
-        result = load_result(folder)
-        tables = {m.name: m.rows for m in result.measurements}
-        _write_comparison(folder, list(tables.items()))
-        write_report(result, folder / "report.html")
-    warn_of_range(beyond)
-    warn_of_sampling(tables, experiment.spp or experiment.max_spp)
+    result = _computed(experiment, progress or _unwatched, scene, announce)
+    _warn(result)
+    return result
 
 
 def estimate(experiment: Experiment) -> Cost:
@@ -141,30 +133,89 @@ def estimate(experiment: Experiment) -> Cost:
     ValueError, FileFormatError, EnvironmentProblem
         As `run`, but for the memory.
     """
-    scene = rangesim.load_scene(experiment.scene, material=experiment.material, unit_m=experiment.unit_m)
+    from rangesim.scene import load_scene
+
+    scene = load_scene(experiment.scene, material=experiment.material, unit_m=experiment.unit_m)
     return estimate_cost(experiment, scene, group_by_rig(experiment, scene))
 
 
-def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, ambient: Ambient | None = None) -> None:
-    """Expose, decode, compare, explain and segment for one instrument; write all to the new directory `folder`."""
-    from pcgraph.parallel import side_by_side
+def _computed(
+    experiment: Experiment, tell: Progress, scene: Scene | None, announce: Callable[[Cost], None] | None
+) -> Result:
+    """The result, before anything is warned about."""
+    import mitsuba as mi
 
-    folder.mkdir()
+    from pcgraph.all_kernels import compile_kernels
+    from rangesim.light_transport.kernel_launches import report_part
+    from rangesim.scene import load_scene
+
+    times: dict[str, float] = {}
+    tell("Loading the scene", 0.0)
+    with timed(times, "load"):
+        scene = scene or load_scene(experiment.scene, material=experiment.material, unit_m=experiment.unit_m)
+    if experiment.ambient is not None:
+        experiment.ambient.check_emitters(scene.has_ambient)
+    groups = group_by_rig(experiment, scene)
+    cost = estimate_cost(experiment, scene, groups, trial=announce is not None)
+    cost.check_memory()
+    if announce is not None:
+        announce(cost)
+    with timed(times, "compile_segmentation"):  # once per machine; not to be charged to the first sensor
+        compile_kernels()
+    passes, measurements = [], {}
+    for number, (rig, instruments) in enumerate(groups, 1):
+        stage = f"Tracing light, pass {number} of {len(groups)} ({', '.join(i.name for i in instruments)})"
+        begin, end = (_fraction(number, len(groups), of_pass) for of_pass in (0.0, 1.0))
+        tell(stage, begin)
+        told = None if tell is _unwatched else partial(report_part, partial(tell, stage), begin, end - begin)
+        with timed(times, f"transport_{number}"):
+            signals = _trace(experiment, scene, rig, instruments, told)
+        passes.append(LightPass.of(signals))
+        for instrument in instruments:
+            tell(f"Measuring with {instrument.name}", end)
+            seed = noise_seed(experiment, instrument)
+            measurements[instrument.name] = measure(instrument, signals, seed, experiment.ambient, number)
+    info = provenance(experiment, scene, groups, mi.variant(), times)
+    return Result(experiment, tuple(measurements[i.name] for i in experiment.instruments), tuple(passes), info)
+
+
+def _warn(result: Result) -> None:
+    """Warn of surfaces out of range, and of readings that sampling decides."""
+    beyond = []
+    for m in result.measurements:
+        assert m.capture.rig is not None
+        beyond.append((m.name, *fraction_beyond_range(m.capture.sensor, m.capture.rig, m.truth)))
+    warn_of_range(beyond)
+    experiment = result.experiment
+    warn_of_sampling({m.name: m.rows for m in result.measurements}, experiment.spp or experiment.max_spp)
+
+
+def measure(
+    instrument: Instrument, signals: Signals, seed: int, ambient: Ambient | None = None, light_pass: int = 1
+) -> Measurement:
+    """The measurement of one instrument: exposed, decoded, compared, explained and segmented.
+
+    Parameters
+    ----------
+    signals : of the pass that the instrument takes part in, `light_pass`.
+    seed : of the detector's noise.
+    ambient : as for `rangesim.expose`.
+    """
     times: dict[str, float] = {}
     moves = signals.motion_m is not None
     with timed(times, "exposure"):
         detector = _in_time(instrument) if moves else instrument.detector
-        capture = rangesim.expose(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
+        capture = expose(signals, instrument.sensor, detector, instrument.exposure_s, seed, ambient)
     if instrument.exposure_s is None:
         warn_of_overexposure(instrument.name, capture, signals)
     with timed(times, "decode"):
-        image = rangesim.decode(capture, instrument.decoder)
+        image = decode(capture, instrument.decoder)
     noise = None
     if signals.knows_sampling_error:
         with timed(times, "noise"):
             noise = range_noise(image, capture, signals)
         image = replace(image, sampling_sigma_m=np.abs(noise.sampling))
-    comparison = rangesim.compare(image, signals.truth)
+    comparison = compare(image, signals.truth)
     with timed(times, "causes"):
         causes = explain(image, capture, signals, tolerance_m=comparison.outlier_m)
     rows = [row | failures for row, failures in zip(comparison.rows(), causes.fractions(signals.truth), strict=True)]
@@ -172,22 +223,21 @@ def measure(instrument: Instrument, signals: Signals, folder: Path, seed: int, a
         rows = [row | sigmas for row, sigmas in zip(rows, noise.by_material(signals.truth), strict=True)]
     with timed(times, "points"):
         cloud = image.to_point_cloud()
-    enough = bool(cloud.valid.sum() >= MIN_POINTS)
-
-    def write_readings() -> None:
-        image.save(folder / "range.npz")
-        save_causes(causes, folder / "causes.npz")
-        save_rows(comparison.outlier_m, rows, folder)
-        if enough:
-            cloud.save(folder / "cloud.ply")
-
-    (folder / "capture").mkdir()
-    side_by_side(partial(write_capture, capture, folder / "capture"), write_readings)
-    if enough:
+    points, segmentation = int(cloud.valid.sum()), None
+    if points >= MIN_POINTS:
         with timed(times, "segmentation"):
-            segment(cloud, folder / "segmentation.npz")
-    metadata = acquisition(capture, signals, instrument.timing, int(cloud.valid.sum()), times)
-    write_record(folder / "measurement.json", metadata)
+            segmentation = segmented(cloud)
+    return Measurement(
+        name=instrument.name,
+        capture=capture,
+        image=image,
+        truth=signals.truth,
+        causes=causes,
+        rows=complete_rows(rows),
+        segmentation=segmentation,
+        metadata=acquisition(capture, signals, instrument.timing, points, times),
+        light_pass=light_pass,
+    )
 
 
 def _in_time(instrument: Instrument) -> PhotoDetector | None:
@@ -199,14 +249,12 @@ def _in_time(instrument: Instrument) -> PhotoDetector | None:
     return replace(instrument.detector, max_exposure_s=longest_s)  # type: ignore[type-var]
 
 
-def segment(cloud: PointCloud, path: Path) -> None:
-    """Write supervoxels, objects and the tree of an organised cloud in camera coordinates to a .npz file."""
+def segmented(cloud: PointCloud) -> Segmentation:
+    """Supervoxels, objects and the tree of an organised cloud in camera coordinates."""
     import pcgraph
 
     result = pcgraph.segment(cloud.points, colors=cloud.colors, viewpoint=(0.0, 0.0, 0.0))
-    tree = result.tree
-    arrays = {"supervoxels": result.supervoxels, "labels": result.labels}
-    write_arrays(path, {**arrays, "parents": tree.parents, "altitudes": tree.altitudes})
+    return Segmentation(result.supervoxels, result.labels, result.tree.parents, result.tree.altitudes)
 
 
 def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
@@ -281,9 +329,11 @@ def _trace(
     progress: Callable[[float], None] | None,
 ) -> Signals:
     """The light of a pass; `progress` is called with the fraction of it that is done."""
+    from rangesim.instrument.transport import transport
+
     settings = experiment.transport_settings(instruments)
     if experiment.motion is None:
-        return rangesim.transport(scene, rig, [i.sensor for i in instruments], settings, progress=progress)
+        return transport(scene, rig, [i.sensor for i in instruments], settings, progress=progress)
     (instrument,) = instruments
     timings = {instrument.sensor: instrument.timing}
     return transport_moving(scene, rig, timings, experiment.motion, settings, progress=progress)[instrument.sensor]
@@ -291,9 +341,3 @@ def _trace(
 
 def _fraction(number: int, passes: int, of_pass: float) -> float:
     return 0.05 + 0.9 * (number - 1 + _TRANSPORT_FRACTION * of_pass) / passes
-
-
-def _write_comparison(folder: Path, tables: list[tuple[str, list[dict[str, Any]]]]) -> None:
-    from rangesim.report.tables import markdown
-
-    (folder / "comparison.md").write_text(markdown(tables), encoding="utf-8")

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ambient light: light of the scene's own emitters, such as the sun, the sky and luminaires.
+
+Two ways find it: a ray of a camera path that meets an emitter by chance, and a direction sampled towards an emitter.
+Multiple importance sampling weights the two against each other (Veach 1997), so that no light is counted twice.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from rangesim.light_transport.spectrum import mono
+from rangesim.light_transport.specular_chain import RayState
+from rangesim.light_transport.traced_scene import TracedScene
+
+
+def ambient_on_ray(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    previous: mi.Interaction3f,
+    pdf: mi.Float,
+    alone: mi.Bool,
+    active: mi.Bool,
+) -> mi.Float:
+    """Radiance (W/m2/sr) that an emitter of the scene sends along the ray that met it at `si`, with its weight.
+
+    Parameters
+    ----------
+    previous : Interaction3f, where the ray started.
+    pdf : Float, 1/sr, density of the BSDF sample that made the ray.
+    alone : Bool, whether directions to emitters were not sampled there, so that the weight is 1.
+    """
+    emitter = si.emitter(scene, active)
+    ds = mi.DirectionSample3f(scene, si, previous)
+    emitter_pdf = scene.pdf_emitter_direction(previous, ds, active & ~alone)
+    weight = dr.select(alone, 1, power_heuristic(pdf, emitter_pdf))
+    return dr.select(active, weight * mono(emitter.eval(si, active)), 0)
+
+
+def sampled_ambient(
+    traced: TracedScene,
+    bsdf: mi.BSDFPtr,
+    si: mi.SurfaceInteraction3f,
+    ray_state: RayState,
+    xi: mi.Point2f,
+    active: mi.Bool,
+) -> mi.Float:
+    """Radiance (W/m2/sr) of one sampled emitter of the scene that the surface `si` reflects, with its weight.
+
+    `ray_state` is the state of the ray that met `si`; `xi` is uniform in the unit square.
+    """
+    ds, radiance = traced.scene.sample_emitter_direction(si, xi, True, active)
+    active &= ds.pdf != 0
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+    weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
+    absorbers = traced.absorbers
+    if absorbers is not None:
+        weight *= absorbers.transmittance(absorbers.beyond(si, ds.d, ray_state.sigma_a, active), ds.dist)
+    return dr.select(active, weight * mono(value) * mono(radiance), 0)
+
+
+def sampled_ambient_through_media(
+    traced: TracedScene,
+    bsdf: mi.BSDFPtr,
+    si: mi.SurfaceInteraction3f,
+    direction: mi.Vector3f,
+    ray_state: RayState,
+    scatters: mi.Bool,
+    xi: mi.Point2f,
+    active: mi.Bool,
+) -> mi.Float:
+    """The same as `sampled_ambient`, also through media, and also at scattering events inside them.
+
+    Emitters of finite size are not sampled at such events, nor through boundaries: camera paths meet them by chance
+    there, and would count them twice.
+
+    Parameters
+    ----------
+    direction : Vector3f, direction of the ray that met `si`.
+    scatters : Bool, whether `si` is a scattering event instead of a surface.
+    """
+    scene, media, absorbers, inside = traced.scene, traced.media, traced.absorbers, ray_state.inside
+    ds, radiance = scene.sample_emitter_direction(si, xi, False, active)
+    active &= ds.pdf != 0
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active & ~scatters)
+    value = dr.select(scatters, inside.albedo * inside.phase(dr.dot(direction, ds.d)), mono(value))
+    around = None if absorbers is None else absorbers.beyond(si, ds.d, ray_state.sigma_a, active & ~scatters)
+    fraction, crossed = media.transmittance(scene, si, ds.p, inside, active, around)
+    weight = dr.select(scatters | crossed, 0, power_heuristic(ds.pdf, pdf))
+    weight = dr.select(ds.delta, 1, weight)
+    return dr.select(active, weight * fraction * value * mono(radiance), 0)
+
+
+def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
+    """Weight of a sample of density `a` that could have been made with density `b` as well (Veach 1997).
+
+    Densities are in 1/sr.
+    """
+    weight = dr.square(a) / (dr.square(a) + dr.square(b))
+    return dr.select(dr.isfinite(weight), weight, 0)

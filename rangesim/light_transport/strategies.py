@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which strategy brings a light path from the projector to the camera.
+
+A vertex of a light path is a surface point where light scatters into many directions, or a scattering event inside a
+medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats,
+holes), which send it on in single directions.
+
+Three strategies bring the projector's light to the camera. They partition all light paths: each path belongs to one of
+them, so that no light is counted twice and none is left out. `owner` says to which one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from rangesim.response import DIRECT, MULTIPATH, SPECULAR
+
+
+class Owner(NamedTuple):
+    """Three masks, of which exactly one is true for each light path.
+
+    next_event, photons, glint : Bool.
+    """
+
+    next_event: mi.Bool
+    photons: mi.Bool
+    glint: mi.Bool
+
+
+def owner(has_vertex: mi.Bool, delta_interactions: mi.UInt32 | int) -> Owner:
+    """The strategy that owns a light path.
+
+    | strategy | paths | kinds | files |
+    | --- | --- | --- | --- |
+    | next-event estimation | a straight segment leads from the projector to a vertex | direct, specular, multipath \
+| `loop.py` |
+    | caustic photons | delta interactions lie between the projector and the vertex next to it | caustic \
+| `photons.py` and `photon_flight.py` trace them before the pass, `photon_maps.py` sorts them, `loop.py` gathers them |
+    | glint | no vertex at all: the camera sees the projector's lens, directly or by delta interactions | glint \
+| `glint.py`, beside the pass |
+
+    Parameters
+    ----------
+    has_vertex : Bool, whether the path has any vertex.
+    delta_interactions : UInt32, number of delta interactions between the projector and the vertex next to it. It does
+        not count where there is no vertex.
+    """
+    is_straight = delta_interactions == 0
+    return Owner(has_vertex & is_straight, has_vertex & (delta_interactions != 0), ~has_vertex)
+
+
+def next_event_kind(is_first: mi.Bool, via_delta: mi.Bool) -> mi.UInt32:
+    """Kind of the light that next-event estimation finds at a vertex, an index into `rangesim.response.KINDS`.
+
+    Parameters
+    ----------
+    is_first : Bool, whether the vertex is the first one that the camera path meets.
+    via_delta : Bool, whether the camera path met a delta interaction before.
+    """
+    return dr.select(is_first, dr.select(via_delta, mi.UInt32(SPECULAR), mi.UInt32(DIRECT)), mi.UInt32(MULTIPATH))
+
+
+def can_be_vertex(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """Whether a surface scatters light into many directions (diffuse or glossy), perhaps besides delta interactions."""
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+
+
+def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
+    """Whether a sample of a BSDF is a delta interaction."""
+    return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+
+
+def delta_only(mode: mi.TransportMode) -> mi.BSDFContext:
+    """A context in which BSDFs sample delta interactions alone, as photons and glint do."""
+    context = mi.BSDFContext(mode)
+    context.type_mask = mi.BSDFFlags.Delta
+    return context

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The examples in the docstrings of every room run and print what they say."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import pkgutil
+
+import pytest
+
+ROOMS = ["rangesim.geometry", "rangesim.multiview"]
+"""Packages whose docstrings are run, all of their modules."""
+
+
+def modules_of(room: str) -> list[str]:
+    """Full names of a package and of every module in it."""
+    package = importlib.import_module(room)
+    return [room, *(module.name for module in pkgutil.walk_packages(package.__path__, f"{room}."))]
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_the_examples_of_a_room_print_what_they_say(room):
+    options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    modules = modules_of(room)
+    assert len(modules) > 1
+    failures = {
+        name: failed
+        for name in modules
+        if (failed := doctest.testmod(importlib.import_module(name), optionflags=options).failed)
+    }
+    assert not failures, f"failed examples per module: {failures}; doctest's report stands above."
