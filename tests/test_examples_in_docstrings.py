@@ -9,7 +9,7 @@ import pkgutil
 
 import pytest
 
-ROOMS = ["rangesim.geometry", "rangesim.multiview"]
+ROOMS = ["rangesim.geometry", "rangesim.multiview", "rangesim.response", "rangesim.settings"]
 """Packages whose docstrings are run, all of their modules."""
 
 
