@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesim.light_transport.scattering import Media, Medium
 from rangesim.rig import Intrinsics, Lens, Rig
-from rangesim.rig.distortion import distort, undistort
+from rangesim.rig.camera_model import distort, undistort
 
 NO_RAY_PX = 1e-2
 """Where the inverse of a lens model reprojects worse than this in single precision, there is none."""
