@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def group_by_rig(experiment: Experiment, scene: Scene) -> list[tuple[Rig, list[Instrument]]]:
     """The passes of an experiment: a rig each, and the instruments that share it; in order of first appearance.
 
-    An instrument without a wavelength, an ideal one, joins any. Where something moves, each instrument has a pass of its
-    own: its frames are taken at times of its own, and so its truth is another.
+    An ideal instrument has no wavelength and joins the first group with its camera and emitter. Where something moves,
+    each instrument has a pass of its own, because its frames are taken at times of its own.
     """
     groups: list[tuple[Rig, list[Instrument]]] = []
     for instrument in experiment.instruments:
