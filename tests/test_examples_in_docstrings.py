@@ -9,7 +9,7 @@ import pkgutil
 
 import pytest
 
-ROOMS = ["rangesim.geometry", "rangesim.multiview"]
+ROOMS = ["pcgraph.plumbing", "rangesim.geometry", "rangesim.multiview"]
 """Packages whose docstrings are run, all of their modules."""
 
 
