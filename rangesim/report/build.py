@@ -3,17 +3,14 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
-
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from pcgraph.plumbing.plain_files import write_file
 from rangesim.errors import FileFormatError
 from rangesim.report import cloud, figures, palette, tables
-from rangesim.report.policy import StyleRules, content_policy, visible_text
+from rangesim.report.policy import visible_text
+from rangesim.report.template import render_page
 from rangesim.report.verdict import verdict
 from rangesim.results.run_files import Measurement, Result
 
@@ -33,11 +30,7 @@ def write_report(result: Result, path: Path) -> None:
 
 def render_report(result: Result) -> str:
     """The report of a result as HTML."""
-    environment = Environment(
-        autoescape=True, finalize=visible_text, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(_asset("report.html.j2"))
-    return template.render(context(result))
+    return render_page("report.html.j2", context(result), SCRIPTS)
 
 
 def context(result: Result) -> dict[str, Any]:
@@ -49,10 +42,6 @@ def context(result: Result) -> dict[str, Any]:
     depth, error = palette.color_table("viridis"), palette.color_table("RdBu_r")
     limits = palette.depth_limits(measurements)
     return {
-        "css": Markup(_asset("style.css")),  # our own files
-        "script": Markup("\n".join(_asset(name) for name in SCRIPTS)),
-        "rules": StyleRules(),
-        "content_policy": content_policy,
         "scene": result.info.scene,
         "titles": names,
         "references": [m.name for m in measurements if tables.is_reference(m)],
@@ -158,7 +147,3 @@ def _flat(data: Any, prefix: str = "") -> list[tuple[str, str]]:
     if isinstance(data, list) and data and isinstance(data[0], dict):
         return [pair for i, value in enumerate(data) for pair in _flat(value, f"{prefix}[{i}]")]
     return [(prefix, "default" if data is None else str(data))]
-
-
-def _asset(name: str) -> str:
-    return (files("rangesim.report") / name).read_text(encoding="utf-8")
