@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Python file of a user, run as a module; it finds the files beside it, as with `python FILE.py`.
 
-The module of a file that PACKAGE asks for is PACKAGE.own_files.NAME, where NAME spells out the path of the file. So what
-a file defines can be pickled, and another process that can read the file unpickles it: importing that module runs it.
+A file that PACKAGE asks for becomes the module PACKAGE.own_files.NAME, where NAME spells out the path of the file. So
+what the file defines can be pickled: another process imports that module, which runs the file.
 """
 
 from __future__ import annotations
