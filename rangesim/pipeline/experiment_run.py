@@ -25,8 +25,8 @@ from rangesim.files.result_directories import new_directory
 from rangesim.instrument.instrument import Instrument
 from rangesim.motion import transport_moving
 from rangesim.pipeline.cost import Cost, estimate_cost
-from rangesim.pipeline.passes import group_by_rig
 from rangesim.pipeline.provenance import provenance
+from rangesim.pipeline.shared_passes import group_by_rig
 from rangesim.results.run_files import (
     RESULT,
     Measurement,
