@@ -25,8 +25,8 @@ from rangesim.multiview.schur_complement import NormalEquations, Prior, Sizes, S
 from rangesim.multiview.tracks import Tracks
 
 MIN_DAMPING = 1e-12
-"""Smallest damping of Levenberg-Marquardt, relative to the diagonal of the normal equations. It keeps them regular
-along the gauge, which changes no residual."""
+"""Smallest damping of Levenberg-Marquardt over the diagonal of the normal equations, a ratio. It must not be 0, because
+the gauge changes no residual and would leave the equations singular."""
 
 
 @dataclass(frozen=True, eq=False)
