@@ -421,8 +421,10 @@ def _freedom(some: Tracks, sizes: Sizes, held: Sequence[int]) -> int:
 
 
 def _refuse_undetermined(covariance: Array, T: Array, sizes: Sizes, is_free: np.ndarray, noise: float) -> None:
-    """Raise ValueError if the rotation of a pose has a deviation above `MAX_ROTATION_DEVIATION`, or its translation one
-    above the extent of all cameras."""
+    """Raise ValueError if the deviation of a pose is too large.
+
+    The limit of a rotation is `MAX_ROTATION_DEVIATION`, that of a translation the extent of all cameras.
+    """
     of_images = np.diag(covariance)[sizes.shared :].reshape(-1, POSE)
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()

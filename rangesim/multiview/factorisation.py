@@ -346,8 +346,10 @@ def _affine_descent(tracks: Tracks, start: AffineCameras) -> tuple[AffineCameras
 
 
 def whitened(cameras: AffineCameras) -> tuple[AffineCameras, Array]:
-    """The same cameras, their points with zero mean and unit covariance along principal axes, and the singular
-    values."""
+    """The same cameras with whitened points, and the singular values of the pixels.
+
+    Whitened points have zero mean and unit covariance, along their principal axes.
+    """
     middle = cameras.X.mean(axis=0)
     t = cameras.t + cameras.M @ middle
     n, _, rank = cameras.M.shape

@@ -238,8 +238,10 @@ def _ray_angles(K: Array, T: Array, first: Array, second: Array) -> Array:
 def _with_next(
     tracks: Tracks, camera: Intrinsics, T: Array, X: Array, waiting: np.ndarray, noise_px: float, seed: int
 ) -> Array:
-    """The poses T (n, 4, 4) with that of one more image: the one of those waiting that sees most of the known points
-    X."""
+    """The poses (n, 4, 4) with that of one more image, the one of `waiting` that sees most of the known points.
+
+    T : (n, 4, 4), NaN for an image without a pose. X : (n_points, 3), NaN for an unknown point.
+    """
     known = np.asarray(np.isfinite(X).all(axis=1))
     counts = np.bincount(tracks.image[known[tracks.point]], minlength=tracks.n_images)
     refusal = ""

@@ -184,8 +184,10 @@ def _flat(by_point: Array) -> Array:
 
 
 def _shape_bends(shapes: Shapes, sizes: Sizes, deviation: float) -> Term:
-    """The term of the prior on the shape: second differences over the images of each point, residuals (p (n - 2),
-    3)."""
+    """The term of the prior on the shape, with residuals (p (n - 2), 3).
+
+    They are the second differences of each point over the images.
+    """
     n, K = shapes.coefficients.shape
     p = len(shapes.basis)
     point, middle = (a.ravel() for a in np.meshgrid(np.arange(p), np.arange(1, n - 1), indexing="ij"))
