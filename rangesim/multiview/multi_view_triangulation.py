@@ -49,6 +49,10 @@ class ManyViewPoints:
     deviation : (n_points,) float64, standard deviation of a point if the poses are exact, in the unit of the poses: the
         square root of the sum of the variances of its three coordinates. NaN where the point is NaN.
     agrees : (m,) bool, whether the point of an observation was found and projects within `max_error_px` of its pixel.
+
+    Examples
+    --------
+    See `triangulate_many`.
     """
 
     points: Array
