@@ -60,7 +60,7 @@ from rangesim.scene.spectral_reflectance import (
     coloured_materials,
     take_sensor_reflectances,
     warn_of_colours,
-    warn_of_lamps_behind_glass,
+    warn_of_emitters_behind_glass,
 )
 from rangesim.settings.bounds import Bounds, check_number
 
@@ -136,7 +136,7 @@ def load_scene(
     _check(loaded, ids, sensor, label)
     if chosen is None and (n := len(loaded.sensors())) > 1:
         warn(f"{label} has {n} sensors, and the first becomes the camera; Python's load_scene(sensor=) takes another.")
-    warn_of_lamps_behind_glass(loaded, label)
+    warn_of_emitters_behind_glass(loaded, label)
     repeat_normals(loaded)
     camera, T_camera = camera_of(loaded.sensors()[sensor], label)
     working_distance_m = _median_depth(loaded, camera, T_camera)
