@@ -55,16 +55,17 @@ NEIGHBOURS = 256
 take about equally long. Longer runs spread less evenly; runs shorter than a vector of the processor (16 lanes) would
 put pixels into one vector whose paths differ."""
 ITERATIONS_PER_SAMPLE = 2
-"""Iterations of the loop that a sample is taken to need, before any were counted. It sets the size of the first launch
-alone: later ones go by the count."""
+"""Number of iterations of the loop per sample that is assumed before any were counted. Only the first launch is chosen
+by it; later ones go by the count."""
 GOLDEN_STEP = 2654435769
-"""2^32 divided by the golden ratio. Its multiples modulo 2^32 are spread evenly, however many there are."""
+"""Step of a sequence of fractions of 2^32: 2^32 divided by the golden ratio, because its multiples modulo 2^32 are
+spread evenly, however many there are."""
 
 Array = TypeVar("Array")
 
 
 class PathSettings(NamedTuple):
-    """How the loop samples paths. Numbers are opaque to the kernel cache; the flags shape the kernel.
+    """Settings of the loop. Numbers are opaque to the kernel cache; the flags shape the kernel.
 
     seed : Seed. max_depth, rr_depth : UInt32, see `TransportSettings`.
     delta : whether some surface of the scene has a delta interaction.
@@ -95,7 +96,7 @@ class PathSettings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SampleAllocation:
-    """How many samples some of the pixels get, and the projector's light.
+    """Numbers of samples for some of the pixels, and the projector's light.
 
     pixels : (n,) int, flat indices in the whole image.
     samples : (n,) uint32, number of samples to be taken of each pixel.

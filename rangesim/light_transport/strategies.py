@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which strategy brings a light path from the projector to the camera.
+"""The strategies that bring light from the projector to the camera, and which of them owns a light path.
 
 A vertex of a light path is a surface point where light scatters into many directions, or a scattering event inside a
 medium. Between vertices, light runs along segments and through delta interactions (glass, mirrors, thin panes, coats,
