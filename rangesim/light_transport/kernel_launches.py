@@ -80,7 +80,7 @@ class Launches:
         self.units = int(FIRST_UNITS * self.launch_s / LAUNCH_S)
 
     def evaluate(self, arrays: object, units: int) -> None:
-        """Compute a nested structure of Dr.Jit arrays, wait for it, and learn from the time that these units of work took."""
+        """Compute Dr.Jit arrays, wait for them, and learn from the time that these units of work took."""
         self.learn(units, evaluate(arrays))
 
     def learn(self, units: int, seconds: float, prepared_s: float = 0.0) -> None:
@@ -168,13 +168,12 @@ def raised_as_it_is() -> Iterator[None]:
 def evaluate(arrays: object) -> float:
     """Compute a nested structure of Dr.Jit arrays and wait for it; returns the seconds that its kernels took.
 
-    The time in which they were compiled does not count.
-
-    If Dr.Jit has a single thread, it runs the kernels before it returns, so that the time of compilation is included.
+    The time in which kernels were compiled does not count, unless Dr.Jit has a single thread: then it runs the kernels
+    before it returns.
     """
     begin = time.perf_counter()
     try:
-        dr.eval(arrays)  # where there are more, returns when the last kernel is compiled and under way
+        dr.eval(arrays)  # with several threads, returns when the last kernel is compiled and under way
         if mi.variant().startswith("cuda") or dr.thread_count() > 1:
             begin = time.perf_counter()
     finally:
