@@ -89,7 +89,7 @@ class Launches:
         fits = units * launch_s / max(seconds, 1e-6)
         if fits > self.units:
             self.units = int(min(fits, MAX_GROWTH * self.units))
-        elif seconds > launch_s / 2:  # a shorter launch says how long its overhead takes
+        elif seconds > launch_s / 2:  # a shorter launch took mostly overhead
             self.units = max(1, int(fits))
 
     def run(

@@ -316,7 +316,7 @@ class Lanes:
         width = mi.UInt32(view.traced.camera.size.x)
         self.corner = mi.Point2f(mi.Float(self.pixel % width), mi.Float(self.pixel // width))
         rng = random_stream(settings.seed, self.pixel)
-        self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the samples in the pixel
+        self.shift = mi.Point2f(rng.next_float32(), rng.next_float32())  # of the places of samples within the pixel
         on_lens = view.traced.camera.has_lens
         self.lens_shift = mi.Point2f(rng.next_float32(), rng.next_float32()) if on_lens else None
         self.random = Continued(of_part(rng, self.part))
@@ -427,7 +427,7 @@ def walk(
                 path.ray_state.inside, path.ray_state.previous, ray.d, si, hit, rng.next_float32()
             )
         at_surface = hit & ~scatters
-        # It counts if it scatters the path; whether it does is known when the next direction is
+        # The surface counts towards the depth if it scatters the path; the next direction will tell
         if dr.hint(media is not None, mode="scalar"):
             arrives = ~(crosses | (scatters & path.scattered_inside))
             path.depth += dr.select(arrives, mi.UInt32(1), mi.UInt32(0))
@@ -469,7 +469,7 @@ def walk(
             xi = mi.Point2f(rng.next_float32(), rng.next_float32())
             wo = dr.select(scatters, medium.scattered(ray.d, xi), wo)
         light = dr.select(link.lit, path.throughput * value * link.geometry * lanes.irradiance, 0)
-        # Nothing undefined (u at z = 0, say) may reach a response: 0 times it is not always 0
+        # No undefined number (u at z = 0, for example) may reach a response: 0 times NaN is not 0
         u, v, path_length = (
             dr.select(link.lit, x, 0) for x in (link.uv.x, link.uv.y, path.ray_state.length + link.distance)
         )
@@ -519,7 +519,7 @@ def walk(
         if dr.hint(settings.delta, mode="scalar"):
             path.depth -= dr.select(path.left_delta, mi.UInt32(1), mi.UInt32(0))
             path.chain = dr.select(crosses, path.chain, dr.select(path.left_delta, path.chain + 1, 0))
-        fraction = path.throughput * dr.square(path.ray_state.ior)  # of the light, that this path stands for
+        fraction = path.throughput * dr.square(path.ray_state.ior)  # of the light is left on the path
         chance = dr.select(path.depth > settings.rr_depth, dr.minimum(fraction, 0.95), 1)
         if dr.hint(settings.delta, mode="scalar"):
             chance = dr.minimum(chance, survival(path.chain, fraction))
@@ -545,7 +545,7 @@ def walk(
         path.ray_state = path.ray_state.entering(traced, si, wo, at_surface, crosses)
 
         # ---- Or next sample --------------------------------------------------------------------------
-        # The last surface can only be seen to emit, so it is needed for ambient light alone
+        # At the last surface only its own emission matters, so it is met for ambient light alone
         last = settings.max_depth if settings.ambient else settings.max_depth - 1
         goes_on = path.depth < last
         if dr.hint(media is not None, mode="scalar"):

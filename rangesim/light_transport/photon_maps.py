@@ -278,7 +278,7 @@ class PhotonMaps:
         starts, counts = self._ranges(point, of_map + level * self.maps, reach.edge * shrunk, reach.kind, active)
         one, two = counts[0] + counts[1], counts[0] + counts[1] + counts[2]
         count = two + counts[3]
-        # Where photons crowd, every n-th will do; they are in the order in which they left the projector
+        # Where photons crowd, only every n-th is looked at. They are in the order in which they left the projector
         every = (count + (MAX_LOOKED_AT - 1)) // MAX_LOOKED_AT
         k = mi.UInt32(offset * mi.Float(every))
         total, chosen, pick = mi.Float(0), mi.UInt32(0), mi.Float(pick)
@@ -296,7 +296,7 @@ class PhotonMaps:
             fraction = dr.select(beside, weight / total, 0)
             taken = pick < fraction
             chosen = dr.select(taken, index, chosen)
-            pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))  # as good as new
+            pick = dr.select(taken, pick / fraction, (pick - fraction) / (1 - fraction))  # uniform again
             k += every
         return Gathered(chosen, total * mi.Float(every) * (2 / dr.pi) * inverse_square)
 

@@ -192,7 +192,7 @@ def _chances(scene: mi.Scene, projector: Device) -> tuple[np.ndarray, np.ndarray
     chance = np.where(
         mask, 1.0, DEFENSIVE_FRACTION / (1 - DEFENSIVE_FRACTION) * max(mask.sum(), 1) / max(rest.sum(), 1)
     )
-    # Places grow along every row of the image: runs, which a stable sort merges
+    # Places grow along every row of the image, so a stable sort has only to merge sorted runs
     order = np.argsort(_morton(w, h).ravel(), kind="stable")
     return order, chance[order]
 

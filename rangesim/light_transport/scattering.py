@@ -69,7 +69,7 @@ class Medium:
 
         `direction` is the one before; `xi` is uniform in the unit square.
         """
-        g = dr.select(dr.abs(self.g) < 1e-3, 1e-3, self.g)  # the inverse has no value at g = 0
+        g = dr.select(dr.abs(self.g) < 1e-3, 1e-3, self.g)  # the inverse would be 0 / 0 at g = 0
         way = (1 - dr.square(g)) / (1 - g + 2 * g * xi.x)
         cosine = dr.clip((1 + dr.square(g) - dr.square(way)) / (2 * g), -1, 1)
         cosine = dr.select(dr.abs(self.g) < 1e-3, 1 - 2 * xi.x, cosine)

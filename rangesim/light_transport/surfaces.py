@@ -143,7 +143,7 @@ class Meshes:
             np.concatenate([own + np.uint32(first) for own, first in zip(own_faces, vertices[:-1], strict=True)])
         )
         parameters["vertex_positions"] = _joined([m.vertex_positions_buffer() for m in meshes])
-        parameters.update()  # makes normals, so those of the meshes come later
+        parameters.update()  # computes normals, so those of the meshes are set later
         if has_normals:
             parameters["vertex_normals"] = _joined([m.vertex_normals_buffer() for m in meshes])
         if has_texcoords:
